@@ -1,0 +1,537 @@
+"""RoboArmEnv: motion planning for a 7-DoF arm as a goal-conditioned MDP.
+
+Paper: sections 2 and 4, appendix "Extended NMP goal-conditioned MDP description".
+"""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pybullet as p
+
+from envs import panda
+from envs.scenes import Box, Scene
+
+GOAL_TYPES = ("ee", "config", "combined")
+ACTION_MODES = ("relative", "subgoal")
+
+# One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
+# controller; docs/environment.md has the measured tracking error.
+TIME_STEP = 1.0 / 120.0
+SUBSTEPS = 4
+SOLVER_ITERATIONS = 20  # PyBullet's default of 50 tracks no better and costs a fifth of the speed
+POSITION_GAINS = [0.6] * panda.NUM_JOINTS
+# A configuration is "held" if the controller keeps it, untouched, this many environment steps
+# without drifting further than this (normalised).
+HOLD_STEPS = 5
+HOLD_DRIFT = 1e-3
+MAX_SAMPLING_TRIES = 10_000
+
+
+class RoboArmEnv(gym.Env):
+    """A Franka Panda that has to reach a goal among obstacles, touching nothing.
+
+    Observations are a dict (the GoalEnv interface of Gymnasium-Robotics), all float32:
+
+    - `observation`: normalised configuration (7), then joint velocities in normalised units per
+      second (7, only with `velocities=True`), then the end-effector position in metres (3);
+    - `achieved_goal`, `desired_goal`: `ee` the end-effector position (3, metres), `config` the
+      normalised configuration (7), `combined` both, configuration first (10).
+
+    Actions are float32 in [-1, 1]^7: `relative`, a displacement of the normalised configuration, or
+    `subgoal`, the next normalised configuration itself. Either way the displacement is clipped to
+    the L2 norm `max_step`, so an action is a direction unless it is shorter than that.
+
+    `info` carries `is_success`, `collision` (something was touched in this step),
+    `collision_so_far` (in this episode), `ee_distance` (m) and `config_distance` (normalised; NaN
+    if the goal was given as a position only), and `elapsed_steps`.
+
+    Args:
+        scene: a `Scene`.
+        goal_type: `ee`, `config` or `combined` (reached like `ee`).
+        ee_tolerance: goal radius in metres (paper: 0.02).
+        config_tolerance: goal radius in the normalised configuration space (paper: 0.05).
+        action_mode: `relative` or `subgoal`.
+        max_step: longest displacement per step, L2 in the normalised space (paper: 0.03).
+        horizon: steps after which an episode is truncated (paper: 400).
+        stop_on_collision: end the episode at the first touch (paper: False).
+        reward: `sparse`, -1 per step and 0 on reaching the goal, or `dense`, minus the distance
+            to the goal in the goal's own metric (metres for `ee` and `combined`).
+        sink_state: instead of terminating, stay where the episode ended, at reward 0 whatever the
+            action, until the horizon.
+        velocities: add joint velocities to `observation`.
+        render_mode: None, `rgb_array`, or `human` (opens PyBullet's window).
+        render_size: (width, height) of `rgb_array` pictures in pixels.
+
+    Raises:
+        ValueError: for an argument out of its range; the message says what was expected.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": round(1 / TIME_STEP / SUBSTEPS)}
+
+    def __init__(
+        self,
+        scene=None,
+        goal_type="ee",
+        ee_tolerance=0.02,
+        config_tolerance=0.05,
+        action_mode="relative",
+        max_step=0.03,
+        horizon=400,
+        stop_on_collision=False,
+        reward="sparse",
+        sink_state=False,
+        velocities=False,
+        render_mode=None,
+        render_size=(480, 360),
+    ):
+        self._client = None
+        _one_of("goal_type", goal_type, GOAL_TYPES)
+        _one_of("action_mode", action_mode, ACTION_MODES)
+        _one_of("reward", reward, ("sparse", "dense"))
+        _one_of("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        for name, value in [
+            ("ee_tolerance", ee_tolerance),
+            ("config_tolerance", config_tolerance),
+            ("max_step", max_step),
+            ("horizon", horizon),
+        ]:
+            if not (np.isscalar(value) and np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be a positive number, got {value!r}")
+        scene = Scene() if scene is None else scene
+        _check_scene(scene)
+        self.goal_type = goal_type
+        self._tolerance = config_tolerance if goal_type == "config" else ee_tolerance
+        self.ee_tolerance = ee_tolerance
+        self.config_tolerance = config_tolerance
+        self.action_mode = action_mode
+        self.max_step = max_step
+        self.horizon = int(horizon)
+        self.stop_on_collision = stop_on_collision
+        self.reward = reward
+        self.sink_state = sink_state
+        self.velocities = velocities
+        self.render_mode = render_mode
+        self.render_size = render_size
+
+        goal_size = {"ee": 3, "config": 7, "combined": 10}[goal_type]
+        observation_size = 17 if velocities else 10
+        unbounded = [
+            ("observation", observation_size),
+            ("achieved_goal", goal_size),
+            ("desired_goal", goal_size),
+        ]
+        self.observation_space = gym.spaces.Dict(
+            {name: gym.spaces.Box(-np.inf, np.inf, (size,), np.float32) for name, size in unbounded}
+        )
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (panda.NUM_JOINTS,), np.float32)
+
+        self._client = p.connect(p.GUI if render_mode == "human" else p.DIRECT)
+        # Without deterministicOverlappingPairs the same episode differs from run to run.
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP,
+            numSolverIterations=SOLVER_ITERATIONS,
+            deterministicOverlappingPairs=1,
+            physicsClientId=self._client,
+        )
+        p.setGravity(0, 0, -9.81, physicsClientId=self._client)
+        self.robot = panda.load(self._client)
+        self._bodies = []
+        self._goal_marker = None
+        self.scene = None
+        self.set_scene(scene)
+
+        self.start_configuration = None
+        """Start of this episode, float32 (7,), rad; None before the first reset."""
+        self.goal_configuration = None
+        """Goal of this episode, float32 (7,), rad; None if it was given as a position."""
+
+    # --- The scene
+
+    def set_scene(self, scene):
+        """Put the arm into another `Scene`. The running episode ends: call a reset next."""
+        _check_scene(scene)
+        self.start_configuration = None
+        if scene == self.scene:
+            return
+        for body in self._bodies:
+            p.removeBody(body, physicsClientId=self._client)
+        self._bodies = []
+        self.scene = scene
+        if scene.floor is not None:
+            floor = Box((0.0, 0.0, scene.floor - 0.05), (6.0, 6.0, 0.1))
+            self._add(floor, (0.55, 0.55, 0.55, 1))
+        if scene.table is not None:
+            table = self._add(scene.table, (0.76, 0.70, 0.60, 1))
+            # The base is bolted to the table.
+            p.setCollisionFilterPair(self.robot, table, -1, -1, 0, physicsClientId=self._client)
+        for obstacle in scene.obstacles:
+            self._add(obstacle, (0.36, 0.50, 0.65, 1))
+
+    def _add(self, obstacle, colour):
+        if isinstance(obstacle, Box):
+            half = [edge / 2 for edge in obstacle.size]
+            collision, visual = {"halfExtents": half}, {"halfExtents": half}
+            kind = p.GEOM_BOX
+        else:
+            collision = {"radius": obstacle.radius, "height": obstacle.length}
+            visual = {"radius": obstacle.radius, "length": obstacle.length}
+            kind = p.GEOM_CYLINDER
+        client = self._client
+        body = p.createMultiBody(
+            baseCollisionShapeIndex=p.createCollisionShape(kind, **collision, physicsClientId=client),
+            baseVisualShapeIndex=p.createVisualShape(
+                kind, **visual, rgbaColor=colour, physicsClientId=client
+            ),
+            basePosition=obstacle.position,
+            baseOrientation=obstacle.orientation,
+            physicsClientId=client,
+        )
+        self._bodies.append(body)
+        return body
+
+    # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
+
+    def in_collision(self, configuration):
+        """Whether the arm at joint angles (7, rad), inside the limits, overlaps the scene or itself.
+
+        Moves the arm: call it between episodes, or go on with a reset.
+        """
+        panda.set_configuration(self._client, self.robot, configuration)
+        p.performCollisionDetection(physicsClientId=self._client)
+        return any(
+            contact[8] < 0.0
+            for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self._client)
+        )
+
+    def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
+        """Whether joint angles (7, rad) are inside the limits, collision free and held.
+
+        Held: the position controller keeps the arm there for `hold_steps` environment steps. Moves
+        the arm: call it between episodes, or go on with a reset.
+        """
+        if np.any(configuration < panda.LOWER) or np.any(configuration > panda.UPPER):
+            return False
+        if self.in_collision(configuration):
+            return False
+        panda.command(self._client, self.robot, list(configuration), POSITION_GAINS)
+        for _ in range(hold_steps):
+            if self._simulate():
+                return False
+        self._read_arm()
+        drift = self._state - panda.normalise(configuration)
+        return math.sqrt(drift @ drift) <= HOLD_DRIFT
+
+    def sample_feasible(self, rng):
+        """A feasible configuration, uniform in the limits: float32 (7,), rad. `rng`: a NumPy Generator."""
+        for _ in range(MAX_SAMPLING_TRIES):
+            configuration = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
+            if self.is_feasible(configuration):
+                return configuration
+        raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples: {self.scene}")
+
+    def sample_query(self, rng):
+        """A start and a goal the start does not already reach: two float32 (7,), rad."""
+        start = self.sample_feasible(rng)
+        while True:
+            goal = self.sample_feasible(rng)
+            pair = np.stack([start, goal])
+            states, positions = panda.normalise(pair), panda.forward_kinematics(pair)
+            if self.goal_type == "config":
+                if np.linalg.norm(states[0] - states[1]) > self.config_tolerance:
+                    return start, goal
+            elif np.linalg.norm(positions[0] - positions[1]) > self.ee_tolerance:
+                return start, goal
+
+    # --- Episodes
+
+    def reset(self, *, seed=None, options=None):
+        """Start an episode from a random feasible start to a random feasible goal."""
+        super().reset(seed=seed)
+        return self._begin(*self.sample_query(self.np_random))
+
+    def reset_specific(self, start, goal, scene=None):
+        """Start an episode on a given query.
+
+        Args:
+            start: joint angles (7, rad).
+            goal: joint angles (7, rad); or, with goal type `ee`, an end-effector position (3, m).
+            scene: a `Scene` to change to first.
+
+        Raises:
+            ValueError: wrong size, not finite, outside the joint limits or in collision. A running
+                episode is left as it was (unless the scene was changed).
+        """
+        start = _vector("start", start, (7,))
+        goal = _vector("goal", goal, (7, 3) if self.goal_type == "ee" else (7,))
+        for name, configuration in (("start", start), ("goal", goal)):
+            if configuration.size == 7:
+                outside = (configuration < panda.LOWER) | (configuration > panda.UPPER)
+                if outside.any():
+                    joint = int(np.argmax(outside))
+                    raise ValueError(
+                        f"{name} is outside the joint limits: joint {joint + 1} is "
+                        f"{configuration[joint]:.4f} rad, limits {panda.LOWER[joint]} to "
+                        f"{panda.UPPER[joint]}"
+                    )
+        if scene is not None:
+            self.set_scene(scene)
+        before = p.getJointStates(self.robot, panda._RESET_JOINTS, physicsClientId=self._client)
+        for name, configuration in (("goal", goal), ("start", start)):
+            if configuration.size == 7 and self.in_collision(configuration):
+                touched = self._touched_names()
+                p.resetJointStatesMultiDof(
+                    self.robot,
+                    panda._RESET_JOINTS,
+                    [[joint[0]] for joint in before],
+                    [[joint[1]] for joint in before],
+                    physicsClientId=self._client,
+                )
+                raise ValueError(f"{name} is in collision: {touched}")
+        return self._begin(start, goal)
+
+    def _begin(self, start, goal):
+        panda.set_configuration(self._client, self.robot, start)
+        panda.command(self._client, self.robot, start.tolist(), POSITION_GAINS)
+        self.start_configuration = start
+        if goal.size == 7:
+            self.goal_configuration = goal
+            self._goal_state = panda.normalise(goal)
+            self._goal_position = panda.forward_kinematics(goal)
+        else:
+            self.goal_configuration = None
+            self._goal_state = np.full(7, np.nan)
+            self._goal_position = goal.astype(np.float64)
+        self._desired_goal = self._goal_vector(self._goal_state, self._goal_position)
+        self._steps = 0
+        self._collision_so_far = False
+        self._in_sink = False
+        self._read_arm()
+        if self.render_mode is not None:
+            self._mark_goal()
+        observation = self._observation()
+        distance = self._distance(observation["achieved_goal"], self._desired_goal)
+        self._is_success = bool(distance <= self._tolerance)
+        return observation, self._info(False, self._is_success)
+
+    def step(self, action):
+        """One step: `(observation, reward, terminated, truncated, info)`.
+
+        Raises:
+            ValueError: the action is not 7 finite numbers; nothing has moved then.
+            RuntimeError: there was no reset yet.
+        """
+        if self.start_configuration is None:
+            raise RuntimeError("no episode: call reset() or reset_specific() before step()")
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (7,) or not np.isfinite(action).all():
+            raise ValueError(f"an action is 7 finite numbers in [-1, 1], got {action}")
+        self._steps += 1
+        if self._in_sink:
+            info = self._info(False, self._is_success)
+            return self._observation(), 0.0, False, self._steps >= self.horizon, info
+
+        action = np.clip(action, -1.0, 1.0)
+        delta = action if self.action_mode == "relative" else action - self._state
+        length = math.sqrt(delta @ delta)
+        if length > self.max_step:
+            delta = delta * (self.max_step / length)
+        target = panda.denormalise(np.clip(self._state + delta, -1.0, 1.0))
+        panda.command(self._client, self.robot, target.tolist(), POSITION_GAINS)
+        collision = self._simulate()
+        self._collision_so_far = self._collision_so_far or collision
+        self._read_arm()
+
+        observation = self._observation()
+        distance = self._distance(observation["achieved_goal"], self._desired_goal)
+        self._is_success = bool(distance <= self._tolerance)
+        info = self._info(collision, self._is_success)
+        reward = float(self._reward(distance))
+        ended = self._is_success or (self.stop_on_collision and collision)
+        self._in_sink = self.sink_state and ended
+        terminated = ended and not self.sink_state
+        return observation, reward, terminated, self._steps >= self.horizon and not terminated, info
+
+    def _simulate(self):
+        """Run the physics of one environment step; whether the arm touched anything in it."""
+        touched = False
+        for _ in range(SUBSTEPS):
+            p.stepSimulation(physicsClientId=self._client)
+            if not touched:
+                # A contact also counts at distance zero, when the surfaces push on each other.
+                touched = any(
+                    contact[8] < 0.0 or contact[9] > 0.0
+                    for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self._client)
+                )
+        return touched
+
+    def _touched_names(self):
+        """What the arm overlaps, in words; after `in_collision`."""
+        names = set()
+        for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self._client):
+            if contact[8] < 0.0:
+                body = contact[2]
+                if body == self.robot:
+                    names.add("the arm with itself")
+                else:
+                    index = self._bodies.index(body)
+                    kinds = ["the floor"] * (self.scene.floor is not None)
+                    kinds += ["the table"] * (self.scene.table is not None)
+                    kinds += [f"obstacle {i}" for i in range(len(self.scene.obstacles))]
+                    names.add(f"the arm with {kinds[index]}")
+        return ", ".join(sorted(names))
+
+    def _read_arm(self):
+        joints = p.getJointStates(self.robot, panda.ARM_JOINTS, physicsClientId=self._client)
+        self._state = panda.normalise([joint[0] for joint in joints])
+        if self.velocities:
+            speeds = np.array([joint[1] for joint in joints])
+            self._velocity = 2.0 * speeds / (panda.UPPER - panda.LOWER)
+        link = p.getLinkState(
+            self.robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=self._client
+        )
+        self._position = np.array(link[4])
+
+    def _goal_vector(self, state, position):
+        if self.goal_type == "ee":
+            return position.astype(np.float32)
+        if self.goal_type == "config":
+            return state.astype(np.float32)
+        return np.concatenate([state, position]).astype(np.float32)
+
+    def _observation(self):
+        middle = [self._velocity] if self.velocities else []
+        observation = np.concatenate([self._state, *middle, self._position])
+        return {
+            "observation": observation.astype(np.float32),
+            "achieved_goal": self._goal_vector(self._state, self._position),
+            "desired_goal": self._desired_goal.copy(),
+        }
+
+    def _info(self, collision, is_success):
+        to_goal, apart = self._position - self._goal_position, self._state - self._goal_state
+        ee_distance, config_distance = math.sqrt(to_goal @ to_goal), math.sqrt(apart @ apart)
+        return {
+            "is_success": is_success,
+            "collision": collision,
+            "collision_so_far": self._collision_so_far,
+            "ee_distance": ee_distance,
+            "config_distance": config_distance,
+            "elapsed_steps": self._steps,
+        }
+
+    # --- The goal-conditioned MDP on batches (for relabelling)
+
+    def _distance(self, achieved_goal, desired_goal):
+        apart = np.asarray(achieved_goal) - np.asarray(desired_goal)
+        if self.goal_type == "combined":
+            apart = apart[..., 7:]  # reached like `ee`
+        return np.sqrt(np.square(apart).sum(-1))
+
+    def _reward(self, distance):
+        if self.reward == "dense":
+            return -distance
+        return np.where(distance <= self._tolerance, 0.0, -1.0).astype(np.float32)
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        """Reward of arriving at `achieved_goal` (..., d) when the goal is `desired_goal` (..., d).
+
+        Returns an array of the batch shape (a scalar for single goals). `info` is not used.
+        """
+        return self._reward(self._distance(achieved_goal, desired_goal))
+
+    def compute_terminated(self, achieved_goal, desired_goal, info):
+        """Whether an episode ends there: a bool array of the batch shape.
+
+        `info` is one info dict (entries may be arrays), or a sequence of them as long as the
+        batch; with `stop_on_collision` its `collision` ends the episode too.
+        """
+        ended = self._distance(achieved_goal, desired_goal) <= self._tolerance
+        if self.stop_on_collision:
+            ended = ended | _entry(info, "collision", bool)
+        return ended & (not self.sink_state)
+
+    def compute_truncated(self, achieved_goal, desired_goal, info):
+        """Whether the horizon cuts the episode there: a bool array of the batch shape.
+
+        `info`: as for `compute_terminated`; `elapsed_steps` is read.
+        """
+        late = _entry(info, "elapsed_steps", int) >= self.horizon
+        return late & ~self.compute_terminated(achieved_goal, desired_goal, info)
+
+    # --- Pictures
+
+    def _mark_goal(self):
+        """A green ball, visual only, at the goal position."""
+        if self._goal_marker is None:
+            ball = p.createVisualShape(
+                p.GEOM_SPHERE,
+                radius=self.ee_tolerance,
+                rgbaColor=(0.1, 0.75, 0.2, 1),
+                physicsClientId=self._client,
+            )
+            self._goal_marker = p.createMultiBody(
+                baseVisualShapeIndex=ball, physicsClientId=self._client
+            )
+        p.resetBasePositionAndOrientation(
+            self._goal_marker, self._goal_position, (0, 0, 0, 1), physicsClientId=self._client
+        )
+
+    def render(self):
+        """With `rgb_array`: a uint8 picture (height, width, 3) of the arm, the scene and the goal."""
+        if self.render_mode != "rgb_array":
+            return None
+        width, height = self.render_size
+        view = p.computeViewMatrixFromYawPitchRoll((0.15, 0.0, 0.3), 2.1, 55, -28, 0, 2)
+        projection = p.computeProjectionMatrixFOV(50, width / height, 0.1, 10.0)
+        _, _, pixels, _, _ = p.getCameraImage(
+            width,
+            height,
+            view,
+            projection,
+            lightDirection=(1.0, 1.0, 2.5),
+            renderer=p.ER_TINY_RENDERER,
+            physicsClientId=self._client,
+        )
+        return np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
+
+    def close(self):
+        """Disconnect from PyBullet. Closing twice is allowed."""
+        if self._client is not None:
+            p.disconnect(physicsClientId=self._client)
+            self._client = None
+
+    def __del__(self):
+        # An env that nobody closed must not keep one of PyBullet's connections.
+        if getattr(self, "_client", None) is not None and p.isConnected(self._client):
+            p.disconnect(physicsClientId=self._client)
+
+
+def _one_of(name, value, allowed):
+    if value not in allowed:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+
+
+def _check_scene(scene):
+    if not isinstance(scene, Scene):
+        raise TypeError(f"a scene must be an envs.scenes.Scene, got {scene!r}")
+
+
+def _vector(name, value, sizes):
+    try:
+        vector = np.asarray(value, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers, got {value!r}") from error
+    if vector.ndim != 1 or vector.size not in sizes:
+        expected = " or ".join(str(size) for size in sizes)
+        raise ValueError(f"{name} must have {expected} numbers, got shape {vector.shape}")
+    if not np.isfinite(vector).all():
+        raise ValueError(f"{name} must be finite, got {vector}")
+    return vector.copy()
+
+
+def _entry(info, key, dtype):
+    """One entry of an info dict, or of a sequence of info dicts, as an array."""
+    if isinstance(info, dict):
+        return np.asarray(info[key], dtype=dtype)
+    return np.array([one[key] for one in info], dtype=dtype)
