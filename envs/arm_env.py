@@ -4,6 +4,8 @@ Paper: sections 2 and 4, appendix "Extended NMP goal-conditioned MDP description
 """
 
 import math
+import os
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +21,6 @@ ACTION_MODES = ("relative", "subgoal")
 # controller; docs/environment.md has the measured tracking error.
 TIME_STEP = 1.0 / 120.0
 SUBSTEPS = 4
-SOLVER_ITERATIONS = 20  # PyBullet's default of 50 tracks no better and costs a fifth of the speed
 POSITION_GAINS = [0.6] * panda.NUM_JOINTS
 # A configuration is "held" if the controller keeps it, untouched, this many environment steps
 # without drifting further than this (normalised).
@@ -115,9 +116,9 @@ class RoboArmEnv(gym.Env):
         self.render_size = render_size
 
         goal_size = {"ee": 3, "config": 7, "combined": 10}[goal_type]
-        observation_size = 17 if velocities else 10
+        self._observation_size = 17 if velocities else 10
         unbounded = [
-            ("observation", observation_size),
+            ("observation", self._observation_size),
             ("achieved_goal", goal_size),
             ("desired_goal", goal_size),
         ]
@@ -126,13 +127,15 @@ class RoboArmEnv(gym.Env):
         )
         self.action_space = gym.spaces.Box(-1.0, 1.0, (panda.NUM_JOINTS,), np.float32)
 
-        self._client = p.connect(p.GUI if render_mode == "human" else p.DIRECT)
+        window = render_mode == "human"
+        if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+            # PyBullet would end the whole process.
+            gym.logger.warn("render_mode='human' needs a display (DISPLAY is not set): no window")
+            window = False
+        self._client = p.connect(p.GUI if window else p.DIRECT)
         # Without deterministicOverlappingPairs the same episode differs from run to run.
         p.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP,
-            numSolverIterations=SOLVER_ITERATIONS,
-            deterministicOverlappingPairs=1,
-            physicsClientId=self._client,
+            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self._client
         )
         p.setGravity(0, 0, -9.81, physicsClientId=self._client)
         self.robot = panda.load(self._client)
@@ -324,19 +327,19 @@ class RoboArmEnv(gym.Env):
         if self.start_configuration is None:
             raise RuntimeError("no episode: call reset() or reset_specific() before step()")
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != (7,) or not np.isfinite(action).all():
+        if action.shape != (7,) or not math.isfinite(action @ action):
             raise ValueError(f"an action is 7 finite numbers in [-1, 1], got {action}")
         self._steps += 1
         if self._in_sink:
             info = self._info(False, self._is_success)
             return self._observation(), 0.0, False, self._steps >= self.horizon, info
 
-        action = np.clip(action, -1.0, 1.0)
+        action = _clip(action)
         delta = action if self.action_mode == "relative" else action - self._state
         length = math.sqrt(delta @ delta)
         if length > self.max_step:
             delta = delta * (self.max_step / length)
-        target = panda.denormalise(np.clip(self._state + delta, -1.0, 1.0))
+        target = panda.denormalise(_clip(self._state + delta))
         panda.command(self._client, self.robot, target.tolist(), POSITION_GAINS)
         collision = self._simulate()
         self._collision_so_far = self._collision_so_far or collision
@@ -400,10 +403,12 @@ class RoboArmEnv(gym.Env):
         return np.concatenate([state, position]).astype(np.float32)
 
     def _observation(self):
-        middle = [self._velocity] if self.velocities else []
-        observation = np.concatenate([self._state, *middle, self._position])
+        observation = np.empty(self._observation_size, np.float32)
+        observation[:7], observation[-3:] = self._state, self._position
+        if self.velocities:
+            observation[7:14] = self._velocity
         return {
-            "observation": observation.astype(np.float32),
+            "observation": observation,
             "achieved_goal": self._goal_vector(self._state, self._position),
             "desired_goal": self._desired_goal.copy(),
         }
@@ -505,6 +510,11 @@ class RoboArmEnv(gym.Env):
         # An env that nobody closed must not keep one of PyBullet's connections.
         if getattr(self, "_client", None) is not None and p.isConnected(self._client):
             p.disconnect(physicsClientId=self._client)
+
+
+def _clip(vector):
+    """np.clip to [-1, 1], which takes a fifth of the time this way on 7 numbers."""
+    return np.minimum(np.maximum(vector, -1.0), 1.0)
 
 
 def _one_of(name, value, allowed):

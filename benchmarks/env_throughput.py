@@ -1,0 +1,166 @@
+"""Environment steps per second on one core, against panda-gym and against bare PyBullet.
+
+    pip install -c constraints.txt -e ".[bench]"
+    python benchmarks/env_throughput.py
+
+Three loops take turns in one process, block by block, so that a machine whose speed drifts slows
+all of them; medians over the blocks are compared. Only steps are timed, resets are not.
+
+- ours: `double_walls` with every collision on, made by `gymnasium.make`.
+- panda-gym: `PandaReachJoints-v3`, random actions.
+- bare loop: PyBullet alone in the same world, replaying the joint targets our env commanded on the
+  same episodes: the same commands, physics steps, and reads of contacts, joints and end-effector.
+
+The last line is JSON.
+"""
+
+import argparse
+import json
+import os
+import platform
+import time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium
+import numpy as np
+import panda_gym  # noqa: F401  (registers PandaReachJoints-v3)
+import pybullet as p
+from tqdm import trange
+
+import envs
+from envs import arm_env, panda
+
+EPISODE = 100  # steps
+
+
+def make_episodes(env, number, rng):
+    """Queries with actions that keep a random direction for 10 steps at a time."""
+    episodes = []
+    for _ in range(number):
+        directions = rng.uniform(-1, 1, (EPISODE // 10, 7)).astype(np.float32)
+        episodes.append((*env.sample_query(rng), directions.repeat(10, axis=0)))
+    return episodes
+
+
+def run_ours(env, episode):
+    """Seconds for the steps of one episode."""
+    start, goal, actions = episode
+    env.unwrapped.reset_specific(start, goal)
+    began = time.perf_counter()
+    for action in actions:
+        env.step(action)
+    return time.perf_counter() - began
+
+
+def run_panda_gym(env, actions):
+    env.reset()
+    began = time.perf_counter()
+    for action in actions:
+        env.step(action)
+    return time.perf_counter() - began
+
+
+def run_bare(env, start, targets):
+    client, robot = env._client, env.robot
+    panda.set_configuration(client, robot, start)
+    forces = panda.MAX_TORQUE.tolist()
+    began = time.perf_counter()
+    for target in targets:
+        p.setJointMotorControlArray(
+            robot,
+            panda.ARM_JOINTS,
+            p.POSITION_CONTROL,
+            targetPositions=target,
+            forces=forces,
+            positionGains=arm_env.POSITION_GAINS,
+            physicsClientId=client,
+        )
+        for _ in range(arm_env.SUBSTEPS):
+            p.stepSimulation(physicsClientId=client)
+            p.getContactPoints(bodyA=robot, physicsClientId=client)
+        p.getJointStates(robot, panda.ARM_JOINTS, physicsClientId=client)
+        p.getLinkState(robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=client)
+    return time.perf_counter() - began
+
+
+def record_targets(env, episode):
+    """The joint targets that our env commands on an episode, and how well the arm follows them.
+
+    Tracking: the share of a commanded displacement that the arm made, steps without contact.
+    """
+    start, goal, actions = episode
+    targets, tracking = [], []
+    command = panda.command
+    panda.command = lambda client, robot, target, gains: (
+        targets.append(target),
+        command(client, robot, target, gains),
+    )
+    try:
+        env.reset_specific(start, goal)
+        targets.clear()
+        before = panda.normalise(start)
+        for action in actions:
+            observation, _, _, _, info = env.step(action)
+            after = observation["observation"][:7].astype(np.float64)
+            asked = panda.normalise(targets[-1]) - before
+            if not info["collision"]:
+                tracking.append((after - before) @ asked / (asked @ asked))
+            before = after
+    finally:
+        panda.command = command
+    return targets, tracking
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--blocks", type=int, default=60, help="blocks of 100 steps per loop")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    rng = np.random.default_rng(args.seed)
+
+    ours = gymnasium.make(envs.gymnasium_id("double_walls"), disable_env_checker=True)
+    ours.reset(seed=args.seed)
+    bare = envs.make("double_walls")
+    peer = gymnasium.make("PandaReachJoints-v3")
+    peer.reset(seed=args.seed)
+    peer.action_space.seed(args.seed)
+
+    episodes = make_episodes(bare, args.blocks, rng)
+    seconds = {"ours": [], "panda-gym": [], "bare loop": []}
+    resets, tracking = [], []
+    for i in trange(args.blocks, unit="block"):
+        targets, block_tracking = record_targets(bare, episodes[i])
+        tracking += block_tracking
+        peer_actions = [peer.action_space.sample() for _ in range(EPISODE)]
+        seconds["ours"].append(run_ours(ours, episodes[i]))
+        seconds["panda-gym"].append(run_panda_gym(peer, peer_actions))
+        seconds["bare loop"].append(run_bare(bare, episodes[i][0], targets))
+        began = time.perf_counter()
+        ours.reset(seed=i)
+        resets.append(time.perf_counter() - began)
+
+    per_second = {name: EPISODE / np.median(times) for name, times in seconds.items()}
+    print(f"\n{'loop':12}{'env steps/s':>14}{'ours / loop':>14}")
+    for name, rate in per_second.items():
+        print(f"{name:12}{rate:14.0f}{per_second['ours'] / rate:14.2f}")
+    print(f"\nreset to a random feasible query: {1e3 * np.median(resets):.2f} ms (median)")
+    percentiles = np.percentile(tracking, [5, 50, 95])
+    print(
+        "share of a commanded displacement made in one step, away from contacts: "
+        f"median {percentiles[1]:.3f}, 5 to 95 % {percentiles[0]:.3f} to {percentiles[2]:.3f}\n"
+    )
+    result = {
+        "env_steps_per_second": per_second["ours"],
+        "ratio_to_panda_gym": per_second["ours"] / per_second["panda-gym"],
+        "ratio_to_bare_loop": per_second["ours"] / per_second["bare loop"],
+        "reset_ms": 1e3 * float(np.median(resets)),
+        "tracking_median": percentiles[1],
+        "blocks": args.blocks,
+        "python": platform.python_version(),
+    }
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,625 @@
+"""SAC with hindsight experience replay (HER) on RoboArm-NMP's tasks. One file: read it top to bottom.
+
+    python clean_rl_scripts/sac_her_mp.py --task no_obstacles --goal-type ee
+
+Soft Actor-Critic (Haarnoja et al., 2018) in CleanRL's form, goals relabelled with the `future`
+strategy (Andrychowicz et al., 2017), as in the paper's sections 2 and 5. To make an algorithm of
+your own, copy this file and change the parts under `# ALGO LOGIC`.
+"""
+
+import json
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+import envs as roboarm
+from envs import panda
+from envs.datasets import load_queries
+from envs.programs import load_program, save_program
+
+
+@dataclass
+class Args:
+    # The run
+    exp_name: str = "sac_her_mp"
+    """name of the experiment, part of the run's folder"""
+    seed: int = 1
+    """seed of everything random; the same seed gives the same run on the same machine and device"""
+    runs_dir: Path = Path("runs")
+    """the run's folder is made in here: TensorBoard events, checkpoint, policy.pt, result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint; its own flags are used"""
+    device: str = "cpu"
+    """`cpu` or `cuda`"""
+    threads: int = 1
+    """torch threads; one is fastest for networks of this size, and leaves the other cores alone"""
+
+    # The task (the paper's MDP; `docs/environment.md`)
+    task: str = "no_obstacles"
+    """task to train on, one of `envs.TASKS`"""
+    goal_type: Literal["ee", "config", "combined"] = "ee"
+    """what the goal is: end-effector position, configuration, or both"""
+    action_mode: Literal["relative", "subgoal"] = "relative"
+    """action: a displacement of the normalised configuration, or the next one itself"""
+    max_step: float = 0.03
+    """longest displacement per step (L2, normalised configuration)"""
+    horizon: int = 400
+    """steps after which an episode is cut off"""
+    stop_on_collision: bool = False
+    """end an episode at the first touch"""
+    velocities: bool = False
+    """joint velocities in the observation"""
+    num_envs: int = 4
+    """environments stepped together; every one of their steps counts"""
+
+    # The algorithm
+    total_timesteps: int = 1_000_000
+    """environment steps of the whole run"""
+    learning_starts: int = 2_000
+    """environment steps with random actions before the first update"""
+    updates_per_step: float = 1.0
+    """gradient updates per environment step"""
+    buffer_size: int = 1_000_000
+    """transitions in the replay buffer"""
+    batch_size: int = 256
+    """transitions per update"""
+    her_probability: float = 0.8
+    """share of sampled transitions whose goal is replaced by one reached later in their episode"""
+    gamma: float = 0.95
+    """discount factor (CleanRL: 0.99)"""
+    tau: float = 0.005
+    """share of the critics that moves into the target critics per update"""
+    policy_lr: float = 3e-4
+    """learning rate of the policy (Adam)"""
+    q_lr: float = 1e-3
+    """learning rate of the critics (Adam)"""
+    alpha: float = 0.2
+    """entropy coefficient, if it is not tuned"""
+    autotune: bool = True
+    """tune the entropy coefficient to the target entropy -7"""
+    hidden_size: int = 256
+    """width of the hidden layers of policy and critics"""
+    num_hidden_layers: int = 2
+    """number of hidden layers of policy and critics"""
+    layer_norm: bool = True
+    """LayerNorm in the critics' hidden layers (CleanRL: no)"""
+    action_scale: float = 0.06
+    """the policy's outputs are in [-action_scale, action_scale]; the MDP clips a step at max_step,
+    so with the full range of 1 every step is a longest step, which overshoots the goal"""
+    relative_goal: bool = True
+    """add goal minus end-effector position, times 5, to the networks' inputs"""
+    trigonometric: bool = True
+    """add the joint angles' sines and cosines to the networks' inputs"""
+    entropy_backup: bool = True
+    """entropy term in the critics' target"""
+    bf16: bool = True
+    """multiply hidden layer by hidden layer in bfloat16, everything else in float32"""
+
+    # Evaluation and bookkeeping
+    eval_every: int = 25_000
+    """environment steps between evaluations on validation queries; the best policy is kept"""
+    eval_queries: int = 200
+    """validation queries per evaluation"""
+    test_queries: int = 1_000
+    """test queries for the best policy at the end"""
+    stop_at_success: float = 1.0
+    """stop as soon as a validation success rate is this high, e.g. 0.9"""
+
+
+def configuration_of(args):
+    """The fields that define what is computed: a run can only be resumed with the same."""
+    free = {"resume", "runs_dir", "threads", "test_queries", "stop_at_success"}
+    return {k: v for k, v in asdict(args).items() if k not in free}
+
+
+def env_arguments(args):
+    names = ("goal_type", "action_mode", "max_step", "horizon", "stop_on_collision", "velocities")
+    return {name: getattr(args, name) for name in names}
+
+
+# ALGO LOGIC: networks
+class Features(nn.Module):
+    """Network inputs: observation and desired goal, and functions of them that speed up learning."""
+
+    def __init__(self, args):
+        super().__init__()
+        self.goal_type, self.relative_goal = args.goal_type, args.relative_goal
+        self.trigonometric = args.trigonometric
+        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        self.register_buffer("middle", ((high + low) / 2).float())
+        self.register_buffer("half_range", ((high - low) / 2).float())
+        goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
+        self.size = 10 + 7 * args.velocities + goal_size
+        self.size += 14 * args.trigonometric
+        self.size += 3 * (args.relative_goal and args.goal_type != "config")
+
+    def forward(self, observation, desired_goal):
+        """(N, o), (N, g) -> (N, size)."""
+        inputs = [observation, desired_goal]
+        if self.trigonometric:
+            angles = observation[:, :7] * self.half_range + self.middle
+            inputs += [torch.sin(angles), torch.cos(angles)]
+        if self.relative_goal and self.goal_type != "config":
+            inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, -3:]))
+        return torch.cat(inputs, dim=1)
+
+
+class MLP(nn.Module):
+    def __init__(self, num_inputs, num_outputs, args, layer_norm):
+        super().__init__()
+        sizes = [num_inputs] + [args.hidden_size] * args.num_hidden_layers
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        norm = nn.LayerNorm if layer_norm else lambda _: nn.Identity()
+        self.norms = nn.ModuleList(norm(args.hidden_size) for _ in self.layers)
+        self.head = nn.Linear(args.hidden_size, num_outputs)
+        self.bf16 = args.bf16
+
+    def forward(self, x):
+        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
+            if self.bf16 and self.training and i > 0:
+                # Inputs, outputs and sums stay in float32: 2 cm need more than bfloat16's 8 bits.
+                x = F.linear(x.bfloat16(), layer.weight.bfloat16()).float() + layer.bias
+            else:
+                x = layer(x)
+            x = F.relu(norm(x))
+        return self.head(x)
+
+
+class SoftQNetwork(nn.Module):
+    def __init__(self, args):
+        super().__init__()
+        self.features = Features(args)
+        self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
+        self.mlp = MLP(self.features.size + 7, 1, args, args.layer_norm)
+
+    def forward(self, observation, desired_goal, action):
+        """(N, o), (N, g), (N, 7) -> (N,)."""
+        inputs = [self.features(observation, desired_goal), action / self.action_scale]
+        return self.mlp(torch.cat(inputs, dim=1)).squeeze(-1)
+
+
+LOG_STD_MAX = 2
+LOG_STD_MIN = -5
+
+
+class Actor(nn.Module):
+    def __init__(self, args):
+        super().__init__()
+        self.features = Features(args)
+        self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
+        self.mlp = MLP(self.features.size, 14, args, layer_norm=False)
+
+    def sample(self, observation, desired_goal):
+        """A random action (N, 7) and its log-density (N,) before scaling by `action_scale`."""
+        mean, log_std = self.mlp(self.features(observation, desired_goal)).chunk(2, dim=1)
+        log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
+        noise = torch.randn_like(mean)
+        unsquashed = mean + log_std.exp() * noise
+        log_prob = -0.5 * noise.square() - log_std - 0.5 * np.log(2 * np.pi)
+        # log(1 - tanh(u)^2) without cancellation
+        log_prob = log_prob - 2 * (np.log(2) - unsquashed - F.softplus(-2 * unsquashed))
+        return self.action_scale * torch.tanh(unsquashed), log_prob.sum(1)
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        """The deterministic action (N, 7), for evaluation; this is what policy.pt contains."""
+        mean = self.mlp(self.features(observation, desired_goal))[:, :7]
+        return self.action_scale * torch.tanh(mean)
+
+
+# ALGO LOGIC: replay buffer
+class HerReplayBuffer:
+    """Transitions of finished episodes in a ring; goals are relabelled when they are sampled.
+
+    One float32 row per transition. `remaining` counts the transitions that follow in the same
+    episode, so a goal reached later in it is found without storing episodes. New episodes
+    overwrite the oldest rows from an episode's start on, so what a row points to outlives it.
+    """
+
+    def __init__(self, env, capacity, her_probability, rng):
+        spaces = env.observation_space
+        sizes = {
+            "observation": spaces["observation"].shape[0],
+            "action": 7,
+            "next_observation": spaces["observation"].shape[0],
+            "next_achieved_goal": spaces["achieved_goal"].shape[0],
+            "desired_goal": spaces["desired_goal"].shape[0],
+            "collision": 1,
+        }
+        ends = np.cumsum(list(sizes.values()))
+        self.columns = {
+            name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)
+        }
+        self.rows = np.zeros((capacity, ends[-1]), np.float32)
+        self.remaining = np.zeros(capacity, np.int32)
+        self.env, self.capacity, self.her_probability, self.rng = env, capacity, her_probability, rng
+        self.position, self.size = 0, 0
+
+    def add_episode(self, transitions):
+        """`transitions`: a list of dicts with the columns' names as keys."""
+        index = (self.position + np.arange(len(transitions))) % self.capacity
+        for name, columns in self.columns.items():
+            self.rows[index, columns] = np.stack([np.atleast_1d(t[name]) for t in transitions])
+        self.remaining[index] = np.arange(len(transitions))[::-1]
+        self.position = (self.position + len(transitions)) % self.capacity
+        self.size = min(self.size + len(transitions), self.capacity)
+
+    def sample(self, batch_size):
+        """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
+        index = self.rng.integers(self.size, size=batch_size)
+        rows = self.rows[index]
+        batch = {name: rows[:, columns] for name, columns in self.columns.items()}
+        later = self.rng.random(batch_size) * (self.remaining[index] + 1)
+        later = (index + later.astype(np.int64)) % self.capacity
+        relabel = self.rng.random(batch_size) < self.her_probability
+        hindsight_goal = self.rows[later, self.columns["next_achieved_goal"]]
+        batch["desired_goal"] = np.where(relabel[:, None], hindsight_goal, batch["desired_goal"])
+        goals = batch["next_achieved_goal"], batch["desired_goal"]
+        info = {"collision": batch["collision"][:, 0] > 0}
+        batch["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
+        batch["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
+        return batch
+
+    def state_dict(self):
+        return {
+            "rows": torch.from_numpy(self.rows[: self.size]),
+            "remaining": torch.from_numpy(self.remaining[: self.size]),
+            "position": self.position,
+            "rng": json.dumps(self.rng.bit_generator.state),
+        }
+
+    def load_state_dict(self, state):
+        self.size, self.position = len(state["rows"]), state["position"]
+        self.rows[: self.size] = state["rows"].numpy()
+        self.remaining[: self.size] = state["remaining"].numpy()
+        self.rng.bit_generator.state = json.loads(state["rng"])
+
+
+def td_target(reward, terminated, next_q1, next_q2, next_log_prob, alpha, gamma):
+    """The critics' target r + gamma (1 - terminated) (min(Q1', Q2') - alpha log pi'), all (N,)."""
+    next_value = torch.minimum(next_q1, next_q2) - alpha * next_log_prob
+    return reward + gamma * (1.0 - terminated) * next_value
+
+
+# Evaluation
+def stack(observations, device):
+    """List of observation dicts -> dict of float32 tensors (N, ...)."""
+    return {
+        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
+        for name in observations[0]
+    }
+
+
+@torch.no_grad()
+def evaluate(actor, envs, queries, device):
+    """Run the deterministic policy on every query, one per env at a time; mean results."""
+    actor.eval()
+    waiting = iter(range(len(queries)))
+    running, results = {}, []
+
+    def start(env):
+        i = next(waiting, None)
+        running.pop(env, None)
+        if i is not None:
+            running[env] = env.reset_specific(queries.start[i], queries.goal[i])[0]
+
+    for env in envs:
+        start(env)
+    while running:
+        actions = actor(**stack(list(running.values()), device)).cpu().numpy()
+        for env, action in zip(list(running), actions, strict=True):
+            running[env], _, terminated, truncated, info = env.step(action)
+            if terminated or truncated:
+                results.append((info["is_success"], info["collision_so_far"], info["elapsed_steps"]))
+                start(env)
+    actor.train()
+    success, touched, steps = np.array(results, dtype=np.float64).T
+    return {
+        "success_rate": success.mean(),
+        "clean_success_rate": (success * (1 - touched)).mean(),
+        "collision_rate": touched.mean(),
+        "episode_length": steps.mean(),
+    }
+
+
+@torch.no_grad()
+def picture_of_rollout(actor, env, queries, device, frames=8):
+    """An image strip (height, frames * width, 3), uint8, of the policy on the first query."""
+    actor.eval()
+    observation, _ = env.reset_specific(queries.start[0], queries.goal[0])
+    pictures, done = [env.render()], False
+    while not done:
+        action = actor(**stack([observation], device))[0].cpu().numpy()
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        if info["elapsed_steps"] % 10 == 0 or done:
+            pictures.append(env.render())
+    actor.train()
+    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
+    return np.concatenate([pictures[i] for i in chosen], axis=1)
+
+
+def write_atomically(path, write):
+    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
+    temporary = path.with_name(path.name + ".part")
+    write(temporary)
+    with open(temporary, "rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def parse_args():
+    """Flags, or with --resume those of the run, which must not be contradicted."""
+    args = tyro.cli(Args)
+    if args.resume is None:
+        return args
+    saved_file = args.resume / "args.json"
+    if not saved_file.exists():
+        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
+    saved = json.loads(saved_file.read_text())
+    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
+    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
+    args = tyro.cli(Args, default=defaults)
+    contradicted = [
+        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
+        for name, value in configuration_of(args).items()
+        if value != saved.get(name)
+    ]
+    if contradicted:
+        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
+    return args
+
+
+if __name__ == "__main__":
+    args = parse_args()
+    if args.task not in roboarm.TASKS:
+        sys.exit(f"unknown task {args.task!r}: one of {', '.join(roboarm.TASKS)}")
+    if args.resume is not None:
+        run = args.resume
+    else:
+        run = args.runs_dir / f"{args.task}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        run.mkdir(parents=True)
+        text = json.dumps(asdict(args), indent=2, default=str)
+        write_atomically(run / "args.json", lambda path: path.write_text(text))
+
+    # TRY NOT TO MODIFY: seeding
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    torch.use_deterministic_algorithms(True)
+    device = torch.device(args.device)
+
+    # env setup
+    kwargs = env_arguments(args)
+    envs = [roboarm.make(args.task, **kwargs) for _ in range(args.num_envs)]
+    eval_envs = [
+        roboarm.make(args.task, **kwargs, render_mode=None if i else "rgb_array", render_size=(240, 180))
+        for i in range(16)
+    ]
+    validation = load_queries(args.task, "validation")[: args.eval_queries]
+
+    # ALGO LOGIC: networks and optimisers
+    actor = Actor(args).to(device)
+    qf1, qf2 = SoftQNetwork(args).to(device), SoftQNetwork(args).to(device)
+    qf1_target, qf2_target = SoftQNetwork(args).to(device), SoftQNetwork(args).to(device)
+    qf1_target.load_state_dict(qf1.state_dict())
+    qf2_target.load_state_dict(qf2.state_dict())
+    q_parameters = [*qf1.parameters(), *qf2.parameters()]
+    q_target_parameters = [*qf1_target.parameters(), *qf2_target.parameters()]
+    q_optimizer = torch.optim.Adam(q_parameters, lr=args.q_lr, fused=True)
+    actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.policy_lr, fused=True)
+    target_entropy = -7.0
+    log_alpha = torch.full((1,), float(np.log(args.alpha)), device=device, requires_grad=True)
+    alpha_optimizer = torch.optim.Adam([log_alpha], lr=args.q_lr, fused=True)
+    buffer = HerReplayBuffer(
+        eval_envs[0], args.buffer_size, args.her_probability, np.random.default_rng(args.seed)
+    )
+    saved_parts = {
+        "actor": actor,
+        "qf1": qf1,
+        "qf2": qf2,
+        "qf1_target": qf1_target,
+        "qf2_target": qf2_target,
+        "q_optimizer": q_optimizer,
+        "actor_optimizer": actor_optimizer,
+        "alpha_optimizer": alpha_optimizer,
+        "buffer": buffer,
+    }
+    progress = {"global_step": 0, "updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
+
+    def save_checkpoint():
+        state = {name: part.state_dict() for name, part in saved_parts.items()}
+        state |= {"log_alpha": log_alpha.detach(), "progress": progress}
+        state["torch_rng"] = torch.get_rng_state()
+        if device.type == "cuda":
+            state["cuda_rng"] = torch.cuda.get_rng_state()
+        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
+
+    if args.resume is not None and (run / "checkpoint.pt").exists():
+        state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
+        for name, part in saved_parts.items():
+            part.load_state_dict(state[name])
+        log_alpha.data.copy_(state["log_alpha"])
+        progress.update(state["progress"])
+        torch.set_rng_state(state["torch_rng"].cpu())
+        if device.type == "cuda":
+            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
+        del state
+
+    writer = SummaryWriter(run, purge_step=progress["global_step"] + 1)
+    writer.add_text(
+        "hyperparameters",
+        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
+    )
+
+    def begin_episodes():
+        """Fresh episodes in all envs, from seeds that depend on the step count alone.
+
+        Every checkpoint cuts the running episodes off and begins new ones here, so a resumed run
+        needs no simulator state to go on exactly like an uninterrupted one.
+        """
+        seeds = np.random.SeedSequence([args.seed, progress["global_step"]])
+        seeds = seeds.generate_state(args.num_envs).tolist()
+        return [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+
+    observations = begin_episodes()
+    staged = [[] for _ in envs]  # transitions of the running episodes
+    returns = [0.0] * args.num_envs
+    recent_success = []
+    started, seconds_before = time.time(), progress["seconds"]
+    steps_before = progress["global_step"]
+    bar = tqdm(total=args.total_timesteps, initial=steps_before, unit="step", smoothing=0.05)
+
+    stop = False
+    while progress["global_step"] < args.total_timesteps and not stop:
+        # ALGO LOGIC: act
+        if progress["global_step"] < args.learning_starts:
+            actions = (2 * torch.rand(args.num_envs, 7) - 1).numpy() * actor.action_scale
+        else:
+            with torch.no_grad():
+                now = stack(observations, device)
+                actor.eval()
+                actions, _ = actor.sample(now["observation"], now["desired_goal"])
+                actor.train()
+                actions = actions.cpu().numpy()
+
+        for i, env in enumerate(envs):
+            next_observation, reward, terminated, truncated, info = env.step(actions[i])
+            staged[i].append(
+                {
+                    "observation": observations[i]["observation"],
+                    "action": actions[i],
+                    "next_observation": next_observation["observation"],
+                    "next_achieved_goal": next_observation["achieved_goal"],
+                    "desired_goal": next_observation["desired_goal"],
+                    "collision": info["collision"],
+                }
+            )
+            observations[i] = next_observation
+            returns[i] += reward
+            if terminated or truncated:
+                buffer.add_episode(staged[i])
+                recent_success = [*recent_success[-99:], info["is_success"]]
+                step = progress["global_step"] + i + 1
+                writer.add_scalar("charts/episodic_return", returns[i], step)
+                writer.add_scalar("charts/episodic_length", info["elapsed_steps"], step)
+                writer.add_scalar("charts/success", np.mean(recent_success), step)
+                staged[i], returns[i] = [], 0.0
+                observations[i], _ = env.reset()
+        progress["global_step"] += args.num_envs
+        bar.update(args.num_envs)
+
+        # ALGO LOGIC: learn
+        due = (progress["global_step"] - args.learning_starts) * args.updates_per_step
+        while progress["updates"] < due and buffer.size > 0:
+            batch = {
+                name: torch.as_tensor(array, device=device)
+                for name, array in buffer.sample(args.batch_size).items()
+            }
+            goal = batch["desired_goal"]
+            alpha = log_alpha.detach().exp()
+
+            with torch.no_grad():
+                next_action, next_log_prob = actor.sample(batch["next_observation"], goal)
+                target = td_target(
+                    batch["reward"],
+                    batch["terminated"],
+                    qf1_target(batch["next_observation"], goal, next_action),
+                    qf2_target(batch["next_observation"], goal, next_action),
+                    next_log_prob,
+                    alpha * args.entropy_backup,
+                    args.gamma,
+                )
+            q1 = qf1(batch["observation"], goal, batch["action"])
+            q2 = qf2(batch["observation"], goal, batch["action"])
+            qf1_loss, qf2_loss = F.mse_loss(q1, target), F.mse_loss(q2, target)
+            q_optimizer.zero_grad()
+            (qf1_loss + qf2_loss).backward()
+            q_optimizer.step()
+
+            for parameter in q_parameters:  # the policy's gradient needs none into the critics
+                parameter.requires_grad_(False)
+            action, log_prob = actor.sample(batch["observation"], goal)
+            min_q = torch.minimum(
+                qf1(batch["observation"], goal, action), qf2(batch["observation"], goal, action)
+            )
+            actor_loss = (alpha * log_prob - min_q).mean()
+            actor_optimizer.zero_grad()
+            actor_loss.backward()
+            actor_optimizer.step()
+            for parameter in q_parameters:
+                parameter.requires_grad_(True)
+
+            if args.autotune:
+                alpha_loss = -(log_alpha.exp() * (log_prob.detach() + target_entropy)).mean()
+                alpha_optimizer.zero_grad()
+                alpha_loss.backward()
+                alpha_optimizer.step()
+
+            with torch.no_grad():
+                torch._foreach_lerp_(q_target_parameters, q_parameters, args.tau)
+            progress["updates"] += 1
+
+            if progress["updates"] % 1000 == 0:
+                step = progress["global_step"]
+                writer.add_scalar("losses/qf1_values", q1.mean().item(), step)
+                writer.add_scalar("losses/qf2_values", q2.mean().item(), step)
+                writer.add_scalar("losses/qf1_loss", qf1_loss.item(), step)
+                writer.add_scalar("losses/qf2_loss", qf2_loss.item(), step)
+                writer.add_scalar("losses/qf_loss", (qf1_loss + qf2_loss).item() / 2, step)
+                writer.add_scalar("losses/actor_loss", actor_loss.item(), step)
+                writer.add_scalar("losses/alpha", alpha.item(), step)
+                sps = (step - steps_before) / (time.time() - started)
+                writer.add_scalar("charts/SPS", int(sps), step)
+
+        # Evaluate, keep the best policy, checkpoint
+        step = progress["global_step"]
+        if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
+            result = evaluate(actor, eval_envs, validation, device)
+            for name, value in result.items():
+                writer.add_scalar(f"eval/{name}", value, step)
+            picture = picture_of_rollout(actor, eval_envs[0], validation, device)
+            writer.add_image("eval/rollout", picture, step, dataformats="HWC")
+            if result["success_rate"] > progress["best_success"]:
+                progress["best_success"], progress["best_step"] = result["success_rate"], step
+                metadata = {"kind": "policy", "task": args.task, "env": env_arguments(args)}
+                metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
+                save_program(run / "policy.pt", actor, stack(observations, device), metadata)
+            bar.set_postfix(
+                eval=f"{result['success_rate']:.3f}", best=f"{progress['best_success']:.3f}"
+            )
+            for episode in filter(None, staged):
+                buffer.add_episode(episode)
+            staged, returns = [[] for _ in envs], [0.0] * args.num_envs
+            progress["seconds"] = seconds_before + time.time() - started
+            save_checkpoint()
+            observations = begin_episodes()
+            stop = result["success_rate"] >= args.stop_at_success
+    bar.close()
+
+    # The best policy (by validation) on test queries
+    best = load_program(run / "policy.pt").to(device)
+    queries = load_queries(args.task, "test")[: args.test_queries]
+    result = evaluate(best, eval_envs, queries, device)
+    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
+    result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
+    result |= {"validation_success_rate": progress["best_success"]}
+    result |= {"steps": progress["global_step"], "seconds": round(progress["seconds"])}
+    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
+    write_atomically(run / "result.json", lambda path: path.write_text(text))
+    print(
+        f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
+        f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
+        f"{progress['global_step']} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
+    )
+    writer.close()

@@ -1,0 +1,1 @@
+"""Making the tasks' queries and demonstrations."""

@@ -1,0 +1,354 @@
+"""Saving and loading networks: the same results for any batch size, and never a stranger's code."""
+
+import os
+import pickle
+import shutil
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from envs.programs import ProgramError, load_program, save_program
+
+
+class Actor(nn.Module):
+    """An actor with most of what an MLP policy may use."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.Linear(16, 64), nn.LayerNorm(64), nn.ReLU(), nn.Dropout(0.5), nn.Linear(64, 64)
+        )
+        self.head = nn.Sequential(nn.GELU(), nn.SiLU(), nn.Linear(64, 14))
+        self.register_buffer("scale", torch.full((7,), 0.06))
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        x = torch.cat([observation, achieved_goal, desired_goal - achieved_goal], -1)
+        mean, log_std = self.head(self.net(x)).chunk(2, -1)
+        action = torch.tanh(mean) * self.scale * torch.tensor([0.5])
+        length = action.norm(dim=-1, keepdim=True)
+        shrunk = action / torch.clamp(length / 0.03, min=1.0)
+        return torch.clamp(shrunk + 0 * nn.functional.softplus(log_std[:, :7]), -1, 1)
+
+
+class ConvNet(nn.Module):
+    """Images (N, 3, 32, 32) as bytes -> features; with a size that depends on the batch."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.Conv2d(3, 8, 4, 2, 1), nn.BatchNorm2d(8), nn.ReLU(), nn.MaxPool2d(2)
+        )
+        self.head = nn.Sequential(nn.Conv2d(8, 8, 3), nn.GroupNorm(2, 8), nn.ELU(), nn.Flatten())
+        self.up = nn.ConvTranspose2d(8, 3, 4, 2, 1)
+
+    def forward(self, image):
+        x = self.net(image.float() / 255)
+        pixels = x.permute(0, 2, 3, 1).reshape(-1, 8)
+        again = pixels.view(x.shape[0], 8, 8, 8).permute(0, 3, 1, 2)
+        return {"code": self.head(x), "pictures": [torch.sigmoid(self.up(again)), x.mean((2, 3))]}
+
+
+class VectorQuantiser(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.book = nn.Embedding(32, 8)
+
+    def forward(self, code):
+        index = torch.cdist(code.reshape(-1, 8), self.book.weight).argmin(-1)
+        quantised = self.book(index).view_as(code)
+        return code + (quantised - code).detach(), index.view(code.shape[0], -1)
+
+
+class PointNet(nn.Module):
+    """Farthest points, their neighbours, and a maximum over them."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(nn.Conv1d(3, 16, 1), nn.LeakyReLU(), nn.Conv1d(16, 8, 1))
+
+    def forward(self, points):
+        batch, count, _ = points.shape
+        farthest = torch.zeros(batch, dtype=torch.long, device=points.device)
+        distance = torch.full((batch, count), 1e10, device=points.device)
+        chosen = []
+        for _ in range(4):
+            chosen.append(farthest)
+            centre = points.gather(1, farthest[:, None, None].expand(-1, 1, 3))
+            distance = torch.minimum(distance, (points - centre).square().sum(-1))
+            farthest = distance.argmax(-1)
+        centres = points[torch.arange(batch)[:, None], torch.stack(chosen, 1)]
+        near = torch.cdist(centres, points).topk(5, largest=False).indices
+        shape = (batch, 4, count, 3)
+        groups = points[:, None].expand(shape).gather(2, near[..., None].expand(-1, -1, -1, 3))
+        groups = groups - centres[:, :, None]
+        groups = torch.where(groups.norm(dim=-1, keepdim=True) < 0.5, groups, 0)
+        features = self.net(groups.reshape(batch * 4, 5, 3).mT).max(-1).values
+        return features.view(batch, 4, 8).amax(1)
+
+
+class Transformer(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.TransformerEncoderLayer(16, 2, 32, batch_first=True)
+        self.gru = nn.GRU(16, 8, batch_first=True)
+
+    def forward(self, tokens):
+        return self.gru(self.layer(tokens))[0][:, -1]
+
+
+def _inputs(rows, generator=None):
+    sizes = {"observation": 10, "achieved_goal": 3, "desired_goal": 3}
+    return {name: torch.randn(rows, size, generator=generator) for name, size in sizes.items()}
+
+
+ARCHITECTURES = {
+    "actor": (Actor, lambda n: _inputs(n)),
+    "conv": (ConvNet, lambda n: {"image": torch.randint(0, 255, (n, 3, 32, 32)).byte()}),
+    "quantiser": (VectorQuantiser, lambda n: {"code": torch.randn(n, 6, 8)}),
+    "points": (PointNet, lambda n: {"points": torch.rand(n, 40, 3)}),
+    "transformer": (Transformer, lambda n: {"tokens": torch.randn(n, 5, 16)}),
+}
+
+
+def _leaves(value):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, (list, tuple)):
+        return [leaf for one in value for leaf in _leaves(one)]
+    return [value]
+
+
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_a_loaded_program_computes_what_the_module_does_for_any_batch(name, tmp_path):
+    torch.manual_seed(0)
+    make, inputs = ARCHITECTURES[name]
+    module = make().eval()
+    save_program(tmp_path / "net.pt", module, inputs(1), {"kind": name})
+    program = load_program(tmp_path / "net.pt")
+    assert program.metadata == {"kind": name}
+    assert program.inputs == list(inputs(1))
+    for rows in (1, 2, 7):
+        batch = inputs(rows)
+        with torch.no_grad():
+            expected = _leaves(module(**batch))
+        got = _leaves(program(**batch))
+        assert len(got) == len(expected)
+        for one, other in zip(got, expected, strict=True):
+            assert one.dtype == other.dtype and one.shape == other.shape
+            assert not one.requires_grad
+            assert torch.allclose(one, other, rtol=0, atol=1e-6)
+
+
+def test_structure_of_the_outputs_is_kept(tmp_path):
+    save_program(
+        tmp_path / "net.pt", ConvNet(), {"image": torch.zeros(2, 3, 32, 32).byte()}, metadata={}
+    )
+    outputs = load_program(tmp_path / "net.pt")(torch.zeros(4, 3, 32, 32).byte())
+    assert set(outputs) == {"code", "pictures"}
+    assert [len(picture) for picture in outputs["pictures"]] == [4, 4]
+
+
+def test_saving_does_not_touch_the_module_or_the_random_numbers(tmp_path):
+    module = Actor().train()
+    before = {name: tensor.clone() for name, tensor in module.state_dict().items()}
+    torch.manual_seed(3)
+    expected = torch.rand(3)
+    torch.manual_seed(3)
+    save_program(tmp_path / "net.pt", module, _inputs(2, torch.Generator()), {})
+    assert torch.equal(torch.rand(3), expected)
+    assert module.training and all(parameter.requires_grad for parameter in module.parameters())
+    assert all(torch.equal(before[name], tensor) for name, tensor in module.state_dict().items())
+    assert os.listdir(tmp_path) == ["net.pt"]  # no temporary file is left
+
+
+def test_a_file_holds_its_own_tensors_only(tmp_path):
+    module = nn.Linear(4, 4)
+    module.weight = nn.Parameter(torch.zeros(1_000_000)[:16].view(4, 4))
+    save_program(tmp_path / "net.pt", module, {"input": torch.zeros(1, 4)}, {})
+    assert (tmp_path / "net.pt").stat().st_size < 20_000
+
+
+class _Branches(nn.Module):
+    def forward(self, x):
+        return x if x.sum() > 0 else -x
+
+
+class _Random(nn.Module):
+    def forward(self, x):
+        return x + torch.randn_like(x)
+
+
+class _ChangesItsInput(nn.Module):
+    def forward(self, x):
+        return x.add_(1)
+
+
+class _LooksAtTheBatch(nn.Module):
+    def forward(self, x):
+        return x if x.shape[0] == 1 else 2 * x
+
+
+@pytest.mark.parametrize("make", [_Branches, _Random, _ChangesItsInput, _LooksAtTheBatch])
+def test_what_cannot_be_saved_is_an_error_and_leaves_the_old_file(make, tmp_path):
+    path = tmp_path / "net.pt"
+    path.write_text("old")
+    with pytest.raises(ProgramError, match="net.pt"):
+        save_program(path, make(), {"x": torch.ones(2, 3)}, {})
+    assert path.read_text() == "old" and os.listdir(tmp_path) == ["net.pt"]
+
+
+def test_metadata_must_be_json(tmp_path):
+    with pytest.raises(ProgramError, match="JSON"):
+        save_program(tmp_path / "net.pt", nn.ReLU(), {"input": torch.ones(1, 3)}, {"a": object()})
+
+
+@pytest.fixture(scope="module")
+def actor_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("program") / "actor.pt"
+    save_program(path, Actor(), _inputs(2), {"kind": "policy"})
+    return path
+
+
+@pytest.fixture
+def saved(actor_file, tmp_path):
+    """A good program file, to be damaged."""
+    return Path(shutil.copy(actor_file, tmp_path))
+
+
+def test_inputs_are_checked_when_it_is_called(saved):
+    program = load_program(saved)
+    inputs = _inputs(2)
+    assert torch.equal(program(*inputs.values()), program(**inputs))
+    with pytest.raises(ProgramError, match=r"actor.pt: its inputs are observation, achieved_goal"):
+        program(observation=inputs["observation"])
+    with pytest.raises(ProgramError, match="picture"):
+        program(**inputs, picture=torch.zeros(2))
+    with pytest.raises(ProgramError, match="by name"):
+        program(*inputs.values(), observation=inputs["observation"])
+    with pytest.raises(ProgramError, match=r"actor.pt: aten.cat.default failed"):
+        program(**(inputs | {"observation": torch.zeros(3, 10)}))
+
+
+class _Malicious:
+    """Unpickled by an unsafe reader, this makes a file."""
+
+    def __init__(self, target):
+        self.target = target
+
+    def __reduce__(self):
+        return open, (str(self.target), "w")
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_file_with_code_in_it_is_refused_and_does_nothing(zipped, saved, tmp_path):
+    target = tmp_path / "made by the file"
+    content = torch.load(saved, weights_only=True) | {"metadata": _Malicious(target)}
+    torch.save(content, tmp_path / "bad.pt", _use_new_zipfile_serialization=zipped)
+    with pytest.raises(ProgramError, match=r"bad.pt: not a program file"):
+        load_program(tmp_path / "bad.pt")
+    assert not target.exists()
+    torch.load(tmp_path / "bad.pt", weights_only=False)  # the file would have worked
+    assert target.exists()
+
+
+def test_a_torch_export_archive_is_refused(tmp_path):
+    exported = torch.export.export(nn.ReLU(), (torch.ones(2),))
+    torch.export.save(exported, tmp_path / "net.pt2")
+    with pytest.raises(ProgramError, match="not a program file"):
+        load_program(tmp_path / "net.pt2")
+
+
+def _edit(path, change):
+    content = torch.load(path, weights_only=True)
+    change(content)
+    torch.save(content, path)
+
+
+@pytest.mark.parametrize(
+    "operation",
+    [
+        "aten.relu_.default",  # in place
+        "aten.add.out",
+        "aten.randn.default",  # random
+        "aten.from_file.default",  # reads files
+        "aten.as_strided.default",
+        "aten.empty.memory_format",
+        "aten.max_pool2d_with_indices_backward.default",
+        "aten.no_such_operation.default",
+        "aten.relu.no_such_overload",
+        "aten.__class__.__name__",
+        "aten.relu",
+        "prims.add.default",
+        "operator.attrgetter",
+        "os.system",
+        "eval",
+        7,
+    ],
+)
+def test_other_operations_are_refused(operation, saved):
+    def change(content):
+        content["nodes"][0][1] = operation
+
+    _edit(saved, change)
+    with pytest.raises(ProgramError, match=r"actor.pt: the operation .* is not allowed"):
+        load_program(saved)
+
+
+def _constant(name):
+    def change(content):
+        content["nodes"][0][3]["dtype"] = {"torch": name}
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: content.update(format="another"), "not a program file"),
+        (lambda content: content.update(version=2), "program version 2, this code reads 1"),
+        (lambda content: content.pop("nodes"), "damaged program"),
+        (lambda content: content.pop("metadata"), "damaged program"),
+        (lambda content: content["nodes"].pop(0), "damaged program"),
+        (lambda content: content["nodes"][0].pop(), "damaged program"),
+        (lambda content: content["tensors"].clear(), "damaged program"),
+        (lambda content: content.update(outputs={"node": "nowhere"}), "damaged program"),
+        (lambda content: content["tensors"].update(a=nn.Parameter(torch.ones(1))), "not plain"),
+        (lambda content: content.update(metadata=torch.Size([1])), "not plain"),
+        (_constant("load"), "torch.load is not allowed"),
+        (_constant("no_such_thing"), "damaged program"),
+    ],
+)
+def test_damaged_and_foreign_contents_are_refused(change, message, saved):
+    _edit(saved, change)
+    with pytest.raises(ProgramError, match=message) as error:
+        load_program(saved)
+    assert str(saved) in str(error.value)
+
+
+def test_damaged_and_foreign_files_are_refused(saved, tmp_path):
+    whole = saved.read_bytes()
+    with zipfile.ZipFile(saved) as archive:
+        weights = max(archive.infolist(), key=lambda entry: entry.file_size)
+    flipped = bytearray(whole)
+    flipped[weights.header_offset + 200] ^= 1
+    cases = {
+        "empty": b"",
+        "text": b"hello",
+        "truncated": whole[: len(whole) // 2],
+        "flipped": bytes(flipped),
+        "pickle": pickle.dumps({"format": "roboarm-nmp program"}),
+    }
+    for name, content in cases.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(ProgramError, match=name):
+            load_program(path)
+    torch.save([1, 2], tmp_path / "list")
+    with zipfile.ZipFile(tmp_path / "zip", "w") as archive:
+        archive.writestr("a", "b")
+    for name in ("list", "zip", "missing", "."):
+        with pytest.raises(ProgramError):
+            load_program(tmp_path / name)
