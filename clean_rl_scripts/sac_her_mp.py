@@ -1,4 +1,4 @@
-"""SAC with hindsight experience replay (HER) on RoboArm-NMP's tasks. One file: read it top to bottom.
+"""SAC with hindsight experience replay (HER). One file: read it top to bottom.
 
     python clean_rl_scripts/sac_her_mp.py --task no_obstacles --goal-type ee
 
@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-import gymnasium as gym
 import numpy as np
 import torch
 import torch.nn as nn
@@ -81,14 +80,18 @@ class Args:
     """discount factor (CleanRL: 0.99)"""
     tau: float = 0.005
     """share of the critics that moves into the target critics per update"""
-    policy_lr: float = 3e-4
-    """learning rate of the policy (Adam)"""
+    policy_lr: float = 1e-3
+    """learning rate of the policy (Adam; CleanRL: 3e-4)"""
     q_lr: float = 1e-3
     """learning rate of the critics (Adam)"""
     alpha: float = 0.2
     """entropy coefficient, if it is not tuned"""
     autotune: bool = True
-    """tune the entropy coefficient to the target entropy -7"""
+    """tune the entropy coefficient to the target entropy"""
+    target_entropy: float = -7.0
+    """entropy that the tuning aims at, of the unscaled action (CleanRL: minus its dimensions)"""
+    policy_frequency: int = 1
+    """critic updates per update of the policy"""
     hidden_size: int = 256
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: int = 2
@@ -131,7 +134,7 @@ def env_arguments(args):
 
 # ALGO LOGIC: networks
 class Features(nn.Module):
-    """Network inputs: observation and desired goal, and functions of them that speed up learning."""
+    """Network inputs: observation, desired goal, and functions of them that speed up learning."""
 
     def __init__(self, args):
         super().__init__()
@@ -243,7 +246,8 @@ class HerReplayBuffer:
         }
         self.rows = np.zeros((capacity, ends[-1]), np.float32)
         self.remaining = np.zeros(capacity, np.int32)
-        self.env, self.capacity, self.her_probability, self.rng = env, capacity, her_probability, rng
+        self.env, self.rng = env, rng
+        self.capacity, self.her_probability = capacity, her_probability
         self.position, self.size = 0, 0
 
     def add_episode(self, transitions):
@@ -321,7 +325,9 @@ def evaluate(actor, envs, queries, device):
         for env, action in zip(list(running), actions, strict=True):
             running[env], _, terminated, truncated, info = env.step(action)
             if terminated or truncated:
-                results.append((info["is_success"], info["collision_so_far"], info["elapsed_steps"]))
+                results.append(
+                    (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
+                )
                 start(env)
     actor.train()
     success, touched, steps = np.array(results, dtype=np.float64).T
@@ -402,10 +408,8 @@ if __name__ == "__main__":
     # env setup
     kwargs = env_arguments(args)
     envs = [roboarm.make(args.task, **kwargs) for _ in range(args.num_envs)]
-    eval_envs = [
-        roboarm.make(args.task, **kwargs, render_mode=None if i else "rgb_array", render_size=(240, 180))
-        for i in range(16)
-    ]
+    eval_envs = [roboarm.make(args.task, **kwargs) for _ in range(16)]
+    picture_env = roboarm.make(args.task, **kwargs, render_mode="rgb_array", render_size=(240, 180))
     validation = load_queries(args.task, "validation")[: args.eval_queries]
 
     # ALGO LOGIC: networks and optimisers
@@ -418,7 +422,6 @@ if __name__ == "__main__":
     q_target_parameters = [*qf1_target.parameters(), *qf2_target.parameters()]
     q_optimizer = torch.optim.Adam(q_parameters, lr=args.q_lr, fused=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.policy_lr, fused=True)
-    target_entropy = -7.0
     log_alpha = torch.full((1,), float(np.log(args.alpha)), device=device, requires_grad=True)
     alpha_optimizer = torch.optim.Adam([log_alpha], lr=args.q_lr, fused=True)
     buffer = HerReplayBuffer(
@@ -435,7 +438,8 @@ if __name__ == "__main__":
         "alpha_optimizer": alpha_optimizer,
         "buffer": buffer,
     }
-    progress = {"global_step": 0, "updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
+    progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
+    progress |= {"best_success": -1.0, "best_step": 0}
 
     def save_checkpoint():
         state = {name: part.state_dict() for name, part in saved_parts.items()}
@@ -547,24 +551,27 @@ if __name__ == "__main__":
             (qf1_loss + qf2_loss).backward()
             q_optimizer.step()
 
-            for parameter in q_parameters:  # the policy's gradient needs none into the critics
-                parameter.requires_grad_(False)
-            action, log_prob = actor.sample(batch["observation"], goal)
-            min_q = torch.minimum(
-                qf1(batch["observation"], goal, action), qf2(batch["observation"], goal, action)
-            )
-            actor_loss = (alpha * log_prob - min_q).mean()
-            actor_optimizer.zero_grad()
-            actor_loss.backward()
-            actor_optimizer.step()
-            for parameter in q_parameters:
-                parameter.requires_grad_(True)
+            if progress["updates"] % args.policy_frequency == 0:
+                for parameter in q_parameters:  # the policy's gradient needs none into the critics
+                    parameter.requires_grad_(False)
+                action, log_prob = actor.sample(batch["observation"], goal)
+                min_q = torch.minimum(
+                    qf1(batch["observation"], goal, action), qf2(batch["observation"], goal, action)
+                )
+                actor_loss = (alpha * log_prob - min_q).mean()
+                actor_optimizer.zero_grad()
+                actor_loss.backward()
+                actor_optimizer.step()
+                for parameter in q_parameters:
+                    parameter.requires_grad_(True)
 
-            if args.autotune:
-                alpha_loss = -(log_alpha.exp() * (log_prob.detach() + target_entropy)).mean()
-                alpha_optimizer.zero_grad()
-                alpha_loss.backward()
-                alpha_optimizer.step()
+                if args.autotune:
+                    alpha_loss = -(
+                        log_alpha.exp() * (log_prob.detach() + args.target_entropy)
+                    ).mean()
+                    alpha_optimizer.zero_grad()
+                    alpha_loss.backward()
+                    alpha_optimizer.step()
 
             with torch.no_grad():
                 torch._foreach_lerp_(q_target_parameters, q_parameters, args.tau)
@@ -588,7 +595,7 @@ if __name__ == "__main__":
             result = evaluate(actor, eval_envs, validation, device)
             for name, value in result.items():
                 writer.add_scalar(f"eval/{name}", value, step)
-            picture = picture_of_rollout(actor, eval_envs[0], validation, device)
+            picture = picture_of_rollout(actor, picture_env, validation, device)
             writer.add_image("eval/rollout", picture, step, dataformats="HWC")
             if result["success_rate"] > progress["best_success"]:
                 progress["best_success"], progress["best_step"] = result["success_rate"], step

@@ -1,4 +1,4 @@
-"""RoboArm-NMP's environments. `make(task)` builds one; importing this registers the Gymnasium ids."""
+"""RoboArm-NMP's environments. `make(task)` builds one; importing registers the Gymnasium ids."""
 
 import gymnasium
 

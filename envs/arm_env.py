@@ -68,7 +68,10 @@ class RoboArmEnv(gym.Env):
         ValueError: for an argument out of its range; the message says what was expected.
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": round(1 / TIME_STEP / SUBSTEPS)}
+    metadata = {
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": round(1 / TIME_STEP / SUBSTEPS),
+    }
 
     def __init__(
         self,
@@ -182,10 +185,9 @@ class RoboArmEnv(gym.Env):
             kind = p.GEOM_CYLINDER
         client = self._client
         body = p.createMultiBody(
-            baseCollisionShapeIndex=p.createCollisionShape(kind, **collision, physicsClientId=client),
-            baseVisualShapeIndex=p.createVisualShape(
-                kind, **visual, rgbaColor=colour, physicsClientId=client
-            ),
+            0.0,  # kg: it never moves
+            p.createCollisionShape(kind, **collision, physicsClientId=client),
+            p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client),
             basePosition=obstacle.position,
             baseOrientation=obstacle.orientation,
             physicsClientId=client,
@@ -196,7 +198,7 @@ class RoboArmEnv(gym.Env):
     # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
 
     def in_collision(self, configuration):
-        """Whether the arm at joint angles (7, rad), inside the limits, overlaps the scene or itself.
+        """Whether the arm at joint angles (7, rad, inside the limits) overlaps the scene or itself.
 
         Moves the arm: call it between episodes, or go on with a reset.
         """
@@ -226,12 +228,15 @@ class RoboArmEnv(gym.Env):
         return math.sqrt(drift @ drift) <= HOLD_DRIFT
 
     def sample_feasible(self, rng):
-        """A feasible configuration, uniform in the limits: float32 (7,), rad. `rng`: a NumPy Generator."""
+        """A feasible configuration, uniform in the limits: float32 (7,), rad.
+
+        `rng` is a NumPy Generator.
+        """
         for _ in range(MAX_SAMPLING_TRIES):
             configuration = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
             if self.is_feasible(configuration):
                 return configuration
-        raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples: {self.scene}")
+        raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
 
     def sample_query(self, rng):
         """A start and a goal the start does not already reach: two float32 (7,), rad."""
@@ -362,10 +367,8 @@ class RoboArmEnv(gym.Env):
             p.stepSimulation(physicsClientId=self._client)
             if not touched:
                 # A contact also counts at distance zero, when the surfaces push on each other.
-                touched = any(
-                    contact[8] < 0.0 or contact[9] > 0.0
-                    for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self._client)
-                )
+                contacts = p.getContactPoints(bodyA=self.robot, physicsClientId=self._client)
+                touched = any(contact[8] < 0.0 or contact[9] > 0.0 for contact in contacts)
         return touched
 
     def _touched_names(self):
@@ -483,7 +486,7 @@ class RoboArmEnv(gym.Env):
         )
 
     def render(self):
-        """With `rgb_array`: a uint8 picture (height, width, 3) of the arm, the scene and the goal."""
+        """With `rgb_array`: a uint8 picture (height, width, 3) of the arm, scene and goal."""
         if self.render_mode != "rgb_array":
             return None
         width, height = self.render_size

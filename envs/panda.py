@@ -58,7 +58,7 @@ _FLANGE_TO_EE = 0.107 + 0.105  # m along the last joint's axis: link8, then the 
 
 
 def forward_kinematics(configuration):
-    """End-effector position (m, robot base at the origin), shape (..., 3), for joint angles (..., 7)."""
+    """Joint angles in rad, (..., 7) -> end-effector position in m from the base, (..., 3)."""
     configuration = np.asarray(configuration, dtype=np.float64)
     position = np.zeros((*configuration.shape[:-1], 3))
     rotation = np.broadcast_to(np.eye(3), (*configuration.shape[:-1], 3, 3))

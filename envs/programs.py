@@ -21,6 +21,7 @@ import json
 import operator
 import os
 import pickle
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -41,6 +42,8 @@ _EXTRA = (
     _ATEN.cdist.default,
     _ATEN.linalg_vector_norm.default,
 )
+# Numbers of rows on which a network is compared with its module before it is saved.
+_ROWS = (1, 2, 32)
 # Arithmetic on sizes, where a shape depends on the batch, and picking one of several results.
 _PYTHON = {
     f"operator.{name}": getattr(operator, name)
@@ -71,27 +74,17 @@ def save_program(path, module, example_inputs, metadata):
     """
     path = Path(path)
     module = copy.deepcopy(getattr(module, "_orig_mod", module)).cpu().eval()  # undo torch.compile
-    # Three rows, because torch.export takes sizes 0 and 1 for constants.
     inputs = {
-        name: tensor.detach().cpu()[torch.arange(3) % len(tensor)]
+        name: tensor.detach().cpu()[torch.arange(max(_ROWS)) % len(tensor)]
         for name, tensor in example_inputs.items()
     }
     try:
         metadata = json.loads(json.dumps(dict(metadata)))
         content = {"format": FORMAT, "version": VERSION, "metadata": metadata}
-        with torch.no_grad():
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # torch's, about itself
             content |= _export(module, inputs)
-            program = Program(content)
-            for rows in (3, 1):
-                batch = {name: tensor[:rows] for name, tensor in inputs.items()}
-                expected, saved = pytree.tree_leaves(module(**batch)), program(**batch)
-                for one, other in zip(expected, pytree.tree_leaves(saved), strict=True):
-                    torch.testing.assert_close(other, one, rtol=1e-4, atol=1e-5, equal_nan=True)
-    except AssertionError as error:
-        raise ProgramError(
-            f"{path}: saved, this network would behave differently; does its forward depend on "
-            f"values or on the batch size? {error}"
-        ) from error
+            _compare(Program(content), module, inputs)
     except Exception as error:  # torch.export raises many kinds
         raise ProgramError(f"{path}: this network cannot be saved: {error}") from error
     buffer = io.BytesIO()
@@ -213,11 +206,10 @@ class _ByName(torch.nn.Module):
 
 def _export(module, inputs):
     """The parts of a program's content that say what it computes."""
-    batch = torch.export.Dim("batch")
     exported = torch.export.export(
         _ByName(module, tuple(inputs)),
         tuple(inputs.values()),
-        dynamic_shapes=(tuple({0: batch} for _ in inputs),),
+        dynamic_shapes=(tuple({0: torch.export.Dim.DYNAMIC} for _ in inputs),),
     )
     decompositions = torch.export.default_decompositions()
     for operation in _EXTRA:
@@ -253,6 +245,21 @@ def _export(module, inputs):
             references[node] = {"node": node.name}
     outputs = _encode(outputs, references)
     return {"inputs": list(inputs), "outputs": outputs, "nodes": nodes, "tensors": tensors}
+
+
+def _compare(program, module, inputs):
+    """Raise ProgramError unless both compute the same, whatever the number of rows."""
+    for rows in _ROWS:
+        batch = {name: tensor[:rows] for name, tensor in inputs.items()}
+        saved, expected = pytree.tree_leaves(program(**batch)), pytree.tree_leaves(module(**batch))
+        try:
+            for one, other in zip(saved, expected, strict=True):
+                torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5, equal_nan=True)
+        except (AssertionError, ValueError) as error:
+            raise ProgramError(
+                "saved, it would behave differently; does its forward depend on values or on the "
+                f"batch size? {error}"
+            ) from error
 
 
 def _encode(value, references):

@@ -12,7 +12,7 @@ IDENTITY = (0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Box:
-    """A box. `position` is its centre, `size` its full edges, `orientation` a quaternion (x, y, z, w)."""
+    """A box: centre, full edges, and orientation as a quaternion (x, y, z, w)."""
 
     position: tuple[float, float, float]
     size: tuple[float, float, float]

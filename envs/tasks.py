@@ -20,7 +20,7 @@ class Task:
 
 
 def _two_walls(gap):
-    """Walls left and right of the base, so that the arm passes from front to back through the gap."""
+    """Walls left and right of the base: the arm goes from front to back through the gap."""
     length, height = 0.7, 0.745
     return Scene(
         tuple(

@@ -1,4 +1,4 @@
-"""The MDP: numbers against independent formulas, exact replay, the Gymnasium interface, bad input."""
+"""The MDP: numbers against independent formulas, exact replay, Gymnasium, bad input."""
 
 import hashlib
 import os

@@ -384,6 +384,7 @@ def test_a_writer_killed_in_the_middle_leaves_the_old_file(path):
     process = start_writer(KILLED_IN_THE_MIDDLE, path)
     process.kill()
     assert process.wait() == -signal.SIGKILL
+    process.stdout.close()
     assert path.read_bytes() == before
     write(path)  # and what the killed writer left behind is in nobody's way
     assert path.read_bytes() == before

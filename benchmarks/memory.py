@@ -1,0 +1,38 @@
+"""How much the process grows over 20,000 episodes. The target is below 20 MB.
+
+    pip install -c constraints.txt -e ".[bench]"
+    python benchmarks/memory.py
+
+The last line is JSON.
+"""
+
+import argparse
+import json
+
+import psutil
+from tqdm import trange
+
+import envs
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--task", default="double_walls", choices=list(envs.TASKS))
+    parser.add_argument("--episodes", type=int, default=20_000)
+    parser.add_argument("--steps", type=int, default=20)
+    args = parser.parse_args()
+    env = envs.make(args.task)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    before = psutil.Process().memory_info().rss
+    for _ in trange(args.episodes, unit="episode"):
+        env.reset()
+        for _ in range(args.steps):
+            env.step(env.action_space.sample())
+    grown = (psutil.Process().memory_info().rss - before) / 1e6
+    print(f"{args.episodes} episodes of {args.task}: the process grew by {grown:.1f} MB")
+    print(json.dumps({"episodes": args.episodes, "grown_mb": grown}))
+
+
+if __name__ == "__main__":
+    main()
