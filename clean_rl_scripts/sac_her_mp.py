@@ -105,10 +105,9 @@ class Args:
     """add goal minus end-effector position, times 5, to the networks' inputs"""
     trigonometric: bool = True
     """add the joint angles' sines and cosines to the networks' inputs"""
-    entropy_backup: bool = True
-    """entropy term in the critics' target"""
-    bf16: bool = True
-    """multiply hidden layer by hidden layer in bfloat16, everything else in float32"""
+    bf16: bool | None = None
+    """products of hidden layers in bfloat16 while training, everything else in float32; by default
+    where the hardware has it"""
 
     # Evaluation and bookkeeping
     eval_every: int = 25_000
@@ -123,7 +122,7 @@ class Args:
 
 def configuration_of(args):
     """The fields that define what is computed: a run can only be resumed with the same."""
-    free = {"resume", "runs_dir", "threads", "test_queries", "stop_at_success"}
+    free = {"resume", "runs_dir", "threads", "total_timesteps", "test_queries", "stop_at_success"}
     return {k: v for k, v in asdict(args).items() if k not in free}
 
 
@@ -306,9 +305,8 @@ def stack(observations, device):
 
 
 @torch.no_grad()
-def evaluate(actor, envs, queries, device):
-    """Run the deterministic policy on every query, one per env at a time; mean results."""
-    actor.eval()
+def evaluate(policy, envs, queries, device):
+    """Run a deterministic policy on every query, each env one at a time; mean results."""
     waiting = iter(range(len(queries)))
     running, results = {}, []
 
@@ -321,7 +319,7 @@ def evaluate(actor, envs, queries, device):
     for env in envs:
         start(env)
     while running:
-        actions = actor(**stack(list(running.values()), device)).cpu().numpy()
+        actions = policy(**stack(list(running.values()), device)).cpu().numpy()
         for env, action in zip(list(running), actions, strict=True):
             running[env], _, terminated, truncated, info = env.step(action)
             if terminated or truncated:
@@ -329,7 +327,6 @@ def evaluate(actor, envs, queries, device):
                     (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
                 )
                 start(env)
-    actor.train()
     success, touched, steps = np.array(results, dtype=np.float64).T
     return {
         "success_rate": success.mean(),
@@ -340,18 +337,16 @@ def evaluate(actor, envs, queries, device):
 
 
 @torch.no_grad()
-def picture_of_rollout(actor, env, queries, device, frames=8):
+def picture_of_rollout(policy, env, queries, device, frames=8):
     """An image strip (height, frames * width, 3), uint8, of the policy on the first query."""
-    actor.eval()
     observation, _ = env.reset_specific(queries.start[0], queries.goal[0])
     pictures, done = [env.render()], False
     while not done:
-        action = actor(**stack([observation], device))[0].cpu().numpy()
+        action = policy(**stack([observation], device))[0].cpu().numpy()
         observation, _, terminated, truncated, info = env.step(action)
         done = terminated or truncated
         if info["elapsed_steps"] % 10 == 0 or done:
             pictures.append(env.render())
-    actor.train()
     chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
     return np.concatenate([pictures[i] for i in chosen], axis=1)
 
@@ -404,6 +399,9 @@ if __name__ == "__main__":
     torch.manual_seed(args.seed)
     torch.use_deterministic_algorithms(True)
     device = torch.device(args.device)
+
+    if args.bf16 is None:
+        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
 
     # env setup
     kwargs = env_arguments(args)
@@ -541,7 +539,7 @@ if __name__ == "__main__":
                     qf1_target(batch["next_observation"], goal, next_action),
                     qf2_target(batch["next_observation"], goal, next_action),
                     next_log_prob,
-                    alpha * args.entropy_backup,
+                    alpha,
                     args.gamma,
                 )
             q1 = qf1(batch["observation"], goal, batch["action"])
@@ -566,9 +564,8 @@ if __name__ == "__main__":
                     parameter.requires_grad_(True)
 
                 if args.autotune:
-                    alpha_loss = -(
-                        log_alpha.exp() * (log_prob.detach() + args.target_entropy)
-                    ).mean()
+                    surplus = log_prob.detach().mean() + args.target_entropy
+                    alpha_loss = -(log_alpha.exp() * surplus).squeeze()
                     alpha_optimizer.zero_grad()
                     alpha_loss.backward()
                     alpha_optimizer.step()
@@ -592,10 +589,12 @@ if __name__ == "__main__":
         # Evaluate, keep the best policy, checkpoint
         step = progress["global_step"]
         if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
+            actor.eval()
             result = evaluate(actor, eval_envs, validation, device)
             for name, value in result.items():
                 writer.add_scalar(f"eval/{name}", value, step)
             picture = picture_of_rollout(actor, picture_env, validation, device)
+            actor.train()
             writer.add_image("eval/rollout", picture, step, dataformats="HWC")
             if result["success_rate"] > progress["best_success"]:
                 progress["best_success"], progress["best_step"] = result["success_rate"], step
