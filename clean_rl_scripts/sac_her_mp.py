@@ -295,6 +295,12 @@ def td_target(reward, terminated, next_q1, next_q2, next_log_prob, alpha, gamma)
     return reward + gamma * (1.0 - terminated) * next_value
 
 
+def polyak_update(target_parameters, parameters, tau):
+    """target <- (1 - tau) target + tau parameter, all tensors at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(target_parameters, parameters, tau)
+
+
 # Evaluation
 def stack(observations, device):
     """List of observation dicts -> dict of float32 tensors (N, ...)."""
@@ -329,10 +335,10 @@ def evaluate(policy, envs, queries, device):
                 start(env)
     success, touched, steps = np.array(results, dtype=np.float64).T
     return {
-        "success_rate": success.mean(),
-        "clean_success_rate": (success * (1 - touched)).mean(),
-        "collision_rate": touched.mean(),
-        "episode_length": steps.mean(),
+        "success_rate": float(success.mean()),
+        "clean_success_rate": float((success * (1 - touched)).mean()),
+        "collision_rate": float(touched.mean()),
+        "episode_length": float(steps.mean()),
     }
 
 
@@ -448,7 +454,10 @@ if __name__ == "__main__":
         write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
 
     if args.resume is not None and (run / "checkpoint.pt").exists():
-        state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
+        try:
+            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
+        except Exception as error:  # whatever a damaged file leads to
+            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
         for name, part in saved_parts.items():
             part.load_state_dict(state[name])
         log_alpha.data.copy_(state["log_alpha"])
@@ -570,8 +579,7 @@ if __name__ == "__main__":
                     alpha_loss.backward()
                     alpha_optimizer.step()
 
-            with torch.no_grad():
-                torch._foreach_lerp_(q_target_parameters, q_parameters, args.tau)
+            polyak_update(q_target_parameters, q_parameters, args.tau)
             progress["updates"] += 1
 
             if progress["updates"] % 1000 == 0:

@@ -157,7 +157,7 @@ class Program:
 
     def _build(self, content, device):
         _check_plain(content)
-        self.metadata = copy.deepcopy(content["metadata"])
+        self.metadata = dict(copy.deepcopy(content["metadata"]))
         self.inputs = list(content["inputs"])
         # While it runs, its values lie in one list: tensors, inputs, the results of the nodes.
         self._tensors = [tensor.to(device) for tensor in content["tensors"].values()]

@@ -1,0 +1,524 @@
+"""Evaluate a policy on the queries of a task: how often it gets there, and how well.
+
+    python clean_rl_scripts/evaluate.py --policy go-to-goal --task double_walls --workers 2
+    python clean_rl_scripts/evaluate.py --policy runs/my_run --task wall --json result.json
+
+An episode is one query under the task's standard rules (goal tolerances and horizon of
+`RoboArmEnv`'s defaults). The same arguments give the same numbers, times excepted, whatever the
+number of workers.
+
+- success: share of episodes that reached the goal, with a 95% Wilson interval;
+- clean success: share that reached it and never touched anything on the way;
+- collision: share in which anything was touched, whether the goal was reached or not;
+- steps, path length, smoothness: means over the successful episodes. With configurations
+  c_0 ... c_T in rad, the path length is the sum of |c_t+1 - c_t|, in rad, and the smoothness the
+  mean of |c_t+1 - 2 c_t + c_t-1|, in rad per step^2 (L2 norms; lower is smoother);
+- time per action: of the policy alone, without the simulator.
+
+From Python: `evaluate(policy, task, ...)` returns the same numbers as a dict.
+"""
+
+import io
+import json
+import multiprocessing
+import os
+import platform
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+import tyro
+from PIL import Image
+from tqdm import tqdm
+
+import envs
+from envs import panda
+from envs.datasets import load_queries
+from envs.programs import ProgramError, load_program
+
+# What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
+# they decide what a success is.
+ENV_ARGUMENTS = ("action_mode", "max_step", "velocities")
+CHUNK = 10  # queries a worker takes at a time
+FRAMES = 8  # of a picture
+
+
+@dataclass
+class Args:
+    policy: str
+    """`go-to-goal` (straight to the goal configuration), `random`, a policy program, or a run's
+    folder with a `policy.pt` in it"""
+    task: str
+    """the task, one of `envs.TASKS`"""
+    goal_type: Literal["ee", "config", "combined"] | None = None
+    """what the goal is; by default what the policy was trained with, or else `ee`"""
+    split: Literal["test", "validation"] = "test"
+    """which of the task's queries"""
+    queries: Path | None = None
+    """a query file to use instead of the task's own"""
+    num_queries: int | None = None
+    """only the first so many queries of the split"""
+    workers: int = 1
+    """processes; each uses one core"""
+    stop_on_collision: bool = False
+    """end an episode at the first touch"""
+    seed: int = 0
+    """of the `random` policy"""
+    json: Path | None = None
+    """write the results to this file too"""
+    picture: Path | None = None
+    """draw the first query's episode as a strip of pictures into this PNG file"""
+
+
+class EvaluationError(ValueError):
+    """An evaluation that cannot be done; the message says why."""
+
+
+class Outcome(NamedTuple):
+    """What came out of one episode; lengths are NaN where the goal was not reached."""
+
+    success: bool
+    collision: bool
+    steps: int
+    path_length: float
+    smoothness: float
+    policy_seconds: float
+
+
+# --- Metrics
+
+
+def wilson_interval(successes, n):
+    """The 95% Wilson score interval (low, high) of a share, for `successes` out of `n` >= 1."""
+    z = 1.959964
+    share = successes / n
+    centre = share + z * z / (2 * n)
+    spread = z * (share * (1 - share) / n + z * z / (4 * n * n)) ** 0.5
+    scale = 1 + z * z / n
+    return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
+
+
+def path_length(configurations):
+    """Sum of the L2 distances, in rad, between successive configurations (T + 1, 7), rad."""
+    return float(np.linalg.norm(np.diff(configurations, axis=0), axis=1).sum())
+
+
+def smoothness(configurations):
+    """Mean L2 norm of the second differences, rad per step^2, of configurations (T + 1, 7), rad.
+
+    Zero for fewer than three configurations.
+    """
+    if len(configurations) < 3:
+        return 0.0
+    return float(np.linalg.norm(np.diff(configurations, n=2, axis=0), axis=1).mean())
+
+
+# --- Policies: at the start of an episode, (query's number, goal configuration) -> act, and then
+# act(observation) -> action (7,)
+
+
+def _make_policy(policy, seed):
+    if policy == "go-to-goal":
+        return _go_to_goal
+    if policy == "random":
+        return lambda index, goal: _random(np.random.default_rng([seed, index]))
+    if isinstance(policy, Path):
+        act = _run_program(load_program(policy))
+        return lambda index, goal: act
+    return lambda index, goal: policy
+
+
+def _go_to_goal(index, goal):
+    target = panda.normalise(goal)
+    return lambda observation: target - observation["observation"][:7]
+
+
+def _random(rng):
+    return lambda observation: rng.uniform(-1.0, 1.0, 7)
+
+
+def _run_program(program):
+    # One observation at a time: in a batch its last bits would depend on the batch's size, for a
+    # gain of a tenth of the time at most.
+    def act(observation):
+        inputs = {name: torch.from_numpy(observation[name])[None] for name in program.inputs}
+        return program(**inputs)[0].numpy()
+
+    return act
+
+
+# --- Episodes
+
+
+@dataclass(frozen=True)
+class _Job:
+    """All that a worker needs to know."""
+
+    policy: str | Path | Callable
+    task: str
+    env: dict
+    seed: int
+    start: np.ndarray
+    goal: np.ndarray
+    split: str | None
+    workers: int
+
+    def make(self, **kwargs):
+        return envs.make(self.task, **self.env, **kwargs), _make_policy(self.policy, self.seed)
+
+
+def _run_episode(env, act, start, goal, on_step=None):
+    """One episode's `Outcome`. `on_step(action)` is called after every step."""
+    observation, info = env.reset_specific(start, goal)
+    states = [observation["observation"][:7]]
+    seconds, ended = 0.0, info["is_success"]
+    while not ended:
+        began = time.perf_counter()
+        action = act(observation)
+        seconds += time.perf_counter() - began
+        observation, _, terminated, truncated, info = env.step(action)
+        states.append(observation["observation"][:7])
+        ended = terminated or truncated
+        if on_step is not None:
+            on_step(action)
+    lengths = [np.nan, np.nan]
+    if info["is_success"]:
+        configurations = panda.denormalise(states)
+        lengths = [path_length(configurations), smoothness(configurations)]
+    steps = len(states) - 1
+    return Outcome(info["is_success"], info["collision_so_far"], steps, *lengths, seconds)
+
+
+def _run_queries(job, env, policy, indices):
+    outcomes = []
+    for index in indices:
+        start, goal = job.start[index], job.goal[index]
+        try:
+            outcomes.append(_run_episode(env, policy(index, goal), start, goal))
+        except ValueError as error:  # the query or the action was refused
+            raise EvaluationError(f"query {index}: {error}") from error
+    return outcomes
+
+
+_worker = None  # (job, env, policy) of this process
+
+
+def _start_worker(job):
+    global _worker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's business
+    torch.set_num_threads(1)
+    _worker = (job, *job.make())
+
+
+def _work(indices):
+    return indices, _run_queries(*_worker, indices)
+
+
+def _run(job, progress):
+    """The outcomes of all queries, in their order."""
+    count = len(job.start)
+    chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
+    outcomes = [None] * count
+    bar = tqdm(total=count, unit="query", disable=None if progress else True)
+    successes = 0
+
+    def store(indices, results):
+        nonlocal successes
+        outcomes[indices.start : indices.stop] = results
+        successes += sum(result.success for result in results)
+        bar.update(len(results))
+        bar.set_postfix(success=f"{successes / bar.n:.3f}" if bar.n else "-")
+
+    with bar:
+        if job.workers == 1:
+            threads = torch.get_num_threads()
+            torch.set_num_threads(1)
+            try:
+                env, policy = job.make()
+                for chunk in chunks:
+                    store(chunk, _run_queries(job, env, policy, chunk))
+            finally:
+                torch.set_num_threads(threads)
+            return outcomes
+        pool = ProcessPoolExecutor(
+            min(job.workers, len(chunks)),
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_start_worker,
+            initargs=(job,),
+        )
+        try:
+            for future in as_completed([pool.submit(_work, chunk) for chunk in chunks]):
+                store(*future.result())
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return outcomes
+
+
+# --- The evaluation
+
+
+def evaluate(
+    policy,
+    task,
+    goal_type=None,
+    *,
+    queries=None,
+    split="test",
+    num_queries=None,
+    stop_on_collision=False,
+    seed=0,
+    workers=1,
+    env=None,
+    progress=False,
+):
+    """Run a policy on a task's queries.
+
+    Args:
+        policy: `go-to-goal`, `random`, the path of a policy program or of a folder with a
+            `policy.pt`, or a function from an observation (dict of `RoboArmEnv`) to an action
+            (7,); with several workers, one that can be pickled.
+        task: name of the task.
+        goal_type: `ee`, `config`, `combined`; None for the policy's own, or else `ee`.
+        queries: what to use instead of the task's own queries: the path of a query file, or an
+            object with `start` and `goal`, float32 (n, 7), rad, like `envs.datasets.Queries`.
+        split: `test` or `validation`; which queries of the file.
+        num_queries: only the first so many of them.
+        stop_on_collision: end an episode at the first touch.
+        seed: of the `random` policy; each query has its own generator.
+        workers: processes. More than one needs the caller's script to be importable
+            (`if __name__ == "__main__":`), as always with `multiprocessing`.
+        env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
+            defaults. A policy program brings its own.
+        progress: show a progress bar, with the success rate so far.
+
+    Returns:
+        A dict that fits into JSON; what it holds is described at the top of this file. Means over
+        no successful episode are None.
+
+    Raises:
+        EvaluationError: the policy, the task or the queries cannot be used.
+    """
+    job = _prepare(
+        policy, task, goal_type, queries, split, num_queries, stop_on_collision, seed, workers, env
+    )
+    return _summary(job, _run(job, progress))
+
+
+def _prepare(
+    policy, task, goal_type, queries, split, num_queries, stop_on_collision, seed, workers, env
+):
+    """The `_Job` of `evaluate`'s arguments, once everything about them has been checked."""
+    if task not in envs.TASKS:
+        raise EvaluationError(f"unknown task {task!r}: one of {', '.join(envs.TASKS)}")
+    if workers < 1:
+        raise EvaluationError(f"workers must be at least 1, got {workers}")
+    env, program = dict(env or {}), None
+    if not callable(policy) and policy not in ("go-to-goal", "random"):
+        policy = Path(policy)
+        if policy.is_dir():
+            policy = policy / "policy.pt"
+        if not policy.exists():
+            raise EvaluationError(
+                f"no such policy: {policy} (expected go-to-goal, random, a policy program or a "
+                f"folder with a policy.pt in it)"
+            )
+        program, trained = _load_policy(policy)
+        env = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
+        if goal_type not in (None, trained["goal_type"]):
+            raise EvaluationError(
+                f"{policy} was trained with the goal type {trained['goal_type']!r}, it cannot be "
+                f"evaluated with {goal_type!r}"
+            )
+        goal_type = trained["goal_type"]
+    env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
+
+    try:
+        if queries is None or isinstance(queries, (str, Path)):
+            queries = load_queries(queries or task, split)
+        arm = envs.make(task, **env)
+        arm.close()
+        if program is not None:
+            _try(program, policy, arm.observation_space)
+    except (TypeError, ValueError) as error:
+        raise EvaluationError(str(error)) from error
+    if getattr(queries, "task", task) != task:
+        raise EvaluationError(f"these queries are for the task {queries.task!r}, not {task!r}")
+    available = len(queries.start)
+    count = available if num_queries is None else num_queries
+    if not 1 <= count <= available:
+        raise EvaluationError(f"num_queries must be 1 to {available}, got {num_queries}")
+    start, goal = queries.start[:count], queries.goal[:count]
+    return _Job(policy, task, env, seed, start, goal, getattr(queries, "split", None), workers)
+
+
+def _load_policy(path):
+    """A policy program, and the arguments of the environment it was trained in."""
+    try:
+        program = load_program(path)
+    except ProgramError as error:
+        raise EvaluationError(str(error)) from error
+    trained = program.metadata.get("env")
+    if program.metadata.get("kind") != "policy" or not isinstance(trained, dict):
+        raise EvaluationError(f"{path}: a program, but not a policy")
+    if "goal_type" not in trained:
+        raise EvaluationError(f"{path}: does not say which goal type it was trained with")
+    return program, trained
+
+
+def _try(program, path, space):
+    """Raise EvaluationError unless a policy program makes an action out of an observation."""
+    unknown = set(program.inputs) - set(space)
+    if unknown:
+        raise EvaluationError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
+    zeros = {name: torch.zeros(1, *space[name].shape) for name in program.inputs}
+    action = program(**zeros)
+    if not isinstance(action, torch.Tensor) or action.shape != (1, panda.NUM_JOINTS):
+        raise EvaluationError(f"{path}: its output is not an action for each observation")
+
+
+def _summary(job, outcomes):
+    count = len(outcomes)
+    columns = Outcome(*(np.array(column) for column in zip(*outcomes, strict=True)))
+    reached = columns.success
+    clean = reached & ~columns.collision
+    actions = int(columns.steps.sum())
+
+    def share(name, hits):
+        low, high = wilson_interval(int(hits.sum()), count)
+        return {name: float(hits.mean()), f"{name}_interval": [low, high]}
+
+    def mean(values):
+        return float(values[reached].mean()) if reached.any() else None
+
+    return {
+        "policy": getattr(job.policy, "__name__", str(job.policy)),
+        "task": job.task,
+        "goal_type": job.env["goal_type"],
+        "split": job.split,
+        "num_queries": count,
+        **share("success_rate", reached),
+        **share("clean_success_rate", clean),
+        **share("collision_rate", columns.collision),
+        "mean_steps": mean(columns.steps),
+        "path_length": mean(columns.path_length),
+        "smoothness": mean(columns.smoothness),
+        "ms_per_action": 1e3 * float(columns.policy_seconds.sum()) / actions if actions else None,
+        "env": job.env,
+        "seed": job.seed if job.policy == "random" else None,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("pybullet", "torch", "numpy")},
+        },
+    }
+
+
+# --- The command
+
+
+def _table(result):
+    def row(name, value, unit="", interval=None):
+        number = "-" if value is None else f"{value:.4g}" if unit else f"{value:.4f}"
+        between = f"[{interval[0]:.4f}, {interval[1]:.4f}]" if interval else unit
+        return f"  {name:<16}{number:>9}  {between}"
+
+    shares = [
+        row(label, result[name], interval=result[f"{name}_interval"])
+        for label, name in (
+            ("success", "success_rate"),
+            ("clean success", "clean_success_rate"),
+            ("collision", "collision_rate"),
+        )
+    ]
+    return "\n".join(
+        [
+            f"{result['policy']} on {result['task']}: {result['num_queries']} {result['split']} "
+            f"queries, goal type {result['goal_type']}",
+            *shares,
+            row("mean steps", result["mean_steps"], "on the way to the goal"),
+            row("path length", result["path_length"], "rad"),
+            row("smoothness", result["smoothness"], "rad/step^2"),
+            row("time per action", result["ms_per_action"], "ms"),
+        ]
+    )
+
+
+def _draw(job):
+    """A PNG file's bytes: the first query's episode in `FRAMES` pictures, side by side."""
+    env, policy = job.make(render_mode="rgb_array")
+    query, actions = (job.start[0], job.goal[0]), []
+    _run_episode(env, policy(0, query[1]), *query, on_step=actions.append)
+    # Again, exactly the same, to take the pictures where they are wanted.
+    wanted = set(np.linspace(0, len(actions), FRAMES).round().astype(int).tolist())
+    env.reset_specific(*query)
+    frames = [env.render()]
+    for step, action in enumerate(actions, start=1):
+        env.step(action)
+        if step in wanted:
+            frames.append(env.render())
+    env.close()
+    png = io.BytesIO()
+    Image.fromarray(np.concatenate(frames, axis=1)).save(png, format="PNG")
+    return png.getvalue()
+
+
+def _check_writable(path):
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(None, "it is a folder")
+        with tempfile.NamedTemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise EvaluationError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _write_atomically(path, contents):
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(contents)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def main(arguments=None):
+    """The command. Returns the exit code: 0, or 2 for arguments that make no sense."""
+    args = tyro.cli(Args, args=arguments, description=__doc__)
+    try:
+        for path in (args.json, args.picture):
+            if path is not None:
+                _check_writable(path)
+        job = _prepare(
+            args.policy,
+            args.task,
+            args.goal_type,
+            args.queries,
+            args.split,
+            args.num_queries,
+            args.stop_on_collision,
+            args.seed,
+            args.workers,
+            env=None,
+        )
+        result = _summary(job, _run(job, progress=True))
+    except EvaluationError as error:
+        print(f"evaluate.py: {error}", file=sys.stderr)
+        return 2
+    print(_table(result))
+    if args.json is not None:
+        _write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())
+    if args.picture is not None:
+        _write_atomically(args.picture, _draw(job))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,274 @@
+"""evaluate.py: its metrics, its baselines, the same numbers however it is run, and its errors."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import envs
+from envs import panda
+from envs.datasets import write_queries
+from envs.programs import save_program
+
+SCRIPT = Path(__file__).resolve().parents[1] / "clean_rl_scripts" / "evaluate.py"
+sys.path.append(str(SCRIPT.parent))
+evaluation = importlib.import_module("evaluate")
+evaluate = evaluation.evaluate
+
+
+@pytest.fixture(scope="module")
+def queries():
+    env, rng = envs.make("no_obstacles"), np.random.default_rng(0)
+    pairs = [env.sample_query(rng) for _ in range(40)]
+    env.close()
+    return SimpleNamespace(
+        start=np.array([pair[0] for pair in pairs]), goal=np.array([pair[1] for pair in pairs])
+    )
+
+
+@pytest.fixture(scope="module")
+def query_file(queries, tmp_path_factory):
+    path = tmp_path_factory.mktemp("queries") / "queries.h5"
+    splits = {
+        "test": (queries.start[:30], queries.goal[:30]),
+        "validation": (queries.start[30:], queries.goal[30:]),
+    }
+    write_queries(path, "no_obstacles", 0, splits, "a test", {})
+    return path
+
+
+class Straight(nn.Module):
+    """The go-to-goal policy as a network, for goals that are configurations."""
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        return torch.clamp(desired_goal - observation[:, :7], -1, 1)
+
+
+def _save(path, module=None, goal_size=7, observation_size=10, **metadata):
+    inputs = {
+        "observation": torch.zeros(1, observation_size),
+        "achieved_goal": torch.zeros(1, goal_size),
+        "desired_goal": torch.zeros(1, goal_size),
+    }
+    metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
+    save_program(path, module or Straight(), inputs, metadata)
+    return path
+
+
+def _numbers(result):
+    """What must not depend on how an evaluation is run."""
+    return {name: value for name, value in result.items() if name != "ms_per_action"}
+
+
+# --- Metrics
+
+
+def test_wilson_interval():
+    # p = 0.8, n = 10, z^2 = 3.84146: centre (0.8 + 0.192073) / 1.384146, half width
+    # 1.959964 * sqrt(0.016 + 0.0096036) / 1.384146
+    low, high = evaluation.wilson_interval(8, 10)
+    assert low == pytest.approx(0.490162, abs=1e-5)
+    assert high == pytest.approx(0.943318, abs=1e-5)
+    assert evaluation.wilson_interval(0, 10) == pytest.approx((0.0, 0.277533), abs=1e-5)
+    assert evaluation.wilson_interval(10, 10) == pytest.approx((0.722467, 1.0), abs=1e-5)
+
+
+def test_path_length_and_smoothness():
+    configurations = np.zeros((4, 7))
+    configurations[:, 0] = [0.0, 3.0, 3.0, 3.0]
+    configurations[:, 1] = [0.0, 4.0, 4.0, 6.0]
+    # steps (3, 4), (0, 0), (0, 2); their differences (-3, -4), (0, 2)
+    assert evaluation.path_length(configurations) == pytest.approx(5 + 0 + 2)
+    assert evaluation.smoothness(configurations) == pytest.approx((5 + 2) / 2)
+    straight = np.linspace(np.zeros(7), np.ones(7), 11)
+    assert evaluation.path_length(straight) == pytest.approx(np.sqrt(7))
+    assert evaluation.smoothness(straight) == pytest.approx(0.0, abs=1e-12)
+    assert evaluation.path_length(straight[:1]) == evaluation.smoothness(straight[:2]) == 0.0
+
+
+def test_metrics_of_an_evaluation_are_those_of_its_episodes(queries):
+    result = evaluate("go-to-goal", "no_obstacles", queries=queries)
+    env, rows = envs.make("no_obstacles"), []
+    for start, goal in zip(queries.start, queries.goal, strict=True):
+        observation, info = env.reset_specific(start, goal)
+        path, ended = [start.astype(float)], False
+        while not ended:
+            action = panda.normalise(goal) - observation["observation"][:7]
+            observation, _, terminated, truncated, info = env.step(action)
+            path.append(panda.denormalise(observation["observation"][:7]))
+            ended = terminated or truncated
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        rows.append((info["is_success"], info["collision_so_far"], len(path) - 1, length))
+    env.close()
+    success, touched, steps, lengths = (np.array(column) for column in zip(*rows, strict=True))
+    assert result["num_queries"] == 40
+    assert result["success_rate"] == success.mean() > 0.9
+    assert result["clean_success_rate"] == (success & ~touched).mean()
+    assert result["collision_rate"] == touched.mean()
+    assert 0 < result["clean_success_rate"] < result["success_rate"]
+    assert result["mean_steps"] == pytest.approx(steps[success].mean())
+    assert result["path_length"] == pytest.approx(lengths[success].mean(), abs=1e-5)
+    assert 0 < result["smoothness"] < 0.1 and result["ms_per_action"] > 0
+    low, high = result["clean_success_rate_interval"]
+    assert low < result["clean_success_rate"] < high
+    assert json.loads(json.dumps(result)) == result
+
+
+def test_a_start_at_the_goal_is_a_success_of_no_steps():
+    start = np.array([[0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0]], np.float32)
+    result = evaluate(
+        "go-to-goal", "no_obstacles", queries=SimpleNamespace(start=start, goal=start)
+    )
+    assert result["success_rate"] == 1.0
+    assert result["mean_steps"] == result["path_length"] == result["smoothness"] == 0.0
+    assert result["ms_per_action"] is None
+
+
+def test_stopping_on_collision_leaves_clean_successes_only(queries):
+    free = evaluate("go-to-goal", "no_obstacles", queries=queries)
+    stopped = evaluate("go-to-goal", "no_obstacles", queries=queries, stop_on_collision=True)
+    assert stopped["success_rate"] == stopped["clean_success_rate"] == free["clean_success_rate"]
+    assert stopped["collision_rate"] == free["collision_rate"]
+
+
+# --- The same numbers however it is run
+
+
+def test_workers_do_not_change_the_result(queries):
+    alone = evaluate("random", "no_obstacles", queries=queries, num_queries=12, seed=3)
+    assert alone["success_rate"] == 0 and alone["mean_steps"] is None
+    alone = evaluate("go-to-goal", "no_obstacles", queries=queries)
+    shared = evaluate("go-to-goal", "no_obstacles", queries=queries, workers=2)
+    assert _numbers(alone) == _numbers(shared)
+
+
+def test_random_actions_depend_on_seed_and_query_only():
+    def actions(seed, index):
+        act = evaluation._make_policy("random", seed)(index, None)
+        return np.array([act({}) for _ in range(5)])
+
+    assert np.array_equal(actions(1, 4), actions(1, 4))
+    assert not np.array_equal(actions(1, 4), actions(1, 5))
+    assert not np.array_equal(actions(1, 4), actions(2, 4))
+    assert np.abs(actions(1, 4)).max() <= 1
+
+
+def test_a_program_a_function_and_the_baseline_agree(queries, tmp_path):
+    def straight(observation):
+        return observation["desired_goal"] - observation["observation"][:7]
+
+    few = {"queries": queries, "num_queries": 15}
+    threads = torch.get_num_threads()
+    baseline = evaluate("go-to-goal", "no_obstacles", "config", **few)
+    function = evaluate(straight, "no_obstacles", "config", **few)
+    program = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
+    folder = evaluate(str(tmp_path), "no_obstacles", **few, workers=2)
+    assert torch.get_num_threads() == threads
+    assert _numbers(program) == _numbers(folder)
+    assert function["policy"] == "straight"
+    assert program["goal_type"] == "config" and program["policy"] == str(tmp_path / "policy.pt")
+    for result in (function, program):
+        assert result["success_rate"] == baseline["success_rate"] > 0.8
+        assert result["path_length"] == pytest.approx(baseline["path_length"], rel=1e-3)
+
+
+def test_a_program_brings_its_environment_but_not_the_rules(queries, tmp_path):
+    class Still(Straight):
+        def forward(self, observation, achieved_goal, desired_goal):
+            return observation[:, :7] + 0 * observation[:, 14:].sum(1, keepdim=True)
+
+    env = {"goal_type": "ee", "action_mode": "subgoal", "max_step": 0.05, "velocities": True}
+    cheat = {"ee_tolerance": 10.0, "horizon": 10_000, "render_mode": "human"}
+    path = _save(tmp_path / "still.pt", Still(), 3, 17, env=env | cheat)
+    result = evaluate(path, "no_obstacles", queries=queries, num_queries=2)
+    assert result["env"] == env | {"stop_on_collision": False}
+    assert result["success_rate"] == 0.0
+
+
+# --- The command
+
+
+def test_the_command_from_another_folder(query_file, tmp_path):
+    arguments = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", query_file]
+    arguments += ["--num-queries", "12", "--workers", "2"]
+    arguments += ["--json", tmp_path / "out.json", "--picture", tmp_path / "out.png"]
+    path = os.pathsep.join([str(SCRIPT.parents[1]), os.environ.get("PYTHONPATH", "")])
+    run = subprocess.run(
+        [sys.executable, SCRIPT, *arguments],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "go-to-goal on no_obstacles: 12 test queries" in run.stdout
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert f"success {result['success_rate']:>17.4f}" in run.stdout
+    assert result["split"] == "test" and result["num_queries"] == 12
+    assert set(result["versions"]) == {"python", "pybullet", "torch", "numpy"}
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(os.listdir(tmp_path)) == ["out.json", "out.png"]
+
+
+def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
+    def never(job, progress):
+        raise AssertionError("work was done")
+
+    monkeypatch.setattr(evaluation, "_run", never)
+    policy = str(_save(tmp_path / "policy.pt"))
+    (tmp_path / "broken.pt").write_bytes(Path(policy).read_bytes()[:500])
+    encoder = str(_save(tmp_path / "encoder.pt", kind="encoder"))
+    unsaid = str(_save(tmp_path / "unsaid.pt", env={}))
+    unfit = str(_save(tmp_path / "unfit.pt", env={"goal_type": "ee"}))
+    (tmp_path / "empty").mkdir()
+    cases = [
+        ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol"),
+        ({"policy": str(tmp_path / "empty")}, "no such policy"),
+        ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a program file"),
+        ({"policy": encoder}, "encoder.pt: a program, but not a policy"),
+        ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
+        ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
+        ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
+        ({"task": "moon"}, "unknown task 'moon': one of no_obstacles"),
+        ({"task": "wall"}, "these queries are for the task 'no_obstacles', not 'wall'"),
+        ({"queries": str(tmp_path / "no.h5")}, "no.h5"),
+        ({"num-queries": "31"}, "num_queries must be 1 to 30, got 31"),
+        ({"num-queries": "0"}, "num_queries must be 1 to 30"),
+        ({"split": "validation", "num-queries": "11"}, "num_queries must be 1 to 10"),
+        ({"workers": "0"}, "workers must be at least 1"),
+        ({"json": str(tmp_path)}, "cannot write"),
+        ({"json": str(tmp_path / "no such folder" / "a.json")}, "cannot write"),
+        ({"picture": str(tmp_path / "no such folder" / "a.png")}, "cannot write"),
+    ]
+    good = {"policy": "go-to-goal", "task": "no_obstacles", "queries": str(query_file)}
+    for change, message in cases:
+        flags = good | change
+        arguments = [text for name, value in flags.items() for text in (f"--{name}", value)]
+        assert evaluation.main(arguments) == 2, change
+        output = capsys.readouterr()
+        assert output.out == "" and message in output.err
+        assert output.err.startswith("evaluate.py: ") and output.err.count("\n") == 1
+    with pytest.raises(SystemExit) as stop:
+        evaluation.main(["--policy", "random", "--task", "wall", "--goal-type", "pose"])
+    assert stop.value.code == 2
+
+
+def test_a_query_that_is_refused_is_named(queries):
+    goal = queries.goal.copy()
+    goal[3] = 7.0
+    broken = SimpleNamespace(start=queries.start, goal=goal)
+    with pytest.raises(evaluation.EvaluationError, match="query 3: goal is outside the joint"):
+        evaluate("go-to-goal", "no_obstacles", queries=broken)
+
+
+def test_an_action_that_is_no_number_is_an_error(queries):
+    with pytest.raises(evaluation.EvaluationError, match="query 0: an action is 7 finite numbers"):
+        evaluate(lambda observation: np.full(7, np.nan), "no_obstacles", queries=queries)

@@ -1,0 +1,308 @@
+"""sac_her_mp.py: its numbers against independent formulas, real short runs, kill and resume."""
+
+import importlib.util
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import envs
+from envs.programs import load_program
+
+SCRIPT = Path(__file__).parents[1] / "clean_rl_scripts" / "sac_her_mp.py"
+spec = importlib.util.spec_from_file_location("sac_her_mp", SCRIPT)
+sac = importlib.util.module_from_spec(spec)
+sys.modules["sac_her_mp"] = sac
+spec.loader.exec_module(sac)
+
+TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
+TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1800"
+
+
+def command(folder, *flags):
+    return [sys.executable, str(SCRIPT), "--runs-dir", str(folder), *TINY.split(), *flags]
+
+
+def run_script(folder, *flags):
+    done = subprocess.run(command(folder, *flags), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return next(folder.iterdir())
+
+
+# --- Numbers
+
+
+def test_td_target_by_hand():
+    target = sac.td_target(
+        torch.tensor([-1.0, 0.0]),
+        torch.tensor([0.0, 1.0]),
+        torch.tensor([-3.0, -9.0]),
+        torch.tensor([-4.0, -8.0]),
+        torch.tensor([2.0, 2.0]),
+        alpha=0.1,
+        gamma=0.5,
+    )
+    # -1 + 0.5 (min(-3, -4) - 0.1 * 2); a terminal state has no value
+    torch.testing.assert_close(target, torch.tensor([-3.1, 0.0]))
+
+
+def test_polyak_update_by_hand():
+    target, parameter = [torch.tensor([1.0, 2.0])], [torch.tensor([3.0, -2.0])]
+    sac.polyak_update(target, parameter, 0.25)
+    torch.testing.assert_close(target[0], torch.tensor([1.5, 1.0]))
+    torch.testing.assert_close(parameter[0], torch.tensor([3.0, -2.0]))
+
+
+def test_log_probability_is_the_squashed_gaussians():
+    torch.manual_seed(0)
+    actor = sac.Actor(sac.Args(bf16=False)).eval()
+    observation, goal = torch.randn(64, 10), torch.randn(64, 3)
+    action, log_prob = actor.sample(observation, goal)
+    mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
+    std = (-5 + 3.5 * (torch.tanh(log_std) + 1)).exp()
+    squashed = torch.distributions.TransformedDistribution(
+        torch.distributions.Normal(mean.double(), std.double()),
+        torch.distributions.transforms.TanhTransform(),
+    )
+    expected = squashed.log_prob(action.double() / 0.06).sum(1)
+    torch.testing.assert_close(log_prob.double(), expected, rtol=1e-3, atol=1e-3)
+    deterministic = actor(observation, None, goal)
+    torch.testing.assert_close(deterministic, 0.06 * torch.tanh(mean))
+
+
+def test_network_inputs():
+    from envs import panda
+
+    rng = np.random.default_rng(0)
+    c = rng.uniform(panda.LOWER, panda.UPPER, (5, 7))
+    position, goal = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
+    observation = torch.tensor(np.hstack([panda.normalise(c), position]), dtype=torch.float32)
+    features = sac.Features(sac.Args())
+    inputs = features(observation, torch.tensor(goal, dtype=torch.float32)).numpy()
+    assert inputs.shape == (5, features.size)
+    expected = np.hstack([observation, goal, np.sin(c), np.cos(c), 5 * (goal - position)])
+    np.testing.assert_allclose(inputs, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+@pytest.mark.parametrize("velocities", [False, True])
+def test_networks_fit_every_observation(goal_type, velocities):
+    args = sac.Args(goal_type=goal_type, velocities=velocities, num_hidden_layers=4)
+    env = envs.make("wall", goal_type=goal_type, velocities=velocities)
+    batch = sac.stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
+    action = sac.Actor(args)(**batch)
+    assert action.shape == (2, 7)
+    value = sac.SoftQNetwork(args)(batch["observation"], batch["desired_goal"], action)
+    assert value.shape == (2,)
+
+
+def episode(length, offset, env):
+    """Transition t of a made-up episode arrives at the position (offset + t, 0, 0)."""
+    return [
+        {
+            "observation": np.full(10, offset + t, np.float32),
+            "action": np.full(7, 0.01 * t, np.float32),
+            "next_observation": np.full(10, offset + t + 1, np.float32),
+            "next_achieved_goal": np.array([offset + t, 0, 0], np.float32),
+            "desired_goal": np.array([-5, 0, 0], np.float32),
+            "collision": t == 1,
+        }
+        for t in range(length)
+    ]
+
+
+def test_relabelled_goals_are_reached_later_in_the_same_episode():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 100, 1.0, np.random.default_rng(0))
+    buffer.add_episode(episode(4, 0, env))
+    buffer.add_episode(episode(6, 100, env))
+    batch = buffer.sample(4000)
+    now, goal = batch["next_achieved_goal"][:, 0], batch["desired_goal"][:, 0]
+    assert set(zip(now.tolist(), goal.tolist(), strict=True)) == {
+        (start + t, start + k)
+        for start, n in ((0, 4), (100, 6))
+        for t in range(n)
+        for k in range(t, n)
+    }
+    # Positions are a metre apart: reached means the very same.
+    np.testing.assert_array_equal(batch["reward"], np.where(now == goal, 0.0, -1.0))
+    np.testing.assert_array_equal(batch["terminated"], now == goal)
+    # The rest of a transition stays together.
+    np.testing.assert_array_equal(batch["observation"][:, 0], now)
+    np.testing.assert_array_equal(batch["next_observation"][:, 3], now + 1)
+    # The future strategy: each later step of an episode is equally likely.
+    first = goal[now == 100]
+    counts = np.bincount((first - 100).astype(int), minlength=6)
+    assert abs(counts / len(first) - 1 / 6).max() < 0.06
+
+
+def test_share_of_relabelled_goals():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 100, 0.8, np.random.default_rng(0))
+    buffer.add_episode(episode(20, 0, env))
+    goals = buffer.sample(10_000)["desired_goal"][:, 0]
+    assert abs((goals != -5).mean() - 0.8) < 0.02
+
+
+def test_collisions_end_episodes_only_if_asked():
+    for stop in (False, True):
+        env = envs.make("no_obstacles", stop_on_collision=stop)
+        buffer = sac.HerReplayBuffer(env, 10, 0.0, np.random.default_rng(0))
+        buffer.add_episode(episode(3, 0, env))
+        batch = buffer.sample(100)
+        collided = batch["next_achieved_goal"][:, 0] == 1
+        np.testing.assert_array_equal(batch["terminated"], collided if stop else 0 * collided)
+        np.testing.assert_array_equal(batch["reward"], -1)
+
+
+def test_the_ring_overwrites_the_oldest_and_keeps_episodes_apart():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 10, 1.0, np.random.default_rng(0))
+    for offset in (0, 100, 200):
+        buffer.add_episode(episode(4, offset, env))  # the third wraps around over half the first
+    assert buffer.size == 10
+    batch = buffer.sample(5000)
+    now, goal = batch["next_achieved_goal"][:, 0], batch["desired_goal"][:, 0]
+    assert set(now.tolist()) == {2, 3, 100, 101, 102, 103, 200, 201, 202, 203}
+    assert (now // 100 == goal // 100).all() and (goal >= now).all()
+
+
+def test_a_million_transitions_fit_into_400_mb():
+    for arguments in ({}, {"goal_type": "combined", "velocities": True}):
+        env = envs.make("no_obstacles", **arguments)
+        buffer = sac.HerReplayBuffer(env, 1_000_000, 0.8, np.random.default_rng(0))
+        assert buffer.rows.nbytes + buffer.remaining.nbytes < 400e6
+
+
+def test_bfloat16_products_stay_close_to_float32():
+    torch.manual_seed(0)
+    args = sac.Args(bf16=True)
+    q = sac.SoftQNetwork(args)
+    inputs = torch.randn(256, 10), torch.randn(256, 3), torch.rand(256, 7) * 0.06
+    in_training, exact = q.train()(*inputs), q.eval()(*inputs)
+    assert 0 < (in_training - exact).abs().max() < 0.02
+    assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
+
+
+# --- Real runs
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory):
+    return run_script(tmp_path_factory.mktemp("runs"), "--goal-type", "combined", "--velocities")
+
+
+def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run):
+    result = json.loads((finished_run / "result.json").read_text())
+    assert result["steps"] == 1800 and result["num_queries"] == 4
+    assert 0 <= result["clean_success_rate"] <= result["success_rate"] <= 1
+    assert result["args"]["goal_type"] == "combined"
+
+    events = EventAccumulator(str(finished_run))
+    events.Reload()
+    scalars = set(events.Tags()["scalars"])
+    for tag in ("episodic_return", "episodic_length", "success"):
+        assert f"charts/{tag}" in scalars
+    for tag in ("success_rate", "clean_success_rate", "episode_length", "collision_rate"):
+        assert [event.step for event in events.Scalars(f"eval/{tag}")] == [600, 1200, 1800]
+    assert "eval/rollout" in events.Tags()["images"]
+    assert "hyperparameters/text_summary" in events.Tags()["tensors"]
+
+
+def test_the_saved_policy_acts_without_the_script(finished_run):
+    policy = load_program(finished_run / "policy.pt")
+    assert policy.metadata["kind"] == "policy" and policy.metadata["task"] == "no_obstacles"
+    env = envs.make(policy.metadata["task"], **policy.metadata["env"])
+    observation, _ = env.reset(seed=0)
+    action = policy(**sac.stack([observation], "cpu"))[0].numpy()
+    assert action.shape == (7,) and np.abs(action).max() <= 0.06
+    env.step(action)
+
+
+def test_losses_are_logged_and_subgoal_actions_train(tmp_path):
+    run = run_script(
+        tmp_path, "--action-mode", "subgoal", "--updates-per-step", "1", "--goal-type", "config"
+    )
+    events = EventAccumulator(str(run))
+    events.Reload()
+    for tag in ("qf1_values", "qf1_loss", "qf2_loss", "qf_loss", "actor_loss", "alpha"):
+        assert np.isfinite([event.value for event in events.Scalars(f"losses/{tag}")]).all()
+    assert events.Scalars("charts/SPS")[-1].value > 0
+
+
+def same(a, b):
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a.keys() - {"seconds"}:
+            same(a[key], b[key])
+    elif isinstance(a, list):
+        for one, other in zip(a, b, strict=True):
+            same(one, other)
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a, b)
+    else:
+        assert a == b
+
+
+def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path):
+    whole = run_script(tmp_path / "whole")
+    process = subprocess.Popen(
+        command(tmp_path / "killed"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    deadline = time.time() + 120
+    while not list((tmp_path / "killed").glob("*/checkpoint.pt")) and time.time() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    killed = next((tmp_path / "killed").iterdir())
+    assert not (killed / "result.json").exists()
+    (killed / "checkpoint.pt.part").write_bytes(b"half a checkpoint")  # must not be read
+
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), "--resume", str(killed)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    same(*(torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed)))
+    results = [json.loads((run / "result.json").read_text()) for run in (whole, killed)]
+    assert results[0]["success_rate"] == results[1]["success_rate"]
+
+
+# --- Bad input
+
+
+@pytest.mark.parametrize(
+    "flags, message",
+    [
+        (["--task", "walls"], "unknown task 'walls': one of no_obstacles, wall"),
+        (["--resume", "nowhere"], "nowhere is no run's folder"),
+        (["--goal-type", "pose"], "goal-type"),
+    ],
+)
+def test_bad_flags(tmp_path, flags, message):
+    done = subprocess.run(command(tmp_path, *flags), capture_output=True, text=True)
+    assert done.returncode != 0 and message in done.stderr + done.stdout
+    assert "Traceback" not in done.stderr and not list(tmp_path.iterdir())
+
+
+def test_resuming_refuses_another_configuration_and_a_damaged_checkpoint(finished_run, tmp_path):
+    resume = [sys.executable, str(SCRIPT), "--resume", str(finished_run)]
+    done = subprocess.run([*resume, "--gamma", "0.9"], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "--gamma is 0.9 now, the run had 0.95" in done.stderr and "task" not in done.stderr
+
+    (tmp_path / "args.json").write_bytes((finished_run / "args.json").read_bytes())
+    checkpoint = (finished_run / "checkpoint.pt").read_bytes()
+    (tmp_path / "checkpoint.pt").write_bytes(checkpoint[: len(checkpoint) // 2])
+    resume[-1] = str(tmp_path)
+    done = subprocess.run(resume, capture_output=True, text=True)
+    assert done.returncode != 0 and "checkpoint.pt is damaged" in done.stderr
+    assert "Traceback" not in done.stderr
