@@ -68,8 +68,8 @@ class Args:
     """environment steps of the whole run"""
     learning_starts: int = 2_000
     """environment steps with random actions before the first update"""
-    updates_per_step: float = 1.0
-    """gradient updates per environment step"""
+    updates_per_step: float = 0.5
+    """updates of the critics per environment step (CleanRL: 1)"""
     buffer_size: int = 1_000_000
     """transitions in the replay buffer"""
     batch_size: int = 256
@@ -90,8 +90,8 @@ class Args:
     """tune the entropy coefficient to the target entropy"""
     target_entropy: float = -7.0
     """entropy that the tuning aims at, of the unscaled action (CleanRL: minus its dimensions)"""
-    policy_frequency: int = 1
-    """critic updates per update of the policy"""
+    policy_frequency: int = 2
+    """updates of the critics per update of the policy (CleanRL: as often as the critics)"""
     hidden_size: int = 256
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: int = 2
