@@ -23,7 +23,7 @@ from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 SCRIPT = Path(__file__).parents[1] / "clean_rl_scripts" / "sac_her_mp.py"
-LEARNING_STARTS = 1000
+LEARNING_STARTS = 2000
 PLAIN = ["--no-layer-norm", "--no-relative-goal", "--no-trigonometric"]
 
 
@@ -56,7 +56,7 @@ def stable_baselines3(num_envs, steps):
 
     class Clock(BaseCallback):
         def _on_step(self):
-            if self.num_timesteps >= LEARNING_STARTS + 1000 and not hasattr(self, "began"):
+            if self.num_timesteps >= LEARNING_STARTS + 500 and not hasattr(self, "began"):
                 self.began = time.time(), self.num_timesteps
             return True
 

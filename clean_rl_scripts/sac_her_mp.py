@@ -106,8 +106,8 @@ class Args:
     trigonometric: bool = True
     """add the joint angles' sines and cosines to the networks' inputs"""
     bf16: bool | None = None
-    """products of hidden layers in bfloat16 while training, everything else in float32; by default
-    where the hardware has it"""
+    """train with hidden layers in bfloat16 (first layer, head and weights stay in float32); by
+    default where the hardware has it"""
 
     # Evaluation and bookkeeping
     eval_every: int = 25_000
@@ -169,14 +169,15 @@ class MLP(nn.Module):
         self.bf16 = args.bf16
 
     def forward(self, x):
-        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
-            if self.bf16 and self.training and i > 0:
-                # Inputs, outputs and sums stay in float32: 2 cm need more than bfloat16's 8 bits.
-                x = F.linear(x.bfloat16(), layer.weight.bfloat16()).float() + layer.bias
-            else:
-                x = layer(x)
-            x = F.relu(norm(x))
-        return self.head(x)
+        if not (self.bf16 and self.training):
+            for layer, norm in zip(self.layers, self.norms, strict=True):
+                x = F.relu(norm(layer(x)))
+            return self.head(x)
+        # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
+        x = F.relu(self.norms[0](self.layers[0](x).bfloat16()))
+        for layer, norm in zip(self.layers[1:], self.norms[1:], strict=True):
+            x = F.relu(norm(F.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16())))
+        return self.head(x.float())
 
 
 class SoftQNetwork(nn.Module):
@@ -390,6 +391,8 @@ def parse_args():
 
 if __name__ == "__main__":
     args = parse_args()
+    if args.device == "cuda" and not torch.cuda.is_available():
+        sys.exit("--device cuda: PyTorch sees no CUDA device here")
     if args.task not in roboarm.TASKS:
         sys.exit(f"unknown task {args.task!r}: one of {', '.join(roboarm.TASKS)}")
     if args.resume is not None:
@@ -403,6 +406,7 @@ if __name__ == "__main__":
     # TRY NOT TO MODIFY: seeding
     torch.set_num_threads(args.threads)
     torch.manual_seed(args.seed)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
     torch.use_deterministic_algorithms(True)
     device = torch.device(args.device)
 
@@ -532,11 +536,14 @@ if __name__ == "__main__":
 
         # ALGO LOGIC: learn
         due = (progress["global_step"] - args.learning_starts) * args.updates_per_step
-        while progress["updates"] < due and buffer.size > 0:
-            batch = {
-                name: torch.as_tensor(array, device=device)
-                for name, array in buffer.sample(args.batch_size).items()
+        updates = max(0, int(due) - progress["updates"]) if buffer.size > 0 else 0
+        if updates > 0:
+            batches = {  # sampled together, because that is faster
+                name: torch.as_tensor(array, device=device).split(args.batch_size)
+                for name, array in buffer.sample(updates * args.batch_size).items()
             }
+        for update in range(updates):
+            batch = {name: tensors[update] for name, tensors in batches.items()}
             goal = batch["desired_goal"]
             alpha = log_alpha.detach().exp()
 
@@ -591,6 +598,8 @@ if __name__ == "__main__":
                 writer.add_scalar("losses/qf_loss", (qf1_loss + qf2_loss).item() / 2, step)
                 writer.add_scalar("losses/actor_loss", actor_loss.item(), step)
                 writer.add_scalar("losses/alpha", alpha.item(), step)
+                if args.autotune:
+                    writer.add_scalar("losses/alpha_loss", alpha_loss.item(), step)
                 sps = (step - steps_before) / (time.time() - started)
                 writer.add_scalar("charts/SPS", int(sps), step)
 

@@ -2,7 +2,7 @@
 
     python docs/make_pictures.py
 
-For each task: the first test query, the arm at its start, a green ball at the goal.
+For each task: one test query, the arm at its start, a green ball at the goal.
 """
 
 from pathlib import Path
@@ -14,6 +14,7 @@ from tqdm import tqdm
 import envs
 from envs.datasets import load_queries
 
+QUERY = 2  # its start and goal lie on two sides of the walls
 FOLDER = Path(__file__).parent / "pictures"
 
 
@@ -21,7 +22,7 @@ def main():
     pictures = {}
     for task in tqdm(envs.TASKS, unit="task"):
         env = envs.make(task, render_mode="rgb_array", render_size=(960, 720))
-        env.reset_specific(*load_queries(task)[0])
+        env.reset_specific(*load_queries(task)[QUERY])
         # Twice the size, then averaged: PyBullet's software renderer has jagged edges.
         pictures[task] = Image.fromarray(env.render()).resize((480, 360), Image.LANCZOS)
         pictures[task].quantize(64).save(FOLDER / f"{task}.png", optimize=True)

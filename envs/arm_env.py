@@ -452,7 +452,8 @@ class RoboArmEnv(gym.Env):
         """Whether an episode ends there: a bool array of the batch shape.
 
         `info` is one info dict (entries may be arrays), or a sequence of them as long as the
-        batch; with `stop_on_collision` its `collision` ends the episode too.
+        batch; with `stop_on_collision` its `collision` ends the episode too. What is missing in
+        an info counts as False.
         """
         ended = self._distance(achieved_goal, desired_goal) <= self._tolerance
         if self.stop_on_collision:
@@ -462,7 +463,7 @@ class RoboArmEnv(gym.Env):
     def compute_truncated(self, achieved_goal, desired_goal, info):
         """Whether the horizon cuts the episode there: a bool array of the batch shape.
 
-        `info`: as for `compute_terminated`; `elapsed_steps` is read.
+        `info`: as for `compute_terminated`; `elapsed_steps` is read, 0 where it is missing.
         """
         late = _entry(info, "elapsed_steps", int) >= self.horizon
         return late & ~self.compute_terminated(achieved_goal, desired_goal, info)
@@ -546,5 +547,5 @@ def _vector(name, value, sizes):
 def _entry(info, key, dtype):
     """One entry of an info dict, or of a sequence of info dicts, as an array."""
     if isinstance(info, dict):
-        return np.asarray(info[key], dtype=dtype)
-    return np.array([one[key] for one in info], dtype=dtype)
+        return np.asarray(info.get(key, 0), dtype=dtype)
+    return np.array([one.get(key, 0) for one in info], dtype=dtype)
