@@ -473,8 +473,6 @@ def test_make_queries_refuses_before_it_works(arguments, complaint):
 
 @pytest.mark.parametrize("task", envs.TASKS)
 def test_packaged_queries(task):
-    if not query_path(task).exists():
-        pytest.skip(f"{query_path(task).name} is not made yet")
     env = envs.make(task)
     client = p.connect(p.DIRECT)
     robot = p.loadURDF(
@@ -484,6 +482,7 @@ def test_packaged_queries(task):
     )
     for split in datasets.SPLITS:
         queries = load_queries(task, split)
+        assert len(queries) == {"test": 10_000, "validation": 200}[split]
         chosen = np.random.default_rng(0).choice(len(queries), 20, replace=False)
         for start, goal in queries[chosen]:
             assert env.is_feasible(start) and env.is_feasible(goal)
