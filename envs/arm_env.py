@@ -6,6 +6,7 @@ Paper: sections 2 and 4, appendix "Extended NMP goal-conditioned MDP description
 import math
 import os
 import sys
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -130,12 +131,12 @@ class RoboArmEnv(gym.Env):
         )
         self.action_space = gym.spaces.Box(-1.0, 1.0, (panda.NUM_JOINTS,), np.float32)
 
-        window = render_mode == "human"
-        if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        self._window = render_mode == "human"
+        if self._window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
             # PyBullet would end the whole process.
             gym.logger.warn("render_mode='human' needs a display (DISPLAY is not set): no window")
-            window = False
-        self._client = p.connect(p.GUI if window else p.DIRECT)
+            self._window = False
+        self._client = p.connect(p.GUI if self._window else p.DIRECT)
         # Without deterministicOverlappingPairs the same episode differs from run to run.
         p.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self._client
@@ -155,11 +156,11 @@ class RoboArmEnv(gym.Env):
     # --- The scene
 
     def set_scene(self, scene):
-        """Put the arm into another `Scene`. The running episode ends: call a reset next."""
+        """Put the arm into another `Scene`, which ends the episode. Nothing happens if it is equal."""
         _check_scene(scene)
-        self.start_configuration = None
         if scene == self.scene:
             return
+        self.start_configuration = None
         for body in self._bodies:
             p.removeBody(body, physicsClientId=self._client)
         self._bodies = []
@@ -274,7 +275,8 @@ class RoboArmEnv(gym.Env):
         goal = _vector("goal", goal, (7, 3) if self.goal_type == "ee" else (7,))
         for name, configuration in (("start", start), ("goal", goal)):
             if configuration.size == 7:
-                outside = (configuration < panda.LOWER) | (configuration > panda.UPPER)
+                # float32 may round a limit to just beyond it.
+                outside = np.abs(panda.normalise(configuration)) > 1.0 + 1e-6
                 if outside.any():
                     joint = int(np.argmax(outside))
                     raise ValueError(
@@ -284,13 +286,13 @@ class RoboArmEnv(gym.Env):
                     )
         if scene is not None:
             self.set_scene(scene)
-        before = p.getJointStates(self.robot, panda._RESET_JOINTS, physicsClientId=self._client)
+        before = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self._client)
         for name, configuration in (("goal", goal), ("start", start)):
             if configuration.size == 7 and self.in_collision(configuration):
                 touched = self._touched_names()
                 p.resetJointStatesMultiDof(
                     self.robot,
-                    panda._RESET_JOINTS,
+                    panda.RESET_JOINTS,
                     [[joint[0]] for joint in before],
                     [[joint[1]] for joint in before],
                     physicsClientId=self._client,
@@ -363,6 +365,8 @@ class RoboArmEnv(gym.Env):
     def _simulate(self):
         """Run the physics of one environment step; whether the arm touched anything in it."""
         touched = False
+        if self._window:
+            time.sleep(TIME_STEP * SUBSTEPS)  # as fast as it would be
         for _ in range(SUBSTEPS):
             p.stepSimulation(physicsClientId=self._client)
             if not touched:

@@ -98,9 +98,9 @@ def load(client):
     return robot
 
 
-_RESET_JOINTS = ARM_JOINTS + FINGER_JOINTS
+RESET_JOINTS = ARM_JOINTS + FINGER_JOINTS
 _FINGER_POSITIONS = [[FINGER_OPENING]] * 2
-_AT_REST = [[0.0]] * len(_RESET_JOINTS)
+_AT_REST = [[0.0]] * len(RESET_JOINTS)
 _FORCES = MAX_TORQUE.tolist()
 
 
@@ -108,7 +108,7 @@ def set_configuration(client, robot, configuration):
     """Teleport the arm to joint angles (7, rad), at rest."""
     p.resetJointStatesMultiDof(
         robot,
-        _RESET_JOINTS,
+        RESET_JOINTS,
         [[angle] for angle in configuration] + _FINGER_POSITIONS,
         _AT_REST,
         physicsClientId=client,
