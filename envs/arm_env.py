@@ -156,7 +156,7 @@ class RoboArmEnv(gym.Env):
     # --- The scene
 
     def set_scene(self, scene):
-        """Put the arm into another `Scene`, which ends the episode; an equal one changes nothing."""
+        """Put the arm into another `Scene`. That ends the episode; an equal one changes nothing."""
         _check_scene(scene)
         if scene == self.scene:
             return
