@@ -119,7 +119,7 @@ def main():
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
 
-    ours = gymnasium.make(envs.gymnasium_id("double_walls"), disable_env_checker=True)
+    ours = gymnasium.make(envs.gymnasium_id("double_walls"))
     ours.reset(seed=args.seed)
     bare = envs.make("double_walls")
     peer = gymnasium.make("PandaReachJoints-v3")
