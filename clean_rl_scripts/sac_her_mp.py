@@ -429,9 +429,12 @@ if __name__ == "__main__":
     q_parameters = [*qf1.parameters(), *qf2.parameters()]
     q_target_parameters = [*qf1_target.parameters(), *qf2_target.parameters()]
     q_optimizer = torch.optim.Adam(q_parameters, lr=args.q_lr, fused=True)
-    actor_optimizer = torch.optim.Adam(actor.parameters(), lr=args.policy_lr, fused=True)
     log_alpha = torch.full((1,), float(np.log(args.alpha)), device=device, requires_grad=True)
-    alpha_optimizer = torch.optim.Adam([log_alpha], lr=args.q_lr, fused=True)
+    actor_optimizer = torch.optim.Adam(
+        [{"params": actor.parameters()}, {"params": [log_alpha], "lr": args.q_lr}],
+        lr=args.policy_lr,
+        fused=True,
+    )
     buffer = HerReplayBuffer(
         eval_envs[0], args.buffer_size, args.her_probability, np.random.default_rng(args.seed)
     )
@@ -443,7 +446,6 @@ if __name__ == "__main__":
         "qf2_target": qf2_target,
         "q_optimizer": q_optimizer,
         "actor_optimizer": actor_optimizer,
-        "alpha_optimizer": alpha_optimizer,
         "buffer": buffer,
     }
     progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
@@ -573,18 +575,13 @@ if __name__ == "__main__":
                     qf1(batch["observation"], goal, action), qf2(batch["observation"], goal, action)
                 )
                 actor_loss = (alpha * log_prob - min_q).mean()
+                surplus = log_prob.detach().mean() + args.target_entropy
+                alpha_loss = -log_alpha.exp() * surplus * args.autotune
                 actor_optimizer.zero_grad()
-                actor_loss.backward()
+                (actor_loss + alpha_loss).backward()
                 actor_optimizer.step()
                 for parameter in q_parameters:
                     parameter.requires_grad_(True)
-
-                if args.autotune:
-                    surplus = log_prob.detach().mean() + args.target_entropy
-                    alpha_loss = -(log_alpha.exp() * surplus).squeeze()
-                    alpha_optimizer.zero_grad()
-                    alpha_loss.backward()
-                    alpha_optimizer.step()
 
             polyak_update(q_target_parameters, q_parameters, args.tau)
             progress["updates"] += 1
@@ -598,8 +595,7 @@ if __name__ == "__main__":
                 writer.add_scalar("losses/qf_loss", (qf1_loss + qf2_loss).item() / 2, step)
                 writer.add_scalar("losses/actor_loss", actor_loss.item(), step)
                 writer.add_scalar("losses/alpha", alpha.item(), step)
-                if args.autotune:
-                    writer.add_scalar("losses/alpha_loss", alpha_loss.item(), step)
+                writer.add_scalar("losses/alpha_loss", alpha_loss.item(), step)
                 sps = (step - steps_before) / (time.time() - started)
                 writer.add_scalar("charts/SPS", int(sps), step)
 

@@ -228,14 +228,14 @@ def test_the_saved_policy_acts_without_the_script(finished_run):
     env.step(action)
 
 
-def test_losses_are_logged_and_subgoal_actions_train(tmp_path):
-    run = run_script(
-        tmp_path, "--action-mode", "subgoal", "--updates-per-step", "1", "--goal-type", "config"
-    )
+def test_losses_are_logged_subgoal_actions_train_and_alpha_can_stay(tmp_path):
+    flags = "--action-mode subgoal --updates-per-step 1 --goal-type config --no-autotune"
+    run = run_script(tmp_path, *flags.split())
     events = EventAccumulator(str(run))
     events.Reload()
     for tag in ("qf1_values", "qf1_loss", "qf2_loss", "qf_loss", "actor_loss", "alpha"):
         assert np.isfinite([event.value for event in events.Scalars(f"losses/{tag}")]).all()
+    assert events.Scalars("losses/alpha")[-1].value == pytest.approx(0.2)
     assert events.Scalars("charts/SPS")[-1].value > 0
 
 
