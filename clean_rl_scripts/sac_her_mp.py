@@ -8,6 +8,7 @@ your own, copy this file and change the parts under `# ALGO LOGIC`.
 """
 
 import json
+import math
 import os
 import sys
 import time
@@ -169,14 +170,16 @@ class MLP(nn.Module):
         self.bf16 = args.bf16
 
     def forward(self, x):
-        if not (self.bf16 and self.training):
-            for layer, norm in zip(self.layers, self.norms, strict=True):
-                x = F.relu(norm(layer(x)))
-            return self.head(x)
-        # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
-        x = F.relu(self.norms[0](self.layers[0](x).bfloat16()))
-        for layer, norm in zip(self.layers[1:], self.norms[1:], strict=True):
-            x = F.relu(norm(F.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16())))
+        bf16 = self.bf16 and self.training
+        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
+            # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
+            if not bf16:
+                x = layer(x)
+            elif i == 0:
+                x = layer(x).bfloat16()
+            else:
+                x = F.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16())
+            x = F.relu(norm(x))
         return self.head(x.float())
 
 
@@ -210,9 +213,9 @@ class Actor(nn.Module):
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
         noise = torch.randn_like(mean)
         unsquashed = mean + log_std.exp() * noise
-        log_prob = -0.5 * noise.square() - log_std - 0.5 * np.log(2 * np.pi)
+        log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
         # log(1 - tanh(u)^2) without cancellation
-        log_prob = log_prob - 2 * (np.log(2) - unsquashed - F.softplus(-2 * unsquashed))
+        log_prob = log_prob - 2 * (math.log(2) - unsquashed - F.softplus(-2 * unsquashed))
         return self.action_scale * torch.tanh(unsquashed), log_prob.sum(1)
 
     def forward(self, observation, achieved_goal, desired_goal):
@@ -416,7 +419,7 @@ if __name__ == "__main__":
     # env setup
     kwargs = env_arguments(args)
     envs = [roboarm.make(args.task, **kwargs) for _ in range(args.num_envs)]
-    eval_envs = [roboarm.make(args.task, **kwargs) for _ in range(16)]
+    eval_envs = [roboarm.make(args.task, **kwargs) for _ in range(8)]
     picture_env = roboarm.make(args.task, **kwargs, render_mode="rgb_array", render_size=(240, 180))
     validation = load_queries(args.task, "validation")[: args.eval_queries]
 
@@ -429,7 +432,7 @@ if __name__ == "__main__":
     q_parameters = [*qf1.parameters(), *qf2.parameters()]
     q_target_parameters = [*qf1_target.parameters(), *qf2_target.parameters()]
     q_optimizer = torch.optim.Adam(q_parameters, lr=args.q_lr, fused=True)
-    log_alpha = torch.full((1,), float(np.log(args.alpha)), device=device, requires_grad=True)
+    log_alpha = torch.full((1,), math.log(args.alpha), device=device, requires_grad=True)
     actor_optimizer = torch.optim.Adam(
         [{"params": actor.parameters()}, {"params": [log_alpha], "lr": args.q_lr}],
         lr=args.policy_lr,
@@ -495,7 +498,13 @@ if __name__ == "__main__":
     recent_success = []
     started, seconds_before = time.time(), progress["seconds"]
     steps_before = progress["global_step"]
-    bar = tqdm(total=args.total_timesteps, initial=steps_before, unit="step", smoothing=0.05)
+    bar = tqdm(
+        total=args.total_timesteps,
+        initial=steps_before,
+        unit="step",
+        smoothing=0.05,
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
+    )
 
     stop = False
     while progress["global_step"] < args.total_timesteps and not stop:
