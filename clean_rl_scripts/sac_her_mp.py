@@ -398,6 +398,8 @@ if __name__ == "__main__":
         sys.exit("--device cuda: PyTorch sees no CUDA device here")
     if args.task not in roboarm.TASKS:
         sys.exit(f"unknown task {args.task!r}: one of {', '.join(roboarm.TASKS)}")
+    if args.buffer_size < args.horizon:
+        sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
     if args.resume is not None:
         run = args.resume
     else:

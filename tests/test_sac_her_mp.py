@@ -285,6 +285,7 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path):
         (["--task", "walls"], "unknown task 'walls': one of no_obstacles, wall"),
         (["--resume", "nowhere"], "nowhere is no run's folder"),
         (["--goal-type", "pose"], "goal-type"),
+        (["--buffer-size", "49"], "--buffer-size 49: an episode has 50 transitions"),
     ],
 )
 def test_bad_flags(tmp_path, flags, message):
