@@ -7,8 +7,10 @@ import sys
 
 import gymnasium as gym
 import numpy as np
+import psutil
 import pybullet as p
 import pytest
+import stable_baselines3
 from gymnasium.utils.env_checker import check_env
 
 import envs
@@ -350,12 +352,11 @@ def test_record_video(tmp_path):
 
 
 def test_stable_baselines3_sac_with_her_trains():
-    sb3 = pytest.importorskip("stable_baselines3")
     env = gym.make("RoboArmNMP/NoObstacles-v0", horizon=20)
-    model = sb3.SAC(
+    model = stable_baselines3.SAC(
         "MultiInputPolicy",
         env,
-        replay_buffer_class=sb3.HerReplayBuffer,
+        replay_buffer_class=stable_baselines3.HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
         learning_starts=60,
         seed=0,
@@ -367,7 +368,6 @@ def test_stable_baselines3_sac_with_her_trains():
 
 
 def test_episodes_leave_no_memory_behind(env):
-    psutil = pytest.importorskip("psutil")
     env.reset(seed=0)
     resident = psutil.Process().memory_info().rss
     for _ in range(300):
