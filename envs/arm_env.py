@@ -341,14 +341,16 @@ class RoboArmEnv(gym.Env):
             info = self._info(False, self._is_success)
             return self._observation(), 0.0, False, self._steps >= self.horizon, info
 
-        action = _clip(action)
+        action = np.clip(action, -1.0, 1.0)
         delta = action if self.action_mode == "relative" else action - self._state
         length = math.sqrt(delta @ delta)
         if length > self.max_step:
             delta = delta * (self.max_step / length)
-        target = panda.denormalise(_clip(self._state + delta))
+        target = panda.denormalise(np.clip(self._state + delta, -1.0, 1.0))
         panda.command(self._client, self.robot, target.tolist(), POSITION_GAINS)
         collision = self._simulate()
+        if self._window:
+            time.sleep(TIME_STEP * SUBSTEPS)  # for the eye: about as fast as the real arm
         self._collision_so_far = self._collision_so_far or collision
         self._read_arm()
 
@@ -365,8 +367,6 @@ class RoboArmEnv(gym.Env):
     def _simulate(self):
         """Run the physics of one environment step; whether the arm touched anything in it."""
         touched = False
-        if self._window:
-            time.sleep(TIME_STEP * SUBSTEPS)  # as fast as it would be
         for _ in range(SUBSTEPS):
             p.stepSimulation(physicsClientId=self._client)
             if not touched:
@@ -518,11 +518,6 @@ class RoboArmEnv(gym.Env):
         # An env that nobody closed must not keep one of PyBullet's connections.
         if getattr(self, "_client", None) is not None and p.isConnected(self._client):
             p.disconnect(physicsClientId=self._client)
-
-
-def _clip(vector):
-    """np.clip to [-1, 1], which takes a fifth of the time this way on 7 numbers."""
-    return np.minimum(np.maximum(vector, -1.0), 1.0)
 
 
 def _one_of(name, value, allowed):
