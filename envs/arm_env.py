@@ -350,7 +350,7 @@ class RoboArmEnv(gym.Env):
         panda.command(self._client, self.robot, target.tolist(), POSITION_GAINS)
         collision = self._simulate()
         if self._window:
-            time.sleep(TIME_STEP * SUBSTEPS)  # for the eye: about as fast as the real arm
+            time.sleep(TIME_STEP * SUBSTEPS)  # as long as the simulated time
         self._collision_so_far = self._collision_so_far or collision
         self._read_arm()
 
