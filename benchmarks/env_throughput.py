@@ -62,7 +62,7 @@ def run_panda_gym(env, actions):
 
 
 def run_bare(env, start, targets):
-    client, robot = env._client, env.robot
+    client, robot = env.client, env.robot
     panda.set_configuration(client, robot, start)
     forces = panda.MAX_TORQUE.tolist()
     began = time.perf_counter()

@@ -28,6 +28,9 @@ POSITION_GAINS = [0.6] * panda.NUM_JOINTS
 HOLD_STEPS = 5
 HOLD_DRIFT = 1e-3
 MAX_SAMPLING_TRIES = 10_000
+# Where and how the arm touches nothing (m, rad). PyBullet places a body by its centre of mass.
+FAR_AWAY, IN_PLACE, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0)
+CONTACT_FREE = ((panda.LOWER + panda.UPPER) / 2).tolist()
 
 
 class RoboArmEnv(gym.Env):
@@ -90,7 +93,7 @@ class RoboArmEnv(gym.Env):
         render_mode=None,
         render_size=(480, 360),
     ):
-        self._client = None
+        self.client = None
         _one_of("goal_type", goal_type, GOAL_TYPES)
         _one_of("action_mode", action_mode, ACTION_MODES)
         _one_of("reward", reward, ("sparse", "dense"))
@@ -136,13 +139,13 @@ class RoboArmEnv(gym.Env):
             # PyBullet would end the whole process.
             gym.logger.warn("render_mode='human' needs a display (DISPLAY is not set): no window")
             self._window = False
-        self._client = p.connect(p.GUI if self._window else p.DIRECT)
+        self.client = p.connect(p.GUI if self._window else p.DIRECT)
         # Without deterministicOverlappingPairs the same episode differs from run to run.
         p.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self._client
+            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self.client
         )
-        p.setGravity(0, 0, -9.81, physicsClientId=self._client)
-        self.robot = panda.load(self._client)
+        p.setGravity(0, 0, -9.81, physicsClientId=self.client)
+        self.robot = panda.load(self.client)
         self._bodies = []
         self._goal_marker = None
         self.scene = None
@@ -162,7 +165,7 @@ class RoboArmEnv(gym.Env):
             return
         self.start_configuration = None
         for body in self._bodies:
-            p.removeBody(body, physicsClientId=self._client)
+            p.removeBody(body, physicsClientId=self.client)
         self._bodies = []
         self.scene = scene
         if scene.floor is not None:
@@ -171,7 +174,7 @@ class RoboArmEnv(gym.Env):
         if scene.table is not None:
             table = self._add(scene.table, (0.76, 0.70, 0.60, 1))
             # The base is bolted to the table.
-            p.setCollisionFilterPair(self.robot, table, -1, -1, 0, physicsClientId=self._client)
+            p.setCollisionFilterPair(self.robot, table, -1, -1, 0, physicsClientId=self.client)
         for obstacle in scene.obstacles:
             self._add(obstacle, (0.36, 0.50, 0.65, 1))
 
@@ -184,7 +187,7 @@ class RoboArmEnv(gym.Env):
             collision = {"radius": obstacle.radius, "height": obstacle.length}
             visual = {"radius": obstacle.radius, "length": obstacle.length}
             kind = p.GEOM_CYLINDER
-        client = self._client
+        client = self.client
         body = p.createMultiBody(
             0.0,  # kg: it never moves
             p.createCollisionShape(kind, **collision, physicsClientId=client),
@@ -203,11 +206,11 @@ class RoboArmEnv(gym.Env):
 
         Moves the arm: call it between episodes, or go on with a reset.
         """
-        panda.set_configuration(self._client, self.robot, configuration)
-        p.performCollisionDetection(physicsClientId=self._client)
+        self._place(configuration)
+        p.performCollisionDetection(physicsClientId=self.client)
         return any(
             contact[8] < 0.0
-            for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self._client)
+            for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
         )
 
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
@@ -220,7 +223,7 @@ class RoboArmEnv(gym.Env):
             return False
         if self.in_collision(configuration):
             return False
-        panda.command(self._client, self.robot, list(configuration), POSITION_GAINS)
+        panda.command(self.client, self.robot, list(configuration), POSITION_GAINS)
         for _ in range(hold_steps):
             if self._simulate():
                 return False
@@ -286,7 +289,7 @@ class RoboArmEnv(gym.Env):
                     )
         if scene is not None:
             self.set_scene(scene)
-        before = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self._client)
+        before = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
         for name, configuration in (("goal", goal), ("start", start)):
             if configuration.size == 7 and self.in_collision(configuration):
                 touched = self._touched_names()
@@ -295,14 +298,28 @@ class RoboArmEnv(gym.Env):
                     panda.RESET_JOINTS,
                     [[joint[0]] for joint in before],
                     [[joint[1]] for joint in before],
-                    physicsClientId=self._client,
+                    physicsClientId=self.client,
                 )
                 raise ValueError(f"{name} is in collision: {touched}")
         return self._begin(start, goal)
 
+    def _place(self, configuration):
+        """Teleport the arm, at rest, leaving no contact points from before.
+
+        Bullet keeps the contact points of two bodies while these move little against each other.
+        So a configuration could inherit points from an earlier one that brought the same two links
+        nearly as close. Out in the open, in a pose without contacts, all of them are dropped.
+        """
+        client, robot = self.client, self.robot
+        p.resetBasePositionAndOrientation(robot, FAR_AWAY, NO_TURN, physicsClientId=client)
+        panda.set_configuration(client, robot, CONTACT_FREE)
+        p.performCollisionDetection(physicsClientId=client)
+        p.resetBasePositionAndOrientation(robot, IN_PLACE, NO_TURN, physicsClientId=client)
+        panda.set_configuration(client, robot, configuration)
+
     def _begin(self, start, goal):
-        panda.set_configuration(self._client, self.robot, start)
-        panda.command(self._client, self.robot, start.tolist(), POSITION_GAINS)
+        self._place(start)
+        panda.command(self.client, self.robot, start.tolist(), POSITION_GAINS)
         self.start_configuration = start
         if goal.size == 7:
             self.goal_configuration = goal
@@ -347,7 +364,7 @@ class RoboArmEnv(gym.Env):
         if length > self.max_step:
             delta = delta * (self.max_step / length)
         target = panda.denormalise(np.clip(self._state + delta, -1.0, 1.0))
-        panda.command(self._client, self.robot, target.tolist(), POSITION_GAINS)
+        panda.command(self.client, self.robot, target.tolist(), POSITION_GAINS)
         collision = self._simulate()
         if self._window:
             time.sleep(TIME_STEP * SUBSTEPS)  # as long as the simulated time
@@ -368,17 +385,17 @@ class RoboArmEnv(gym.Env):
         """Run the physics of one environment step; whether the arm touched anything in it."""
         touched = False
         for _ in range(SUBSTEPS):
-            p.stepSimulation(physicsClientId=self._client)
+            p.stepSimulation(physicsClientId=self.client)
             if not touched:
                 # A contact also counts at distance zero, when the surfaces push on each other.
-                contacts = p.getContactPoints(bodyA=self.robot, physicsClientId=self._client)
+                contacts = p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
                 touched = any(contact[8] < 0.0 or contact[9] > 0.0 for contact in contacts)
         return touched
 
     def _touched_names(self):
         """What the arm overlaps, in words; after `in_collision`."""
         names = set()
-        for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self._client):
+        for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client):
             if contact[8] < 0.0:
                 body = contact[2]
                 if body == self.robot:
@@ -392,13 +409,13 @@ class RoboArmEnv(gym.Env):
         return ", ".join(sorted(names))
 
     def _read_arm(self):
-        joints = p.getJointStates(self.robot, panda.ARM_JOINTS, physicsClientId=self._client)
+        joints = p.getJointStates(self.robot, panda.ARM_JOINTS, physicsClientId=self.client)
         self._state = panda.normalise([joint[0] for joint in joints])
         if self.velocities:
             speeds = np.array([joint[1] for joint in joints])
             self._velocity = 2.0 * speeds / (panda.UPPER - panda.LOWER)
         link = p.getLinkState(
-            self.robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=self._client
+            self.robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=self.client
         )
         self._position = np.array(link[4])
 
@@ -481,13 +498,13 @@ class RoboArmEnv(gym.Env):
                 p.GEOM_SPHERE,
                 radius=self.ee_tolerance,
                 rgbaColor=(0.1, 0.75, 0.2, 1),
-                physicsClientId=self._client,
+                physicsClientId=self.client,
             )
             self._goal_marker = p.createMultiBody(
-                baseVisualShapeIndex=ball, physicsClientId=self._client
+                baseVisualShapeIndex=ball, physicsClientId=self.client
             )
         p.resetBasePositionAndOrientation(
-            self._goal_marker, self._goal_position, (0, 0, 0, 1), physicsClientId=self._client
+            self._goal_marker, self._goal_position, (0, 0, 0, 1), physicsClientId=self.client
         )
 
     def render(self):
@@ -504,20 +521,20 @@ class RoboArmEnv(gym.Env):
             projection,
             lightDirection=(1.0, 1.0, 2.5),
             renderer=p.ER_TINY_RENDERER,
-            physicsClientId=self._client,
+            physicsClientId=self.client,
         )
         return np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
 
     def close(self):
         """Disconnect from PyBullet. Closing twice is allowed."""
-        if self._client is not None:
-            p.disconnect(physicsClientId=self._client)
-            self._client = None
+        if self.client is not None:
+            p.disconnect(physicsClientId=self.client)
+            self.client = None
 
     def __del__(self):
         # An env that nobody closed must not keep one of PyBullet's connections.
-        if getattr(self, "_client", None) is not None and p.isConnected(self._client):
-            p.disconnect(physicsClientId=self._client)
+        if getattr(self, "client", None) is not None and p.isConnected(self.client):
+            p.disconnect(physicsClientId=self.client)
 
 
 def _one_of(name, value, allowed):
