@@ -6,14 +6,7 @@ Query i of a split depends on the seed, the split and i only, so the file is the
 number of workers. It is written at the end, in one piece: an interrupted run leaves what was there.
 """
 
-import concurrent.futures
-import contextlib
-import multiprocessing
-import os
-import signal
 import sys
-import tempfile
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,15 +15,15 @@ import tyro
 from tqdm import tqdm
 
 import envs
+from demo_generation import workers
 from envs.arm_env import HOLD_DRIFT, SUBSTEPS, TIME_STEP
-from envs.datasets import query_path, write_queries
+from envs.datasets import check_writable, query_path, write_queries
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
 HOLD_STEPS = 24
 # Not 0: NumPy makes the same stream of [seed, 0, 0] as of plain seed, so the first query would be
 # that of an environment's `reset(seed=seed)`.
 STREAMS = {"test": 1, "validation": 2}
-CHUNK = 16  # queries per message between processes
 
 
 @dataclass
@@ -70,7 +63,17 @@ def sample_query(env, seed, split, index):
         rejected += 1
 
 
-def make_queries(path, task, seed, num_test, num_validation, workers=1, progress=True):
+class Sampler:
+    """Samples queries of a task; a job is (seed, split, index)."""
+
+    def __init__(self, task):
+        self.env = envs.make(task)
+
+    def __call__(self, job):
+        return job, sample_query(self.env, *job)
+
+
+def make_queries(path, task, seed, num_test, num_validation, num_workers=1, progress=True):
     """Sample the queries of a task and write its file.
 
     Args:
@@ -78,7 +81,7 @@ def make_queries(path, task, seed, num_test, num_validation, workers=1, progress
         task: name of the task.
         seed: int >= 0.
         num_test, num_validation: numbers of queries, > 0.
-        workers: number of processes; 1 samples in this one.
+        num_workers: number of processes.
         progress: show a progress bar.
 
     Returns:
@@ -88,11 +91,16 @@ def make_queries(path, task, seed, num_test, num_validation, workers=1, progress
         ValueError: unknown task.
         DatasetError, OSError: as `envs.datasets.write_queries` does.
     """
+    query_path(task)  # refuses an unknown task
     jobs = [(seed, "test", i) for i in range(num_test)]
     jobs += [(seed, "validation", i) for i in range(num_validation)]
-    with _sampling(task, jobs, workers) as results:
-        bar = tqdm(results, desc=task, total=len(jobs), unit=" queries", disable=not progress)
-        start, goal, rejected = zip(*bar, strict=True)
+    bar = tqdm(desc=task, total=len(jobs), unit=" queries", disable=not progress)
+    made = {}
+    with bar:
+        for job, query in workers.run(Sampler, (task,), jobs, num_workers, warn=bar.write):
+            made[job] = query
+            bar.update()
+    start, goal, rejected = zip(*(made[job] for job in jobs), strict=True)
     start, goal = np.stack(start), np.stack(goal)
     test, validation = slice(0, num_test), slice(num_test, None)
     write_queries(
@@ -113,40 +121,6 @@ def make_queries(path, task, seed, num_test, num_validation, workers=1, progress
     return sum(rejected)
 
 
-@contextlib.contextmanager
-def _sampling(task, jobs, workers):
-    """An iterator over the results of `sample_query(env, *job)`, in the order of the jobs."""
-    if workers == 1:
-        with contextlib.closing(envs.make(task)) as env:
-            yield (sample_query(env, *job) for job in jobs)
-        return
-    # An executor and not a multiprocessing.Pool, which waits for ever when a worker is killed.
-    executor = concurrent.futures.ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), _start_worker, (task,)
-    )
-    try:
-        yield executor.map(_work, jobs, chunksize=CHUNK)
-    finally:
-        executor.shutdown(cancel_futures=True)
-
-
-def _start_worker(task):
-    global _env
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    threading.Thread(target=_follow_parent, daemon=True).start()
-    _env = envs.make(task)
-
-
-def _follow_parent():
-    """End this worker when the parent was killed; it would wait for work for ever."""
-    multiprocessing.parent_process().join()
-    os._exit(1)
-
-
-def _work(job):
-    return sample_query(_env, *job)
-
-
 def _check(args):
     """The (task, path) pairs to make. Raises ValueError for arguments that cannot work."""
     tasks = tuple(envs.TASKS) if args.task == ("all",) else tuple(dict.fromkeys(args.task))
@@ -161,12 +135,7 @@ def _check(args):
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
         query_path(task)  # refuses an unknown task, also with --output
-        if path.is_dir():
-            raise ValueError(f"{path} is a directory, not a file")
-        try:
-            tempfile.TemporaryFile(dir=path.absolute().parent).close()
-        except OSError as error:
-            raise ValueError(f"cannot write {path}: {error.strerror}") from error
+        check_writable(path)
     return pairs
 
 

@@ -1,11 +1,20 @@
-"""The HDF5 files of the tasks: queries (start and goal configurations), read, written, validated.
+"""The HDF5 files of the tasks, read, written, validated: queries and demonstrations.
 
 A query file, `envs/data/<task>.h5`, has two groups, `test` and `validation`, each with
 
 - `start`, `goal`: float32 (n, 7), joint angles in rad, exactly those the simulator was asked about;
 - `goal_position`: float32 (n, 3), the end-effector position at the goal in metres,
 
-and the attributes `schema`, `schema_version`, `task`, `seed`, `scene` (JSON), `made_by` (the
+A demonstration file, `envs/demos/<task>.h5`, has the arrays
+
+- `plan`: float32 (p, 7), joint angles in rad: the waypoints of all plans, one plan after another,
+  the first one of each the start, the last one the goal; `plan_length`: uint32 (n,);
+- `residual`: int16 (m, 7), the executed configurations (see `write_demos`), one execution
+  after another; `length`: uint32 (n,), configurations in each;
+- `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
+- `collided`: uint8 (n,), whether the execution touched something.
+
+Both have the attributes `schema`, `schema_version`, `task`, `seed`, `scene` (JSON), `made_by` (the
 command that makes the file again), `parameters` (JSON) and `checksum` (SHA-256 of all the others
 and the arrays). Files are written to a temporary name and then renamed: there is never half a file.
 
@@ -19,6 +28,7 @@ import io
 import json
 import os
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,10 +39,25 @@ from envs import panda, scenes
 from envs.arm_env import HOLD_STEPS, RoboArmEnv
 from envs.tasks import TASKS
 
-SCHEMA = "roboarm-nmp queries"
-SCHEMA_VERSION = 1
 SPLITS = ("test", "validation")
-_WIDTHS = {"start": 7, "goal": 7, "goal_position": 3}
+QUERY_SCHEMA, DEMO_SCHEMA = "roboarm-nmp queries", "roboarm-nmp demonstrations"
+SCHEMA_VERSION = 1
+# Of each array: dtype, numbers per row (None: one dimension), and the array of the same length.
+_QUERY_ARRAYS = {
+    f"{split}/{name}": ("<f4", width, f"{split}/start")
+    for split in SPLITS
+    for name, width in (("start", 7), ("goal", 7), ("goal_position", 3))
+}
+_DEMO_ARRAYS = {
+    "plan": ("<f4", 7, "plan"),
+    "plan_length": ("<u4", None, "plan_length"),
+    "residual": ("<i2", 7, "residual"),
+    "length": ("<u4", None, "plan_length"),
+    "plan_seed": ("<u4", None, "plan_length"),
+    "digest": ("<u4", None, "plan_length"),
+    "collided": ("<u1", None, "plan_length"),
+}
+_ARRAYS = {QUERY_SCHEMA: _QUERY_ARRAYS, DEMO_SCHEMA: _DEMO_ARRAYS}
 _ATTRIBUTES = {
     "schema": str,
     "schema_version": int,
@@ -83,9 +108,7 @@ class Queries:
 
 def query_path(task):
     """Where the packaged query file of a task is (or belongs). Raises ValueError: unknown task."""
-    if task not in TASKS:
-        raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}")
-    return Path(__file__).parent / "data" / f"{task}.h5"
+    return _task_file("data", task)
 
 
 def load_queries(task_or_path, split="test"):
@@ -102,8 +125,8 @@ def load_queries(task_or_path, split="test"):
     """
     if split not in SPLITS:
         raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
-    path, task = _locate(task_or_path)
-    return _read(path, task)[0][split]
+    path, task = _locate(task_or_path, query_path)
+    return _read_queries(path, task)[0][split]
 
 
 def write_queries(path, task, seed, splits, made_by, parameters):
@@ -130,43 +153,14 @@ def write_queries(path, task, seed, splits, made_by, parameters):
         raise ValueError(f"splits must be {', '.join(SPLITS)}, got {', '.join(splits)}")
     arrays = {}
     for split in SPLITS:
-        start, goal = splits[split]
-        arrays[split] = {"start": np.asarray(start), "goal": np.asarray(goal)}
-        _check_format(path, split, arrays[split])
-    _check_values(path, arrays)
-    for columns in arrays.values():
-        position = panda.forward_kinematics(columns["goal"])
-        columns["goal_position"] = position.astype(np.float32)
-    attributes = {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "task": task,
-        "seed": int(seed),
-        "scene": _scene_to_json(TASKS[task].scene),
-        "made_by": made_by,
-        "parameters": json.dumps(parameters, sort_keys=True),
-    }
-    # HDF5 crashes the process on damaged metadata in its oldest format and in strings of variable
-    # length (h5py's default); newer formats have checksums over metadata, fixed lengths included.
-    # It is made in memory because HDF5 also crashes when the disk is full.
-    contents = io.BytesIO()
-    with h5py.File(contents, "w", libver=("v110", "v110")) as file:
-        for name, value in {**attributes, "checksum": _checksum(attributes, arrays)}.items():
-            file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
-        for split in SPLITS:
-            group = file.create_group(split)
-            for name, array in arrays[split].items():
-                # Shuffled in one chunk, sign and exponent bytes compress: 13% off the file.
-                group.create_dataset(
-                    name,
-                    data=array.astype("<f4"),
-                    chunks=array.shape,
-                    shuffle=True,
-                    compression="gzip",
-                    compression_opts=9,
-                    track_times=False,
-                )
-    _write_atomically(path, contents.getbuffer())
+        start, goal = (np.asarray(ends) for ends in splits[split])
+        arrays |= {f"{split}/start": start, f"{split}/goal": goal}
+        if goal.ndim == 2 and goal.shape[1] == panda.NUM_JOINTS:
+            position = panda.forward_kinematics(goal).astype(np.float32)
+            arrays[f"{split}/goal_position"] = position
+    _check_format(path, QUERY_SCHEMA, arrays)
+    _check_queries(path, arrays)
+    _write(path, QUERY_SCHEMA, task, seed, arrays, made_by, parameters)
 
 
 def validate(path, task=None, simulate=False, progress=False):
@@ -182,17 +176,68 @@ def validate(path, task=None, simulate=False, progress=False):
     Raises:
         DatasetError: the first thing found wrong.
     """
-    queries, parameters = _read(path, task)
+    queries, parameters = _read_queries(path, task)
     if simulate:
         _simulate(path, queries, parameters.get("hold_steps", HOLD_STEPS), progress)
     return queries
 
 
-def _locate(task_or_path):
+# --- What both kinds of file share
+
+
+def _task_file(folder, task):
+    if task not in TASKS:
+        raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}")
+    return Path(__file__).parent / folder / f"{task}.h5"
+
+
+def _locate(task_or_path, path_of_task):
     """(path, task it must be for): `task_or_path` is a task's name or the path of any file."""
     if task_or_path in TASKS:
-        return query_path(task_or_path), task_or_path
+        return path_of_task(task_or_path), task_or_path
     return Path(task_or_path), None
+
+
+def _write(path, schema, task, seed, arrays, made_by, parameters):
+    arrays = {name: arrays[name].astype(dtype) for name, (dtype, *_) in _ARRAYS[schema].items()}
+    attributes = {
+        "schema": schema,
+        "schema_version": SCHEMA_VERSION,
+        "task": task,
+        "seed": int(seed),
+        "scene": _scene_to_json(TASKS[task].scene),
+        "made_by": made_by,
+        "parameters": json.dumps(parameters, sort_keys=True),
+    }
+    # HDF5 crashes the process on damaged metadata in its oldest format and in strings of variable
+    # length (h5py's default); newer formats have checksums over metadata, fixed lengths included.
+    # It is made in memory because HDF5 also crashes when the disk is full.
+    contents = io.BytesIO()
+    with h5py.File(contents, "w", libver=("v110", "v110")) as file:
+        for name, value in {**attributes, "checksum": _checksum(attributes, arrays)}.items():
+            file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+        for name, array in arrays.items():
+            # Shuffled in one chunk, sign and exponent bytes compress: 13% off a query file.
+            file.create_dataset(
+                name,
+                data=array,
+                chunks=array.shape,
+                shuffle=True,
+                compression="gzip",
+                compression_opts=9,
+                track_times=False,
+            )
+    _write_atomically(path, contents.getbuffer())
+
+
+def check_writable(path):
+    """Raise ValueError if no file can be written at `path`. To be called before long work."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory, not a file")
+    try:
+        tempfile.TemporaryFile(dir=path.absolute().parent).close()
+    except OSError as error:
+        raise ValueError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _write_atomically(path, contents):
@@ -234,52 +279,29 @@ def _same_scene(one, other):
 def _checksum(attributes, arrays):
     """SHA-256 of the attributes, and of the names, shapes and contents of the arrays."""
     digest = hashlib.sha256(json.dumps(attributes, sort_keys=True).encode())
-    for split in SPLITS:
-        for name in _WIDTHS:
-            array = arrays[split][name]
-            digest.update(f"{split}/{name} {array.shape}".encode())
-            digest.update(array.astype("<f4").tobytes())
+    for name, (dtype, *_) in _ARRAYS[attributes["schema"]].items():
+        digest.update(f"{name} {arrays[name].shape}".encode())
+        digest.update(arrays[name].astype(dtype).tobytes())
     return digest.hexdigest()
 
 
-def _check_format(path, split, arrays):
-    """Shapes and dtypes of one split; `arrays` are NumPy arrays or HDF5 datasets, by name."""
+def _check_format(path, schema, arrays):
+    """Shapes and dtypes; `arrays` are NumPy arrays or HDF5 datasets, by name."""
     for name, array in arrays.items():
-        if array.dtype != np.float32:
-            raise DatasetError(f"{path}: {split}/{name} must be float32, is {array.dtype}")
-        if array.ndim != 2 or array.shape[1] != _WIDTHS[name] or len(array) == 0:
-            expected = f"(n, {_WIDTHS[name]}) with n > 0"
+        dtype, width, sibling = _ARRAYS[schema][name]
+        if array.dtype != np.dtype(dtype):
+            raise DatasetError(f"{path}: {name} must be {np.dtype(dtype)}, is {array.dtype}")
+        if array.shape[1:] != (() if width is None else (width,)) or array.size == 0:
+            expected = "(n,)" if width is None else f"(n, {width})"
             raise DatasetError(
-                f"{path}: {split}/{name} must have shape {expected}, has {array.shape}"
+                f"{path}: {name} must have shape {expected} with n > 0, has {array.shape}"
             )
-        if len(array) != len(arrays["start"]):
-            raise DatasetError(
-                f"{path}: {split}/{name} has {len(array)} rows, not {len(arrays['start'])}"
-            )
+        if len(array) != len(arrays[sibling]):
+            raise DatasetError(f"{path}: {name} has {len(array)} rows, not {len(arrays[sibling])}")
 
 
-def _check_values(path, arrays):
-    """Joint limits, finite numbers, and no query in both splits."""
-    for split in SPLITS:
-        for name, array in arrays[split].items():
-            if not np.isfinite(array).all():
-                raise DatasetError(f"{path}: {split}/{name} has numbers that are not finite")
-        for name in ("start", "goal"):
-            configuration = arrays[split][name]
-            outside = (configuration < panda.LOWER) | (configuration > panda.UPPER)
-            if outside.any():
-                row = int(np.argmax(outside.any(axis=1)))
-                raise DatasetError(f"{path}: {split}/{name}[{row}] is outside the joint limits")
-    test, validation = (
-        {row.tobytes() for row in np.hstack([arrays[split]["start"], arrays[split]["goal"]])}
-        for split in SPLITS
-    )
-    if test & validation:
-        raise DatasetError(f"{path}: {len(test & validation)} queries are in both splits")
-
-
-def _read(path, task):
-    """({split: Queries}, parameters) of a file, after every check that needs no simulator."""
+def _read(path, schema, task):
+    """(attributes, arrays) of a file, after the checks that both kinds share."""
     try:
         with open(path, "rb"):
             pass
@@ -291,7 +313,7 @@ def _read(path, task):
         raise DatasetError(f"{path}: not an HDF5 file")
     try:
         with h5py.File(path, "r") as file:
-            return _read_open(path, file, task)
+            return _read_open(path, file, schema, task)
     except DatasetError:
         raise
     except Exception as error:  # damaged HDF5 raises all kinds of exceptions
@@ -305,44 +327,83 @@ def _attribute(file, name):
     return value.decode() if isinstance(value, bytes) else value
 
 
-def _read_open(path, file, task):
+def _read_open(path, file, schema, task):
     attributes = {}
     for name, kind in _ATTRIBUTES.items():
         value = _attribute(file, name)
-        if name == "schema" and value != SCHEMA:
-            raise DatasetError(f"{path}: not a query file (schema {value!r}, not {SCHEMA!r})")
+        if name == "schema" and value != schema:
+            kind_of_file = {QUERY_SCHEMA: "query", DEMO_SCHEMA: "demonstration"}[schema]
+            raise DatasetError(
+                f"{path}: not a {kind_of_file} file (schema {value!r}, not {schema!r})"
+            )
         if not isinstance(value, kind):
             raise DatasetError(f"{path}: attribute {name} is {value!r}, must be {kind.__name__}")
         if name == "schema_version" and value != SCHEMA_VERSION:
             raise DatasetError(f"{path}: schema version {value}, this code reads {SCHEMA_VERSION}")
         attributes[name] = value
 
-    arrays = {}
-    for split in SPLITS:
-        datasets = {name: file.get(f"{split}/{name}") for name in _WIDTHS}
-        for name, dataset in datasets.items():
-            if not isinstance(dataset, h5py.Dataset):
-                raise DatasetError(f"{path}: array {split}/{name} is missing or damaged")
-        _check_format(path, split, datasets)
-        arrays[split] = {name: dataset[()] for name, dataset in datasets.items()}
+    datasets = {name: file.get(name) for name in _ARRAYS[schema]}
+    for name, dataset in datasets.items():
+        if not isinstance(dataset, h5py.Dataset):
+            raise DatasetError(f"{path}: array {name} is missing or damaged")
+    _check_format(path, schema, datasets)
+    arrays = {name: dataset[()] for name, dataset in datasets.items()}
     if _attribute(file, "checksum") != _checksum(attributes, arrays):
         raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
 
     made_for = attributes["task"]
     if task is not None and made_for != task:
-        raise DatasetError(f"{path}: these queries are for the task {made_for!r}, not {task!r}")
+        raise DatasetError(f"{path}: this file is for the task {made_for!r}, not {task!r}")
     if made_for not in TASKS:
-        raise DatasetError(f"{path}: these queries are for the unknown task {made_for!r}")
+        raise DatasetError(f"{path}: this file is for the unknown task {made_for!r}")
     if not _same_scene(attributes["scene"], _scene_to_json(TASKS[made_for].scene)):
         raise DatasetError(
             f"{path}: out of date: made for another version of the scene of {made_for!r}; "
             f"make it again with: {attributes['made_by']}"
         )
-    _check_values(path, arrays)
-    queries = {
-        split: Queries(made_for, split, attributes["seed"], **arrays[split]) for split in SPLITS
-    }
+    return attributes, arrays
+
+
+# --- Queries, continued
+
+
+def _read_queries(path, task):
+    """({split: Queries}, parameters) of a file, after every check that needs no simulator."""
+    attributes, arrays = _read(path, QUERY_SCHEMA, task)
+    _check_queries(path, arrays)
+    queries = {}
+    for split in SPLITS:
+        columns = {name: arrays[f"{split}/{name}"] for name in ("start", "goal", "goal_position")}
+        queries[split] = Queries(attributes["task"], split, attributes["seed"], **columns)
     return queries, json.loads(attributes["parameters"])
+
+
+def _check_configurations(path, name, configurations):
+    if not np.isfinite(configurations).all():
+        raise DatasetError(f"{path}: {name} has numbers that are not finite")
+    outside = (configurations < panda.LOWER) | (configurations > panda.UPPER)
+    if outside.any():
+        row = int(np.argmax(outside.any(axis=1)))
+        raise DatasetError(f"{path}: {name}[{row}] is outside the joint limits")
+
+
+def query_keys(start, goal):
+    """The set of queries as bytes: start and goal, each float32 (n, 7), exactly."""
+    return {row.tobytes() for row in np.hstack([start, goal])}
+
+
+def _check_queries(path, arrays):
+    """Joint limits, finite numbers, and no query in both splits."""
+    for split in SPLITS:
+        for name in ("start", "goal"):
+            _check_configurations(path, f"{split}/{name}", arrays[f"{split}/{name}"])
+        if not np.isfinite(arrays[f"{split}/goal_position"]).all():
+            raise DatasetError(f"{path}: {split}/goal_position has numbers that are not finite")
+    test, validation = (
+        query_keys(arrays[f"{split}/start"], arrays[f"{split}/goal"]) for split in SPLITS
+    )
+    if test & validation:
+        raise DatasetError(f"{path}: {len(test & validation)} queries are in both splits")
 
 
 def _simulate(path, queries, hold_steps, progress):
@@ -368,16 +429,282 @@ def _simulate(path, queries, hold_steps, progress):
                 bar.update()
 
 
+# --- Demonstrations
+
+# A plan is followed by commanding one sub-goal per step. This far apart, the controller's lag
+# seldom makes a step longer than the paper's 0.03, to which it is clipped.
+MAX_STEP = 0.03
+SUBGOAL_SPACING = 0.95 * MAX_STEP
+# Resolution of the stored configurations, normalised: they are off by half of it at most, which
+# moves the end-effector by less than 0.5 mm.
+QUANTUM = 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Demo:
+    """One demonstration.
+
+    Attributes:
+        start, goal: float32 (7,), rad.
+        plan: float32 (p, 7), rad: the waypoints from start to goal.
+        states: float32 (m, 7), the executed configurations, normalised.
+        actions: float32 (m - 1, 7), the displacement commanded in each, clipped to `MAX_STEP` as
+            the environment does.
+        digest: CRC-32 of the bytes of the exact states, before rounding to `QUANTUM`.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    plan: np.ndarray
+    states: np.ndarray
+    actions: np.ndarray
+    digest: int
+
+
+@dataclass(frozen=True, eq=False)
+class Demos:
+    """The demonstrations of a file, flat. `demos[i]` is a `Demo`.
+
+    Attributes:
+        task: name of the task they are for.
+        seed: of the command that made them.
+        start, goal: float32 (n, 7), rad.
+        states: float32 (m, 7): the executed configurations of all demonstrations, normalised.
+        actions: float32 (m, 7): the displacement commanded in each; zero in the last of a
+            demonstration, from which nothing was commanded.
+        offsets: int64 (n + 1,): demonstration i is `states[offsets[i] : offsets[i + 1]]`.
+        plan: float32 (p, 7), rad: the waypoints of all plans.
+        plan_offsets: int64 (n + 1,), the same for `plan`.
+        plan_seed: uint32 (n,), the planner's seeds.
+        digest: uint32 (n,), see `Demo`.
+        collided: bool (n,), whether something was touched.
+        made_by: the command that made the file.
+        parameters: dict of what else determined them, and of how many attempts were rejected.
+    """
+
+    task: str
+    seed: int
+    start: np.ndarray
+    goal: np.ndarray
+    states: np.ndarray
+    actions: np.ndarray
+    offsets: np.ndarray
+    plan: np.ndarray
+    plan_offsets: np.ndarray
+    plan_seed: np.ndarray
+    digest: np.ndarray
+    collided: np.ndarray
+    made_by: str
+    parameters: dict
+
+    def __len__(self):
+        return len(self.start)
+
+    def __getitem__(self, i):
+        if not 0 <= i < len(self):
+            raise IndexError(f"demonstration {i} of {len(self)}")
+        rows = slice(self.offsets[i], self.offsets[i + 1])
+        return Demo(
+            self.start[i],
+            self.goal[i],
+            self.plan[self.plan_offsets[i] : self.plan_offsets[i + 1]],
+            self.states[rows],
+            self.actions[rows][:-1],
+            int(self.digest[i]),
+        )
+
+
+def demo_path(task):
+    """Where the packaged demonstrations of a task are (or belong). ValueError: unknown task."""
+    return _task_file("demos", task)
+
+
+def load_demos(task_or_path):
+    """The `Demos` of a task's packaged file, or of any demonstration file.
+
+    Raises:
+        DatasetError: the file is missing, corrupt, not a demonstration file, or made for another
+            task or for another version of the task's scene.
+    """
+    path, task = _locate(task_or_path, demo_path)
+    attributes, arrays = _read(path, DEMO_SCHEMA, task)
+    offsets, plan_offsets = (
+        np.concatenate([[0], np.cumsum(arrays[name].astype(np.int64))])
+        for name in ("length", "plan_length")
+    )
+    if offsets[-1] != len(arrays["residual"]) or plan_offsets[-1] != len(arrays["plan"]):
+        raise DatasetError(f"{path}: the lengths do not add up to the number of rows")
+    if arrays["length"].min() < 2 or arrays["plan_length"].min() < 2:
+        raise DatasetError(f"{path}: a demonstration has at least two configurations")
+    _check_configurations(path, "plan", arrays["plan"])
+    parameters = json.loads(attributes["parameters"])
+    before, here, after = _schedule(arrays["plan"], plan_offsets, offsets)
+    states = here - parameters["lag"] * (here - before) + arrays["residual"] * QUANTUM
+    states = states.astype(np.float32)
+    actions = after - states
+    length = np.maximum(np.linalg.norm(actions, axis=1, keepdims=True), 1e-9)
+    actions *= np.minimum(1.0, MAX_STEP / length)
+    actions[offsets[1:] - 1] = 0.0
+    return Demos(
+        task=attributes["task"],
+        seed=attributes["seed"],
+        start=arrays["plan"][plan_offsets[:-1]],
+        goal=arrays["plan"][plan_offsets[1:] - 1],
+        states=states,
+        actions=actions.astype(np.float32),
+        offsets=offsets,
+        plan=arrays["plan"],
+        plan_offsets=plan_offsets,
+        plan_seed=arrays["plan_seed"],
+        digest=arrays["digest"],
+        collided=arrays["collided"].astype(bool),
+        made_by=attributes["made_by"],
+        parameters=parameters,
+    )
+
+
+def write_demos(path, task, seed, plans, executions, columns, made_by, parameters):
+    """Write a demonstration file, atomically, as `write_queries` does.
+
+    Args:
+        path: file to write; an existing one is replaced.
+        task: name of the task.
+        seed: the seed they were made with, an int.
+        plans: list of float32 (p, 7) arrays, rad, from start to goal.
+        executions: list of float32 (m, 7) arrays, normalised configurations, starting at the start.
+        columns: `{"plan_seed", "digest", "collided"}`: sequences of ints, one per demonstration.
+        made_by: the command line that makes this file.
+        parameters: dict of whatever else determined them; must fit into JSON.
+
+    Raises:
+        DatasetError: arrays that a file must not have, or a query twice, or one of the task's test
+            or validation queries; nothing is written then.
+        ValueError: unknown task.
+        OSError: the file cannot be written; an old file is left as it was.
+    """
+    path = Path(path)
+    demo_path(task)  # refuses an unknown task
+    lengths, plan_lengths = [len(one) for one in executions], [len(one) for one in plans]
+    if not plans or len(executions) != len(plans):
+        raise DatasetError(f"{path}: {len(plans)} plans and {len(executions)} executions")
+    if min(lengths + plan_lengths) < 2:
+        raise DatasetError(f"{path}: a demonstration has at least two configurations")
+    plan, states = np.concatenate(plans), np.concatenate(executions)
+    _check_configurations(path, "plan", plan)
+    if states.shape[1:] != (panda.NUM_JOINTS,) or not np.isfinite(states).all():
+        raise DatasetError(f"{path}: executions have numbers that are not finite, or not 7 a row")
+    offsets, plan_offsets = np.cumsum([0, *lengths]), np.cumsum([0, *plan_lengths])
+    start, goal = plan[plan_offsets[:-1]], plan[plan_offsets[1:] - 1]
+    keys = query_keys(start, goal)
+    if len(keys) < len(start):
+        raise DatasetError(f"{path}: {len(start) - len(keys)} queries are in it twice")
+    if query_path(task).exists():
+        for split in SPLITS:
+            queries = load_queries(task, split)
+            shared = len(keys & query_keys(queries.start, queries.goal))
+            if shared:
+                raise DatasetError(f"{path}: {shared} queries are {split} queries of {task}")
+    # The arm lags behind the sub-goals, each joint by a nearly constant share of their last move.
+    before, here, _ = _schedule(plan, plan_offsets, offsets)
+    moved = here - before
+    lag = ((here - states) * moved).sum(0) / np.maximum(np.square(moved).sum(0), 1e-9)
+    lag = [round(value, 6) for value in lag.tolist()]
+    residual = np.round((states - (here - lag * moved)) / QUANTUM)
+    arrays = {
+        "plan": plan,
+        "plan_length": np.array(plan_lengths, np.uint32),
+        "residual": residual.astype(np.int16),
+        "length": np.array(lengths, np.uint32),
+        **{name: np.array(columns[name], _DEMO_ARRAYS[name][0]) for name in columns},
+    }
+    _check_format(path, DEMO_SCHEMA, arrays)
+    _write(path, DEMO_SCHEMA, task, seed, arrays, made_by, {**parameters, "lag": lag})
+
+
+def subgoals(path):
+    """Points along a path at most `SUBGOAL_SPACING` apart, every waypoint among them.
+
+    Args:
+        path: (n, 7), rad.
+
+    Returns:
+        float64 (m, 7), normalised; the first is the path's start, the last its goal.
+    """
+    return _all_subgoals(np.asarray(path), np.array([0, len(path)]))[0]
+
+
+def _all_subgoals(plan, plan_offsets):
+    """The sub-goals of all plans (k, 7), and the offsets (n + 1,) of each plan's first one."""
+    waypoints = panda.normalise(plan.astype(np.float64))
+    moves = np.diff(waypoints, axis=0)
+    steps = np.ceil(np.sqrt(np.square(moves).sum(1)) / SUBGOAL_SPACING)
+    steps = np.maximum(steps, 1).astype(np.int64)
+    steps[plan_offsets[1:-1] - 1] = 1  # from the end of a plan to the start of the next
+    move = np.repeat(np.arange(len(moves)), steps)
+    first = np.concatenate([[0], np.cumsum(steps)])  # sub-goals before each waypoint
+    share = (np.arange(len(move)) - first[move] + 1) / steps[move]
+    points = np.concatenate([waypoints[:1], waypoints[move] + moves[move] * share[:, None]])
+    return points, np.concatenate([first[plan_offsets[:-1]], [len(points)]])
+
+
+def _schedule(plan, plan_offsets, offsets):
+    """The sub-goal (m, 7) due at each executed configuration, the one before and the one after.
+
+    The last one is repeated as long as the execution went on; so is the first, as `before`.
+    """
+    points, first = _all_subgoals(plan, plan_offsets)
+    demo = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    step = np.arange(offsets[-1]) - offsets[demo]
+    here = first[demo] + step
+    low, high = first[demo], first[demo + 1] - 1
+    return (points[np.clip(here + shift, low, high)] for shift in (-1, 0, 1))
+
+
+def describe(demos):
+    """Statistics of `Demos`: a dict of numbers.
+
+    `steps`, `waypoints` and `path_length` (rad, sum of the joints' L2 displacements) are means;
+    `steps_95` is the 95th percentile; `detour` the mean of path length over the straight line's, in
+    the normalised space; `solved` the share of queries that had a demonstration within the allowed
+    attempts.
+    """
+    moves = np.diff(demos.states.astype(np.float64), axis=0)
+    inside = np.ones(len(moves), bool)
+    inside[demos.offsets[1:-1] - 1] = False  # not from one demonstration to the next
+    owner = np.repeat(np.arange(len(demos)), np.diff(demos.offsets))[:-1][inside]
+
+    def length_of(displacements):
+        lengths = np.linalg.norm(displacements[inside], axis=1)
+        return np.bincount(owner, lengths, len(demos))
+
+    straight = np.linalg.norm(panda.normalise(demos.goal) - panda.normalise(demos.start), axis=1)
+    steps = np.diff(demos.offsets) - 1
+    counts = demos.parameters.get("counts", {})
+    return {
+        "demonstrations": len(demos),
+        "steps": float(steps.mean()),
+        "steps_95": float(np.percentile(steps, 95)),
+        "path_length": float(length_of(moves * (panda.UPPER - panda.LOWER) / 2).mean()),
+        "detour": float((length_of(moves) / straight).mean()),
+        "waypoints": float(np.diff(demos.plan_offsets).mean()),
+        "touching": int(demos.collided.sum()),
+        "solved": len(demos) / (len(demos) + counts.get("queries_given_up", 0)),
+        **counts,
+    }
+
+
 def _main(arguments=None):
     parser = argparse.ArgumentParser(
-        prog="python -m envs.datasets", description="The query files of the tasks."
+        prog="python -m envs.datasets",
+        description="The files of the tasks: queries and demonstrations.",
     )
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser(
         "validate",
         help="check query files",
         description="Check query files. One line on stdout for each good one, one on stderr for "
-        "each bad one, saying what is wrong; exits with 1 if any is bad.",
+        "each bad one, saying what is wrong; exits with 1 if any is bad. (For demonstrations: "
+        "python -m demo_generation.verify.)",
     )
     command.add_argument(
         "files", nargs="+", metavar="FILE", help="path of a file, or a task's name (its own file)"
@@ -389,10 +716,23 @@ def _main(arguments=None):
         help="also check in the simulator that every start and goal is feasible (about 140 queries "
         "a second)",
     )
+    command = commands.add_parser(
+        "describe",
+        help="statistics of demonstration files",
+        description="Print statistics of demonstration files, one column per file.",
+    )
+    command.add_argument(
+        "files", nargs="+", metavar="FILE", help="path of a file, or a task's name (its own file)"
+    )
     options = parser.parse_args(arguments)
+    run = {"validate": _main_validate, "describe": _main_describe}[options.command]
+    return run(options)
+
+
+def _main_validate(options):
     bad = False
     for file in options.files:
-        path, task = _locate(file)
+        path, task = _locate(file, query_path)
         try:
             queries = validate(path, options.task or task, options.simulate, progress=True)
         except DatasetError as error:
@@ -403,6 +743,19 @@ def _main(arguments=None):
             counts = f"{len(test)} test and {len(validation)} validation queries"
             print(f"{path}: good, {counts} for {test.task}, seed {test.seed}")
     return int(bad)
+
+
+def _main_describe(options):
+    try:
+        columns = [describe(load_demos(file)) for file in options.files]
+    except DatasetError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(" | ".join(["", *options.files]))
+    for name in columns[0]:
+        values = [column.get(name, 0) for column in columns]
+        print(" | ".join([name, *(f"{v:.4g}" if isinstance(v, float) else str(v) for v in values)]))
+    return 0
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def path(tmp_path):
 def made(tmp_path_factory):
     """A small file made by the generator in this process."""
     path = tmp_path_factory.mktemp("made") / "wall.h5"
-    make_queries.make_queries(path, "wall", 0, 30, 10, workers=1, progress=False)
+    make_queries.make_queries(path, "wall", 0, 30, 10, progress=False)
     return path
 
 
@@ -97,7 +97,7 @@ def test_same_contents_same_bytes(tmp_path):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_made_again_the_file_has_the_same_bytes(made, tmp_path, workers):
     again = tmp_path / "again.h5"
-    make_queries.make_queries(again, "wall", 0, 30, 10, workers=workers, progress=False)
+    make_queries.make_queries(again, "wall", 0, 30, 10, num_workers=workers, progress=False)
     assert again.read_bytes() == made.read_bytes()
 
 
@@ -321,10 +321,7 @@ def test_simulating_finds_wrong_positions(path):
     with h5py.File(path, "r+") as file:
         file["test/goal_position"][4, 0] += np.float32(0.001)
         attributes = {name: datasets._attribute(file, name) for name in datasets._ATTRIBUTES}
-        arrays = {
-            split: {name: file[split][name][()] for name in file[split]}
-            for split in datasets.SPLITS
-        }
+        arrays = {name: file[name][()] for name in datasets._QUERY_ARRAYS}
         file.attrs["checksum"] = np.bytes_(datasets._checksum(attributes, arrays))
     validate(path)
     with pytest.raises(DatasetError, match=r"test/goal_position\[4\]"):

@@ -1,0 +1,338 @@
+"""Verified demonstrations per second on one core, against planning and following the plain way.
+
+    pip install -c constraints.txt -e .
+    python benchmarks/demo_throughput.py    # 3 minutes
+
+Ours is `demo_generation.collect.Collector` with the default options. Both ways get the first
+queries that it draws, its planner seeds, its limits on a plan and its three attempts on a query,
+and the same scene and arm; a demonstration counts if it reaches its goal (0.02 m and 0.05
+normalised) and touched nothing in any physics step. Drawing the queries is not timed: it is the
+same for both (and is in the column "end to end").
+
+The plain way is what PyBullet's and OMPL's own examples lead to:
+
+- world: PyBullet's default physics (1/240 s); the URDF's self-collision switched on, without
+  filters. Link pairs that touch in every configuration or never can (`panda.SELF_COLLISION_PAIRS`
+  has the others) and the base on its table are skipped in Python when contacts are read.
+- validity: `resetJointState` joint by joint, `performCollisionDetection`, `getContactPoints`;
+  any overlap is a collision. At the same fraction of the space's diagonal as ours.
+- plan: RRT-Connect in joint space (rad), then `simplifyMax`.
+- following: the plan, interpolated like ours, is commanded joint by joint with
+  `setJointMotorControl2` and default gains; on to the next point when the arm is within 0.01
+  (normalised) of this one, or after 30 physics steps. It gives up at the first touch.
+
+They take turns in one process, block by block, so that a machine whose speed drifts slows both.
+Seconds are processor time. A rate is all demonstrations by all seconds, because queries differ too
+much for a median over blocks; the interval (90 %) is from resampling the queries.
+
+The last line is JSON.
+"""
+
+import argparse
+import json
+import os
+import platform
+import time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import pybullet as p
+import pybullet_data
+from ompl import base as ob
+from ompl import geometric as og
+from ompl import util as ou
+from tqdm import tqdm
+
+import envs
+from demo_generation import collect
+from demo_generation.planning import RESOLUTION
+from envs import datasets, panda
+from envs.scenes import Box
+
+BLOCK = 5  # queries
+TOLERANCE, STEP_LIMIT = 0.01, 30  # of the plain way, at one sub-goal
+
+
+class GivenUp(Exception):
+    """All attempts on a query failed."""
+
+
+class Ours:
+    """The collector, on given queries; `checks` has the collision checks of each plan."""
+
+    def __init__(self, options):
+        self.collector = collect.Collector(options)
+        self.checks = []
+        self._draw = self.collector.env.sample_query
+        self._plan = self.collector.planner.plan
+        self.collector.env.sample_query = self._given
+        self.collector.planner.plan = self._counted
+
+    def draw(self, index):
+        """Query `index` as the collector draws it: (start, goal, the random numbers after it)."""
+        options = self.collector.options
+        rng = np.random.default_rng([options["seed"], collect.STREAM, index])
+        return *self._draw(rng), rng.bit_generator.state
+
+    def _given(self, rng):
+        if self._query is None:
+            raise GivenUp  # the collector would go on to another query
+        start, goal, rng.bit_generator.state = self._query
+        self._query = None
+        return start, goal
+
+    def _counted(self, *query, **options):
+        try:
+            return self._plan(*query, **options)
+        finally:
+            self.checks.append(self.collector.planner.checks)
+
+    def __call__(self, query):
+        """Whether a query could be solved."""
+        self._query = query
+        try:
+            self.collector(0)  # the index matters only for drawing
+        except GivenUp:
+            return False
+        return True
+
+
+class Plain:
+    """The plain way, see above; the same interface."""
+
+    def __init__(self, options):
+        self.options = options
+        self.checks = []
+        self.client = client = p.connect(p.DIRECT)
+        p.setGravity(0, 0, -9.81, physicsClientId=client)
+        self.robot = p.loadURDF(
+            pybullet_data.getDataPath() + "/franka_panda/panda.urdf",
+            useFixedBase=True,
+            flags=p.URDF_USE_SELF_COLLISION,
+            physicsClientId=client,
+        )
+        for finger in panda.FINGER_JOINTS:
+            opening = panda.FINGER_OPENING
+            p.resetJointState(self.robot, finger, opening, physicsClientId=client)
+            self.command(finger, opening, 20.0)
+        scene = envs.TASKS[options["task"]].scene
+        self.table = self.add(scene.table)
+        for box in (Box((0, 0, scene.floor - 0.05), (6, 6, 0.1)), *scene.obstacles):
+            self.add(box)
+
+        space = ob.RealVectorStateSpace(panda.NUM_JOINTS)
+        bounds = ob.RealVectorBounds(panda.NUM_JOINTS)
+        for i in range(panda.NUM_JOINTS):
+            bounds.setLow(i, panda.LOWER[i])
+            bounds.setHigh(i, panda.UPPER[i])
+        space.setBounds(bounds)
+        self.space = ob.SpaceInformation(space)
+        self.space.setStateValidityChecker(self.is_valid)
+        self.space.setStateValidityCheckingResolution(RESOLUTION)
+        self.space.setup()
+
+    def add(self, box):
+        half = [edge / 2 for edge in box.size]
+        client = self.client
+        shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
+        return p.createMultiBody(
+            0, shape, -1, box.position, box.orientation, physicsClientId=client
+        )
+
+    def command(self, joint, angle, force):
+        p.setJointMotorControl2(
+            self.robot,
+            joint,
+            p.POSITION_CONTROL,
+            targetPosition=angle,
+            force=force,
+            physicsClientId=self.client,
+        )
+
+    def teleport(self, configuration):
+        for i in panda.ARM_JOINTS:
+            p.resetJointState(self.robot, i, configuration[i], physicsClientId=self.client)
+
+    def touches(self):
+        """Whether one of the contacts is a collision."""
+        for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client):
+            body, link, other_link = contact[2:5]
+            if contact[8] >= 0.0 and contact[9] <= 0.0:
+                continue
+            if body == self.robot:
+                pair = (min(link, other_link), max(link, other_link))
+                if pair in panda.SELF_COLLISION_PAIRS:
+                    return True
+            elif body != self.table or link != -1:
+                return True
+        return False
+
+    def is_valid(self, state):
+        self.plan_checks += 1
+        self.teleport(state)
+        p.performCollisionDetection(physicsClientId=self.client)
+        return not self.touches()
+
+    def plan(self, start, goal, seed):
+        """A path (n, 7), rad; None if there was none within the limits."""
+        self.plan_checks = 0
+        deadline = time.monotonic() + self.options["time_limit"]
+        ou.RNG.setSeed(seed)
+        ends = []
+        for configuration in (start, goal):
+            state = self.space.allocState()
+            for i, angle in enumerate(np.clip(configuration, panda.LOWER, panda.UPPER)):
+                state[i] = float(angle)
+            ends.append(state)
+        problem = ob.ProblemDefinition(self.space)
+        problem.setStartAndGoalStates(*ends)
+        planner = og.RRTConnect(self.space)
+        planner.setProblemDefinition(problem)
+        planner.setup()
+        planner.solve(
+            ob.PlannerTerminationCondition(
+                lambda: (
+                    self.plan_checks >= self.options["max_checks"] or time.monotonic() > deadline
+                )
+            )
+        )
+        path = None
+        if problem.hasExactSolution():
+            path = problem.getSolutionPath()
+            og.PathSimplifier(self.space).simplifyMax(path)
+            path = np.array([[state[i] for i in range(7)] for state in path.getStates()])
+        self.checks.append(self.plan_checks)
+        return path
+
+    def follow(self, path):
+        """Whether the arm gets from the start of a path to its end without touching anything."""
+        client, robot = self.client, self.robot
+        self.teleport(path[0])
+        targets = datasets.subgoals(path)[1:]
+        for target in targets:
+            for i, angle in zip(panda.ARM_JOINTS, panda.denormalise(target), strict=True):
+                self.command(i, angle, panda.MAX_TORQUE[i])
+            for _ in range(STEP_LIMIT):
+                p.stepSimulation(physicsClientId=client)
+                if self.touches():
+                    return False
+                joints = p.getJointStates(robot, panda.ARM_JOINTS, physicsClientId=client)
+                state = panda.normalise([joint[0] for joint in joints])
+                if np.linalg.norm(state - target) <= TOLERANCE:
+                    break
+        link = p.getLinkState(
+            robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=client
+        )
+        ee_distance = np.linalg.norm(link[4] - panda.forward_kinematics(path[-1]))
+        return ee_distance <= 0.02 and np.linalg.norm(state - targets[-1]) <= 0.05
+
+    def __call__(self, query):
+        """Whether a query could be solved."""
+        start, goal, random_state = query
+        rng = np.random.default_rng()
+        rng.bit_generator.state = random_state
+        for _ in range(self.options["attempts"]):
+            path = self.plan(start, goal, int(rng.integers(1, 2**32)))
+            if path is not None and self.follow(path):
+                return True
+        return False
+
+
+def measure(task, number, progress):
+    """Dict way -> (seconds (n,), solved (n,), checks); and the seconds for drawing a query."""
+    args = collect.Args(task)
+    options = {name: getattr(args, name) for name in collect.OPTIONS}
+    ways = {"ours": Ours(options), "plain": Plain(options)}
+    seconds, solved = {way: [] for way in ways}, {way: [] for way in ways}
+    drawing = 0.0
+    for first in range(0, number, BLOCK):
+        block = range(first, min(first + BLOCK, number))
+        began = time.process_time()
+        queries = [ways["ours"].draw(index) for index in block]
+        drawing += time.process_time() - began
+        for way, solve in ways.items():
+            for query in queries:
+                began = time.process_time()
+                solved[way].append(solve(query))
+                seconds[way].append(time.process_time() - began)
+        progress.update(len(block))
+    measured = {
+        way: (np.array(seconds[way]), np.array(solved[way]), np.mean(ways[way].checks))
+        for way in ways
+    }
+    return measured, drawing / number
+
+
+def ratio_of(measured, rows):
+    """Our rate by the plain one, on the queries `rows`."""
+    (seconds, solved, _), (plain_seconds, plain_solved, _) = measured["ours"], measured["plain"]
+    ours = solved[rows].sum(-1) / seconds[rows].sum(-1)
+    return ours * plain_seconds[rows].sum(-1) / np.maximum(plain_solved[rows].sum(-1), 1)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--num", type=int, default=100, help="queries per task")
+    parser.add_argument("--tasks", nargs="+", default=list(envs.TASKS), choices=list(envs.TASKS))
+    args = parser.parse_args()
+    if args.num < 1:
+        parser.error("--num must be at least 1")
+
+    names = (
+        "demos_per_second",
+        "end_to_end_demos_per_second",
+        "plain_demos_per_second",
+        "ratio_to_plain",
+        "ratio_interval",
+        "solved",
+        "plain_solved",
+        "checks_per_plan",
+        "plain_checks_per_plan",
+    )
+    result = {name: {} for name in names}
+    resamples = np.random.default_rng(0).integers(0, args.num, (2000, args.num))
+    with tqdm(total=args.num * len(args.tasks), unit=" queries") as progress:
+        for task in args.tasks:
+            progress.set_description(task)
+            measured, drawing = measure(task, args.num, progress)
+            seconds, solved, checks = measured["ours"]
+            plain_seconds, plain_solved, plain_checks = measured["plain"]
+            interval = np.percentile(ratio_of(measured, resamples), [5, 95])
+            values = (
+                solved.sum() / seconds.sum(),
+                solved.sum() / (seconds.sum() + args.num * drawing),
+                plain_solved.sum() / plain_seconds.sum(),
+                ratio_of(measured, np.arange(args.num)),
+                interval.tolist(),
+                solved.mean(),
+                plain_solved.mean(),
+                checks,
+                plain_checks,
+            )
+            for name, value in zip(names, values, strict=True):
+                result[name][task] = value
+
+    print(
+        "\ndemonstrations per second and core; solved: share of queries; checks: mean of a plan\n"
+    )
+    print(
+        f"{'task':22}{'ours':>7}{'end to end':>12}{'plain':>7}{'ratio':>7}{'interval':>12}"
+        f"{'solved':>8}{'plain':>7}{'checks':>8}{'plain':>7}"
+    )
+    for task in args.tasks:
+        row = {name: result[name][task] for name in names}
+        low, high = row["ratio_interval"]
+        print(
+            f"{task:22}{row['demos_per_second']:7.1f}{row['end_to_end_demos_per_second']:12.1f}"
+            f"{row['plain_demos_per_second']:7.2f}{row['ratio_to_plain']:7.2f}"
+            f"{f'{low:.1f} to {high:.1f}':>12}{row['solved']:8.2f}{row['plain_solved']:7.2f}"
+            f"{row['checks_per_plan']:8.0f}{row['plain_checks_per_plan']:7.0f}"
+        )
+    print()
+    result |= {"queries_per_task": args.num, "python": platform.python_version()}
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,323 @@
+"""Collect demonstrations: sample a query, plan, follow the plan in the simulator, verify, keep.
+
+    python -m demo_generation.collect --task double_walls --num 10000
+
+Paper: appendix "Collection of demonstrations". Demonstration i depends on the seed, i and the
+options only, so the file is the same whatever the number of workers. Every verified demonstration
+goes to a journal beside the output at once; a run that was interrupted or killed in whatever way
+goes on from there when it is started again.
+"""
+
+import base64
+import collections
+import contextlib
+import fcntl
+import importlib.util
+import json
+import os
+import re
+import socket
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+import envs
+from demo_generation import workers
+from demo_generation.following import follow
+from demo_generation.planning import Planner, PlanningError
+from envs.datasets import check_writable, demo_path, write_demos
+
+# Streams 1 and 2 of random numbers are those of the test and validation queries.
+STREAM = 3
+JOURNAL_VERSION = 1
+MAX_QUERIES = 100  # tried for one demonstration
+REASONS = ("no_plan", "missed", "collided", "too_long")
+
+
+@dataclass
+class Args:
+    task: str
+    """Name of a task."""
+    num: int = 10_000
+    """Number of demonstrations."""
+    seed: int = 0
+    """Seed of queries and plans; 0 gives the packaged files."""
+    workers: int = 2
+    """Number of processes. The file does not depend on it."""
+    planner: str = "RRTConnect"
+    """One of OMPL's planners, by name."""
+    time_limit: float = 10.0
+    """Seconds for one plan, a safeguard: where it strikes, the result depends on the machine."""
+    max_checks: int = 30_000
+    """Collision checks for one plan (about 15 us each)."""
+    clearance: float = 0.005
+    """Metres that plans keep from the scene, where start and goal do."""
+    attempts: int = 3
+    """Plans tried on a query before it is given up for a new one (paper: 3)."""
+    allow_collisions: bool = False
+    """Keep demonstrations that touched something but reached the goal (the paper's rule)."""
+    output: Path | None = None
+    """File to write. The default is `envs/demos/<task>.h5`."""
+    overwrite: bool = False
+    """Replace the output, if it exists."""
+    ray_address: str | None = None
+    """Work on the Ray cluster at this address (`auto`, `HOST:PORT`) and not in local processes."""
+
+
+# What a demonstration depends on, besides its number.
+OPTIONS = (
+    "task",
+    "seed",
+    "planner",
+    "time_limit",
+    "max_checks",
+    "clearance",
+    "attempts",
+    "allow_collisions",
+)
+
+
+class Collector:
+    """Makes demonstrations one by one; `options` is a dict with the keys `OPTIONS`."""
+
+    def __init__(self, options):
+        self.options = options
+        self.env = envs.make(options["task"])
+        limits = {name: options[name] for name in ("time_limit", "max_checks", "clearance")}
+        self.planner = Planner(self.env, options["planner"], **limits)
+
+    def __call__(self, index):
+        """Demonstration `index`: a JSON-ready dict with its plan, execution and rejections."""
+        options, rejected = self.options, collections.Counter()
+        rng = np.random.default_rng([options["seed"], STREAM, index])
+        for given_up in range(MAX_QUERIES):
+            start, goal = self.env.sample_query(rng)
+            for attempt in range(options["attempts"]):
+                seed = int(rng.integers(1, 2**32))
+                try:
+                    # Each attempt dares to go nearer to obstacles: some queries leave no choice.
+                    path = self.planner.plan(start, goal, seed, caution=0.5**attempt)
+                except PlanningError:
+                    rejected["no_plan"] += 1
+                    continue
+                execution = follow(self.env, path)
+                if not execution.reached:
+                    rejected["missed"] += 1
+                elif execution.collided and not options["allow_collisions"]:
+                    rejected["collided"] += 1
+                elif len(execution.states) - 1 > self.env.horizon:
+                    rejected["too_long"] += 1
+                else:
+                    return {
+                        "index": index,
+                        "plan": _encode(path),
+                        "states": _encode(execution.states),
+                        "digest": execution.digest,
+                        "collided": execution.collided,
+                        "plan_seed": seed,
+                        "rejected": dict(rejected),
+                        "given_up": given_up,
+                    }
+        raise RuntimeError(
+            f"{MAX_QUERIES} queries in a row could not be solved ({dict(rejected)}): "
+            f"are the limits too tight?"
+        )
+
+
+def _encode(array):
+    return base64.b64encode(array.astype("<f4").tobytes()).decode()
+
+
+def _decode(text):
+    return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 7)
+
+
+class Journal:
+    """The demonstrations so far: JSON lines, the first one saying which collection it is.
+
+    Lines are appended and flushed one at a time, so whatever happens only the last can be damaged;
+    it is dropped when the journal is opened again. One process at a time holds it.
+    """
+
+    def __init__(self, path, options):
+        self.path = path
+        self.demos = {}
+        """Index -> demonstration."""
+        header = {"journal": JOURNAL_VERSION, **options}
+        self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ValueError(f"{path}: another collection is writing to it") from error
+        if not path.exists() or not os.path.samestat(os.fstat(self._file.fileno()), path.stat()):
+            raise ValueError(f"{path}: another collection has just finished with it")
+        self._file.seek(0)
+        contents = self._file.read()
+        lines = contents.split(b"\n")
+        good = 0
+        for number, line in enumerate(lines[:-1]):  # what follows the last line's end is damaged
+            try:
+                entry = json.loads(line)
+            except ValueError:
+                if number == 0:
+                    raise ValueError(_difference(path, None, header)) from None
+                break
+            if number == 0:
+                if entry != header:
+                    raise ValueError(_difference(path, entry, header))
+            else:
+                self.demos[entry["index"]] = entry
+            good += len(line) + 1
+        if good == 0 and not json.dumps(header).encode().startswith(contents):
+            raise ValueError(_difference(path, None, header))  # and not a torn first line either
+        self._file.truncate(good)
+        if good == 0:
+            self._write(header)
+
+    def append(self, demo):
+        self._write(demo)
+        self.demos[demo["index"]] = demo
+
+    def _write(self, entry):
+        line = json.dumps(entry).encode() + b"\n"
+        end = self._file.seek(0, 2)
+        try:
+            if self._file.write(line) != len(line):  # the disk is full
+                raise OSError("No space left on device")
+        except OSError:
+            self._file.truncate(end)
+            raise
+
+    def close(self):
+        self._file.close()
+
+
+def _difference(path, found, wanted):
+    if not isinstance(found, dict) or found.get("journal") != JOURNAL_VERSION:
+        return f"{path}: not a journal that this version can continue; move it away"
+    names = [name for name in wanted if found.get(name) != wanted[name]]
+    differences = ", ".join(f"{name} {found.get(name)!r}, not {wanted[name]!r}" for name in names)
+    return (
+        f"{path}: the journal of another collection ({differences}): use its flags to continue it, "
+        f"or delete it"
+    )
+
+
+def journal_of(path):
+    """Where the unfinished collection of a file is kept."""
+    return path.with_name(path.name + ".journal")
+
+
+def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
+    """Collect demonstrations into the journal of `path`, write the file, delete the journal.
+
+    Args:
+        path: file to write or replace.
+        num: number of demonstrations, > 0.
+        options: dict with the keys `OPTIONS`.
+        num_workers: number of local processes.
+        ray_address: work on this Ray cluster instead.
+        progress: show a progress bar.
+
+    Returns:
+        Counts, as stored in the file: `attempts`, those rejected by reason, and `queries_given_up`.
+
+    Raises:
+        ValueError: the journal belongs to another collection, or is in use.
+        RuntimeError: no query can be solved, or workers keep dying.
+        ConnectionError: there is no Ray cluster.
+        OSError: journal or file cannot be written.
+        Whatever is raised, what is in the journal is safe.
+    """
+    with contextlib.closing(Journal(journal_of(path), options)) as journal:
+        missing = [index for index in range(num) if index not in journal.demos]
+        bar = tqdm(
+            desc=options["task"],
+            total=num,
+            initial=num - len(missing),
+            unit=" demos",
+            mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+            disable=not progress,
+        )
+        if ray_address is None:
+            results = workers.run(Collector, (options,), missing, num_workers, warn=bar.write)
+        else:
+            results = workers.run_on_ray(ray_address, Collector, (options,), missing)
+        with bar, contextlib.closing(results):
+            for demo in results:
+                journal.append(demo)
+                bar.update()
+        demos = [journal.demos[index] for index in range(num)]
+        counts = collections.Counter(attempts=num, queries_given_up=0)
+        for reason in REASONS:
+            counts[reason] = sum(demo["rejected"].get(reason, 0) for demo in demos)
+            counts["attempts"] += counts[reason]
+        counts["queries_given_up"] = sum(demo["given_up"] for demo in demos)
+        flags = " ".join(f"--{name.replace('_', '-')} {options[name]}" for name in OPTIONS[:-1])
+        flags += " --allow-collisions" * options["allow_collisions"]
+        write_demos(
+            path,
+            options["task"],
+            options["seed"],
+            [_decode(demo["plan"]) for demo in demos],
+            [_decode(demo["states"]) for demo in demos],
+            {name: [demo[name] for demo in demos] for name in ("plan_seed", "digest", "collided")},
+            made_by=f"python -m demo_generation.collect --num {num} {flags}",
+            parameters={"options": options, "counts": counts},
+        )
+        journal_of(path).unlink()
+        return counts
+
+
+def _check(args):
+    """The path to write. Raises ValueError for arguments that cannot work."""
+    path = args.output or demo_path(args.task)
+    demo_path(args.task)  # refuses an unknown task, also with --output
+    if not envs.TASKS[args.task].trainable:
+        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
+    for name, lowest in (("num", 1), ("seed", 0), ("workers", 1), ("attempts", 1)):
+        if getattr(args, name) < lowest:
+            raise ValueError(f"--{name} must be at least {lowest}")
+    with contextlib.closing(envs.make(args.task)) as env:
+        # Refuses what a planner refuses, before any work is done.
+        Planner(env, args.planner, args.time_limit, args.max_checks, args.clearance).close()
+    check_writable(path)
+    if path.exists() and not args.overwrite:
+        raise ValueError(f"{path} exists; --overwrite replaces it")
+    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
+        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+    if re.fullmatch(r"[^/]+:\d+", args.ray_address or ""):  # where nobody answers, Ray would wait
+        host, port = args.ray_address.rsplit(":", 1)
+        try:
+            socket.create_connection((host, int(port)), timeout=5).close()
+        except OSError as error:
+            raise ValueError(f"no Ray cluster at {args.ray_address}: {error}") from error
+    return path
+
+
+def main(args):
+    try:
+        path = _check(args)
+        options = {name: getattr(args, name) for name in OPTIONS}
+        counts = collect(path, args.num, options, args.workers, args.ray_address)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    except OSError as error:
+        sys.exit(f"error: {error}\nwhat was collected is safe; the same command goes on from here")
+    except (ValueError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    rejected = ", ".join(f"{counts[reason]} {reason}" for reason in REASONS)
+    solved = args.num / (args.num + counts["queries_given_up"])
+    print(
+        f"{path}: {args.num} demonstrations from {counts['attempts']} attempts (rejected: "
+        f"{rejected}); {counts['queries_given_up']} queries given up, {solved:.4f} solved"
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m demo_generation.collect", description=__doc__))

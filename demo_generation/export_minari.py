@@ -1,0 +1,196 @@
+"""Export demonstrations as a Minari dataset, the format of many offline-learning libraries.
+
+    pip install -e ".[minari]"
+    python -m demo_generation.export_minari --task double_walls --goal-type ee
+
+Then `minari.load_dataset("roboarm-nmp/double_walls/ee-v0")` has the demonstrations as episodes of
+the task's environment, each up to the first time that it reaches its goal. The dataset is in
+Minari's local storage: `~/.minari/datasets`, or the folder in MINARI_DATASETS_PATH.
+
+Demonstration files round configurations to 0.0002 of the normalised space. That is exact enough to
+learn from, but replaying the actions of an episode adds it up, and one in a hundred ends just short
+of its goal. With --exact, replaying the actions repeats the episode.
+"""
+
+import contextlib
+import importlib.util
+import sys
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import gymnasium
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+import envs
+from demo_generation.following import follow
+from envs import panda
+from envs.datasets import MAX_STEP, demo_path, load_demos, subgoals
+
+
+@dataclass
+class Args:
+    task: str | None = None
+    """Name of a task: export its packaged demonstrations."""
+    file: Path | None = None
+    """Demonstration file to export instead."""
+    goal_type: Literal["ee", "config", "combined"] = "ee"
+    """What the goals are."""
+    dataset_id: str | None = None
+    """Minari's name for the dataset. The default is `roboarm-nmp/<task>/<goal type>-v0`."""
+    exact: bool = False
+    """Follow the plans again for exact configurations (about 50 episodes a second)."""
+    overwrite: bool = False
+    """Replace the dataset, if it exists."""
+
+
+def unrounded(demo, env):
+    """The demonstration with its exact states and actions, by following its plan in `env`.
+
+    Raises ValueError: it is another execution on this machine.
+    """
+    execution = follow(env, demo.plan)
+    if execution.digest != demo.digest:
+        raise ValueError(
+            "the demonstrations do not repeat exactly here: `python -m demo_generation.verify "
+            "FILE --mend` first"
+        )
+    states, points = execution.states, subgoals(demo.plan)
+    actions = points[np.minimum(np.arange(1, len(states)), len(points) - 1)] - states[:-1]
+    actions *= np.minimum(1.0, MAX_STEP / np.linalg.norm(actions, axis=1, keepdims=True))
+    return replace(demo, states=states, actions=actions.astype(np.float32))
+
+
+def episode(demo, env):
+    """A demonstration as the environment would have recorded it, up to reaching the goal.
+
+    Args:
+        demo: an `envs.datasets.Demo`.
+        env: a `RoboArmEnv` with relative actions and no velocities.
+
+    Returns:
+        A dict with the fields of Minari's `EpisodeBuffer`, for T actions: `observations`, a dict of
+        float32 arrays (T + 1, ...), `actions`, float32 (T, 7), `rewards`, float32 (T,),
+        `terminations` and `truncations`, bool (T,), `infos`, a dict with `is_success`, bool
+        (T + 1,).
+    """
+    positions = panda.forward_kinematics(panda.denormalise(demo.states))
+    goal_state, goal_position = panda.normalise(demo.goal), panda.forward_kinematics(demo.goal)
+    achieved, desired = {
+        "ee": (positions, goal_position),
+        "config": (demo.states, goal_state),
+        "combined": (np.hstack([demo.states, positions]), np.hstack([goal_state, goal_position])),
+    }[env.goal_type]
+    achieved, desired = achieved.astype(np.float32), desired.astype(np.float32)
+    success = env.compute_terminated(achieved, desired, {})
+    reached = np.flatnonzero(success[1:])
+    length = reached[0] + 1 if len(reached) else len(demo.actions)
+    achieved, success = achieved[: length + 1], success[: length + 1]
+    truncations = np.zeros(length, bool)
+    truncations[-1] = not success[-1]  # the recording ends, not the task
+    return {
+        "observations": {
+            "observation": np.hstack([demo.states, positions])[: length + 1].astype(np.float32),
+            "achieved_goal": achieved,
+            "desired_goal": np.tile(desired, (length + 1, 1)),
+        },
+        "actions": demo.actions[:length],
+        "rewards": env.compute_reward(achieved[1:], desired, {}),
+        "terminations": success[1:],
+        "truncations": truncations,
+        "infos": {"is_success": success},
+    }
+
+
+def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False, progress=True):
+    """Write `Demos` into Minari's local storage; returns the dataset's id and number of steps.
+
+    Args:
+        demos: an `envs.datasets.Demos`.
+        goal_type: `ee`, `config` or `combined`.
+        dataset_id: a name with a version, `namespace/name-v0`; None for the default.
+        exact: follow the plans again, see above.
+        overwrite: replace a dataset of this name. Until the new one is whole, the old one stays.
+        progress: show a progress bar.
+
+    Raises:
+        ImportError: Minari is not installed.
+        ValueError: Minari does not allow the name, or there is a dataset of this name; or, with
+            `exact`, the demonstrations do not repeat on this machine.
+        OSError: the dataset cannot be written.
+    """
+    if importlib.util.find_spec("minari") is None:
+        raise ImportError('this needs the extra `minari`: pip install -e ".[minari]"')
+    import minari
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.dataset.minari_storage import MinariStorage
+    from minari.namespace import create_namespace, list_local_namespaces
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    dataset_id = dataset_id or f"roboarm-nmp/{demos.task}/{goal_type}-v0"
+    try:
+        namespace, _, _ = parse_dataset_id(dataset_id)
+    except (TypeError, ValueError) as error:  # a TypeError if there is no version
+        message = f"bad dataset id {dataset_id!r}: it must be like namespace/name-v0"
+        raise ValueError(message) from error
+    path = get_dataset_path(dataset_id)
+    if path.exists() and not overwrite:
+        raise ValueError(f"the dataset {dataset_id} exists ({path}); --overwrite replaces it")
+    planner = demos.parameters.get("options", {}).get("planner", "a planner")
+    env = gymnasium.make(envs.gymnasium_id(demos.task), goal_type=goal_type)
+    bar = tqdm(
+        range(len(demos)),
+        desc=dataset_id,
+        unit=" episodes",
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+        disable=not progress,
+    )
+    # Minari does not look into hidden folders.
+    with (
+        contextlib.closing(env),
+        tempfile.TemporaryDirectory(prefix=".exporting-", dir=get_dataset_path()) as folder,
+    ):
+        new, old = Path(folder, "new"), Path(folder, "old")
+        new.mkdir()
+        storage = MinariStorage.new(
+            new / "data", env.observation_space, env.action_space, env.spec, data_format="hdf5"
+        )
+        storage.update_metadata(
+            {
+                "dataset_id": dataset_id,
+                "minari_version": minari.__version__,
+                "algorithm_name": f"{planner} (OMPL), followed by a position controller",
+                "description": f"Verified motion-planning demonstrations for the task {demos.task} "
+                f"of RoboArm-NMP, goal type {goal_type}. Made by: {demos.made_by}",
+            }
+        )
+        chosen = (unrounded(demos[i], env.unwrapped) if exact else demos[i] for i in bar)
+        storage.update_episodes(EpisodeBuffer(**episode(demo, env.unwrapped)) for demo in chosen)
+        if namespace is not None and namespace not in list_local_namespaces():
+            create_namespace(namespace)
+        steps = storage.total_steps
+        if path.exists():
+            path.rename(old)
+        new.rename(path)
+    return dataset_id, steps
+
+
+def main(args):
+    try:
+        if (args.task is None) == (args.file is None):
+            raise ValueError("give --task or --file, one of them")
+        demos = load_demos(args.file or demo_path(args.task))
+        dataset_id, steps = export(
+            demos, args.goal_type, args.dataset_id, args.exact, args.overwrite
+        )
+    except (ImportError, OSError, ValueError) as error:  # a DatasetError is a ValueError
+        sys.exit(f"error: {error}")
+    print(f"{dataset_id}: {len(demos)} episodes, {steps} steps")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m demo_generation.export_minari", description=__doc__))

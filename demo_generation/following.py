@@ -1,0 +1,67 @@
+"""Following a plan in the simulator, which is what turns it into a demonstration."""
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from envs.datasets import subgoals
+
+# The goal is reached well inside the tolerances of every goal type, so that rounding the stored
+# configurations cannot take it out again.
+INSIDE = 0.9
+# After the last sub-goal the goal is commanded for at most so many steps until it is reached. No
+# longer: at full speed the arm may swing beyond it, and touch something.
+SETTLE_STEPS = 10
+
+
+@dataclass(frozen=True)
+class Execution:
+    """What happened when a plan was followed.
+
+    Attributes:
+        states: float32 (n + 1, 7), the normalised configuration before each step and at the end.
+        collided: whether anything was touched on the way.
+        reached: whether the end is well inside the tolerances of every goal type.
+        digest: CRC-32 of the bytes of `states`; equal for exactly equal executions.
+    """
+
+    states: np.ndarray
+    collided: bool
+    reached: bool
+    digest: int
+
+
+def follow(env, path):
+    """Follow a path, one sub-goal per step, from its first configuration to its last.
+
+    Args:
+        env: a `RoboArmEnv` with relative actions and a `max_step` of at least 0.03.
+        path: float32 (n, 7), rad.
+
+    Raises:
+        ValueError: the first or last configuration is in collision or outside the limits.
+    """
+    observation, info = env.reset_specific(path[0], path[-1])
+    targets = subgoals(path)[1:]
+    states = [observation["observation"][:7]]
+    for step in range(len(targets) + SETTLE_STEPS):
+        if step >= len(targets) and _reached(env, info):
+            break
+        target = targets[min(step, len(targets) - 1)]
+        observation, _, _, _, info = env.step(target - states[-1])
+        states.append(observation["observation"][:7])
+    states = np.stack(states)
+    return Execution(
+        states,
+        collided=info["collision_so_far"],
+        reached=_reached(env, info),
+        digest=zlib.crc32(states.tobytes()),
+    )
+
+
+def _reached(env, info):
+    return (
+        info["ee_distance"] <= INSIDE * env.ee_tolerance
+        and info["config_distance"] <= INSIDE * env.config_tolerance
+    )

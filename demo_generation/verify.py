@@ -1,0 +1,180 @@
+"""Verify demonstration files: follow every plan again in the simulator; mend what fails.
+
+    python -m demo_generation.verify envs/demos/double_walls.h5 --mend
+
+Paper: appendix "Software package description" ("verification, and correction"). A demonstration
+is good if its plan, followed, gives exactly the execution that is stored, reaches its goal, and
+touches nothing (unless the file was collected with --allow-collisions). Exits with 1 if any is not.
+"""
+
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+import envs
+from demo_generation import workers
+from demo_generation.following import follow
+from demo_generation.planning import Planner, PlanningError
+from envs.datasets import QUANTUM, DatasetError, demo_path, load_demos, write_demos
+
+VERDICTS = ("good", "changed", "missed", "collided", "refused")
+MEND_ATTEMPTS = 10
+
+
+@dataclass
+class Args:
+    files: tyro.conf.Positional[tuple[str, ...]]
+    """Demonstration files, or names of tasks."""
+    workers: int = 2
+    """Number of processes."""
+    mend: bool = False
+    """Plan anew what does not verify, on the same query, and replace the file."""
+
+
+class Verifier:
+    """Follows the demonstrations of a file; with `mend`, plans anew where that fails."""
+
+    def __init__(self, path, mend):
+        self.demos = load_demos(path)
+        self.mend = mend
+        self.env = envs.make(self.demos.task)
+        options = self.demos.parameters["options"]
+        self.allow_collisions = options["allow_collisions"]
+        limits = {name: options[name] for name in ("time_limit", "max_checks", "clearance")}
+        self.planner = Planner(self.env, options["planner"], **limits)
+
+    def __call__(self, index):
+        """`(index, verdict, demo)`: one of `VERDICTS`, and, with `mend`, what to store.
+
+        That is a dict with plan, states, plan_seed, digest, collided; or None: not mended.
+        """
+        demo, seed = self.demos[index], int(self.demos.plan_seed[index])
+        try:
+            execution = follow(self.env, demo.plan)
+        except ValueError:
+            return index, "refused", None  # start or goal: no plan can help
+        verdict = self._verdict(demo, execution)
+        if not self.mend:
+            return index, verdict, None
+        if verdict in ("good", "changed"):
+            return index, verdict, _demo(demo.plan, execution, seed)
+        rng = np.random.default_rng([seed, index])
+        for attempt in range(MEND_ATTEMPTS):
+            seed = int(rng.integers(1, 2**32))
+            try:
+                plan = self.planner.plan(demo.start, demo.goal, seed, caution=0.5**attempt)
+            except PlanningError:
+                continue
+            execution = follow(self.env, plan)
+            short = len(execution.states) - 1 <= self.env.horizon
+            clean = self.allow_collisions or not execution.collided
+            if execution.reached and clean and short:
+                return index, verdict, _demo(plan, execution, seed)
+        return index, verdict, None
+
+    def _verdict(self, demo, execution):
+        if not execution.reached:
+            return "missed"
+        if execution.collided and not self.allow_collisions:
+            return "collided"
+        # The digest is exact; the stored states are rounded.
+        if execution.digest != demo.digest or execution.states.shape != demo.states.shape:
+            return "changed"
+        close = np.abs(execution.states - demo.states).max() <= 0.51 * QUANTUM
+        return "good" if close else "changed"
+
+
+def _demo(plan, execution, seed):
+    return {
+        "plan": plan,
+        "states": execution.states,
+        "plan_seed": seed,
+        "digest": execution.digest,
+        "collided": execution.collided,
+    }
+
+
+def verify(path, num_workers=1, mend=False, progress=True):
+    """Follow every demonstration of a file; with `mend`, replace the file by a good one.
+
+    Mended: an execution that is another one now is stored as it is; what misses or collides is
+    planned anew; what cannot be helped is removed.
+
+    Returns:
+        A dict: how many demonstrations have each of `VERDICTS`, `total`, and `removed`.
+
+    Raises:
+        DatasetError: the file cannot be used.
+        OSError: it cannot be written.
+    """
+    path = Path(path)
+    demos = load_demos(path)
+    if "options" not in demos.parameters:
+        raise DatasetError(f"{path}: it does not say with what options it was collected")
+    counts, kept = Counter(), {}
+    results = workers.run(Verifier, (path, mend), range(len(demos)), num_workers)
+    bar = tqdm(
+        results,
+        desc=path.name,
+        total=len(demos),
+        unit=" demos",
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+        disable=not progress,
+    )
+    for index, verdict, demo in bar:
+        counts[verdict] += 1
+        kept[index] = demo
+    bad = len(demos) - counts["good"]
+    removed = 0
+    if mend and bad:
+        good = [kept[index] for index in range(len(demos)) if kept[index] is not None]
+        removed = len(demos) - len(good)
+        if not good:
+            raise DatasetError(f"{path}: nothing in it can be mended")
+        write_demos(
+            path,
+            demos.task,
+            demos.seed,
+            [demo["plan"] for demo in good],
+            [demo["states"] for demo in good],
+            {name: [demo[name] for demo in good] for name in ("plan_seed", "digest", "collided")},
+            made_by=demos.made_by,
+            parameters={
+                **demos.parameters,
+                "mended": demos.parameters.get("mended", 0) + bad - removed,
+                "removed": demos.parameters.get("removed", 0) + removed,
+            },
+        )
+    return {name: counts[name] for name in VERDICTS} | {"total": len(demos), "removed": removed}
+
+
+def main(args):
+    failed = False
+    for name in args.files:
+        path = demo_path(name) if name in envs.TASKS else Path(name)
+        try:
+            counts = verify(path, args.workers, args.mend)
+        except (DatasetError, OSError, RuntimeError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            failed = True
+            continue
+        except KeyboardInterrupt:
+            print("interrupted; no file was changed by halves", file=sys.stderr)
+            sys.exit(130)
+        bad = counts["total"] - counts["good"]
+        text = ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
+        text += f" of {counts['total']} demonstrations"
+        if bad and args.mend:
+            text += f"; {bad - counts['removed']} mended, {counts['removed']} removed"
+        print(f"{path}: {text}")
+        failed = failed or (bad > 0 and not args.mend)
+    sys.exit(int(failed))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m demo_generation.verify", description=__doc__))

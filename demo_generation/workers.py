@@ -1,0 +1,103 @@
+"""Spreading jobs over local processes, or over an existing Ray cluster.
+
+A job is a small picklable value. `make_worker(*arguments)` is called once in each process and
+returns the function that does jobs; it has an importable, top-level name.
+"""
+
+import collections
+import concurrent.futures
+import multiprocessing
+import os
+import signal
+import threading
+from concurrent.futures.process import BrokenProcessPool
+
+MAX_DEATHS = 5  # without a single result between them
+
+
+def run(make_worker, arguments, jobs, workers, warn=print):
+    """Yield the results of all jobs, as they get ready, from `workers` processes.
+
+    A process that dies is replaced, its job is done again, and `warn` is called with a sentence.
+
+    Raises:
+        RuntimeError: processes died `MAX_DEATHS` times without a result between.
+        Exception: what a job raised.
+    """
+    waiting, deaths = collections.deque(jobs), 0
+    while waiting:
+        executor = concurrent.futures.ProcessPoolExecutor(
+            workers, multiprocessing.get_context("spawn"), _start, (make_worker, arguments)
+        )
+        running = {}
+        try:
+            while waiting or running:
+                while waiting and len(running) < 2 * workers:
+                    running[executor.submit(_work, waiting[0])] = waiting[0]
+                    waiting.popleft()
+                done, _ = concurrent.futures.wait(
+                    running, return_when=concurrent.futures.FIRST_COMPLETED
+                )
+                for future in sorted(done, key=lambda future: future.exception() is not None):
+                    result = future.result()
+                    del running[future]
+                    deaths = 0
+                    yield result
+        except BrokenProcessPool as error:
+            waiting.extendleft(running.values())
+            deaths += 1
+            if deaths == MAX_DEATHS:
+                raise RuntimeError(f"workers died {deaths} times without a result") from error
+            warn("a worker died; going on with new ones")
+        finally:
+            executor.shutdown(cancel_futures=True)
+
+
+def _start(make_worker, arguments):
+    global _worker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    _worker = make_worker(*arguments)
+
+
+def _follow_parent():
+    """End this worker when the parent was killed; it would wait for work for ever."""
+    multiprocessing.parent_process().join()
+    os._exit(1)
+
+
+def _work(job):
+    return _worker(job)
+
+
+def run_on_ray(address, make_worker, arguments, jobs):
+    """Like `run`, on the Ray cluster at `address`; Ray does a lost worker's or node's jobs again.
+
+    The cluster's machines need this project installed. Raises ConnectionError if there is no
+    cluster at the address.
+    """
+    import ray
+
+    ray.init(address=address, log_to_driver=False, logging_level="warning")
+    try:
+        # Spread, so that all nodes work; retried without end, because a node may be lost.
+        work = ray.remote(num_cpus=1, max_retries=-1, scheduling_strategy="SPREAD")(_work_on_ray)
+        waiting, running = collections.deque(jobs), []
+        while waiting or running:
+            capacity = 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
+            while waiting and len(running) < capacity:
+                running.append(work.remote(make_worker, arguments, waiting.popleft()))
+            done, running = ray.wait(running)
+            yield from ray.get(done)
+    finally:
+        ray.shutdown()
+
+
+_ray_workers = {}
+
+
+def _work_on_ray(make_worker, arguments, job):
+    key = repr((make_worker.__qualname__, arguments))
+    if key not in _ray_workers:
+        _ray_workers[key] = make_worker(*arguments)
+    return _ray_workers[key](job)
