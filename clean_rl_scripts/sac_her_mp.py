@@ -1,10 +1,12 @@
-"""SAC with hindsight experience replay (HER). One file: read it top to bottom.
+"""SAC with hindsight experience replay (HER) and demonstrations. One file: read it top to bottom.
 
     python clean_rl_scripts/sac_her_mp.py --task no_obstacles --goal-type ee
+    python clean_rl_scripts/sac_her_mp.py --task double_walls --demo-prob 1
 
 Soft Actor-Critic (Haarnoja et al., 2018) in CleanRL's form, goals relabelled with the `future`
-strategy (Andrychowicz et al., 2017), as in the paper's sections 2 and 5. To make an algorithm of
-your own, copy this file and change the parts under `# ALGO LOGIC`.
+strategy (Andrychowicz et al., 2017), demonstrations injected upon failure (SAC-MP), as in the
+paper's sections 2 and 5. To make an algorithm of your own, copy this file and change the parts
+under `# ALGO LOGIC`.
 """
 
 import json
@@ -26,7 +28,7 @@ from tqdm import tqdm
 
 import envs as roboarm
 from envs import panda
-from envs.datasets import load_queries
+from envs.datasets import MAX_STEP, DatasetError, load_demos, load_queries
 from envs.programs import load_program, save_program
 
 
@@ -77,6 +79,11 @@ class Args:
     """transitions per update"""
     her_probability: float = 0.8
     """share of sampled transitions whose goal is replaced by one reached later in their episode"""
+    demo_prob: float | None = None
+    """train on the queries of the task's demonstrations; when an episode fails, its demonstration
+    enters the replay buffer with this probability (the paper's p). Without it: random queries"""
+    demos: Path | None = None
+    """demonstration file to use with --demo-prob; by default the task's own"""
     gamma: float = 0.95
     """discount factor (CleanRL: 0.99)"""
     tau: float = 0.005
@@ -93,6 +100,9 @@ class Args:
     """entropy that the tuning aims at, of the unscaled action (CleanRL: minus its dimensions)"""
     policy_frequency: int = 2
     """updates of the critics per update of the policy (CleanRL: as often as the critics)"""
+    policy_average: float = 0.001
+    """share of the policy that moves into its running average per update of the policy; the average
+    is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
     hidden_size: int = 256
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: int = 2
@@ -124,7 +134,8 @@ class Args:
 def configuration_of(args):
     """The fields that define what is computed: a run can only be resumed with the same."""
     free = {"resume", "runs_dir", "threads", "total_timesteps", "test_queries", "stop_at_success"}
-    return {k: v for k, v in asdict(args).items() if k not in free}
+    values = {k: v for k, v in asdict(args).items() if k not in free}
+    return values | {"demos": args.demos and str(args.demos)}
 
 
 def env_arguments(args):
@@ -293,6 +304,45 @@ class HerReplayBuffer:
         self.rng.bit_generator.state = json.loads(state["rng"])
 
 
+# ALGO LOGIC: demonstrations
+def demonstration_to_inject(demos, query, is_success, demo_prob, rng):
+    """After an episode on `demos`' query number `query`: its demonstration, or None.
+
+    Only failures are shown how to do it, and only with probability `demo_prob`.
+    """
+    if is_success or rng.random() >= demo_prob:
+        return None
+    return demos[query]
+
+
+def demonstration_episode(demo, env, args):
+    """A demonstration as transitions for `HerReplayBuffer.add_episode`, up to reaching its goal."""
+    positions = panda.forward_kinematics(panda.denormalise(demo.states))
+    goal_position, goal_state = panda.forward_kinematics(demo.goal), panda.normalise(demo.goal)
+    achieved_goals, desired_goal = {
+        "ee": (positions, goal_position),
+        "config": (demo.states, goal_state),
+        "combined": (np.hstack([demo.states, positions]), np.hstack([goal_state, goal_position])),
+    }[args.goal_type]
+    observations = np.hstack([demo.states, positions])
+    actions = demo.actions
+    if args.action_mode == "subgoal":
+        actions = demo.states[:-1] + demo.actions
+    ended = env.compute_terminated(achieved_goals[1:], desired_goal, {})
+    length = int(np.argmax(ended)) + 1 if ended.any() else len(ended)
+    return [
+        {
+            "observation": observations[t],
+            "action": actions[t],
+            "next_observation": observations[t + 1],
+            "next_achieved_goal": achieved_goals[t + 1],
+            "desired_goal": desired_goal,
+            "collision": False,
+        }
+        for t in range(length)
+    ]
+
+
 def td_target(reward, terminated, next_q1, next_q2, next_log_prob, alpha, gamma):
     """The critics' target r + gamma (1 - terminated) (min(Q1', Q2') - alpha log pi'), all (N,)."""
     next_value = torch.minimum(next_q1, next_q2) - alpha * next_log_prob
@@ -400,6 +450,20 @@ if __name__ == "__main__":
         sys.exit(f"unknown task {args.task!r}: one of {', '.join(roboarm.TASKS)}")
     if args.buffer_size < args.horizon:
         sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
+    demos = None
+    if args.demo_prob is not None:
+        if not 0 <= args.demo_prob <= 1:
+            sys.exit(f"--demo-prob {args.demo_prob}: a probability is in [0, 1]")
+        if args.velocities or args.max_step < MAX_STEP:
+            sys.exit(f"--demo-prob: demonstrations have no velocities, and steps up to {MAX_STEP}")
+        try:
+            demos = load_demos(args.demos or args.task)
+        except DatasetError as error:
+            sys.exit(f"--demo-prob: {error}")
+        if demos.task != args.task:
+            sys.exit(f"--demos {args.demos}: demonstrations of {demos.task!r}, not {args.task!r}")
+        if args.stop_on_collision and demos.collided.any():
+            sys.exit("--stop-on-collision: some of these demonstrations touch something")
     if args.resume is not None:
         run = args.resume
     else:
@@ -427,6 +491,10 @@ if __name__ == "__main__":
 
     # ALGO LOGIC: networks and optimisers
     actor = Actor(args).to(device)
+    actor_average = Actor(args).to(device).eval()  # evaluated and saved
+    actor_average.load_state_dict(actor.state_dict())
+    actor_parameters = list(actor.parameters())
+    average_parameters = list(actor_average.parameters())
     qf1, qf2 = SoftQNetwork(args).to(device), SoftQNetwork(args).to(device)
     qf1_target, qf2_target = SoftQNetwork(args).to(device), SoftQNetwork(args).to(device)
     qf1_target.load_state_dict(qf1.state_dict())
@@ -436,7 +504,7 @@ if __name__ == "__main__":
     q_optimizer = torch.optim.Adam(q_parameters, lr=args.q_lr, fused=True)
     log_alpha = torch.full((1,), math.log(args.alpha), device=device, requires_grad=True)
     actor_optimizer = torch.optim.Adam(
-        [{"params": actor.parameters()}, {"params": [log_alpha], "lr": args.q_lr}],
+        [{"params": actor_parameters}, {"params": [log_alpha], "lr": args.q_lr}],
         lr=args.policy_lr,
         fused=True,
     )
@@ -445,6 +513,7 @@ if __name__ == "__main__":
     )
     saved_parts = {
         "actor": actor,
+        "actor_average": actor_average,
         "qf1": qf1,
         "qf2": qf2,
         "qf1_target": qf1_target,
@@ -454,7 +523,7 @@ if __name__ == "__main__":
         "buffer": buffer,
     }
     progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
-    progress |= {"best_success": -1.0, "best_step": 0}
+    progress |= {"best_success": -1.0, "best_step": 0, "demos_injected": 0}
 
     def save_checkpoint():
         state = {name: part.state_dict() for name, part in saved_parts.items()}
@@ -484,6 +553,15 @@ if __name__ == "__main__":
         "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
     )
 
+    query = [None] * args.num_envs  # number of the demonstration whose query each env is on
+
+    def begin_episode(i):
+        """A query of the demonstrations, or a random one."""
+        if demos is None:
+            return envs[i].reset()[0]
+        query[i] = int(envs[i].np_random.integers(len(demos)))
+        return envs[i].reset_specific(demos.start[query[i]], demos.goal[query[i]])[0]
+
     def begin_episodes():
         """Fresh episodes in all envs, from seeds that depend on the step count alone.
 
@@ -492,7 +570,8 @@ if __name__ == "__main__":
         """
         seeds = np.random.SeedSequence([args.seed, progress["global_step"]])
         seeds = seeds.generate_state(args.num_envs).tolist()
-        return [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+        first = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+        return first if demos is None else [begin_episode(i) for i in range(args.num_envs)]
 
     observations = begin_episodes()
     staged = [[] for _ in envs]  # transitions of the running episodes
@@ -542,8 +621,16 @@ if __name__ == "__main__":
                 writer.add_scalar("charts/episodic_return", returns[i], step)
                 writer.add_scalar("charts/episodic_length", info["elapsed_steps"], step)
                 writer.add_scalar("charts/success", np.mean(recent_success), step)
+                if demos is not None:
+                    demo = demonstration_to_inject(
+                        demos, query[i], info["is_success"], args.demo_prob, env.np_random
+                    )
+                    if demo is not None:
+                        buffer.add_episode(demonstration_episode(demo, env, args))
+                        progress["demos_injected"] += 1
+                    writer.add_scalar("charts/demos_injected", progress["demos_injected"], step)
                 staged[i], returns[i] = [], 0.0
-                observations[i], _ = env.reset()
+                observations[i] = begin_episode(i)
         progress["global_step"] += args.num_envs
         bar.update(args.num_envs)
 
@@ -593,6 +680,7 @@ if __name__ == "__main__":
                 actor_optimizer.step()
                 for parameter in q_parameters:
                     parameter.requires_grad_(True)
+                polyak_update(average_parameters, actor_parameters, args.policy_average)
 
             polyak_update(q_target_parameters, q_parameters, args.tau)
             progress["updates"] += 1
@@ -613,18 +701,18 @@ if __name__ == "__main__":
         # Evaluate, keep the best policy, checkpoint
         step = progress["global_step"]
         if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
-            actor.eval()
-            result = evaluate(actor, eval_envs, validation, device)
+            result = evaluate(actor_average, eval_envs, validation, device)
             for name, value in result.items():
                 writer.add_scalar(f"eval/{name}", value, step)
-            picture = picture_of_rollout(actor, picture_env, validation, device)
-            actor.train()
+            picture = picture_of_rollout(actor_average, picture_env, validation, device)
             writer.add_image("eval/rollout", picture, step, dataformats="HWC")
             if result["success_rate"] > progress["best_success"]:
                 progress["best_success"], progress["best_step"] = result["success_rate"], step
                 metadata = {"kind": "policy", "task": args.task, "env": env_arguments(args)}
                 metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
-                save_program(run / "policy.pt", actor, stack(observations, device), metadata)
+                save_program(
+                    run / "policy.pt", actor_average, stack(observations, device), metadata
+                )
             bar.set_postfix(
                 eval=f"{result['success_rate']:.3f}", best=f"{progress['best_success']:.3f}"
             )

@@ -16,6 +16,9 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import envs
+from demo_generation import collect
+from envs import panda
+from envs.datasets import Demos, load_demos
 from envs.programs import load_program
 
 SCRIPT = Path(__file__).parents[1] / "clean_rl_scripts" / "sac_her_mp.py"
@@ -193,6 +196,132 @@ def test_bfloat16_products_stay_close_to_float32():
     assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
 
 
+# --- Demonstrations
+
+
+def hand_made_demos(number=3, steps=12, task="no_obstacles"):
+    """Straight motions of 0.02 per step, normalised; the arm would follow them without lag."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(number, 7))
+    direction *= 0.02 / np.linalg.norm(direction, axis=1, keepdims=True)
+    first = rng.uniform(-0.5, 0.5, (number, 7))
+    states = first[:, None] + np.arange(steps + 1)[:, None] * direction[:, None]
+    actions = np.repeat(direction[:, None], steps + 1, axis=1)
+    actions[:, -1] = 0.0
+    ends = panda.denormalise(states[:, [0, -1]]).astype(np.float32)
+    return Demos(
+        task=task,
+        seed=0,
+        start=ends[:, 0],
+        goal=ends[:, 1],
+        states=states.reshape(-1, 7).astype(np.float32),
+        actions=actions.reshape(-1, 7).astype(np.float32),
+        offsets=np.arange(number + 1) * (steps + 1),
+        plan=ends.reshape(-1, 7),
+        plan_offsets=np.arange(number + 1) * 2,
+        plan_seed=np.arange(number),
+        digest=np.zeros(number, np.uint32),
+        collided=np.zeros(number, bool),
+        made_by="a test",
+        parameters={},
+    )
+
+
+def test_demonstrations_follow_failures_of_their_query_only_and_as_often_as_p():
+    demos, rng = hand_made_demos(), np.random.default_rng(0)
+    for query in range(len(demos)):
+        demo = sac.demonstration_to_inject(demos, query, False, 1.0, rng)
+        np.testing.assert_array_equal(demo.start, demos.start[query])
+        np.testing.assert_array_equal(demo.goal, demos.goal[query])
+        assert sac.demonstration_to_inject(demos, query, True, 1.0, rng) is None
+        assert sac.demonstration_to_inject(demos, query, False, 0.0, rng) is None
+    injected = [
+        sac.demonstration_to_inject(demos, 0, False, 0.3, rng) is not None for _ in range(10_000)
+    ]
+    assert abs(np.mean(injected) - 0.3) < 0.02
+
+
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+def test_a_demonstration_as_transitions_by_hand(goal_type):
+    demo = hand_made_demos()[1]
+    env = envs.make("no_obstacles", goal_type=goal_type)
+    episode = sac.demonstration_episode(demo, env, sac.Args(goal_type=goal_type))
+    angles = panda.denormalise(demo.states.astype(np.float64))
+    positions = panda.forward_kinematics(angles)
+    goal_position = panda.forward_kinematics(demo.goal)
+    if goal_type == "config":
+        reached = np.linalg.norm(demo.states - panda.normalise(demo.goal), axis=1) <= 0.05
+    else:
+        reached = np.linalg.norm(positions - goal_position, axis=1) <= 0.02
+    assert len(episode) == np.argmax(reached) < len(demo.actions)  # cut where the goal is reached
+    for t, transition in enumerate(episode):
+        observation = np.concatenate([demo.states[t], positions[t]])
+        np.testing.assert_allclose(transition["observation"], observation, atol=1e-6)
+        observation = np.concatenate([demo.states[t + 1], positions[t + 1]])
+        np.testing.assert_allclose(transition["next_observation"], observation, atol=1e-6)
+        np.testing.assert_array_equal(transition["action"], demo.actions[t])
+        assert not transition["collision"]
+        goal = {
+            "ee": goal_position,
+            "config": panda.normalise(demo.goal),
+            "combined": np.concatenate([panda.normalise(demo.goal), goal_position]),
+        }[goal_type]
+        np.testing.assert_allclose(transition["desired_goal"], goal, atol=1e-6)
+    sub_goals = sac.demonstration_episode(
+        demo, env, sac.Args(goal_type=goal_type, action_mode="subgoal")
+    )
+    np.testing.assert_allclose(sub_goals[3]["action"], demo.states[4], atol=1e-6)
+    env.close()
+
+
+def test_rewards_and_hindsight_of_injected_demonstrations():
+    demo, env = hand_made_demos()[2], envs.make("no_obstacles")
+    episode = sac.demonstration_episode(demo, env, sac.Args())
+    for her_probability in (0.0, 1.0):
+        buffer = sac.HerReplayBuffer(env, 1000, her_probability, np.random.default_rng(0))
+        buffer.add_episode(episode)
+        batch = buffer.sample(2000)
+        arrived = (batch["next_observation"] == episode[-1]["next_observation"].astype("f4")).all(1)
+        own = np.abs(batch["desired_goal"] - episode[-1]["desired_goal"]).max(1) < 1e-6
+        if her_probability == 0.0:
+            assert own.all()
+            np.testing.assert_array_equal(batch["reward"], np.where(arrived, 0.0, -1.0))
+            np.testing.assert_array_equal(batch["terminated"], arrived)
+        else:
+            achieved = np.stack([t["next_achieved_goal"] for t in episode]).astype("f4")
+            assert all((goal == achieved).all(1).any() for goal in batch["desired_goal"])
+            assert 0 < (batch["reward"] == 0).mean() < 1
+    env.close()
+
+
+@pytest.mark.parametrize("prob", ["1", "0"])
+def test_a_run_trains_on_the_demonstrations_queries_and_injects(tmp_path, prob):
+    path = tmp_path / "demos.h5"
+    options = {name: getattr(collect.Args("no_obstacles"), name) for name in collect.OPTIONS}
+    collect.collect(path, 4, options, progress=False)
+    demos = load_demos(path)
+    run = run_script(tmp_path / "runs", "--demo-prob", prob, "--demos", str(path))
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    rows, remaining = state["buffer"]["rows"].numpy(), state["buffer"]["remaining"].numpy()
+    first = np.concatenate([[True], remaining[:-1] == 0])
+    starts = panda.normalise(demos.start)
+    query = np.array([np.abs(starts - row[:7]).max(1).argmin() for row in rows[first]])
+    assert np.abs(starts[query] - rows[first][:, :7]).max() < 1e-3  # all on the demos' queries
+    goals = panda.forward_kinematics(demos.goal)[query]
+    np.testing.assert_allclose(rows[first][:, -4:-1], goals, atol=1e-6)
+    injected = [
+        np.abs(rows[first][i, 10:17] - demos[q].actions[0]).max() < 1e-6
+        for i, q in enumerate(query)
+    ]
+    events = EventAccumulator(str(run))
+    events.Reload()
+    failures = len(events.Scalars("charts/episodic_length"))  # so short a run never succeeds
+    assert events.Scalars("charts/success")[-1].value == 0
+    assert failures > 10
+    expected = failures if prob == "1" else 0
+    assert sum(injected) == expected == events.Scalars("charts/demos_injected")[-1].value
+
+
 # --- Real runs
 
 
@@ -226,6 +355,21 @@ def test_the_saved_policy_acts_without_the_script(finished_run):
     action = policy(**sac.stack([observation], "cpu"))[0].numpy()
     assert action.shape == (7,) and np.abs(action).max() <= 0.06
     env.step(action)
+
+
+def test_the_running_average_of_the_policy_is_what_is_saved(tmp_path):
+    run = run_script(tmp_path, "--total-timesteps", "600", "--policy-average", "0.1")
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    args = sac.Args(hidden_size=16, bf16=False)
+    actor, average = sac.Actor(args).eval(), sac.Actor(args).eval()
+    actor.load_state_dict(state["actor"])
+    average.load_state_dict(state["actor_average"])
+    observation, goal = torch.randn(8, 10), torch.randn(8, 3)
+    saved = load_program(run / "policy.pt")(
+        observation=observation, achieved_goal=goal, desired_goal=goal
+    )
+    torch.testing.assert_close(saved, average(observation, goal, goal))
+    assert (saved - actor(observation, goal, goal)).abs().max() > 1e-4
 
 
 def test_losses_are_logged_subgoal_actions_train_and_alpha_can_stay(tmp_path):
