@@ -451,6 +451,8 @@ if __name__ == "__main__":
     if args.buffer_size < args.horizon:
         sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
     demos = None
+    if args.demos is not None and args.demo_prob is None:
+        sys.exit("--demos goes with --demo-prob")
     if args.demo_prob is not None:
         if not 0 <= args.demo_prob <= 1:
             sys.exit(f"--demo-prob {args.demo_prob}: a probability is in [0, 1]")

@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import envs
 from demo_generation import collect
 from envs import panda
-from envs.datasets import Demos, load_demos
+from envs.datasets import Demos, demo_path, load_demos
 from envs.programs import load_program
 
 SCRIPT = Path(__file__).parents[1] / "clean_rl_scripts" / "sac_her_mp.py"
@@ -430,6 +430,15 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path):
         (["--resume", "nowhere"], "nowhere is no run's folder"),
         (["--goal-type", "pose"], "goal-type"),
         (["--buffer-size", "49"], "--buffer-size 49: an episode has 50 transitions"),
+        (["--demo-prob", "1.5"], "--demo-prob 1.5: a probability is in [0, 1]"),
+        (["--demo-prob", "1", "--velocities"], "demonstrations have no velocities"),
+        (["--demo-prob", "1", "--max-step", "0.02"], "steps up to 0.03"),
+        (["--demo-prob", "1", "--demos", "nowhere.h5"], "nowhere.h5: no such file"),
+        (
+            ["--demo-prob", "1", "--demos", str(demo_path("wall"))],
+            "demonstrations of 'wall', not 'no_obstacles'",
+        ),
+        (["--demos", "some.h5"], "--demos goes with --demo-prob"),
     ],
 )
 def test_bad_flags(tmp_path, flags, message):
