@@ -53,7 +53,7 @@ class Args:
     time_limit: float = 10.0
     """Seconds for one plan, a safeguard: where it strikes, the result depends on the machine."""
     max_checks: int = 30_000
-    """Collision checks for one plan (about 15 us each)."""
+    """Collision checks for one plan (some 25 us each)."""
     clearance: float = 0.005
     """Metres that plans keep from the scene, where start and goal do."""
     attempts: int = 3
