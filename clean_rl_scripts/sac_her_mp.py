@@ -30,6 +30,7 @@ import envs as roboarm
 from envs import panda
 from envs.datasets import MAX_STEP, DatasetError, load_demos, load_queries
 from envs.programs import load_program, save_program
+from envs.tasks import task_name
 
 
 @dataclass
@@ -50,7 +51,7 @@ class Args:
 
     # The task (the paper's MDP; `docs/environment.md`)
     task: str = "no_obstacles"
-    """task to train on, one of `envs.TASKS`"""
+    """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
     goal_type: Literal["ee", "config", "combined"] = "ee"
     """what the goal is: end-effector position, configuration, or both"""
     action_mode: Literal["relative", "subgoal"] = "relative"
@@ -374,7 +375,7 @@ def evaluate(policy, envs, queries, device):
         i = next(waiting, None)
         running.pop(env, None)
         if i is not None:
-            running[env] = env.reset_specific(queries.start[i], queries.goal[i])[0]
+            running[env] = env.reset_specific(*queries[i])[0]
 
     for env in envs:
         start(env)
@@ -399,7 +400,7 @@ def evaluate(policy, envs, queries, device):
 @torch.no_grad()
 def picture_of_rollout(policy, env, queries, device, frames=8):
     """An image strip (height, frames * width, 3), uint8, of the policy on the first query."""
-    observation, _ = env.reset_specific(queries.start[0], queries.goal[0])
+    observation, _ = env.reset_specific(*queries[0])
     pictures, done = [env.render()], False
     while not done:
         action = policy(**stack([observation], device))[0].cpu().numpy()
@@ -446,8 +447,13 @@ if __name__ == "__main__":
     args = parse_args()
     if args.device == "cuda" and not torch.cuda.is_available():
         sys.exit("--device cuda: PyTorch sees no CUDA device here")
-    if args.task not in roboarm.TASKS:
-        sys.exit(f"unknown task {args.task!r}: one of {', '.join(roboarm.TASKS)}")
+    try:
+        if not roboarm.get_task(args.task).trainable:
+            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
+        validation = load_queries(args.task, "validation")[: args.eval_queries]
+        test = load_queries(args.task, "test")[: args.test_queries]
+    except ValueError as error:
+        sys.exit(f"--task: {error}")
     if args.buffer_size < args.horizon:
         sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
     demos = None
@@ -459,17 +465,16 @@ if __name__ == "__main__":
         if args.velocities or args.max_step < MAX_STEP:
             sys.exit(f"--demo-prob: demonstrations have no velocities, and steps up to {MAX_STEP}")
         try:
-            demos = load_demos(args.demos or args.task)
+            demos = load_demos(args.demos or args.task, args.task)
         except DatasetError as error:
             sys.exit(f"--demo-prob: {error}")
-        if demos.task != args.task:
-            sys.exit(f"--demos {args.demos}: demonstrations of {demos.task!r}, not {args.task!r}")
         if args.stop_on_collision and demos.collided.any():
             sys.exit("--stop-on-collision: some of these demonstrations touch something")
     if args.resume is not None:
         run = args.resume
     else:
-        run = args.runs_dir / f"{args.task}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        name = f"{task_name(args.task)}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        run = args.runs_dir / name
         run.mkdir(parents=True)
         text = json.dumps(asdict(args), indent=2, default=str)
         write_atomically(run / "args.json", lambda path: path.write_text(text))
@@ -489,7 +494,6 @@ if __name__ == "__main__":
     envs = [roboarm.make(args.task, **kwargs) for _ in range(args.num_envs)]
     eval_envs = [roboarm.make(args.task, **kwargs) for _ in range(8)]
     picture_env = roboarm.make(args.task, **kwargs, render_mode="rgb_array", render_size=(240, 180))
-    validation = load_queries(args.task, "validation")[: args.eval_queries]
 
     # ALGO LOGIC: networks and optimisers
     actor = Actor(args).to(device)
@@ -562,7 +566,8 @@ if __name__ == "__main__":
         if demos is None:
             return envs[i].reset()[0]
         query[i] = int(envs[i].np_random.integers(len(demos)))
-        return envs[i].reset_specific(demos.start[query[i]], demos.goal[query[i]])[0]
+        demo = demos[query[i]]
+        return envs[i].reset_specific(demo.start, demo.goal, demo.scene)[0]
 
     def begin_episodes():
         """Fresh episodes in all envs, from seeds that depend on the step count alone.
@@ -729,16 +734,15 @@ if __name__ == "__main__":
 
     # The best policy (by validation) on test queries
     best = load_program(run / "policy.pt").to(device)
-    queries = load_queries(args.task, "test")[: args.test_queries]
-    result = evaluate(best, eval_envs, queries, device)
-    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
+    result = evaluate(best, eval_envs, test, device)
+    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(test)}
     result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
     result |= {"validation_success_rate": progress["best_success"]}
     result |= {"steps": progress["global_step"], "seconds": round(progress["seconds"])}
     text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
     write_atomically(run / "result.json", lambda path: path.write_text(text))
     print(
-        f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
+        f"{args.task}, goal {args.goal_type}, {len(test)} test queries: "
         f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
         f"{progress['global_step']} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
     )

@@ -18,7 +18,7 @@ import os
 import re
 import socket
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,11 +29,19 @@ import envs
 from demo_generation import workers
 from demo_generation.following import follow
 from demo_generation.planning import Planner, PlanningError
-from envs.datasets import check_writable, demo_path, write_demos
+from envs.datasets import (
+    check_writable,
+    demo_path,
+    query_path,
+    scene_to_json,
+    validate,
+    write_demos,
+)
+from envs.scenes import Scene, from_array, to_array
 
 # Streams 1 and 2 of random numbers are those of the test and validation queries.
 STREAM = 3
-JOURNAL_VERSION = 1
+JOURNAL_VERSION = 2
 MAX_QUERIES = 100  # tried for one demonstration
 REASONS = ("no_plan", "missed", "collided", "too_long")
 
@@ -41,7 +49,7 @@ REASONS = ("no_plan", "missed", "collided", "too_long")
 @dataclass
 class Args:
     task: str
-    """Name of a task."""
+    """Name of a task, or path of a scene file."""
     num: int = 10_000
     """Number of demonstrations."""
     seed: int = 0
@@ -95,37 +103,66 @@ class Collector:
         options, rejected = self.options, collections.Counter()
         rng = np.random.default_rng([options["seed"], STREAM, index])
         for given_up in range(MAX_QUERIES):
+            self.env.sample_scene(rng)
             start, goal = self.env.sample_query(rng)
-            for attempt in range(options["attempts"]):
-                seed = int(rng.integers(1, 2**32))
-                try:
-                    # Each attempt dares to go nearer to obstacles: some queries leave no choice.
-                    path = self.planner.plan(start, goal, seed, caution=0.5**attempt)
-                except PlanningError:
-                    rejected["no_plan"] += 1
-                    continue
-                execution = follow(self.env, path)
-                if not execution.reached:
-                    rejected["missed"] += 1
-                elif execution.collided and not options["allow_collisions"]:
-                    rejected["collided"] += 1
-                elif len(execution.states) - 1 > self.env.horizon:
-                    rejected["too_long"] += 1
-                else:
-                    return {
-                        "index": index,
-                        "plan": _encode(path),
-                        "states": _encode(execution.states),
-                        "digest": execution.digest,
-                        "collided": execution.collided,
-                        "plan_seed": seed,
-                        "rejected": dict(rejected),
-                        "given_up": given_up,
-                    }
+            demo = demonstrate(
+                self.planner,
+                start,
+                goal,
+                rng,
+                options["attempts"],
+                options["allow_collisions"],
+                rejected,
+            )
+            if demo is not None:
+                path, execution, seed = demo
+                return {
+                    "index": index,
+                    "plan": _encode(path),
+                    "states": _encode(execution.states),
+                    "digest": execution.digest,
+                    "collided": execution.collided,
+                    "plan_seed": seed,
+                    "obstacles": to_array(self.env.scene.obstacles).tolist(),
+                    "rejected": dict(rejected),
+                    "given_up": given_up,
+                }
         raise RuntimeError(
             f"{MAX_QUERIES} queries in a row could not be solved ({dict(rejected)}): "
             f"are the limits too tight?"
         )
+
+
+def demonstrate(planner, start, goal, rng, attempts, allow_collisions=False, rejected=None):
+    """Plan and follow the plan until it works: `(path, Execution, planner's seed)`, or None.
+
+    Args:
+        planner: a `Planner`; its environment has the query's scene.
+        start, goal: float32 (7,), rad.
+        rng: NumPy Generator that the planner's seeds come from.
+        attempts: plans to try at most.
+        allow_collisions: accept an execution that touched something.
+        rejected: a Counter of the reasons, `REASONS`, why attempts failed, to be added to.
+    """
+    rejected = collections.Counter() if rejected is None else rejected
+    for attempt in range(attempts):
+        seed = int(rng.integers(1, 2**32))
+        try:
+            # Each attempt dares to go nearer to obstacles: some queries leave no choice.
+            path = planner.plan(start, goal, seed=seed, caution=0.5**attempt)
+        except PlanningError:
+            rejected["no_plan"] += 1
+            continue
+        execution = follow(planner.env, path)
+        if not execution.reached:
+            rejected["missed"] += 1
+        elif execution.collided and not allow_collisions:
+            rejected["collided"] += 1
+        elif len(execution.states) - 1 > planner.env.horizon:
+            rejected["too_long"] += 1
+        else:
+            return path, execution, seed
+    return None
 
 
 def _encode(array):
@@ -147,7 +184,8 @@ class Journal:
         self.path = path
         self.demos = {}
         """Index -> demonstration."""
-        header = {"journal": JOURNAL_VERSION, **options}
+        scene = scene_to_json(envs.get_task(options["task"]).base_scene)
+        header = {"journal": JOURNAL_VERSION, **options, "scene": scene}
         self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -200,7 +238,10 @@ def _difference(path, found, wanted):
     if not isinstance(found, dict) or found.get("journal") != JOURNAL_VERSION:
         return f"{path}: not a journal that this version can continue; move it away"
     names = [name for name in wanted if found.get(name) != wanted[name]]
-    differences = ", ".join(f"{name} {found.get(name)!r}, not {wanted[name]!r}" for name in names)
+    differences = ", ".join(
+        "another scene" if name == "scene" else f"{name} {found.get(name)!r}, not {wanted[name]!r}"
+        for name in names
+    )
     return (
         f"{path}: the journal of another collection ({differences}): use its flags to continue it, "
         f"or delete it"
@@ -257,6 +298,10 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             counts[reason] = sum(demo["rejected"].get(reason, 0) for demo in demos)
             counts["attempts"] += counts[reason]
         counts["queries_given_up"] = sum(demo["given_up"] for demo in demos)
+        base, scenes_of = envs.get_task(options["task"]).scene, None
+        if not isinstance(base, Scene):
+            base = base.base
+            scenes_of = [replace(base, obstacles=from_array(demo["obstacles"])) for demo in demos]
         flags = " ".join(f"--{name.replace('_', '-')} {options[name]}" for name in OPTIONS[:-1])
         flags += " --allow-collisions" * options["allow_collisions"]
         write_demos(
@@ -268,6 +313,7 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             {name: [demo[name] for demo in demos] for name in ("plan_seed", "digest", "collided")},
             made_by=f"python -m demo_generation.collect --num {num} {flags}",
             parameters={"options": options, "counts": counts},
+            scenes_of=scenes_of,
         )
         journal_of(path).unlink()
         return counts
@@ -277,7 +323,7 @@ def _check(args):
     """The path to write. Raises ValueError for arguments that cannot work."""
     path = args.output or demo_path(args.task)
     demo_path(args.task)  # refuses an unknown task, also with --output
-    if not envs.TASKS[args.task].trainable:
+    if not envs.get_task(args.task).trainable:
         raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
     for name, lowest in (("num", 1), ("seed", 0), ("workers", 1), ("attempts", 1)):
         if getattr(args, name) < lowest:
@@ -286,6 +332,8 @@ def _check(args):
         # Refuses what a planner refuses, before any work is done.
         Planner(env, args.planner, args.time_limit, args.max_checks, args.clearance).close()
     check_writable(path)
+    if query_path(args.task).exists():
+        validate(query_path(args.task), args.task)  # demonstrations must not be of its queries
     if path.exists() and not args.overwrite:
         raise ValueError(f"{path} exists; --overwrite replaces it")
     if args.ray_address is not None and importlib.util.find_spec("ray") is None:

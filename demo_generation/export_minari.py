@@ -10,6 +10,9 @@ Minari's local storage: `~/.minari/datasets`, or the folder in MINARI_DATASETS_P
 Demonstration files round configurations to 0.0002 of the normalised space. That is exact enough to
 learn from, but replaying the actions of an episode adds it up, and one in a hundred ends just short
 of its goal. With --exact, replaying the actions repeats the episode.
+
+Minari makes the environment again from its Gymnasium id alone, so this works for the tasks of
+`envs.TASKS` whose scene is fixed: not for scenes that vary, and not for scene files.
 """
 
 import contextlib
@@ -34,7 +37,7 @@ from envs.datasets import MAX_STEP, demo_path, load_demos, subgoals
 @dataclass
 class Args:
     task: str | None = None
-    """Name of a task: export its packaged demonstrations."""
+    """Name of a task with a fixed scene: export its packaged demonstrations."""
     file: Path | None = None
     """Demonstration file to export instead."""
     goal_type: Literal["ee", "config", "combined"] = "ee"
@@ -105,6 +108,20 @@ def episode(demo, env):
     }
 
 
+def _check_recoverable(demos):
+    """Raise ValueError unless Minari could make the environment of every episode again."""
+    if demos.task not in envs.TASKS:
+        raise ValueError(
+            f"these demonstrations are for {demos.task!r}, which is none of envs.TASKS: without a "
+            f"registered environment, nobody could recover theirs from a Minari dataset"
+        )
+    if demos.scenes.index is not None:
+        raise ValueError(
+            f"the scenes of {demos.task} vary, and a Minari episode would not say which scene it "
+            f"belongs to: only demonstrations in a fixed scene can be exported"
+        )
+
+
 def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False, progress=True):
     """Write `Demos` into Minari's local storage; returns the dataset's id and number of steps.
 
@@ -118,10 +135,12 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
 
     Raises:
         ImportError: Minari is not installed.
-        ValueError: Minari does not allow the name, or there is a dataset of this name; or, with
-            `exact`, the demonstrations do not repeat on this machine.
+        ValueError: the demonstrations are for a scene file, or their scenes vary; Minari does not
+            allow the name, or there is a dataset of this name; or, with `exact`, the demonstrations
+            do not repeat on this machine.
         OSError: the dataset cannot be written.
     """
+    _check_recoverable(demos)
     if importlib.util.find_spec("minari") is None:
         raise ImportError('this needs the extra `minari`: pip install -e ".[minari]"')
     import minari

@@ -32,17 +32,18 @@ class Execution:
     digest: int
 
 
-def follow(env, path):
+def follow(env, path, scene=None):
     """Follow a path, one sub-goal per step, from its first configuration to its last.
 
     Args:
         env: a `RoboArmEnv` with relative actions and a `max_step` of at least 0.03.
         path: float32 (n, 7), rad.
+        scene: a `Scene` to change the environment to first.
 
     Raises:
         ValueError: the first or last configuration is in collision or outside the limits.
     """
-    observation, info = env.reset_specific(path[0], path[-1])
+    observation, info = env.reset_specific(path[0], path[-1], scene)
     targets = subgoals(path)[1:]
     states = [observation["observation"][:7]]
     for step in range(len(targets) + SETTLE_STEPS):

@@ -1,12 +1,18 @@
 """Make the query files of tasks, `envs/data/<task>.h5`: random feasible starts and goals.
 
     python -m demo_generation.make_queries --task wall
+    python -m demo_generation.make_queries --task random_boxes_hard --solvable
+
+With `--solvable` a query is kept only if a planner solved it: one of `SOLVE_ATTEMPTS` plans of
+RRT-Connect, at most `SOLVE_CHECKS` collision checks each (together a few seconds), reached the goal
+without touching anything when it was followed in the simulator.
 
 Query i of a split depends on the seed, the split and i only, so the file is the same whatever the
 number of workers. It is written at the end, in one piece: an interrupted run leaves what was there.
 """
 
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,20 +22,28 @@ from tqdm import tqdm
 
 import envs
 from demo_generation import workers
+from demo_generation.collect import MAX_QUERIES, demonstrate
+from demo_generation.motionbenchmaker import read_problems
+from demo_generation.planning import Planner
 from envs.arm_env import HOLD_DRIFT, SUBSTEPS, TIME_STEP
-from envs.datasets import check_writable, query_path, write_queries
+from envs.datasets import ORIGINAL, check_writable, query_path, write_queries
+from envs.scenes import Scene
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
 HOLD_STEPS = 24
 # Not 0: NumPy makes the same stream of [seed, 0, 0] as of plain seed, so the first query would be
 # that of an environment's `reset(seed=seed)`.
 STREAMS = {"test": 1, "validation": 2}
+# A bound in seconds would make the file depend on the machine.
+SOLVE_ATTEMPTS, SOLVE_CHECKS = 3, 30_000
 
 
 @dataclass
 class Args:
     task: tuple[str, ...]
-    """Names of tasks, or `all`."""
+    """Names of tasks, paths of scene files, or `all`."""
+    solvable: bool = False
+    """Keep only queries that a planner solved."""
     seed: int = 0
     """Seed of the queries; 0 gives the packaged files."""
     num_test: int = 10_000
@@ -38,87 +52,104 @@ class Args:
     """Number of validation queries."""
     workers: int = 2
     """Number of processes. The file does not depend on it."""
+    original: Path | None = None
+    """JSON file of MotionBenchMaker problems to add as the split `original`; goes with one task."""
     output: Path | None = None
-    """File to write or replace; goes with one task. The default is `envs/data/<task>.h5`."""
-
-
-def sample_query(env, seed, split, index):
-    """Query `index` of a split: `(start, goal, rejected)`.
-
-    Args:
-        env: the task's environment.
-        seed: int >= 0.
-        split: `test` or `validation`.
-        index: int >= 0.
-
-    Returns:
-        start and goal, float32 (7,), rad, and how many samples the long hold check rejected.
-    """
-    rng = np.random.default_rng([seed, STREAMS[split], index])
-    rejected = 0
-    while True:
-        start, goal = env.sample_query(rng)
-        if env.is_feasible(start, HOLD_STEPS) and env.is_feasible(goal, HOLD_STEPS):
-            return start, goal, rejected
-        rejected += 1
+    """File to write or replace; goes with one task. The default is `envs/data/<task>.h5`, or, for a
+    scene file, `<name>_queries.h5` beside it."""
 
 
 class Sampler:
     """Samples queries of a task; a job is (seed, split, index)."""
 
-    def __init__(self, task):
+    def __init__(self, task, solvable):
         self.env = envs.make(task)
+        self.planner = Planner(self.env, max_checks=SOLVE_CHECKS) if solvable else None
 
     def __call__(self, job):
-        return job, sample_query(self.env, *job)
+        """`(job, start, goal, scene, rejected)`: query `index` of a split, in a scene of its own.
+
+        `rejected` counts the samples that were not held for long enough (`unheld`), or that the
+        planner did not solve (`unsolved`).
+        """
+        seed, split, index = job
+        rng = np.random.default_rng([seed, STREAMS[split], index])
+        rejected = Counter()
+        for _ in range(MAX_QUERIES):
+            self.env.sample_scene(rng)
+            start, goal = self.env.sample_query(rng)
+            if not all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal)):
+                rejected["unheld"] += 1
+            elif self.planner and not demonstrate(self.planner, start, goal, rng, SOLVE_ATTEMPTS):
+                rejected["unsolved"] += 1
+            else:
+                return job, start, goal, self.env.scene, rejected
+        raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
 
 
-def make_queries(path, task, seed, num_test, num_validation, num_workers=1, progress=True):
+def make_queries(
+    path,
+    task,
+    seed,
+    num_test,
+    num_validation,
+    solvable=False,
+    original=None,
+    num_workers=1,
+    progress=True,
+):
     """Sample the queries of a task and write its file.
 
     Args:
         path: file to write or replace.
-        task: name of the task.
+        task: name of the task, or path of a scene file.
         seed: int >= 0.
         num_test, num_validation: numbers of queries, > 0.
+        solvable: keep only queries that a planner solved.
+        original: path of a JSON file of MotionBenchMaker problems for the split `original`.
         num_workers: number of processes.
         progress: show a progress bar.
 
     Returns:
-        How many samples the long hold check rejected.
+        A Counter of the samples rejected: `unheld`, `unsolved`.
 
     Raises:
         ValueError: unknown task.
         DatasetError, OSError: as `envs.datasets.write_queries` does.
     """
     query_path(task)  # refuses an unknown task
+    splits = {} if original is None else {ORIGINAL: read_problems(original)}
     jobs = [(seed, "test", i) for i in range(num_test)]
     jobs += [(seed, "validation", i) for i in range(num_validation)]
     bar = tqdm(desc=task, total=len(jobs), unit=" queries", disable=not progress)
-    made = {}
+    made, rejected = {}, Counter()
     with bar:
-        for job, query in workers.run(Sampler, (task,), jobs, num_workers, warn=bar.write):
+        results = workers.run(Sampler, (task, solvable), jobs, num_workers, warn=bar.write)
+        for job, *query, more in results:
             made[job] = query
+            rejected += more
             bar.update()
-    start, goal, rejected = zip(*(made[job] for job in jobs), strict=True)
-    start, goal = np.stack(start), np.stack(goal)
-    test, validation = slice(0, num_test), slice(num_test, None)
-    write_queries(
-        path,
-        task,
-        seed,
-        {"test": (start[test], goal[test]), "validation": (start[validation], goal[validation])},
-        made_by=f"python -m demo_generation.make_queries --task {task} --seed {seed} "
-        f"--num-test {num_test} --num-validation {num_validation}",
-        parameters={
-            "hold_steps": HOLD_STEPS,
-            "hold_drift": HOLD_DRIFT,
-            "time_step": TIME_STEP,
-            "substeps": SUBSTEPS,
-            "rejected": sum(rejected),
-        },
-    )
-    return sum(rejected)
+    for split in STREAMS:
+        start, goal, scenes = zip(*(made[job] for job in jobs if job[1] == split), strict=True)
+        splits[split] = (np.stack(start), np.stack(goal))
+        if not isinstance(envs.get_task(task).scene, Scene):
+            splits[split] += (scenes,)
+    parameters = {
+        "hold_steps": HOLD_STEPS,
+        "hold_drift": HOLD_DRIFT,
+        "time_step": TIME_STEP,
+        "substeps": SUBSTEPS,
+        "rejected": rejected["unheld"],
+    }
+    if solvable:
+        parameters |= {"unsolved": rejected["unsolved"], "solve_checks": SOLVE_CHECKS}
+        parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
+    made_by = f"python -m demo_generation.make_queries --task {task} --seed {seed} "
+    made_by += f"--num-test {num_test} --num-validation {num_validation}" + " --solvable" * solvable
+    if original is not None:
+        made_by += f" --original {Path(original).name}"
+    write_queries(path, task, seed, splits, made_by, parameters)
+    return rejected
 
 
 def _check(args):
@@ -130,8 +161,10 @@ def _check(args):
         lowest = 0 if name == "seed" else 1
         if getattr(args, name) < lowest:
             raise ValueError(f"--{name.replace('_', '-')} must be at least {lowest}")
-    if args.output is not None and len(tasks) > 1:
-        raise ValueError("--output is one file: it goes with one task")
+    if (args.output or args.original) is not None and len(tasks) > 1:
+        raise ValueError("--output and --original are one file: they go with one task")
+    if args.original is not None:
+        read_problems(args.original)
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
         query_path(task)  # refuses an unknown task, also with --output
@@ -142,14 +175,29 @@ def _check(args):
 def main(args):
     try:
         pairs = _check(args)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     try:
         for task, path in pairs:
             rejected = make_queries(
-                path, task, args.seed, args.num_test, args.num_validation, args.workers
+                path,
+                task,
+                args.seed,
+                args.num_test,
+                args.num_validation,
+                args.solvable,
+                args.original,
+                args.workers,
             )
-            print(f"{path}: written; {rejected} samples rejected by the long hold check")
+            text = f"{path}: written; {rejected['unheld']} samples rejected by the long hold check"
+            if args.solvable:
+                share = rejected["unsolved"] / (
+                    args.num_test + args.num_validation + rejected["unsolved"]
+                )
+                text += f", {rejected['unsolved']} not solved by the planner ({share:.3f})"
+            print(text)
+    except (OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         print("interrupted: the file being made was not written", file=sys.stderr)
         sys.exit(130)

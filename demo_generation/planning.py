@@ -5,8 +5,8 @@
     from envs.datasets import load_queries
 
     env = envs.make("double_walls")
-    start, goal = load_queries("double_walls")[0]
-    path = Planner(env).plan(start, goal, seed=1)  # float32 (n, 7), rad
+    query = load_queries("double_walls")[0]  # start, goal, scene
+    path = Planner(env).plan(*query, seed=1)  # float32 (n, 7), rad
 
 Collisions are checked in the environment's own PyBullet world, so planner and simulator agree.
 Planning happens in the normalised configuration space [-1, 1]^7.
@@ -24,7 +24,7 @@ from ompl import util as ou
 
 from envs import panda
 from envs.arm_env import RoboArmEnv
-from envs.scenes import Box, Scene
+from envs.scenes import Box, Cylinder, Scene
 
 # OMPL writes to the console; what a user should know is raised here.
 ou.setLogLevel(ou.LogLevel.LOG_NONE)
@@ -143,11 +143,12 @@ class Planner:
         self.checks = 0
         """Collision checks of the last plan."""
 
-    def plan(self, start, goal, seed, caution=1.0):
+    def plan(self, start, goal, scene=None, *, seed, caution=1.0):
         """A path from start to goal: float32 (n, 7), rad; its ends are exactly start and goal.
 
         Args:
             start, goal: joint angles (7, rad).
+            scene: a `Scene` to change the environment to first.
             seed: int > 0. The same seed gives the same path, whatever was planned before (except
                 where `time_limit` is what ends the search).
             caution: share of `clearance` and `MARGIN` to keep, in [0, 1].
@@ -165,7 +166,7 @@ class Planner:
         if np.shape(goal) == (3,):  # a position, with which an episode may begin
             raise ValueError("goal must have 7 numbers, got shape (3,)")
         # Both are refused here as an episode would refuse them.
-        self.env.reset_specific(start, goal)
+        self.env.reset_specific(start, goal, scene)
         start, goal = (np.asarray(end, dtype=np.float32) for end in (start, goal))
         is_valid = self._validity(start, goal, caution)
         states = panda.normalise(start), panda.normalise(goal)
@@ -213,12 +214,15 @@ def inflate(scene, clearance):
     def grow(body):
         if isinstance(body, Box):
             return replace(body, size=tuple(edge + 2 * clearance for edge in body.size))
-        return replace(body, radius=body.radius + clearance, length=body.length + 2 * clearance)
+        if isinstance(body, Cylinder):
+            return replace(body, radius=body.radius + clearance, length=body.length + 2 * clearance)
+        return replace(body, radius=body.radius + clearance)
 
     return Scene(
         tuple(grow(obstacle) for obstacle in scene.obstacles),
         table=None if scene.table is None else grow(scene.table),
         floor=None if scene.floor is None else scene.floor + clearance,
+        friction=scene.friction,
     )
 
 

@@ -16,11 +16,12 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-import envs
 from demo_generation import workers
 from demo_generation.following import follow
 from demo_generation.planning import Planner, PlanningError
+from envs.arm_env import RoboArmEnv
 from envs.datasets import QUANTUM, DatasetError, demo_path, load_demos, write_demos
+from envs.tasks import is_task
 
 VERDICTS = ("good", "changed", "missed", "collided", "refused")
 MEND_ATTEMPTS = 10
@@ -29,7 +30,7 @@ MEND_ATTEMPTS = 10
 @dataclass
 class Args:
     files: tyro.conf.Positional[tuple[str, ...]]
-    """Demonstration files, or names of tasks."""
+    """Demonstration files, or tasks (names or scene files)."""
     workers: int = 2
     """Number of processes."""
     mend: bool = False
@@ -42,7 +43,7 @@ class Verifier:
     def __init__(self, path, mend):
         self.demos = load_demos(path)
         self.mend = mend
-        self.env = envs.make(self.demos.task)
+        self.env = RoboArmEnv(self.demos.scenes.base)
         options = self.demos.parameters["options"]
         self.allow_collisions = options["allow_collisions"]
         limits = {name: options[name] for name in ("time_limit", "max_checks", "clearance")}
@@ -55,7 +56,7 @@ class Verifier:
         """
         demo, seed = self.demos[index], int(self.demos.plan_seed[index])
         try:
-            execution = follow(self.env, demo.plan)
+            execution = follow(self.env, demo.plan, demo.scene)
         except ValueError:
             return index, "refused", None  # start or goal: no plan can help
         verdict = self._verdict(demo, execution)
@@ -67,7 +68,7 @@ class Verifier:
         for attempt in range(MEND_ATTEMPTS):
             seed = int(rng.integers(1, 2**32))
             try:
-                plan = self.planner.plan(demo.start, demo.goal, seed, caution=0.5**attempt)
+                plan = self.planner.plan(demo.start, demo.goal, seed=seed, caution=0.5**attempt)
             except PlanningError:
                 continue
             execution = follow(self.env, plan)
@@ -99,8 +100,8 @@ def _demo(plan, execution, seed):
     }
 
 
-def verify(path, num_workers=1, mend=False, progress=True):
-    """Follow every demonstration of a file; with `mend`, replace the file by a good one.
+def verify(task_or_path, num_workers=1, mend=False, progress=True):
+    """Follow every demonstration of a task or file; with `mend`, replace the file by a good one.
 
     Mended: an execution that is another one now is stored as it is; what misses or collides is
     planned anew; what cannot be helped is removed.
@@ -112,8 +113,12 @@ def verify(path, num_workers=1, mend=False, progress=True):
         DatasetError: the file cannot be used.
         OSError: it cannot be written.
     """
-    path = Path(path)
-    demos = load_demos(path)
+    demos = load_demos(task_or_path)
+    path, task = Path(task_or_path), demos.task
+    if is_task(task_or_path):
+        path, task = demo_path(task_or_path), task_or_path
+    if mend and not is_task(task):
+        raise DatasetError(f"{path}: to mend it, name the scene file {task}.yaml instead")
     if "options" not in demos.parameters:
         raise DatasetError(f"{path}: it does not say with what options it was collected")
     counts, kept = Counter(), {}
@@ -132,13 +137,14 @@ def verify(path, num_workers=1, mend=False, progress=True):
     bad = len(demos) - counts["good"]
     removed = 0
     if mend and bad:
-        good = [kept[index] for index in range(len(demos)) if kept[index] is not None]
+        kept = {index: kept[index] for index in sorted(kept) if kept[index] is not None}
+        good = list(kept.values())
         removed = len(demos) - len(good)
         if not good:
             raise DatasetError(f"{path}: nothing in it can be mended")
         write_demos(
             path,
-            demos.task,
+            task,
             demos.seed,
             [demo["plan"] for demo in good],
             [demo["states"] for demo in good],
@@ -149,6 +155,7 @@ def verify(path, num_workers=1, mend=False, progress=True):
                 "mended": demos.parameters.get("mended", 0) + bad - removed,
                 "removed": demos.parameters.get("removed", 0) + removed,
             },
+            scenes_of=None if demos.scenes.index is None else map(demos.scenes.__getitem__, kept),
         )
     return {name: counts[name] for name in VERDICTS} | {"total": len(demos), "removed": removed}
 
@@ -156,10 +163,9 @@ def verify(path, num_workers=1, mend=False, progress=True):
 def main(args):
     failed = False
     for name in args.files:
-        path = demo_path(name) if name in envs.TASKS else Path(name)
         try:
-            counts = verify(path, args.workers, args.mend)
-        except (DatasetError, OSError, RuntimeError) as error:
+            counts = verify(name, args.workers, args.mend)
+        except (ValueError, OSError, RuntimeError) as error:
             print(f"error: {error}", file=sys.stderr)
             failed = True
             continue
@@ -171,7 +177,7 @@ def main(args):
         text += f" of {counts['total']} demonstrations"
         if bad and args.mend:
             text += f"; {bad - counts['removed']} mended, {counts['removed']} removed"
-        print(f"{path}: {text}")
+        print(f"{name}: {text}")
         failed = failed or (bad > 0 and not args.mend)
     sys.exit(int(failed))
 

@@ -3,19 +3,22 @@
 import gymnasium
 
 from envs.arm_env import RoboArmEnv
-from envs.tasks import TASKS
+from envs.tasks import TASKS, get_task
 
-__all__ = ["TASKS", "RoboArmEnv", "gymnasium_id", "make"]
+__all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
 
 
 def make(task, **kwargs):
-    """The environment of a task by name, e.g. `make("double_walls", goal_type="ee")`.
+    """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
-    Keyword arguments are those of `RoboArmEnv`. Raises ValueError for an unknown task.
+    Args:
+        task: name of a task (`TASKS`), or path of a scene file (docs/your_own_scene.md).
+        kwargs: arguments of `RoboArmEnv`.
+
+    Raises:
+        ValueError: unknown task, malformed scene file, or an argument out of its range.
     """
-    if task not in TASKS:
-        raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}")
-    return RoboArmEnv(TASKS[task].scene, **kwargs)
+    return RoboArmEnv(get_task(task).scene, **kwargs)
 
 
 def gymnasium_id(task):

@@ -3,6 +3,7 @@
 Paper: sections 2 and 4, appendix "Extended NMP goal-conditioned MDP description".
 """
 
+import contextlib
 import math
 import os
 import sys
@@ -13,7 +14,7 @@ import numpy as np
 import pybullet as p
 
 from envs import panda
-from envs.scenes import Box, Scene
+from envs.scenes import FRICTION, Box, Cylinder, Scene
 
 GOAL_TYPES = ("ee", "config", "combined")
 ACTION_MODES = ("relative", "subgoal")
@@ -27,7 +28,13 @@ POSITION_GAINS = [0.6] * panda.NUM_JOINTS
 # without drifting further than this (normalised).
 HOLD_STEPS = 5
 HOLD_DRIFT = 1e-3
+# Colour and friction.
+FLOOR_LOOK, TABLE_LOOK = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
+OBSTACLE_COLOUR = (0.36, 0.50, 0.65, 1)
 MAX_SAMPLING_TRIES = 10_000
+# PyBullet keeps some 4 kB of each body that is removed, so after this many the world is made anew,
+# which takes as long as 100 changes of scene.
+MAX_BODIES_MADE = 5_000
 # Where and how the arm touches nothing (m, rad). PyBullet places a body by its centre of mass.
 FAR_AWAY, IN_PLACE, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0)
 CONTACT_FREE = ((panda.LOWER + panda.UPPER) / 2).tolist()
@@ -52,7 +59,10 @@ class RoboArmEnv(gym.Env):
     if the goal was given as a position only), and `elapsed_steps`.
 
     Args:
-        scene: a `Scene`.
+        scene: a `Scene`, or a distribution of scenes: an object with `base`, the `Scene` without
+            the obstacles that vary, and `sample(rng)`, which draws a `Scene` with a NumPy
+            Generator (`envs.tasks.RandomBoxes` is one). `reset` then draws a new one.
+        episodes_per_scene: resets in which a drawn scene stays; a reset with a seed always draws.
         goal_type: `ee`, `config` or `combined` (reached like `ee`).
         ee_tolerance: goal radius in metres (paper: 0.02).
         config_tolerance: goal radius in the normalised configuration space (paper: 0.05).
@@ -80,6 +90,7 @@ class RoboArmEnv(gym.Env):
     def __init__(
         self,
         scene=None,
+        episodes_per_scene=1,
         goal_type="ee",
         ee_tolerance=0.02,
         config_tolerance=0.05,
@@ -103,9 +114,16 @@ class RoboArmEnv(gym.Env):
             ("config_tolerance", config_tolerance),
             ("max_step", max_step),
             ("horizon", horizon),
+            ("episodes_per_scene", episodes_per_scene),
         ]:
             if not (np.isscalar(value) and np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be a positive number, got {value!r}")
+        self.scenes = scene if hasattr(scene, "sample") else None
+        """The distribution that scenes are drawn from; None if the scene is fixed."""
+        self.episodes_per_scene = int(episodes_per_scene)
+        self._episodes_in_scene = self.episodes_per_scene
+        if self.scenes is not None:
+            scene = self.scenes.base
         scene = Scene() if scene is None else scene
         _check_scene(scene)
         self.goal_type = goal_type
@@ -140,15 +158,8 @@ class RoboArmEnv(gym.Env):
             gym.logger.warn("render_mode='human' needs a display (DISPLAY is not set): no window")
             self._window = False
         self.client = p.connect(p.GUI if self._window else p.DIRECT)
-        # Without deterministicOverlappingPairs the same episode differs from run to run.
-        p.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self.client
-        )
-        p.setGravity(0, 0, -9.81, physicsClientId=self.client)
-        self.robot = panda.load(self.client)
-        self._bodies = []
-        self._goal_marker = None
         self.scene = None
+        self._make_world()
         self.set_scene(scene)
 
         self.start_configuration = None
@@ -158,46 +169,71 @@ class RoboArmEnv(gym.Env):
 
     # --- The scene
 
+    def _make_world(self):
+        """The physics engine's settings and the robot, without a scene."""
+        p.resetSimulation(physicsClientId=self.client)
+        # Without deterministicOverlappingPairs the same episode differs from run to run.
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self.client
+        )
+        p.setGravity(0, 0, -9.81, physicsClientId=self.client)
+        self.robot = panda.load(self.client)
+        self._parts, self._bodies, self._bodies_made = [], [], 0
+        self._goal_marker = None
+
     def set_scene(self, scene):
         """Put the arm into another `Scene`. That ends the episode; an equal one changes nothing."""
         _check_scene(scene)
-        if scene == self.scene:
+        if scene is self.scene or scene == self.scene:
             return
         self.start_configuration = None
-        for body in self._bodies:
-            p.removeBody(body, physicsClientId=self.client)
-        self._bodies = []
-        self.scene = scene
+        if self._bodies_made > MAX_BODIES_MADE:
+            self._make_world()
+        before, self.scene = self._parts, scene
+        self._parts = []
         if scene.floor is not None:
-            floor = Box((0.0, 0.0, scene.floor - 0.05), (6.0, 6.0, 0.1))
-            self._add(floor, (0.55, 0.55, 0.55, 1))
+            self._parts.append((Box((0.0, 0.0, scene.floor - 0.05), (6.0, 6.0, 0.1)), *FLOOR_LOOK))
         if scene.table is not None:
-            table = self._add(scene.table, (0.76, 0.70, 0.60, 1))
-            # The base is bolted to the table.
-            p.setCollisionFilterPair(self.robot, table, -1, -1, 0, physicsClientId=self.client)
-        for obstacle in scene.obstacles:
-            self._add(obstacle, (0.36, 0.50, 0.65, 1))
+            self._parts.append((scene.table, *TABLE_LOOK))
+        look = (OBSTACLE_COLOUR, scene.friction)
+        self._parts += [(obstacle, *look) for obstacle in scene.obstacles]
+        # What comes first and is the same, floor and table mostly, stays.
+        same = 0
+        while same < min(len(before), len(self._parts)) and before[same] == self._parts[same]:
+            same += 1
+        for body in self._bodies[same:]:
+            p.removeBody(body, physicsClientId=self.client)
+        self._bodies = self._bodies[:same]
+        for part in self._parts[same:]:
+            self._add(*part)
 
-    def _add(self, obstacle, colour):
+    def _add(self, obstacle, colour, friction):
+        orientation = NO_TURN
         if isinstance(obstacle, Box):
-            half = [edge / 2 for edge in obstacle.size]
-            collision, visual = {"halfExtents": half}, {"halfExtents": half}
-            kind = p.GEOM_BOX
-        else:
+            kind, collision = p.GEOM_BOX, {"halfExtents": [edge / 2 for edge in obstacle.size]}
+            visual, orientation = collision, obstacle.orientation
+        elif isinstance(obstacle, Cylinder):
+            kind, orientation = p.GEOM_CYLINDER, obstacle.orientation
             collision = {"radius": obstacle.radius, "height": obstacle.length}
             visual = {"radius": obstacle.radius, "length": obstacle.length}
-            kind = p.GEOM_CYLINDER
+        else:
+            kind, collision = p.GEOM_SPHERE, {"radius": obstacle.radius}
+            visual = collision
         client = self.client
         body = p.createMultiBody(
             0.0,  # kg: it never moves
             p.createCollisionShape(kind, **collision, physicsClientId=client),
             p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client),
             basePosition=obstacle.position,
-            baseOrientation=obstacle.orientation,
+            baseOrientation=orientation,
             physicsClientId=client,
         )
+        if friction != FRICTION:
+            p.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
+        if obstacle is self.scene.table:  # the base is bolted to it
+            p.setCollisionFilterPair(self.robot, body, -1, -1, 0, physicsClientId=client)
         self._bodies.append(body)
-        return body
+        self._bodies_made += 1
 
     # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
 
@@ -257,9 +293,21 @@ class RoboArmEnv(gym.Env):
 
     # --- Episodes
 
+    def sample_scene(self, rng):
+        """Change to a scene drawn from the task's distribution; nothing, if the scene is fixed."""
+        if self.scenes is not None:
+            self.set_scene(self.scenes.sample(rng))
+
     def reset(self, *, seed=None, options=None):
-        """Start an episode from a random feasible start to a random feasible goal."""
+        """Start an episode from a random feasible start to a random feasible goal.
+
+        In a new scene, if scenes are drawn and this one has had its `episodes_per_scene`.
+        """
         super().reset(seed=seed)
+        if seed is not None or self._episodes_in_scene >= self.episodes_per_scene:
+            self.sample_scene(self.np_random)
+            self._episodes_in_scene = 0
+        self._episodes_in_scene += 1
         return self._begin(*self.sample_query(self.np_random))
 
     def reset_specific(self, start, goal, scene=None):
@@ -533,8 +581,10 @@ class RoboArmEnv(gym.Env):
 
     def __del__(self):
         # An env that nobody closed must not keep one of PyBullet's connections.
-        if getattr(self, "client", None) is not None and p.isConnected(self.client):
-            p.disconnect(physicsClientId=self.client)
+        if getattr(self, "client", None) is not None:
+            with contextlib.suppress(TypeError):  # PyBullet is gone already, as the process ends
+                if p.isConnected(self.client):
+                    p.disconnect(physicsClientId=self.client)
 
 
 def _one_of(name, value, allowed):

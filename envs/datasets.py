@@ -1,9 +1,13 @@
 """The HDF5 files of the tasks, read, written, validated: queries and demonstrations.
 
-A query file, `envs/data/<task>.h5`, has two groups, `test` and `validation`, each with
+A query file, `envs/data/<task>.h5`, has the groups `test` and `validation`, and `original` where a
+task has queries from elsewhere, each with
 
 - `start`, `goal`: float32 (n, 7), joint angles in rad, exactly those the simulator was asked about;
 - `goal_position`: float32 (n, 3), the end-effector position at the goal in metres,
+- where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
+  uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
+  scenes, one scene after another, as rows of `envs.scenes.to_array`.
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
@@ -12,11 +16,13 @@ A demonstration file, `envs/demos/<task>.h5`, has the arrays
 - `residual`: int16 (m, 7), the executed configurations (see `write_demos`), one execution
   after another; `length`: uint32 (n,), configurations in each;
 - `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
-- `collided`: uint8 (n,), whether the execution touched something.
+- `collided`: uint8 (n,), whether the execution touched something;
+- where scenes vary, `scene`, `obstacle_count` and `obstacles`, as above.
 
-Both have the attributes `schema`, `schema_version`, `task`, `seed`, `scene` (JSON), `made_by` (the
-command that makes the file again), `parameters` (JSON) and `checksum` (SHA-256 of all the others
-and the arrays). Files are written to a temporary name and then renamed: there is never half a file.
+Both have the attributes `schema`, `schema_version`, `task`, `seed`, `scene` (JSON: the scene,
+without the obstacles that vary), `made_by` (the command that makes the file again), `parameters`
+(JSON) and `checksum` (SHA-256 of all the others and the arrays). Files are written to a temporary
+name and then renamed: there is never half a file.
 
     python -m envs.datasets validate envs/data/wall.h5 --simulate
 """
@@ -29,24 +35,32 @@ import json
 import os
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
 
 from envs import panda, scenes
 from envs.arm_env import HOLD_STEPS, RoboArmEnv
-from envs.tasks import TASKS
+from envs.scenes import Scene
+from envs.tasks import TASKS, get_task, is_task, task_name
 
 SPLITS = ("test", "validation")
+ORIGINAL = "original"  # split of queries that were not sampled; few tasks have it
 QUERY_SCHEMA, DEMO_SCHEMA = "roboarm-nmp queries", "roboarm-nmp demonstrations"
 SCHEMA_VERSION = 1
 # Of each array: dtype, numbers per row (None: one dimension), and the array of the same length.
+_SCENE_ARRAYS = {
+    "scene": ("<u4", None, None),
+    "obstacle_count": ("<u4", None, "obstacle_count"),
+    "obstacles": ("<f8", scenes.ROW, "obstacles"),
+}
 _QUERY_ARRAYS = {
-    f"{split}/{name}": ("<f4", width, f"{split}/start")
-    for split in SPLITS
-    for name, width in (("start", 7), ("goal", 7), ("goal_position", 3))
+    "start": ("<f4", 7, "start"),
+    "goal": ("<f4", 7, "start"),
+    "goal_position": ("<f4", 3, "start"),
 }
 _DEMO_ARRAYS = {
     "plan": ("<f4", 7, "plan"),
@@ -57,7 +71,27 @@ _DEMO_ARRAYS = {
     "digest": ("<u4", None, "plan_length"),
     "collided": ("<u1", None, "plan_length"),
 }
-_ARRAYS = {QUERY_SCHEMA: _QUERY_ARRAYS, DEMO_SCHEMA: _DEMO_ARRAYS}
+
+
+def _arrays_of(schema, names):
+    """The formats of a file's arrays: required ones, and optional ones if `names` has the first."""
+
+    def with_scenes(arrays, rows_of, prefix=""):
+        if f"{prefix}scene" in names:
+            arrays = {**arrays, **_SCENE_ARRAYS, "scene": ("<u4", None, rows_of)}
+        return {
+            prefix + name: (dtype, width, prefix + sibling)
+            for name, (dtype, width, sibling) in arrays.items()
+        }
+
+    if schema == DEMO_SCHEMA:
+        return with_scenes(_DEMO_ARRAYS, "plan_length")
+    arrays = {}
+    for split in (*SPLITS, *(ORIGINAL,) * (f"{ORIGINAL}/start" in names)):
+        arrays |= with_scenes(_QUERY_ARRAYS, "start", f"{split}/")
+    return arrays
+
+
 _ATTRIBUTES = {
     "schema": str,
     "schema_version": int,
@@ -76,17 +110,54 @@ class DatasetError(ValueError):
     """A file that cannot be used. The message names the file and says what is wrong with it."""
 
 
+class Query(NamedTuple):
+    """Joint angles at start and goal, float32 (7,), rad, and the `Scene`.
+
+    `env.reset_specific(*query)` begins an episode on it.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    scene: Scene
+
+
+class Scenes:
+    """The scenes of n queries: `scenes[i]` is the `Scene` of query i, made when asked for.
+
+    Attributes:
+        base: the `Scene` without the obstacles that vary; the scene itself, if none do.
+        index: int64 (n,), the number of each query's scene; None if all have the same scene.
+        offsets: int64 (s + 1,): the obstacles of scene j are `rows[offsets[j] : offsets[j + 1]]`.
+        rows: float64 (k, 11), as of `envs.scenes.to_array`.
+    """
+
+    def __init__(self, base, index=None, offsets=None, rows=None):
+        self.base, self.index, self.offsets, self.rows = base, index, offsets, rows
+
+    def __getitem__(self, i):
+        if self.index is None:
+            return self.base
+        first, last = self.offsets[self.index[i] :][:2]
+        return replace(self.base, obstacles=scenes.from_array(self.rows[first:last]))
+
+    def take(self, which):
+        """The scenes of fewer queries, by slice or index array."""
+        index = None if self.index is None else self.index[which]
+        return Scenes(self.base, index, self.offsets, self.rows)
+
+
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """Queries of one split. `queries[i]` is `(start, goal)`; a slice or index array, fewer queries.
+    """Queries of one split. `queries[i]` is a `Query`; a slice or index array, fewer queries.
 
     Attributes:
         task: name of the task they are for.
-        split: `test` or `validation`.
+        split: `test`, `validation` or `original`.
         seed: of the command that made them.
         start: float32 (n, 7), rad.
         goal: float32 (n, 7), rad.
         goal_position: float32 (n, 3), end-effector position at the goal, m.
+        scenes: `Scenes`; `scenes[i]` is that of query i.
     """
 
     task: str
@@ -95,6 +166,7 @@ class Queries:
     start: np.ndarray
     goal: np.ndarray
     goal_position: np.ndarray
+    scenes: Scenes
 
     def __len__(self):
         return len(self.start)
@@ -102,31 +174,39 @@ class Queries:
     def __getitem__(self, index):
         start, goal, position = self.start[index], self.goal[index], self.goal_position[index]
         if start.ndim == 1:
-            return start, goal
-        return Queries(self.task, self.split, self.seed, start, goal, position)
+            return Query(start, goal, self.scenes[index])
+        scenes_of = self.scenes.take(index)
+        return Queries(self.task, self.split, self.seed, start, goal, position, scenes_of)
 
 
 def query_path(task):
-    """Where the packaged query file of a task is (or belongs). Raises ValueError: unknown task."""
-    return _task_file("data", task)
+    """Where the queries of a task are, or belong: of a scene file, `<name>_queries.h5` beside.
+
+    Raises ValueError for a task that is neither.
+    """
+    return _task_file(task, "data", "_queries.h5")
 
 
 def load_queries(task_or_path, split="test"):
     """The `Queries` of a task's packaged file, or of any query file.
 
     Args:
-        task_or_path: name of a task, or path of a file.
-        split: `test` or `validation`.
+        task_or_path: name of a task, path of a scene file, or path of a query file.
+        split: `test`, `validation`, or, where a task has it, `original`.
 
     Raises:
         DatasetError: the file is missing, corrupt, not a query file, or made for another task or
             for another version of the task's scene.
-        ValueError: unknown split.
+        ValueError: unknown split; a malformed scene file.
     """
-    if split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
+    if split not in (*SPLITS, ORIGINAL):
+        known = ", ".join((*SPLITS, ORIGINAL))
+        raise ValueError(f"split must be one of {known}, got {split!r}")
     path, task = _locate(task_or_path, query_path)
-    return _read_queries(path, task)[0][split]
+    queries = _read_queries(path, task)[0]
+    if split not in queries:
+        raise DatasetError(f"{path}: has no {split} queries")
+    return queries[split]
 
 
 def write_queries(path, task, seed, splits, made_by, parameters):
@@ -136,24 +216,27 @@ def write_queries(path, task, seed, splits, made_by, parameters):
 
     Args:
         path: file to write; an existing one is replaced.
-        task: name of the task.
+        task: name of the task, or path of a scene file.
         seed: the seed the queries were made with, an int.
-        splits: `{"test": (start, goal), "validation": (start, goal)}`, each float32 (n, 7), rad.
+        splits: `{"test": (start, goal, scenes), "validation": (start, goal, scenes)}`, and
+            `original` where there are some; start and goal float32 (n, 7), rad; scenes a sequence
+            of n `Scene`s, left out where all of them are the task's.
         made_by: the command line that makes this file.
         parameters: dict of whatever else determined the queries; must fit into JSON.
 
     Raises:
         DatasetError: arrays that a query file must not have; nothing is written then.
-        ValueError: unknown task, or not exactly these splits.
+        ValueError: unknown task, or other splits.
         OSError: the file cannot be written; an old file is left as it was.
     """
     path = Path(path)
-    query_path(task)  # refuses an unknown task
-    if set(splits) != set(SPLITS):
+    base = get_task(task).base_scene  # refuses an unknown task
+    if set(splits) - {ORIGINAL} != set(SPLITS):
         raise ValueError(f"splits must be {', '.join(SPLITS)}, got {', '.join(splits)}")
     arrays = {}
-    for split in SPLITS:
-        start, goal = (np.asarray(ends) for ends in splits[split])
+    for split, (start, goal, *scenes_of) in splits.items():
+        start, goal = np.asarray(start), np.asarray(goal)
+        arrays |= _scene_arrays(path, scenes_of[0] if scenes_of else None, base, f"{split}/")
         arrays |= {f"{split}/start": start, f"{split}/goal": goal}
         if goal.ndim == 2 and goal.shape[1] == panda.NUM_JOINTS:
             position = panda.forward_kinematics(goal).astype(np.float32)
@@ -185,27 +268,29 @@ def validate(path, task=None, simulate=False, progress=False):
 # --- What both kinds of file share
 
 
-def _task_file(folder, task):
-    if task not in TASKS:
-        raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}")
-    return Path(__file__).parent / folder / f"{task}.h5"
+def _task_file(task, folder, suffix):
+    get_task(task)  # refuses an unknown task
+    if task in TASKS:
+        return Path(__file__).parent / folder / f"{task}.h5"
+    return Path(task).with_name(task_name(task) + suffix)
 
 
 def _locate(task_or_path, path_of_task):
-    """(path, task it must be for): `task_or_path` is a task's name or the path of any file."""
-    if task_or_path in TASKS:
+    """(path, task it must be for): `task_or_path` is a task, or the path of any file."""
+    if is_task(task_or_path):
         return path_of_task(task_or_path), task_or_path
     return Path(task_or_path), None
 
 
 def _write(path, schema, task, seed, arrays, made_by, parameters):
-    arrays = {name: arrays[name].astype(dtype) for name, (dtype, *_) in _ARRAYS[schema].items()}
+    formats = _arrays_of(schema, arrays)
+    arrays = {name: arrays[name].astype(dtype) for name, (dtype, *_) in formats.items()}
     attributes = {
         "schema": schema,
         "schema_version": SCHEMA_VERSION,
-        "task": task,
+        "task": task_name(task),
         "seed": int(seed),
-        "scene": _scene_to_json(TASKS[task].scene),
+        "scene": scene_to_json(get_task(task).base_scene),
         "made_by": made_by,
         "parameters": json.dumps(parameters, sort_keys=True),
     }
@@ -218,14 +303,10 @@ def _write(path, schema, task, seed, arrays, made_by, parameters):
             file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
         for name, array in arrays.items():
             # Shuffled in one chunk, sign and exponent bytes compress: 13% off a query file.
+            packing = {"shuffle": True, "compression": "gzip", "compression_opts": 9}
+            packing |= {"chunks": array.shape}
             file.create_dataset(
-                name,
-                data=array,
-                chunks=array.shape,
-                shuffle=True,
-                compression="gzip",
-                compression_opts=9,
-                track_times=False,
+                name, data=array, track_times=False, **(packing if array.size else {})
             )
     _write_atomically(path, contents.getbuffer())
 
@@ -253,24 +334,72 @@ def _write_atomically(path, contents):
         raise
 
 
-def _scene_to_json(scene):
+def scene_to_json(scene):
+    """A `Scene` as text; equal scenes give equal texts."""
     fields = {
         "obstacles": scenes.to_array(scene.obstacles).tolist(),
         "table": None if scene.table is None else scenes.to_array([scene.table])[0].tolist(),
         "floor": scene.floor,
     }
+    if scene.friction != scenes.FRICTION:
+        fields["friction"] = scene.friction
     return json.dumps(fields, sort_keys=True)
+
+
+def _scene_from_json(text):
+    fields = json.loads(text)
+    table = fields["table"] and scenes.from_array([fields["table"]])[0]
+    rows = np.array(fields["obstacles"]).reshape(-1, scenes.ROW)
+    friction = fields.get("friction", scenes.FRICTION)
+    return Scene(scenes.from_array(rows), table, fields["floor"], friction)
+
+
+def _scene_arrays(path, scenes_of, base, prefix=""):
+    """Arrays for a sequence of `Scene`s, equal ones stored once; none for None."""
+    if scenes_of is None:
+        return {}
+    numbers = {}  # scene -> its number, in the order of their first use
+    index = [numbers.setdefault(scene, len(numbers)) for scene in scenes_of]
+    for scene in numbers:
+        if replace(scene, obstacles=()) != replace(base, obstacles=()):
+            raise DatasetError(
+                f"{path}: {prefix}scene differs from the task's in more than its obstacles"
+            )
+    return {
+        f"{prefix}scene": np.array(index, np.uint32),
+        f"{prefix}obstacle_count": np.array([len(s.obstacles) for s in numbers], np.uint32),
+        f"{prefix}obstacles": scenes.to_array([o for s in numbers for o in s.obstacles]),
+    }
+
+
+def _scenes_from(path, attributes, arrays, prefix=""):
+    """The inverse of `_scene_arrays`: `Scenes`. Raises DatasetError where they make no sense."""
+    base = _scene_from_json(attributes["scene"])
+    if f"{prefix}scene" not in arrays:
+        return Scenes(base)
+    index, counts, rows = (arrays[f"{prefix}{name}"] for name in _SCENE_ARRAYS)
+    offsets = np.concatenate([[0], np.cumsum(counts.astype(np.int64))])
+    if offsets[-1] != len(rows) or index.max() >= len(counts):
+        raise DatasetError(f"{path}: {prefix}scene does not fit the number of scenes or obstacles")
+    try:
+        scenes.from_array(rows)
+    except ValueError as error:
+        raise DatasetError(f"{path}: {prefix}obstacles: {error}") from error
+    if not np.isfinite(rows).all():
+        raise DatasetError(f"{path}: {prefix}obstacles has numbers that are not finite")
+    return Scenes(base, index.astype(np.int64), offsets, rows)
 
 
 def _same_scene(one, other):
     """Whether two scenes (JSON) are equal up to rounding."""
     one, other = json.loads(one), json.loads(other)
-    for field in ("obstacles", "table", "floor"):
-        if one[field] is None or other[field] is None:
-            if one[field] is not other[field]:
+    for field in ("obstacles", "table", "floor", "friction"):
+        here, there = one.get(field), other.get(field)
+        if here is None or there is None:
+            if here is not there:
                 return False
             continue
-        a, b = np.array(one[field], dtype=float), np.array(other[field], dtype=float)
+        a, b = np.array(here, dtype=float), np.array(there, dtype=float)
         if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SCENE_TOLERANCE):
             return False
     return True
@@ -279,7 +408,7 @@ def _same_scene(one, other):
 def _checksum(attributes, arrays):
     """SHA-256 of the attributes, and of the names, shapes and contents of the arrays."""
     digest = hashlib.sha256(json.dumps(attributes, sort_keys=True).encode())
-    for name, (dtype, *_) in _ARRAYS[attributes["schema"]].items():
+    for name, (dtype, *_) in _arrays_of(attributes["schema"], arrays).items():
         digest.update(f"{name} {arrays[name].shape}".encode())
         digest.update(arrays[name].astype(dtype).tobytes())
     return digest.hexdigest()
@@ -287,11 +416,13 @@ def _checksum(attributes, arrays):
 
 def _check_format(path, schema, arrays):
     """Shapes and dtypes; `arrays` are NumPy arrays or HDF5 datasets, by name."""
+    formats = _arrays_of(schema, arrays)
     for name, array in arrays.items():
-        dtype, width, sibling = _ARRAYS[schema][name]
+        dtype, width, sibling = formats[name]
         if array.dtype != np.dtype(dtype):
             raise DatasetError(f"{path}: {name} must be {np.dtype(dtype)}, is {array.dtype}")
-        if array.shape[1:] != (() if width is None else (width,)) or array.size == 0:
+        empty = array.size == 0 and name.rpartition("/")[2] != "obstacles"  # of scenes without any
+        if array.shape[1:] != (() if width is None else (width,)) or empty:
             expected = "(n,)" if width is None else f"(n, {width})"
             raise DatasetError(
                 f"{path}: {name} must have shape {expected} with n > 0, has {array.shape}"
@@ -342,7 +473,7 @@ def _read_open(path, file, schema, task):
             raise DatasetError(f"{path}: schema version {value}, this code reads {SCHEMA_VERSION}")
         attributes[name] = value
 
-    datasets = {name: file.get(name) for name in _ARRAYS[schema]}
+    datasets = {name: file.get(name) for name in _arrays_of(schema, file)}
     for name, dataset in datasets.items():
         if not isinstance(dataset, h5py.Dataset):
             raise DatasetError(f"{path}: array {name} is missing or damaged")
@@ -352,14 +483,19 @@ def _read_open(path, file, schema, task):
         raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
 
     made_for = attributes["task"]
-    if task is not None and made_for != task:
-        raise DatasetError(f"{path}: this file is for the task {made_for!r}, not {task!r}")
-    if made_for not in TASKS:
-        raise DatasetError(f"{path}: this file is for the unknown task {made_for!r}")
-    if not _same_scene(attributes["scene"], _scene_to_json(TASKS[made_for].scene)):
+    if task is not None and made_for != task_name(task):
+        raise DatasetError(
+            f"{path}: this file is for the task {made_for!r}, not {task_name(task)!r}"
+        )
+    if task is None and made_for in TASKS:
+        task = made_for
+    # Of a scene file that is not at hand, the file itself says what the scene is.
+    wanted = scene_to_json(get_task(task).base_scene) if task else attributes["scene"]
+    if not _same_scene(attributes["scene"], wanted):
+        replacing = " --overwrite" * (schema == DEMO_SCHEMA)
         raise DatasetError(
             f"{path}: out of date: made for another version of the scene of {made_for!r}; "
-            f"make it again with: {attributes['made_by']}"
+            f"make it again with: {attributes['made_by']}{replacing}"
         )
     return attributes, arrays
 
@@ -372,8 +508,11 @@ def _read_queries(path, task):
     attributes, arrays = _read(path, QUERY_SCHEMA, task)
     _check_queries(path, arrays)
     queries = {}
-    for split in SPLITS:
-        columns = {name: arrays[f"{split}/{name}"] for name in ("start", "goal", "goal_position")}
+    for split in (*SPLITS, ORIGINAL):
+        if f"{split}/start" not in arrays:
+            continue
+        columns = {name: arrays[f"{split}/{name}"] for name in _QUERY_ARRAYS}
+        columns["scenes"] = _scenes_from(path, attributes, arrays, f"{split}/")
         queries[split] = Queries(attributes["task"], split, attributes["seed"], **columns)
     return queries, json.loads(attributes["parameters"])
 
@@ -394,7 +533,9 @@ def query_keys(start, goal):
 
 def _check_queries(path, arrays):
     """Joint limits, finite numbers, and no query in both splits."""
-    for split in SPLITS:
+    for split in (*SPLITS, ORIGINAL):
+        if f"{split}/start" not in arrays:
+            continue
         for name in ("start", "goal"):
             _check_configurations(path, f"{split}/{name}", arrays[f"{split}/{name}"])
         if not np.isfinite(arrays[f"{split}/goal_position"]).all():
@@ -409,20 +550,21 @@ def _check_queries(path, arrays):
 def _simulate(path, queries, hold_steps, progress):
     from tqdm import tqdm  # here, because nothing else in this module needs it
 
-    for split in SPLITS:
+    for split in queries:
         position = panda.forward_kinematics(queries[split].goal)
         off = np.linalg.norm(position - queries[split].goal_position, axis=1) > _POSITION_TOLERANCE
         if off.any():
             row = int(np.argmax(off))
             raise DatasetError(f"{path}: {split}/goal_position[{row}] is not where the goal is")
-    env = RoboArmEnv(TASKS[queries["test"].task].scene)
-    total = sum(len(queries[split]) for split in SPLITS)
+    env = RoboArmEnv(queries["test"].scenes.base)
+    total = sum(len(queries[split]) for split in queries)
     with (
         contextlib.closing(env),
         tqdm(total=total, unit=" queries", desc=Path(path).name, disable=not progress) as bar,
     ):
-        for split in SPLITS:
-            for row, (start, goal) in enumerate(queries[split]):
+        for split in queries:
+            for row, (start, goal, scene) in enumerate(queries[split]):
+                env.set_scene(scene)
                 for name, configuration in (("start", start), ("goal", goal)):
                     if not env.is_feasible(configuration, hold_steps):
                         raise DatasetError(f"{path}: {split}/{name}[{row}] is not feasible")
@@ -446,6 +588,7 @@ class Demo:
 
     Attributes:
         start, goal: float32 (7,), rad.
+        scene: the `Scene`.
         plan: float32 (p, 7), rad: the waypoints from start to goal.
         states: float32 (m, 7), the executed configurations, normalised.
         actions: float32 (m - 1, 7), the displacement commanded in each, clipped to `MAX_STEP` as
@@ -455,6 +598,7 @@ class Demo:
 
     start: np.ndarray
     goal: np.ndarray
+    scene: Scene
     plan: np.ndarray
     states: np.ndarray
     actions: np.ndarray
@@ -469,6 +613,7 @@ class Demos:
         task: name of the task they are for.
         seed: of the command that made them.
         start, goal: float32 (n, 7), rad.
+        scenes: `Scenes`; `scenes[i]` is that of demonstration i.
         states: float32 (m, 7): the executed configurations of all demonstrations, normalised.
         actions: float32 (m, 7): the displacement commanded in each; zero in the last of a
             demonstration, from which nothing was commanded.
@@ -486,6 +631,7 @@ class Demos:
     seed: int
     start: np.ndarray
     goal: np.ndarray
+    scenes: Scenes
     states: np.ndarray
     actions: np.ndarray
     offsets: np.ndarray
@@ -507,6 +653,7 @@ class Demos:
         return Demo(
             self.start[i],
             self.goal[i],
+            self.scenes[i],
             self.plan[self.plan_offsets[i] : self.plan_offsets[i + 1]],
             self.states[rows],
             self.actions[rows][:-1],
@@ -515,18 +662,26 @@ class Demos:
 
 
 def demo_path(task):
-    """Where the packaged demonstrations of a task are (or belong). ValueError: unknown task."""
-    return _task_file("demos", task)
+    """Where the demonstrations of a task are, or belong: of a scene file, `<name>_demos.h5` beside.
+
+    Raises ValueError for a task that is neither.
+    """
+    return _task_file(task, "demos", "_demos.h5")
 
 
-def load_demos(task_or_path):
+def load_demos(task_or_path, task=None):
     """The `Demos` of a task's packaged file, or of any demonstration file.
+
+    Args:
+        task_or_path: name of a task, path of a scene file, or path of a demonstration file.
+        task: the task that a demonstration file must be for.
 
     Raises:
         DatasetError: the file is missing, corrupt, not a demonstration file, or made for another
             task or for another version of the task's scene.
     """
-    path, task = _locate(task_or_path, demo_path)
+    path, found = _locate(task_or_path, demo_path)
+    task = task or found
     attributes, arrays = _read(path, DEMO_SCHEMA, task)
     offsets, plan_offsets = (
         np.concatenate([[0], np.cumsum(arrays[name].astype(np.int64))])
@@ -550,6 +705,7 @@ def load_demos(task_or_path):
         seed=attributes["seed"],
         start=arrays["plan"][plan_offsets[:-1]],
         goal=arrays["plan"][plan_offsets[1:] - 1],
+        scenes=_scenes_from(path, attributes, arrays),
         states=states,
         actions=actions.astype(np.float32),
         offsets=offsets,
@@ -563,18 +719,19 @@ def load_demos(task_or_path):
     )
 
 
-def write_demos(path, task, seed, plans, executions, columns, made_by, parameters):
+def write_demos(path, task, seed, plans, executions, columns, made_by, parameters, scenes_of=None):
     """Write a demonstration file, atomically, as `write_queries` does.
 
     Args:
         path: file to write; an existing one is replaced.
-        task: name of the task.
+        task: name of the task, or path of a scene file.
         seed: the seed they were made with, an int.
         plans: list of float32 (p, 7) arrays, rad, from start to goal.
         executions: list of float32 (m, 7) arrays, normalised configurations, starting at the start.
         columns: `{"plan_seed", "digest", "collided"}`: sequences of ints, one per demonstration.
         made_by: the command line that makes this file.
         parameters: dict of whatever else determined them; must fit into JSON.
+        scenes_of: sequence of n `Scene`s; None where all of them are the task's.
 
     Raises:
         DatasetError: arrays that a file must not have, or a query twice, or one of the task's test
@@ -599,8 +756,7 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
     if len(keys) < len(start):
         raise DatasetError(f"{path}: {len(start) - len(keys)} queries are in it twice")
     if query_path(task).exists():
-        for split in SPLITS:
-            queries = load_queries(task, split)
+        for split, queries in validate(query_path(task), task).items():
             shared = len(keys & query_keys(queries.start, queries.goal))
             if shared:
                 raise DatasetError(f"{path}: {shared} queries are {split} queries of {task}")
@@ -611,6 +767,7 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
     lag = [round(value, 6) for value in lag.tolist()]
     residual = np.round((states - (here - lag * moved)) / QUANTUM)
     arrays = {
+        **_scene_arrays(path, scenes_of, get_task(task).base_scene),
         "plan": plan,
         "plan_length": np.array(plan_lengths, np.uint32),
         "residual": residual.astype(np.int16),
@@ -732,10 +889,10 @@ def _main(arguments=None):
 def _main_validate(options):
     bad = False
     for file in options.files:
-        path, task = _locate(file, query_path)
         try:
+            path, task = _locate(file, query_path)
             queries = validate(path, options.task or task, options.simulate, progress=True)
-        except DatasetError as error:
+        except ValueError as error:
             print(f"error: {error}", file=sys.stderr)
             bad = True
         else:
@@ -748,7 +905,7 @@ def _main_validate(options):
 def _main_describe(options):
     try:
         columns = [describe(load_demos(file)) for file in options.files]
-    except DatasetError as error:
+    except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(" | ".join(["", *options.files]))

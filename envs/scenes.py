@@ -1,4 +1,4 @@
-"""Scenes as plain data: boxes and cylinders around the arm, a table and a floor.
+"""Scenes as plain data: boxes, cylinders and spheres around the arm, a table and a floor.
 
 All lengths in metres, in the frame of the robot's base (x forward, y left, z up).
 """
@@ -29,45 +29,62 @@ class Cylinder:
     orientation: tuple[float, float, float, float] = IDENTITY
 
 
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere; `position` is its centre."""
+
+    position: tuple[float, float, float]
+    radius: float
+
+
+Obstacle = Box | Cylinder | Sphere
+
 # The arm stands on the table's top (z = 0).
 TABLE = Box(position=(0.2, 0.0, -0.02), size=(1.0, 1.0, 0.04))
 FLOOR = -0.6
+FRICTION = 0.5  # PyBullet's default
 
 
 @dataclass(frozen=True)
 class Scene:
     """Everything the arm can hit apart from itself. `table=None` or `floor=None` leave them out.
 
-    `floor` is the height of the floor's surface. Values, not code: two equal scenes are equal.
+    `floor` is the height of the floor's surface. `friction` is the obstacles' coefficient; PyBullet
+    multiplies it by the arm's, 0.5. Values, not code: two equal scenes are equal.
     """
 
-    obstacles: tuple[Box | Cylinder, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
     table: Box | None = TABLE
     floor: float | None = FLOOR
+    friction: float = FRICTION
 
     def __post_init__(self):
         for obstacle in self.obstacles:
-            if not isinstance(obstacle, (Box, Cylinder)):
-                raise TypeError(f"obstacles must be Box or Cylinder, got {obstacle!r}")
+            if not isinstance(obstacle, Obstacle):
+                raise TypeError(f"obstacles must be Box, Cylinder or Sphere, got {obstacle!r}")
 
 
-_BOX, _CYLINDER = 0.0, 1.0
+_KINDS = (Box, Cylinder, Sphere)
 ROW = 11  # numbers per obstacle: kind, position 3, orientation 4, size 3
 
 
 def to_array(obstacles):
-    """Obstacles -> float64 array (n, 11): kind (0 box, 1 cylinder), position, quaternion, size.
+    """Obstacles -> float64 array (n, 11): kind, position, quaternion, size.
 
-    A box's size is its three edges; a cylinder's is (radius, radius, length).
+    Kinds: 0 box, 1 cylinder, 2 sphere. Sizes: a box's three edges; (radius, radius, length) of a
+    cylinder; three times the radius of a sphere.
     """
     rows = np.zeros((len(obstacles), ROW))
     for row, obstacle in zip(rows, obstacles, strict=True):
+        row[0], row[1:4] = _KINDS.index(type(obstacle)), obstacle.position
+        if isinstance(obstacle, Sphere):
+            row[4:8], row[8:11] = IDENTITY, obstacle.radius
+            continue
+        row[4:8] = obstacle.orientation
         if isinstance(obstacle, Box):
-            size = obstacle.size
+            row[8:11] = obstacle.size
         else:
-            size = (obstacle.radius, obstacle.radius, obstacle.length)
-        row[0] = _BOX if isinstance(obstacle, Box) else _CYLINDER
-        row[1:4], row[4:8], row[8:11] = obstacle.position, obstacle.orientation, size
+            row[8:11] = obstacle.radius, obstacle.radius, obstacle.length
     return rows
 
 
@@ -77,12 +94,14 @@ def from_array(rows):
     if rows.ndim != 2 or rows.shape[1] != ROW:
         raise ValueError(f"an obstacle array has shape (n, {ROW}), got {rows.shape}")
     obstacles = []
-    for row in rows.tolist():
-        position, orientation = tuple(row[1:4]), tuple(row[4:8])
-        if row[0] == _BOX:
-            obstacles.append(Box(position, tuple(row[8:11]), orientation))
-        elif row[0] == _CYLINDER:
-            obstacles.append(Cylinder(position, row[8], row[10], orientation))
+    for kind, *numbers in rows.tolist():
+        position, orientation, size = tuple(numbers[:3]), tuple(numbers[3:7]), tuple(numbers[7:])
+        if kind == 0:
+            obstacles.append(Box(position, size, orientation))
+        elif kind == 1:
+            obstacles.append(Cylinder(position, size[0], size[2], orientation))
+        elif kind == 2:
+            obstacles.append(Sphere(position, size[0]))
         else:
-            raise ValueError(f"unknown kind of obstacle {row[0]}: 0 is a box, 1 a cylinder")
+            raise ValueError(f"unknown kind of obstacle {kind}: 0 box, 1 cylinder, 2 sphere")
     return tuple(obstacles)

@@ -1,22 +1,63 @@
-"""The tasks: name -> scene, and whether training on it is allowed (paper, section 4).
+"""The tasks: name -> scene, or a distribution of scenes, and whether training on it is allowed.
 
-The paper gives no dimensions. These were chosen to be what the names say, then calibrated so that
-the go-to-goal policy succeeds as often as in the paper (docs/tasks.md). A new fixed scene is one
-more entry of `TASKS`.
+Paper: section 4. It gives no dimensions. Those of its own tasks were chosen to be what the names
+say, then calibrated so that the go-to-goal policy succeeds as often as in the paper
+(docs/tasks.md). MotionBenchMaker's scenes are as published.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from envs.scenes import Box, Scene
+from envs.random_boxes import RandomBoxes
+from envs.scene_files import load_scene
+from envs.scenes import Box, Cylinder, Scene
+
+SCENE_FILES = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
 class Task:
-    """A scene under a name; `summary` is one line for listings."""
+    """A scene, or a distribution of scenes, under a name.
 
-    scene: Scene
+    Attributes:
+        scene: a `Scene` or a `RandomBoxes`.
+        summary: one line for listings.
+        trainable: False for the tasks that are there to test generalisation (paper: "OOD").
+    """
+
+    scene: Scene | RandomBoxes
     summary: str
     trainable: bool = True
+
+    @property
+    def base_scene(self):
+        """The `Scene` without the obstacles that vary."""
+        return self.scene if isinstance(self.scene, Scene) else self.scene.base
+
+
+def get_task(task):
+    """The `Task` of a name in `TASKS`, or of the path of a scene file (`envs.scene_files`).
+
+    Raises:
+        ValueError: neither; or the scene file is malformed.
+    """
+    if task in TASKS:
+        return TASKS[task]
+    if is_task(task):
+        if task_name(task) in TASKS:
+            raise ValueError(f"{task}: a scene file may not have the name of a task")
+        return Task(load_scene(task), f"the scene in {task}")
+    raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}, or a scene file (.yaml)")
+
+
+def is_task(task):
+    """Whether `task` is a name in `TASKS` or looks like the path of a scene file."""
+    return task in TASKS or Path(task).suffix in SCENE_FILES
+
+
+def task_name(task):
+    """What files made for a task say it is: its name, or that of the scene file."""
+    return task if task in TASKS else Path(task).stem
 
 
 def _two_walls(gap):
@@ -28,6 +69,29 @@ def _two_walls(gap):
             for side in (1, -1)
         )
     )
+
+
+# MotionBenchMaker's nominal scenes (Chamzas et al., RA-L 7(2), 2022), to the millimetre. They have
+# neither table nor floor: the shelves stand 0.7 m below the robot's base, and a floor at its height
+# would be in the way of 42 of the 100 original goals of the thin one (docs/tasks.md).
+_CAN = {"radius": 0.03, "length": 0.14}
+
+
+def _bookshelf_tall():
+    shelves = [Box((1.3, 0.0, z), (1.2, 1.0, 0.04)) for z in (0.0, 0.3, 0.6, 0.9)]
+    sides = [Box((1.3, y, 0.12), (1.3, 0.04, 1.64)) for y in (-0.5, 0.5)]
+    cans = [Cylinder((x, 0.0, z), **_CAN) for z in (0.68, 0.08, 0.38) for x in (1.2, 1.0, 0.8)]
+    return Scene((*shelves, *sides, *cans), table=None, floor=None)
+
+
+def _bookshelf_thin():
+    heights = (-0.35, -0.1, 0.15, 0.4, 0.65, 0.9)
+    shelves = [Box((0.9, 0.0, z), (0.62, 1.0, 0.04)) for z in heights]
+    board = Box((0.9, 0.0, 0.2), (0.62, 0.04, 1.4))
+    legs = [Box((x, y, 0.12), (0.04, 0.04, 1.64)) for x in (0.6, 1.2) for y in (0.5, -0.5)]
+    levels = ((-0.26, 0.25), (-0.01, -0.25), (0.24, 0.25), (0.49, -0.25), (0.74, 0.25))
+    cans = [Cylinder((x, y, z), **_CAN) for z, y in levels for x in (1.0, 0.7)]
+    return Scene((*shelves, board, *legs, *cans), table=None, floor=None)
 
 
 TASKS = {
@@ -54,5 +118,13 @@ TASKS = {
             )
         ),
         "six boxes, standing and hanging, all around the arm",
+    ),
+    "benchmaker_bookshelf_tall": Task(
+        _bookshelf_tall(), "MotionBenchMaker's bookshelf_tall: four wide shelves", trainable=False
+    ),
+    "benchmaker_bookshelf_thin": Task(
+        _bookshelf_thin(),
+        "MotionBenchMaker's bookshelf_thin: six shelves, divided by a board",
+        trainable=False,
     ),
 }

@@ -24,7 +24,7 @@ from demo_generation.following import follow
 from demo_generation.planning import Planner
 from demo_generation.verify import VERDICTS, Verifier, verify
 from envs import panda
-from envs.datasets import DatasetError, load_demos, write_demos
+from envs.datasets import DatasetError, load_demos, scene_to_json, write_demos
 
 ROOT = Path(__file__).parents[1]
 TASK, NUM = "double_walls", 16
@@ -225,7 +225,8 @@ def test_control_c_and_on_again(whole, output):
 @pytest.fixture(scope="module")
 def journal():
     """The journal of a collection that was stopped just before it wrote its file."""
-    lines = [json.dumps({"journal": collect.JOURNAL_VERSION, **options()})]
+    scene = scene_to_json(envs.TASKS[TASK].scene)
+    lines = [json.dumps({"journal": collect.JOURNAL_VERSION, **options(), "scene": scene})]
     collector = collect.Collector(options())
     lines += [json.dumps(collector(index)) for index in reversed(range(NUM))]
     return "".join(line + "\n" for line in lines).encode()

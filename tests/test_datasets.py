@@ -81,9 +81,10 @@ def test_queries_are_indexed_like_a_list(path):
     few = queries[5:8]
     assert isinstance(few, datasets.Queries) and len(few) == 3
     np.testing.assert_array_equal(few.goal_position, queries.goal_position[5:8])
-    start, goal = queries[6]
+    start, goal, scene = queries[6]
     np.testing.assert_array_equal(start, few.start[1])
     np.testing.assert_array_equal(goal, few.goal[1])
+    assert scene == few[1].scene == envs.TASKS["wall"].scene
     assert len(list(queries)) == len(queries)
     assert len(queries[np.array([1, 4])]) == 2
 
@@ -103,12 +104,12 @@ def test_made_again_the_file_has_the_same_bytes(made, tmp_path, workers):
 
 def test_a_query_does_not_depend_on_the_others(made):
     queries = load_queries(made)
-    env = envs.make("wall")
+    sampler = make_queries.Sampler("wall", solvable=False)
     for index in (29, 3):
-        start, goal, _ = make_queries.sample_query(env, 0, "test", index)
+        _, start, goal, _, _ = sampler((0, "test", index))
         np.testing.assert_array_equal(queries.start[index], start)
         np.testing.assert_array_equal(queries.goal[index], goal)
-    env.close()
+    sampler.env.close()
 
 
 def test_made_queries_are_feasible_and_not_those_of_a_reset(made):
@@ -321,7 +322,8 @@ def test_simulating_finds_wrong_positions(path):
     with h5py.File(path, "r+") as file:
         file["test/goal_position"][4, 0] += np.float32(0.001)
         attributes = {name: datasets._attribute(file, name) for name in datasets._ATTRIBUTES}
-        arrays = {name: file[name][()] for name in datasets._QUERY_ARRAYS}
+        names = datasets._arrays_of(datasets.QUERY_SCHEMA, file)
+        arrays = {name: file[name][()] for name in names}
         file.attrs["checksum"] = np.bytes_(datasets._checksum(attributes, arrays))
     validate(path)
     with pytest.raises(DatasetError, match=r"test/goal_position\[4\]"):
@@ -481,7 +483,8 @@ def test_packaged_queries(task):
         queries = load_queries(task, split)
         assert len(queries) == {"test": 10_000, "validation": 200}[split]
         chosen = np.random.default_rng(0).choice(len(queries), 20, replace=False)
-        for start, goal in queries[chosen]:
+        for start, goal, scene in queries[chosen]:
+            env.set_scene(scene)
             assert env.is_feasible(start) and env.is_feasible(goal)
         for goal, position in zip(queries.goal[chosen], queries.goal_position[chosen], strict=True):
             for joint, angle in enumerate(goal):

@@ -34,7 +34,7 @@ def made():
     env = envs.make("wall")
     planner, rng = Planner(env), np.random.default_rng(11)
     seeds = [3, 2**32 - 1, 5, 6, 7]
-    plans = [planner.plan(*env.sample_query(rng), seed) for seed in seeds]
+    plans = [planner.plan(*env.sample_query(rng), seed=seed) for seed in seeds]
     executions = [follow(env, plan) for plan in plans]
     planner.close()
     env.close()
@@ -252,7 +252,7 @@ def test_following_the_plan_gives_the_digest(path):
 def test_a_plan_through_an_obstacle_collides(made):
     env = envs.make("wall")
     outcomes = []
-    for start, goal in load_queries("wall")[4:8]:  # straight through the wall
+    for start, goal, _ in load_queries("wall")[4:8]:  # straight through the wall
         execution = follow(env, np.stack([start, goal]))
         assert execution.collided
         outcomes.append(execution.reached)
@@ -275,7 +275,7 @@ def the_same_query_twice(arguments):
 
 def a_query_of(split):
     def change(arguments):
-        start, goal = load_queries("no_obstacles", split)[17]
+        start, goal, _ = load_queries("no_obstacles", split)[17]
         arguments["plans"][1][0], arguments["plans"][1][-1] = start, goal
 
     return change

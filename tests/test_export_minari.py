@@ -15,7 +15,9 @@ import minari  # noqa: E402
 import envs  # noqa: E402
 from demo_generation import collect, export_minari  # noqa: E402
 from envs import panda  # noqa: E402
-from envs.datasets import load_demos  # noqa: E402
+from envs.datasets import Scenes, load_demos, write_demos  # noqa: E402
+from envs.scene_files import save_scene  # noqa: E402
+from envs.scenes import to_array  # noqa: E402
 
 OPTIONS = {
     "task": "wall",
@@ -161,6 +163,28 @@ def test_exact_export_refuses_other_executions(demos, storage):
     demos.digest[2] += 1
     with pytest.raises(ValueError, match="verify FILE --mend"):
         export_minari.export(demos, exact=True, progress=False)
+    assert list(storage.iterdir()) == []
+
+
+def test_scenes_that_vary_are_refused(demos, storage):
+    scene = envs.TASKS["wall"].scene
+    index, offsets = np.zeros(len(demos), int), np.array([0, len(scene.obstacles)])
+    varied = Scenes(scene, index, offsets, to_array(scene.obstacles))
+    with pytest.raises(ValueError, match="^the scenes of wall vary, and a Minari episode"):
+        export_minari.export(dataclasses.replace(demos, scenes=varied))
+    assert list(storage.iterdir()) == []
+
+
+def test_a_scene_file_has_no_environment_to_recover(demos, storage, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("own")
+    save_scene(envs.TASKS["wall"].scene, folder / "mine.yaml")
+    columns = {name: getattr(demos, name) for name in ("plan_seed", "digest", "collided")}
+    plans, states = zip(*((demo.plan, demo.states) for demo in demos), strict=True)
+    file = folder / "mine_demos.h5"
+    write_demos(file, str(folder / "mine.yaml"), 5, plans, states, columns, "a test", {})
+    for source in ({"file": file}, {"task": str(folder / "mine.yaml")}):
+        with pytest.raises(SystemExit, match="^error: these .* for 'mine', which is none of"):
+            export_minari.main(export_minari.Args(**source))
     assert list(storage.iterdir()) == []
 
 

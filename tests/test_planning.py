@@ -61,8 +61,8 @@ def test_paths_join_the_query_exactly_and_touch_nothing(worlds):
     env, queries = worlds["double_walls"], load_queries("double_walls")
     planner = Planner(env)
     bent = 0
-    for seed, (start, goal) in enumerate(queries[:12], 1):
-        path = planner.plan(start, goal, seed)
+    for seed, (start, goal, _) in enumerate(queries[:12], 1):
+        path = planner.plan(start, goal, seed=seed)
         assert is_path_of(path, start, goal)
         assert ((path >= panda.LOWER) & (path <= panda.UPPER)).all()
         assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
@@ -75,18 +75,18 @@ def test_a_query_at_the_limits_gets_a_path(worlds):
     start, goal = READY.copy(), READY.copy()
     start[[0, 6]] = panda.UPPER[0], panda.LOWER[6]
     goal[[0, 3, 6]] = panda.LOWER[0], panda.UPPER[3], panda.UPPER[6]
-    assert is_path_of(Planner(worlds["no_obstacles"]).plan(start, goal, 1), start, goal)
+    assert is_path_of(Planner(worlds["no_obstacles"]).plan(start, goal, seed=1), start, goal)
 
 
 def test_a_query_that_goes_nowhere_gets_a_path(worlds):
-    assert is_path_of(Planner(worlds["no_obstacles"]).plan(READY, READY, 1), READY, READY)
+    assert is_path_of(Planner(worlds["no_obstacles"]).plan(READY, READY, seed=1), READY, READY)
 
 
 def test_simplifying_shortens(worlds):
-    start, goal = load_queries("double_walls")[0]
+    start, goal, _ = load_queries("double_walls")[0]
     simple, raw = (
         [
-            length(Planner(worlds["double_walls"], simplify=simplify).plan(start, goal, seed))
+            length(Planner(worlds["double_walls"], simplify=simplify).plan(start, goal, seed=seed))
             for seed in range(1, 9)
         ]
         for simplify in (True, False)
@@ -95,12 +95,12 @@ def test_simplifying_shortens(worlds):
 
 
 def test_a_new_scene_is_planned_in(worlds):
-    env, (start, goal) = envs.make("no_obstacles"), load_queries("wall")[4]
+    env, (start, goal, _) = envs.make("no_obstacles"), load_queries("wall")[4]
     planner = Planner(env)
     assert any(worlds["wall"].in_collision(c) for c in interpolate(np.stack([start, goal]), 0.01))
-    planner.plan(start, goal, 1)
+    planner.plan(start, goal, seed=1)
     env.set_scene(worlds["wall"].scene)
-    path = planner.plan(start, goal, 1)
+    path = planner.plan(start, goal, seed=1)
     assert not any(worlds["wall"].in_collision(c) for c in interpolate(path, 0.01))
     env.close()
 
@@ -111,18 +111,18 @@ def test_a_new_scene_is_planned_in(worlds):
 def test_same_seed_same_path_whatever_was_planned_before(worlds):
     planner = Planner(worlds["double_walls"])
     queries = load_queries("double_walls")
-    first = planner.plan(*queries[0], 7)
+    first = planner.plan(*queries[0], seed=7)
     checks = planner.checks
-    others = [planner.plan(*queries[i], 7 + i) for i in (3, 1)]
-    again = planner.plan(*queries[0], 7)
+    others = [planner.plan(*queries[i], seed=7 + i) for i in (3, 1)]
+    again = planner.plan(*queries[0], seed=7)
     assert again.tobytes() == first.tobytes() and planner.checks == checks
     fresh = Planner(worlds["double_walls"])
-    assert fresh.plan(*queries[1], 8).tobytes() == others[1].tobytes()
+    assert fresh.plan(*queries[1], seed=8).tobytes() == others[1].tobytes()
 
 
 def test_other_seeds_other_paths(worlds):
-    planner, (start, goal) = Planner(worlds["double_walls"]), load_queries("double_walls")[0]
-    assert len({planner.plan(start, goal, seed).tobytes() for seed in range(1, 6)}) == 5
+    planner, (start, goal, _) = Planner(worlds["double_walls"]), load_queries("double_walls")[0]
+    assert len({planner.plan(start, goal, seed=seed).tobytes() for seed in range(1, 6)}) == 5
 
 
 SEARCHES = """
@@ -134,9 +134,9 @@ SEARCHES = """
     env, queries = envs.make("wall"), load_queries("wall")
     for name in sys.argv[2:]:
         for seed in range(int(sys.argv[1])):
-            Planner(env, "RRT").plan(*queries[8], 50 + seed)
+            Planner(env, "RRT").plan(*queries[8], seed=50 + seed)
         planner = Planner(env, name, max_checks=8000, simplify=False)
-        path = planner.plan(*queries[0], 5)
+        path = planner.plan(*queries[0], seed=5)
         print("search:", name, planner.checks, zlib.crc32(path.tobytes()))
 """
 
@@ -162,10 +162,10 @@ def test_same_seed_same_search_in_another_process():
 @pytest.mark.parametrize("name", PLANNERS)
 def test_every_planner_solves_an_easy_query(worlds, name):
     env = worlds["no_obstacles"]
-    start, goal = load_queries("no_obstacles")[0]
+    start, goal, _ = load_queries("no_obstacles")[0]
     # FMT and BFMT first connect a thousand samples; the "stars" use all they are given.
     planner = Planner(env, name, max_checks=100_000 if "FMT" in name else 3000)
-    path = planner.plan(start, goal, 1)
+    path = planner.plan(start, goal, seed=1)
     assert is_path_of(path, start, goal)
     assert not any(env.in_collision(point) for point in interpolate(path, 0.02))
     assert length(path) < 1.2 * length(np.stack([start, goal]))  # simplified
@@ -186,7 +186,7 @@ def test_a_planner_of_your_own(worlds, simplify):
         return [start, top, goal]
 
     planner = Planner(env, over_the_top, simplify=simplify)
-    path = planner.plan(READY, TURNED, 3)
+    path = planner.plan(READY, TURNED, seed=3)
     assert is_path_of(path, READY, TURNED)
     assert asked == [True, False, np.random.default_rng(3).integers(2**40)]
     if simplify:
@@ -203,11 +203,11 @@ def test_your_own_planners_limits(worlds):
 
     planner = Planner(worlds["no_obstacles"], never, max_checks=123)
     with pytest.raises(PlanningError, match="no path in 123 collision checks.*123 checks, 10.0 s"):
-        planner.plan(READY, READY, 1)
+        planner.plan(READY, READY, seed=1)
     assert planner.checks == 123
     planner = Planner(worlds["no_obstacles"], never, time_limit=0.05, max_checks=10**9)
     with pytest.raises(PlanningError, match="0.05 s"):
-        planner.plan(READY, READY, 1)
+        planner.plan(READY, READY, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -226,25 +226,25 @@ def test_your_own_planners_limits(worlds):
     ],
 )
 def test_what_your_own_planner_returns_is_checked(worlds, answer, complaint):
-    start, goal = load_queries("no_obstacles")[0]
+    start, goal, _ = load_queries("no_obstacles")[0]
     planner = Planner(worlds["no_obstacles"], lambda is_valid, *query: answer(*query[:2]))
     with pytest.raises(ValueError, match=complaint):
-        planner.plan(start, goal, 1)
+        planner.plan(start, goal, seed=1)
 
 
 def test_your_own_planner_may_round(worlds):
     def rounded(is_valid, start, goal, rng):
         return np.stack([start, goal]).round(6)
 
-    start, goal = load_queries("no_obstacles")[0]
+    start, goal, _ = load_queries("no_obstacles")[0]
     for simplify in (True, False):
-        path = Planner(worlds["no_obstacles"], rounded, simplify=simplify).plan(start, goal, 1)
+        path = Planner(worlds["no_obstacles"], rounded, simplify=simplify).plan(start, goal, seed=1)
         assert is_path_of(path, start, goal)
 
 
 def test_your_own_planner_may_find_nothing(worlds):
     with pytest.raises(PlanningError, match="no path in 0 collision checks"):
-        Planner(worlds["no_obstacles"], lambda *_: None).plan(READY, READY, 1)
+        Planner(worlds["no_obstacles"], lambda *_: None).plan(READY, READY, seed=1)
 
 
 # --- Clearance
@@ -276,7 +276,7 @@ def box_queries(env, number, low, high):
     The straight line between them touches it.
     """
     chosen = []
-    for start, goal in load_queries("wall")[:400]:
+    for start, goal, _ in load_queries("wall")[:400]:
         ends = min(distance(env, end) for end in (start, goal))
         if low < ends < high and nearest(env, np.stack([start, goal])) < 0:
             chosen.append((start, goal))
@@ -290,8 +290,8 @@ def test_paths_keep_the_clearance(box):
     kept, touched = Planner(box, clearance=0.03), Planner(box, clearance=0.0)
     close = []
     for seed, (start, goal) in enumerate(box_queries(box, 6, 0.056, 0.21), 1):
-        assert nearest(box, kept.plan(start, goal, seed)) > 0.029
-        close.append(nearest(box, touched.plan(start, goal, seed)))
+        assert nearest(box, kept.plan(start, goal, seed=seed)) > 0.029
+        close.append(nearest(box, touched.plan(start, goal, seed=seed)))
     assert np.median(close) < 0.02  # and without, they do not keep it
 
 
@@ -300,7 +300,9 @@ def test_less_caution_less_clearance(box):
     (query,) = box_queries(box, 1, 0.11, 0.21)
     means = []
     for caution in (1.0, 0.5, 0.0):
-        kept = [nearest(box, planner.plan(*query, seed, caution)) for seed in range(1, 6)]
+        kept = [
+            nearest(box, planner.plan(*query, seed=seed, caution=caution)) for seed in range(1, 6)
+        ]
         assert min(kept) > 0.06 * caution - 0.001
         means.append(np.mean(kept))
     assert means[0] > means[1] > means[2]
@@ -313,7 +315,7 @@ def test_a_query_that_nearly_touches_is_planned(worlds):
         start = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
         if not env.in_collision(start) and clearance_at(env, start) < 0.001:
             goal = env.sample_feasible(rng)
-            path = Planner(env).plan(start, goal, 1)
+            path = Planner(env).plan(start, goal, seed=1)
             assert is_path_of(path, start, goal)
             assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
             planned += 1
@@ -321,7 +323,7 @@ def test_a_query_that_nearly_touches_is_planned(worlds):
 
 def test_a_query_nearer_than_the_clearance_is_planned_anyway(box):
     for start, goal in box_queries(box, 2, 0.004, 0.028):
-        path = Planner(box, clearance=0.03).plan(start, goal, 1)
+        path = Planner(box, clearance=0.03).plan(start, goal, seed=1)
         assert is_path_of(path, start, goal)
         assert nearest(box, path) > 0
 
@@ -367,24 +369,24 @@ def test_wrong_arguments_are_refused(worlds, arguments, complaint):
 )
 def test_bad_queries_are_refused(worlds, start, goal, complaint):
     with pytest.raises(ValueError, match=complaint):
-        Planner(worlds["wall"]).plan(start, goal, 1)
+        Planner(worlds["wall"]).plan(start, goal, seed=1)
 
 
 @pytest.mark.parametrize("seed", [0, -1])
 def test_seeds_that_ompl_would_ignore_are_refused(worlds, seed):
     with pytest.raises(ValueError, match="seed"):
-        Planner(worlds["no_obstacles"]).plan(READY, READY, seed)
+        Planner(worlds["no_obstacles"]).plan(READY, READY, seed=seed)
 
 
 def test_a_search_ends_at_its_limits(worlds):
-    start, goal = load_queries("double_walls")[0]
+    start, goal, _ = load_queries("double_walls")[0]
     planner = Planner(worlds["double_walls"], max_checks=50, time_limit=9.0)
     with pytest.raises(PlanningError, match=r"limits: 50 checks, 9.0 s\)"):
-        planner.plan(start, goal, 1)
+        planner.plan(start, goal, seed=1)
     assert 50 <= planner.checks < 200
     planner = Planner(worlds["double_walls"], max_checks=4000, time_limit=1e-6)
     with pytest.raises(PlanningError, match=r"limits: 4000 checks, 1e-06 s\)"):
-        planner.plan(start, goal, 1)
+        planner.plan(start, goal, seed=1)
 
 
 # --- Memory
@@ -393,8 +395,8 @@ def test_a_search_ends_at_its_limits(worlds):
 def test_planning_does_not_grow(worlds):
     planner, queries = Planner(worlds["no_obstacles"]), load_queries("no_obstacles")
     for seed in range(1, 51):
-        planner.plan(*queries[seed], seed)
+        planner.plan(*queries[seed], seed=seed)
     before = psutil.Process().memory_info().rss
     for seed in range(51, 351):
-        planner.plan(*queries[seed], seed)
+        planner.plan(*queries[seed], seed=seed)
     assert psutil.Process().memory_info().rss - before < 20e6

@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import envs
 from demo_generation import collect
 from envs import panda
-from envs.datasets import Demos, demo_path, load_demos
+from envs.datasets import Demos, Scenes, demo_path, load_demos
 from envs.programs import load_program
 
 SCRIPT = Path(__file__).parents[1] / "clean_rl_scripts" / "sac_her_mp.py"
@@ -214,6 +214,7 @@ def hand_made_demos(number=3, steps=12, task="no_obstacles"):
         seed=0,
         start=ends[:, 0],
         goal=ends[:, 1],
+        scenes=Scenes(envs.TASKS[task].scene),
         states=states.reshape(-1, 7).astype(np.float32),
         actions=actions.reshape(-1, 7).astype(np.float32),
         offsets=np.arange(number + 1) * (steps + 1),
@@ -436,7 +437,7 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path):
         (["--demo-prob", "1", "--demos", "nowhere.h5"], "nowhere.h5: no such file"),
         (
             ["--demo-prob", "1", "--demos", str(demo_path("wall"))],
-            "demonstrations of 'wall', not 'no_obstacles'",
+            "this file is for the task 'wall', not 'no_obstacles'",
         ),
         (["--demos", "some.h5"], "--demos goes with --demo-prob"),
     ],
