@@ -3,9 +3,26 @@
     python clean_rl_scripts/evaluate.py --policy go-to-goal --task double_walls --workers 2
     python clean_rl_scripts/evaluate.py --policy runs/my_run --task wall --json result.json
 
-An episode is one query under the task's standard rules (goal tolerances and horizon of
-`RoboArmEnv`'s defaults). The same arguments give the same numbers, times excepted, whatever the
-number of workers.
+An episode is one query, in the query's scene, under the task's standard rules (goal tolerances and
+horizon of `RoboArmEnv`'s defaults). The same arguments give the same numbers, times excepted,
+whatever the number of workers.
+
+Policies to compare a trained one with:
+
+- go-to-goal: straight to the goal configuration, whatever is in the way;
+- random: a random action at every step;
+- via-points: looks before it moves. It goes straight to the goal configuration if that motion is
+  free of collisions, or else by way of the first of `--tries` random configurations for which the
+  motion is free; if there is none it goes straight all the same;
+- planner: plans before it moves, with OMPL's RRT-Connect, and follows the plan. It may search for
+  `--time-limit` seconds per query: half of them for a plan that keeps away from obstacles; if it
+  finds none, a quarter for one that keeps half as far away, and the rest for a quarter as far. (A
+  plan is then shortened, which takes up to a tenth of a second more.) Without a plan it gives up: a
+  failure of 0 steps. As the limit is wall-clock time, the numbers may depend on the machine, and on
+  what else it is doing.
+
+The last two check collisions in the simulator's own world, which a trained policy does not see.
+What comes out:
 
 - success: share of episodes that reached the goal, with a 95% Wilson interval;
 - clean success: share that reached it and never touched anything on the way;
@@ -13,13 +30,21 @@ number of workers.
 - steps, path length, smoothness: means over the successful episodes. With configurations
   c_0 ... c_T in rad, the path length is the sum of |c_t+1 - c_t|, in rad, and the smoothness the
   mean of |c_t+1 - 2 c_t + c_t-1|, in rad per step^2 (L2 norms; lower is smoother);
-- time per action: of the policy alone, without the simulator.
+- time per action: of the policy alone, without the simulator and without planning.
+
+Of `via-points` and `planner` also:
+
+- planning time: what they spent before moving, in s: mean over all queries, and over those for
+  which they found something;
+- free motion (only `via-points`): share of queries for which it found a motion free of collisions.
 
 From Python: `evaluate(policy, task, ...)` returns the same numbers as a dict.
 """
 
 import io
+import itertools
 import json
+import math
 import multiprocessing
 import os
 import platform
@@ -27,7 +52,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -35,6 +60,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+import pybullet as p
 import torch
 import tyro
 from PIL import Image
@@ -42,12 +68,22 @@ from tqdm import tqdm
 
 import envs
 from envs import panda
-from envs.datasets import load_queries
+from envs.datasets import Query, Scenes, load_queries, subgoals, validate
 from envs.programs import ProgramError, load_program
+from envs.scenes import Scene
+from envs.tasks import get_task, task_name
 
 # What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
 # they decide what a success is.
 ENV_ARGUMENTS = ("action_mode", "max_step", "velocities")
+LOOKING = ("via-points", "planner")  # policies that look for a motion before they move
+NAMED = ("go-to-goal", "random", *LOOKING)
+# `via-points` checks a motion at points this far apart in the normalised space, as the planner
+# does; it is less than one step of the arm. It keeps no margin, which would reject more than it
+# saves: with 3 mm, clean success was 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
+RESOLUTION = 0.021
+# The planner's attempts: share of the remaining time, and of its usual distance from obstacles.
+ATTEMPTS = ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25))
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
 
@@ -55,14 +91,14 @@ FRAMES = 8  # of a picture
 @dataclass
 class Args:
     policy: str
-    """`go-to-goal` (straight to the goal configuration), `random`, a policy program, or a run's
+    """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy program, or a run's
     folder with a `policy.pt` in it"""
     task: str
-    """the task, one of `envs.TASKS`"""
+    """the task, one of `envs.TASKS`, or a scene file (.yaml)"""
     goal_type: Literal["ee", "config", "combined"] | None = None
     """what the goal is; by default what the policy was trained with, or else `ee`"""
-    split: Literal["test", "validation"] = "test"
-    """which of the task's queries"""
+    split: Literal["test", "validation", "original"] = "test"
+    """which of the task's queries; few tasks have `original` ones"""
     queries: Path | None = None
     """a query file to use instead of the task's own"""
     num_queries: int | None = None
@@ -72,7 +108,11 @@ class Args:
     stop_on_collision: bool = False
     """end an episode at the first touch"""
     seed: int = 0
-    """of the `random` policy"""
+    """of `random`, `via-points` and `planner`"""
+    tries: int = 16
+    """random configurations that `via-points` tries per query"""
+    time_limit: float = 5.0
+    """seconds that `planner` may search per query"""
     json: Path | None = None
     """write the results to this file too"""
     picture: Path | None = None
@@ -84,7 +124,10 @@ class EvaluationError(ValueError):
 
 
 class Outcome(NamedTuple):
-    """What came out of one episode; lengths are NaN where the goal was not reached."""
+    """What came out of one episode; lengths are NaN where the goal was not reached.
+
+    `found`: whether a motion was found before moving; None if the policy did not look for one.
+    """
 
     success: bool
     collision: bool
@@ -92,6 +135,8 @@ class Outcome(NamedTuple):
     path_length: float
     smoothness: float
     policy_seconds: float
+    planning_seconds: float
+    found: bool | None
 
 
 # --- Metrics
@@ -122,22 +167,34 @@ def smoothness(configurations):
     return float(np.linalg.norm(np.diff(configurations, n=2, axis=0), axis=1).mean())
 
 
-# --- Policies: at the start of an episode, (query's number, goal configuration) -> act, and then
-# act(observation) -> action (7,)
+# --- Policies: at the start of an episode, (query's number, `Query`) -> `_Decision`
 
 
-def _make_policy(policy, seed):
-    if policy == "go-to-goal":
-        return _go_to_goal
-    if policy == "random":
-        return lambda index, goal: _random(np.random.default_rng([seed, index]))
-    if isinstance(policy, Path):
-        act = _run_program(load_program(policy))
-        return lambda index, goal: act
-    return lambda index, goal: policy
+class _Decision(NamedTuple):
+    """What a policy will do in an episode.
+
+    act: act(observation) -> action (7,); None: it gives up.
+    found: whether it found a motion; None if it did not look for one. Looking moves the arm.
+    """
+
+    act: Callable | None
+    found: bool | None = None
 
 
-def _go_to_goal(index, goal):
+def _make_policy(job, env):
+    if job.policy == "go-to-goal":
+        return lambda index, query: _Decision(_go_to_goal(query.goal))
+    if job.policy == "random":
+        return lambda index, query: _Decision(_random(np.random.default_rng([job.seed, index])))
+    if job.policy == "via-points":
+        return _via_points(env, job.seed, job.tries)
+    if job.policy == "planner":
+        return _planner(env, job.seed, job.time_limit)
+    act = _run_program(load_program(job.policy)) if isinstance(job.policy, Path) else job.policy
+    return lambda index, query: _Decision(act)
+
+
+def _go_to_goal(goal):
     target = panda.normalise(goal)
     return lambda observation: target - observation["observation"][:7]
 
@@ -156,6 +213,84 @@ def _run_program(program):
     return act
 
 
+def _via_points(env, seed, tries):
+    """`via-points`, as described at the top of this file."""
+
+    def policy(index, query):
+        start, goal = panda.normalise(query.start), panda.normalise(query.goal)
+        if _is_free(env, np.stack([start, goal])):
+            return _Decision(_go_to_goal(query.goal), found=True)
+        for via in np.random.default_rng([seed, index]).uniform(-1.0, 1.0, (tries, 7)):
+            waypoints = np.stack([start, via, goal])
+            if _is_free(env, waypoints):
+                return _Decision(_follow(panda.denormalise(waypoints)), found=True)
+        return _Decision(_go_to_goal(query.goal), found=False)
+
+    return policy
+
+
+def _is_free(env, waypoints):
+    """Whether a motion through waypoints (n, 7), normalised, is free of collisions. Moves the arm.
+
+    It is checked from coarse to fine, because most motions that are not free are found out early
+    then: first at the waypoints, without the query's own, then between them at multiples of
+    ..., 4, 2, 1 times the resolution.
+    """
+    points, steps = [waypoints[1:-1]], [np.full(len(waypoints) - 2, np.inf)]
+    for here, there in zip(waypoints[:-1], waypoints[1:], strict=True):
+        count = max(1, math.ceil(math.dist(here, there) / RESOLUTION))
+        step = np.arange(1, count)
+        points.append(here + (there - here) * (step / count)[:, None])
+        steps.append(step & -step)  # the largest power of two that divides it
+    order = np.argsort(-np.concatenate(steps), kind="stable")
+    configurations = panda.denormalise(np.concatenate(points)[order])
+    return not any(_touches(env, configuration) for configuration in configurations)
+
+
+def _touches(env, configuration):
+    """`env.in_collision`, in half the time: an old contact point may survive within millimetres."""
+    panda.set_configuration(env.client, env.robot, configuration)
+    p.performCollisionDetection(physicsClientId=env.client)
+    contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
+    return any(contact[8] < 0.0 for contact in contacts)
+
+
+def _planner(env, seed, time_limit):
+    """`planner`, as described at the top of this file."""
+    planning = _import_planning()
+    planner = planning.Planner(env, max_checks=math.inf)
+
+    def policy(index, query):
+        rng = np.random.default_rng([seed, index])
+        deadline = time.monotonic() + time_limit
+        for share, caution in ATTEMPTS:
+            planner.time_limit = share * (deadline - time.monotonic())
+            plan_seed = int(rng.integers(1, 2**32))
+            try:
+                path = planner.plan(*query, seed=plan_seed, caution=caution)
+            except planning.PlanningError:
+                continue
+            return _Decision(_follow(path), found=True)
+        return _Decision(None, found=False)
+
+    return policy
+
+
+def _import_planning():
+    try:  # only here, so that nothing else needs OMPL
+        from demo_generation import planning
+    except ImportError as error:
+        raise EvaluationError(f"the policy planner needs OMPL, and {error}") from error
+    return planning
+
+
+def _follow(path):
+    """One sub-goal per step along a path (n, 7), rad, and then the goal again and again."""
+    targets = subgoals(path)[1:]
+    left = itertools.chain(targets, itertools.repeat(targets[-1]))
+    return lambda observation: next(left) - observation["observation"][:7]
+
+
 # --- Episodes
 
 
@@ -167,20 +302,32 @@ class _Job:
     task: str
     env: dict
     seed: int
+    tries: int
+    time_limit: float
     start: np.ndarray
     goal: np.ndarray
+    scenes: Sequence[Scene]
     split: str | None
     workers: int
 
     def make(self, **kwargs):
-        return envs.make(self.task, **self.env, **kwargs), _make_policy(self.policy, self.seed)
+        env = envs.make(self.task, **self.env, **kwargs)
+        return env, _make_policy(self, env)
+
+    def query(self, index):
+        return Query(self.start[index], self.goal[index], self.scenes[index])
 
 
-def _run_episode(env, act, start, goal, on_step=None):
+def _run_episode(env, policy, index, query, on_step=None):
     """One episode's `Outcome`. `on_step(action)` is called after every step."""
-    observation, info = env.reset_specific(start, goal)
+    observation, info = env.reset_specific(*query)
+    began = time.perf_counter()
+    act, found = policy(index, query)
+    planning_seconds = time.perf_counter() - began
+    if found is not None:  # the policy has moved the arm
+        observation, info = env.reset_specific(*query)
     states = [observation["observation"][:7]]
-    seconds, ended = 0.0, info["is_success"]
+    seconds, ended = 0.0, info["is_success"] or act is None
     while not ended:
         began = time.perf_counter()
         action = act(observation)
@@ -194,16 +341,22 @@ def _run_episode(env, act, start, goal, on_step=None):
     if info["is_success"]:
         configurations = panda.denormalise(states)
         lengths = [path_length(configurations), smoothness(configurations)]
-    steps = len(states) - 1
-    return Outcome(info["is_success"], info["collision_so_far"], steps, *lengths, seconds)
+    return Outcome(
+        info["is_success"],
+        info["collision_so_far"],
+        len(states) - 1,
+        *lengths,
+        seconds,
+        planning_seconds,
+        found,
+    )
 
 
 def _run_queries(job, env, policy, indices):
     outcomes = []
     for index in indices:
-        start, goal = job.start[index], job.goal[index]
         try:
-            outcomes.append(_run_episode(env, policy(index, goal), start, goal))
+            outcomes.append(_run_episode(env, policy, index, job.query(index)))
         except ValueError as error:  # the query or the action was refused
             raise EvaluationError(f"query {index}: {error}") from error
     return outcomes
@@ -276,6 +429,8 @@ def evaluate(
     num_queries=None,
     stop_on_collision=False,
     seed=0,
+    tries=16,
+    time_limit=5.0,
     workers=1,
     env=None,
     progress=False,
@@ -283,17 +438,21 @@ def evaluate(
     """Run a policy on a task's queries.
 
     Args:
-        policy: `go-to-goal`, `random`, the path of a policy program or of a folder with a
-            `policy.pt`, or a function from an observation (dict of `RoboArmEnv`) to an action
-            (7,); with several workers, one that can be pickled.
-        task: name of the task.
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy program or of
+            a folder with a `policy.pt`, or a function from an observation (dict of `RoboArmEnv`) to
+            an action (7,); with several workers, one that can be pickled.
+        task: name of the task, or path of a scene file.
         goal_type: `ee`, `config`, `combined`; None for the policy's own, or else `ee`.
         queries: what to use instead of the task's own queries: the path of a query file, or an
-            object with `start` and `goal`, float32 (n, 7), rad, like `envs.datasets.Queries`.
-        split: `test` or `validation`; which queries of the file.
+            object with `start` and `goal`, float32 (n, 7), rad, and `scenes`, a sequence of n
+            `Scene`s, like `envs.datasets.Queries`. Without `scenes` they are in the task's scene,
+            which must then not be random.
+        split: `test`, `validation` or `original`; which queries of the file.
         num_queries: only the first so many of them.
         stop_on_collision: end an episode at the first touch.
-        seed: of the `random` policy; each query has its own generator.
+        seed: of `random`, `via-points` and `planner`; each query has its own generator.
+        tries: random configurations that `via-points` tries per query, >= 1.
+        time_limit: seconds that `planner` may search per query, > 0.
         workers: processes. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
         env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
@@ -302,33 +461,63 @@ def evaluate(
 
     Returns:
         A dict that fits into JSON; what it holds is described at the top of this file. Means over
-        no successful episode are None.
+        nothing (no successful episode, say) are None, and so is what a policy has not.
 
     Raises:
         EvaluationError: the policy, the task or the queries cannot be used.
     """
     job = _prepare(
-        policy, task, goal_type, queries, split, num_queries, stop_on_collision, seed, workers, env
+        policy,
+        task,
+        goal_type,
+        queries,
+        split,
+        num_queries,
+        stop_on_collision,
+        seed,
+        tries,
+        time_limit,
+        workers,
+        env,
     )
     return _summary(job, _run(job, progress))
 
 
 def _prepare(
-    policy, task, goal_type, queries, split, num_queries, stop_on_collision, seed, workers, env
+    policy,
+    task,
+    goal_type,
+    queries,
+    split,
+    num_queries,
+    stop_on_collision,
+    seed,
+    tries,
+    time_limit,
+    workers,
+    env,
 ):
     """The `_Job` of `evaluate`'s arguments, once everything about them has been checked."""
-    if task not in envs.TASKS:
-        raise EvaluationError(f"unknown task {task!r}: one of {', '.join(envs.TASKS)}")
+    try:
+        scene = get_task(task).scene
+    except ValueError as error:
+        raise EvaluationError(str(error)) from error
     if workers < 1:
         raise EvaluationError(f"workers must be at least 1, got {workers}")
+    if tries < 1:
+        raise EvaluationError(f"tries must be at least 1, got {tries}")
+    if not 0 < time_limit < math.inf:
+        raise EvaluationError(f"time_limit must be a positive number of seconds, got {time_limit}")
     env, program = dict(env or {}), None
-    if not callable(policy) and policy not in ("go-to-goal", "random"):
+    if policy == "planner":
+        _import_planning()
+    if not callable(policy) and policy not in NAMED:
         policy = Path(policy)
         if policy.is_dir():
             policy = policy / "policy.pt"
         if not policy.exists():
             raise EvaluationError(
-                f"no such policy: {policy} (expected go-to-goal, random, a policy program or a "
+                f"no such policy: {policy} (expected {', '.join(NAMED)}, a policy program or a "
                 f"folder with a policy.pt in it)"
             )
         program, trained = _load_policy(policy)
@@ -342,22 +531,42 @@ def _prepare(
     env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
 
     try:
-        if queries is None or isinstance(queries, (str, Path)):
-            queries = load_queries(queries or task, split)
+        if queries is None:
+            queries = load_queries(task, split)
+        elif isinstance(queries, (str, Path)):
+            validate(queries, task)  # they are for this task, with the scene it has now
+            queries = load_queries(queries, split)
         arm = envs.make(task, **env)
         arm.close()
         if program is not None:
             _try(program, policy, arm.observation_space)
     except (TypeError, ValueError) as error:
         raise EvaluationError(str(error)) from error
-    if getattr(queries, "task", task) != task:
-        raise EvaluationError(f"these queries are for the task {queries.task!r}, not {task!r}")
+    name = task_name(task)
+    if getattr(queries, "task", name) != name:
+        raise EvaluationError(f"these queries are for the task {queries.task!r}, not {name!r}")
+    scenes = getattr(queries, "scenes", None)
+    if scenes is None:
+        if not isinstance(scene, Scene):
+            raise EvaluationError(f"{name} has random scenes: these queries need `scenes` as well")
+        scenes = Scenes(scene)
     available = len(queries.start)
     count = available if num_queries is None else num_queries
     if not 1 <= count <= available:
         raise EvaluationError(f"num_queries must be 1 to {available}, got {num_queries}")
-    start, goal = queries.start[:count], queries.goal[:count]
-    return _Job(policy, task, env, seed, start, goal, getattr(queries, "split", None), workers)
+    return _Job(
+        policy,
+        str(task),
+        env,
+        seed,
+        tries,
+        time_limit,
+        queries.start[:count],
+        queries.goal[:count],
+        scenes,
+        getattr(queries, "split", None),
+        workers,
+    )
 
 
 def _load_policy(path):
@@ -396,9 +605,18 @@ def _summary(job, outcomes):
         low, high = wilson_interval(int(hits.sum()), count)
         return {name: float(hits.mean()), f"{name}_interval": [low, high]}
 
-    def mean(values):
-        return float(values[reached].mean()) if reached.any() else None
+    def mean(values, which=reached):
+        return float(values[which].mean()) if which.any() else None
 
+    planning = {"planning_seconds": None, "planning_seconds_solved": None, "free_motion_rate": None}
+    if job.policy in LOOKING:
+        found = columns.found.astype(bool)
+        planning["planning_seconds"] = float(columns.planning_seconds.mean())
+        planning["planning_seconds_solved"] = mean(columns.planning_seconds, found)
+        if job.policy == "via-points":
+            planning["free_motion_rate"] = float(found.mean())
+
+    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy == "planner")
     return {
         "policy": getattr(job.policy, "__name__", str(job.policy)),
         "task": job.task,
@@ -412,11 +630,14 @@ def _summary(job, outcomes):
         "path_length": mean(columns.path_length),
         "smoothness": mean(columns.smoothness),
         "ms_per_action": 1e3 * float(columns.policy_seconds.sum()) / actions if actions else None,
+        **planning,
         "env": job.env,
-        "seed": job.seed if job.policy == "random" else None,
+        "seed": job.seed if job.policy in ("random", *LOOKING) else None,
+        "tries": job.tries if job.policy == "via-points" else None,
+        "time_limit": job.time_limit if job.policy == "planner" else None,
         "versions": {
             "python": platform.python_version(),
-            **{name: version(name) for name in ("pybullet", "torch", "numpy")},
+            **{name: version(name) for name in packages},
         },
     }
 
@@ -438,6 +659,14 @@ def _table(result):
             ("collision", "collision_rate"),
         )
     ]
+    planning = []
+    if result["planning_seconds"] is not None:
+        planning = [
+            row("planning time", result["planning_seconds"], "s"),
+            row("  ... if found", result["planning_seconds_solved"], "s"),
+        ]
+    if result["free_motion_rate"] is not None:
+        planning.append(row("free motion", result["free_motion_rate"]))
     return "\n".join(
         [
             f"{result['policy']} on {result['task']}: {result['num_queries']} {result['split']} "
@@ -447,6 +676,7 @@ def _table(result):
             row("path length", result["path_length"], "rad"),
             row("smoothness", result["smoothness"], "rad/step^2"),
             row("time per action", result["ms_per_action"], "ms"),
+            *planning,
         ]
     )
 
@@ -454,8 +684,8 @@ def _table(result):
 def _draw(job):
     """A PNG file's bytes: the first query's episode in `FRAMES` pictures, side by side."""
     env, policy = job.make(render_mode="rgb_array")
-    query, actions = (job.start[0], job.goal[0]), []
-    _run_episode(env, policy(0, query[1]), *query, on_step=actions.append)
+    query, actions = job.query(0), []
+    _run_episode(env, policy, 0, query, on_step=actions.append)
     # Again, exactly the same, to take the pictures where they are wanted.
     wanted = set(np.linspace(0, len(actions), FRAMES).round().astype(int).tolist())
     env.reset_specific(*query)
@@ -505,6 +735,8 @@ def main(arguments=None):
             args.num_queries,
             args.stop_on_collision,
             args.seed,
+            args.tries,
+            args.time_limit,
             args.workers,
             env=None,
         )

@@ -1,4 +1,4 @@
-"""evaluate.py: its metrics, its baselines, the same numbers however it is run, and its errors."""
+"""evaluate.py: its metrics, its policies, the same numbers however it is run, and its errors."""
 
 import importlib
 import json
@@ -13,10 +13,16 @@ import pytest
 import torch
 from torch import nn
 
+import demo_generation
 import envs
+from demo_generation.following import follow
+from demo_generation.planning import Planner, PlanningError
 from envs import panda
-from envs.datasets import write_queries
+from envs.datasets import load_queries, write_queries
 from envs.programs import save_program
+from envs.scene_files import save_scene
+from envs.scenes import Box, Scene
+from envs.tasks import Task
 
 SCRIPT = Path(__file__).resolve().parents[1] / "clean_rl_scripts" / "evaluate.py"
 sys.path.append(str(SCRIPT.parent))
@@ -65,7 +71,8 @@ def _save(path, module=None, goal_size=7, observation_size=10, **metadata):
 
 def _numbers(result):
     """What must not depend on how an evaluation is run."""
-    return {name: value for name, value in result.items() if name != "ms_per_action"}
+    times = ("ms_per_action", "planning_seconds", "planning_seconds_solved")
+    return {name: value for name, value in result.items() if name not in times}
 
 
 # --- Metrics
@@ -145,14 +152,16 @@ def test_stopping_on_collision_leaves_clean_successes_only(queries):
 def test_workers_do_not_change_the_result(queries):
     alone = evaluate("random", "no_obstacles", queries=queries, num_queries=12, seed=3)
     assert alone["success_rate"] == 0 and alone["mean_steps"] is None
-    alone = evaluate("go-to-goal", "no_obstacles", queries=queries)
-    shared = evaluate("go-to-goal", "no_obstacles", queries=queries, workers=2)
+    options = {"split": "validation", "num_queries": 30, "seed": 5}
+    alone = evaluate("via-points", "wall", **options)
+    shared = evaluate("via-points", "wall", **options, workers=2)
     assert _numbers(alone) == _numbers(shared)
 
 
 def test_random_actions_depend_on_seed_and_query_only():
     def actions(seed, index):
-        act = evaluation._make_policy("random", seed)(index, None)
+        job = SimpleNamespace(policy="random", seed=seed)
+        act, _ = evaluation._make_policy(job, None)(index, None)
         return np.array([act({}) for _ in range(5)])
 
     assert np.array_equal(actions(1, 4), actions(1, 4))
@@ -191,6 +200,182 @@ def test_a_program_brings_its_environment_but_not_the_rules(queries, tmp_path):
     result = evaluate(path, "no_obstacles", queries=queries, num_queries=2)
     assert result["env"] == env | {"stop_on_collision": False}
     assert result["success_rate"] == 0.0
+
+
+# --- Policies that look before they move
+
+# `wall` is the box from x 0.25 to 0.95, z up to 0.775, at y = 0, 0.04 thick. Stretched out to the
+# front, left and right of it: halfway between the two the hand is at (0.57, 0, 0.25), inside it.
+LEFT = np.array([0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8], np.float32)
+RIGHT = np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8], np.float32)
+HIGHER = np.array([0.8, 0.0, 0.0, -1.8, 0.0, 2.3, 0.8], np.float32)
+
+
+def _queries(*pairs, **more):
+    start, goal = (np.array(column) for column in zip(*pairs, strict=True))
+    return SimpleNamespace(start=start, goal=goal, **more)
+
+
+def test_via_points_go_round_the_wall():
+    x, y, z = panda.forward_kinematics((LEFT + RIGHT) / 2)
+    assert 0.25 < x < 0.95 and abs(y) < 0.02 and 0 < z < 0.775
+    behind = _queries((LEFT, RIGHT))
+    straight = evaluate("go-to-goal", "wall", queries=behind)
+    assert straight["clean_success_rate"] == 0 and straight["collision_rate"] == 1
+    assert straight["free_motion_rate"] is None and straight["planning_seconds"] is None
+    result = evaluate("via-points", "wall", queries=behind, tries=200)
+    assert result["clean_success_rate"] == 1 and result["free_motion_rate"] == 1
+    assert result["planning_seconds"] == result["planning_seconds_solved"] > 0
+    assert (result["tries"], result["time_limit"]) == (200, None)
+
+
+def test_via_points_go_straight_where_that_is_free_or_nothing_is_found():
+    both = _queries((LEFT, HIGHER), (LEFT, RIGHT))
+    straight = evaluate("go-to-goal", "wall", queries=both)
+    # The one random configuration of this seed is no way to the second goal.
+    result = evaluate("via-points", "wall", queries=both, tries=1)
+    assert result["free_motion_rate"] == 0.5 and result["clean_success_rate"] == 0.5
+    for name in ("success_rate", "collision_rate", "mean_steps", "path_length"):
+        assert result[name] == straight[name]
+    assert 0 < result["planning_seconds_solved"] != result["planning_seconds"]
+
+
+def test_a_motion_is_checked_everywhere_and_its_waypoints_first(monkeypatch):
+    asked = []
+    monkeypatch.setattr(evaluation, "_touches", lambda env, c: asked.append(panda.normalise(c)))
+    corners = np.array([[0.0] * 7, [0.4] + [0.0] * 6, [0.4, -0.3] + [0.0] * 5])
+    assert evaluation._is_free(None, corners)
+    assert asked[0] == pytest.approx(corners[1])
+    # The first leg is 0.4 long, so in 20 steps of 0.02; next comes the largest power of two.
+    assert asked[1] == pytest.approx([16 * 0.02] + [0.0] * 6)
+    first = sorted(point[0] for point in asked if point[1] == pytest.approx(0.0))
+    assert first == pytest.approx(np.arange(1, 21) * 0.02)
+    second = sorted(point[1] for point in asked if point[1] < -1e-6)
+    assert len(first) + len(second) == len(asked)
+    assert np.diff([-0.3, *second, 0.0]).max() <= 0.021
+    assert evaluation._is_free(None, corners[:1].repeat(2, axis=0))  # nowhere to go
+
+
+def test_the_planner_solves_double_walls_and_follows_its_plan():
+    queries = load_queries("double_walls", "validation")[:4]
+    straight = evaluate("go-to-goal", "double_walls", queries=queries)
+    assert straight["clean_success_rate"] < 0.6
+    options = {"seed": 2, "time_limit": 60.0}  # so long that it does not matter
+    result = evaluate("planner", "double_walls", queries=queries, **options)
+    assert result["clean_success_rate"] == 1
+    assert 0 < result["planning_seconds"] == result["planning_seconds_solved"] < 60
+    assert result["free_motion_rate"] is None and result["time_limit"] == 60.0
+    assert "ompl" in result["versions"] and "ompl" not in straight["versions"]
+
+    env, rows = envs.make("double_walls"), []
+    planner = Planner(env)
+    for index, query in enumerate(queries):
+        seed = int(np.random.default_rng([2, index]).integers(1, 2**32))
+        states = panda.denormalise(follow(env, planner.plan(*query, seed=seed)).states)
+        to_goal = panda.forward_kinematics(states) - panda.forward_kinematics(query.goal)
+        steps = int(np.argmax(np.linalg.norm(to_goal, axis=1) <= env.ee_tolerance))
+        rows.append((steps, evaluation.path_length(states[: steps + 1])))
+    planner.close()
+    env.close()
+    steps, lengths = np.mean(rows, axis=0)
+    assert result["mean_steps"] == steps
+    assert result["path_length"] == pytest.approx(lengths)
+
+
+def test_a_planner_without_time_gives_up():
+    both = _queries((LEFT, RIGHT), (RIGHT, LEFT))
+    result = evaluate("planner", "wall", queries=both, time_limit=1e-6)
+    assert result["success_rate"] == result["collision_rate"] == 0
+    assert result["mean_steps"] is None and result["ms_per_action"] is None
+    assert result["planning_seconds"] > 0 and result["planning_seconds_solved"] is None
+
+
+def test_the_time_of_the_planner_is_shared_by_its_attempts(monkeypatch):
+    now, attempts = [100.0], []
+
+    class Never(Planner):
+        def plan(self, start, goal, scene, *, seed, caution):
+            attempts.append((self.time_limit, caution, seed))
+            now[0] += self.time_limit
+            raise PlanningError("no path")
+
+    monkeypatch.setattr(demo_generation.planning, "Planner", Never)
+    monkeypatch.setattr(evaluation.time, "monotonic", lambda: now[0])
+    evaluate("planner", "wall", queries=_queries((LEFT, RIGHT)), time_limit=8.0)
+    assert [attempt[:2] for attempt in attempts] == [(4.0, 1.0), (2.0, 0.5), (2.0, 0.25)]
+    assert len({seed for *_, seed in attempts}) == 3
+
+
+def test_the_planner_without_ompl(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    monkeypatch.delitem(sys.modules, "demo_generation.planning")
+    monkeypatch.delattr(demo_generation, "planning")
+    queries = _queries((LEFT, HIGHER))
+    with pytest.raises(evaluation.EvaluationError, match="the policy planner needs OMPL"):
+        evaluate("planner", "wall", queries=queries)
+    assert evaluate("via-points", "wall", queries=queries)["success_rate"] == 1
+
+
+# --- Scenes
+
+BLOCKED = Scene((Box((0.6, 0.0, 0.3875), (0.7, 0.04, 0.775)),))
+
+
+def _write_scenes(folder, base, scenes):
+    """A scene file with queries beside it: LEFT to RIGHT in the given scenes, and two others."""
+    task, path = folder / "mine.yaml", folder / "mine_queries.h5"
+    save_scene(base, task)
+    # A little more each, since no two queries may be the same.
+    start = np.array([LEFT + np.float32(1e-6) * i for i in range(len(scenes))])
+    splits = {
+        "test": (start, np.array([RIGHT] * len(scenes)), scenes),
+        "validation": (np.array([RIGHT]), np.array([LEFT])),
+        "original": (np.array([LEFT]), np.array([HIGHER])),
+    }
+    write_queries(path, task, 0, splits, "a test", {})
+    return str(task), path
+
+
+@pytest.mark.parametrize("policy", ["go-to-goal", "via-points", "planner"])
+def test_each_query_is_in_its_own_scene(policy, tmp_path):
+    task, path = _write_scenes(tmp_path, Scene(), [Scene(), BLOCKED, Scene(), BLOCKED])
+    result = evaluate(policy, task, tries=1, time_limit=60.0)
+    assert result["clean_success_rate"] == (1.0 if policy == "planner" else 0.5)
+    assert result["collision_rate"] == (0.0 if policy == "planner" else 0.5)
+    assert result["free_motion_rate"] == (0.5 if policy == "via-points" else None)
+    assert (result["task"], result["num_queries"]) == (task, 4)
+    queries = load_queries(path)
+    alone = SimpleNamespace(start=queries.start, goal=queries.goal)
+    assert evaluate(policy, task, queries=alone, tries=1)["clean_success_rate"] == 1.0
+
+
+def test_queries_of_a_scene_file(tmp_path):
+    task, path = _write_scenes(tmp_path, Scene(), [Scene(), BLOCKED])
+    assert evaluate("go-to-goal", task, split="original", queries=path)["mean_steps"] < 30
+    (tmp_path / "other.yaml").write_text(Path(task).read_text())
+    cases = [
+        ((str(tmp_path / "other.yaml"), path), "is for the task 'mine', not 'other'"),
+        ((str(tmp_path / "other.yaml"), load_queries(path)), "for the task 'mine', not 'other'"),
+        ((str(tmp_path / "other.yaml"), None), "other_queries.h5: no such file"),
+        ((str(tmp_path / "no.yaml"), path), "no.yaml: No such file"),
+    ]
+    for (other, queries), message in cases:
+        with pytest.raises(evaluation.EvaluationError, match=message):
+            evaluate("go-to-goal", other, queries=queries)
+    save_scene(BLOCKED, task)  # after the queries were made
+    for queries in (None, path):
+        with pytest.raises(evaluation.EvaluationError, match="out of date: made for another"):
+            evaluate("go-to-goal", task, queries=queries)
+
+
+def test_random_scenes_are_part_of_a_query(monkeypatch):
+    scenes = SimpleNamespace(base=Scene(), sample=lambda rng: Scene())
+    monkeypatch.setitem(envs.TASKS, "varied", Task(scenes, "scenes that vary"))
+    pairs = [(LEFT, RIGHT), (LEFT, RIGHT)]
+    with pytest.raises(evaluation.EvaluationError, match="varied has random scenes: these queries"):
+        evaluate("go-to-goal", "varied", queries=_queries(*pairs))
+    queries = _queries(*pairs, scenes=[BLOCKED, Scene()])
+    assert evaluate("go-to-goal", "varied", queries=queries)["clean_success_rate"] == 0.5
 
 
 # --- The command
@@ -238,12 +423,16 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
         ({"task": "moon"}, "unknown task 'moon': one of no_obstacles"),
-        ({"task": "wall"}, "these queries are for the task 'no_obstacles', not 'wall'"),
+        ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),
         ({"queries": str(tmp_path / "no.h5")}, "no.h5"),
         ({"num-queries": "31"}, "num_queries must be 1 to 30, got 31"),
         ({"num-queries": "0"}, "num_queries must be 1 to 30"),
         ({"split": "validation", "num-queries": "11"}, "num_queries must be 1 to 10"),
+        ({"split": "original"}, "has no original queries"),
         ({"workers": "0"}, "workers must be at least 1"),
+        ({"tries": "0"}, "tries must be at least 1, got 0"),
+        ({"time-limit": "0"}, "time_limit must be a positive number of seconds, got 0.0"),
+        ({"time-limit": "nan"}, "time_limit must be a positive number of seconds"),
         ({"json": str(tmp_path)}, "cannot write"),
         ({"json": str(tmp_path / "no such folder" / "a.json")}, "cannot write"),
         ({"picture": str(tmp_path / "no such folder" / "a.png")}, "cannot write"),
