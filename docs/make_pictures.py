@@ -2,7 +2,7 @@
 
     python docs/make_pictures.py
 
-For each task: one test query, the arm at its start, a green ball at the goal; and the end-effector
+For each task: one test query, the arm at its start and as a ghost at the goal; and the end-effector
 paths of the first demonstrations, from light (start) to dark (goal).
 """
 
@@ -15,8 +15,10 @@ from tqdm import tqdm
 
 import envs
 from envs import panda
-from envs.datasets import load_demos, load_queries
+from envs.datasets import demo_path, load_demos, load_queries
+from envs.show import picture
 
+SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls
 NUM_DEMOS = 24
 COLOURS = ((0.85, 0.30, 0.25), (0.20, 0.45, 0.80), (0.95, 0.65, 0.15), (0.25, 0.60, 0.35))
@@ -24,10 +26,7 @@ FOLDER = Path(__file__).parent / "pictures"
 
 
 def save(pixels, name):
-    # Twice the size, then averaged: PyBullet's software renderer has jagged edges.
-    picture = Image.fromarray(pixels).resize((480, 360), Image.LANCZOS)
-    picture.quantize(64).save(FOLDER / name, optimize=True)
-    return picture
+    Image.fromarray(pixels).quantize(64).save(FOLDER / name, optimize=True)
 
 
 def draw_path(client, positions, colour):
@@ -44,38 +43,24 @@ def draw_path(client, positions, colour):
             )
 
 
-def from_afar(client, width=960, height=720):
-    """A picture of all the space that the end-effector reaches."""
-    pixels = p.getCameraImage(
-        width,
-        height,
-        p.computeViewMatrixFromYawPitchRoll((0.0, 0.0, 0.35), 3.0, 55, -28, 0, 2),
-        p.computeProjectionMatrixFOV(50, width / height, 0.1, 10.0),
-        lightDirection=(1.0, 1.0, 2.5),
-        renderer=p.ER_TINY_RENDERER,
-        physicsClientId=client,
-    )[2]
-    return np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
-
-
 def main():
-    tasks = []
+    goal_generalisation = []
     for task in tqdm(envs.TASKS, unit="task"):
-        env = envs.make(task, render_mode="rgb_array", render_size=(960, 720))
+        env = envs.make(task, render_mode="rgb_array")
         query = load_queries(task)[QUERY]
-        env.reset_specific(*query)
-        tasks.append(np.asarray(save(env.render(), f"{task}.png")))
-        demos = load_demos(task)
-        for i in range(NUM_DEMOS):
-            configurations = panda.denormalise(demos[i].states)
-            colour = COLOURS[i % len(COLOURS)]
-            draw_path(env.client, panda.forward_kinematics(configurations), colour)
-        save(from_afar(env.client), f"{task}_demos.png")
+        pixels = picture(env, query, SIZE)
+        save(pixels, f"{task}.png")
+        if demo_path(task).exists():
+            goal_generalisation.append(pixels[::2, ::2])
+            demos, everywhere = load_demos(task), []
+            for i in range(NUM_DEMOS):
+                positions = panda.forward_kinematics(panda.denormalise(demos[i].states))
+                draw_path(env.client, positions, COLOURS[i % len(COLOURS)])
+                everywhere.append(positions)
+            pixels = picture(env, query, SIZE, np.concatenate(everywhere))
+            save(pixels, f"{task}_demos.png")
         env.close()
-    strip = Image.fromarray(np.concatenate(tasks, axis=1))
-    strip.resize((strip.width // 2, strip.height // 2), Image.LANCZOS).quantize(64).save(
-        FOLDER / "fixed_tasks.png", optimize=True
-    )
+    save(np.concatenate(goal_generalisation, axis=1), "fixed_tasks.png")
 
 
 if __name__ == "__main__":
