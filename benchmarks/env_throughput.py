@@ -11,6 +11,9 @@ all of them; medians over the blocks are compared. Only steps are timed, resets 
 - bare loop: PyBullet alone in the same world, replaying the joint targets our env commanded on the
   same episodes: the same commands, physics steps, and reads of contacts, joints and end-effector.
 
+Then, with 4 to 8 random boxes, what drawing a new scene adds to a reset: the mean over many, which
+includes the worlds that are made anew now and then.
+
 The last line is JSON.
 """
 
@@ -30,6 +33,8 @@ from tqdm import trange
 
 import envs
 from envs import arm_env, panda
+from envs.arm_env import RoboArmEnv
+from envs.random_boxes import RandomBoxes
 
 EPISODE = 100  # steps
 
@@ -112,9 +117,23 @@ def record_targets(env, episode):
     return targets, tracking
 
 
+def seconds_per_scene(number, rng):
+    """Mean seconds for drawing a scene of 4 to 8 random boxes and putting the arm into it."""
+    env = RoboArmEnv(RandomBoxes(4, 8))
+    seconds = 0.0
+    for _ in trange(number, unit="scene"):
+        began = time.perf_counter()
+        env.sample_scene(rng)
+        seconds += time.perf_counter() - began
+        env.sample_query(rng)
+    env.close()
+    return seconds / number
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--blocks", type=int, default=60, help="blocks of 100 steps per loop")
+    parser.add_argument("--scenes", type=int, default=2000, help="random scenes")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
@@ -140,11 +159,14 @@ def main():
         ours.reset(seed=i)
         resets.append(time.perf_counter() - began)
 
+    scene = seconds_per_scene(args.scenes, rng)
+
     per_second = {name: EPISODE / np.median(times) for name, times in seconds.items()}
     print(f"\n{'loop':12}{'env steps/s':>14}{'ours / loop':>14}")
     for name, rate in per_second.items():
         print(f"{name:12}{rate:14.0f}{per_second['ours'] / rate:14.2f}")
     print(f"\nreset to a random feasible query: {1e3 * np.median(resets):.2f} ms (median)")
+    print(f"a new random scene adds to that: {1e3 * scene:.2f} ms (mean)")
     percentiles = np.percentile(tracking, [5, 50, 95])
     print(
         "share of a commanded displacement made in one step, away from contacts: "
@@ -155,6 +177,7 @@ def main():
         "ratio_to_panda_gym": per_second["ours"] / per_second["panda-gym"],
         "ratio_to_bare_loop": per_second["ours"] / per_second["bare loop"],
         "reset_ms": 1e3 * float(np.median(resets)),
+        "new_scene_ms": 1e3 * scene,
         "tracking_median": percentiles[1],
         "blocks": args.blocks,
         "python": platform.python_version(),
