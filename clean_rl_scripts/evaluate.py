@@ -46,7 +46,6 @@ import itertools
 import json
 import math
 import multiprocessing
-import os
 import platform
 import signal
 import sys
@@ -69,6 +68,7 @@ from tqdm import tqdm
 import envs
 from envs import panda
 from envs.datasets import Query, Scenes, load_queries, subgoals, validate
+from envs.files import write_atomically
 from envs.programs import ProgramError, load_program
 from envs.scenes import Scene
 from envs.tasks import get_task, task_name
@@ -710,15 +710,6 @@ def _check_writable(path):
         raise EvaluationError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def _write_atomically(path, contents):
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(contents)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 for arguments that make no sense."""
     args = tyro.cli(Args, args=arguments, description=__doc__)
@@ -746,9 +737,9 @@ def main(arguments=None):
         return 2
     print(_table(result))
     if args.json is not None:
-        _write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())
+        write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())
     if args.picture is not None:
-        _write_atomically(args.picture, _draw(job))
+        write_atomically(args.picture, _draw(job))
     return 0
 
 

@@ -298,9 +298,9 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             counts[reason] = sum(demo["rejected"].get(reason, 0) for demo in demos)
             counts["attempts"] += counts[reason]
         counts["queries_given_up"] = sum(demo["given_up"] for demo in demos)
-        base, scenes_of = envs.get_task(options["task"]).scene, None
-        if not isinstance(base, Scene):
-            base = base.base
+        task, scenes_of = envs.get_task(options["task"]), None
+        if not isinstance(task.scene, Scene):
+            base = task.base_scene
             scenes_of = [replace(base, obstacles=from_array(demo["obstacles"])) for demo in demos]
         flags = " ".join(f"--{name.replace('_', '-')} {options[name]}" for name in OPTIONS[:-1])
         flags += " --allow-collisions" * options["allow_collisions"]

@@ -61,7 +61,7 @@ class RoboArmEnv(gym.Env):
     Args:
         scene: a `Scene`, or a distribution of scenes: an object with `base`, the `Scene` without
             the obstacles that vary, and `sample(rng)`, which draws a `Scene` with a NumPy
-            Generator (`envs.tasks.RandomBoxes` is one). `reset` then draws a new one.
+            Generator (`envs.random_boxes.RandomBoxes` is one). `reset` then draws a new one.
         episodes_per_scene: resets in which a drawn scene stays; a reset with a seed always draws.
         goal_type: `ee`, `config` or `combined` (reached like `ee`).
         ee_tolerance: goal radius in metres (paper: 0.02).

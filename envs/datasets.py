@@ -32,7 +32,6 @@ import contextlib
 import hashlib
 import io
 import json
-import os
 import sys
 import tempfile
 from dataclasses import dataclass, replace
@@ -44,6 +43,7 @@ import numpy as np
 
 from envs import panda, scenes
 from envs.arm_env import HOLD_STEPS, RoboArmEnv
+from envs.files import write_atomically
 from envs.scenes import Scene
 from envs.tasks import TASKS, get_task, is_task, task_name
 
@@ -308,7 +308,7 @@ def _write(path, schema, task, seed, arrays, made_by, parameters):
             file.create_dataset(
                 name, data=array, track_times=False, **(packing if array.size else {})
             )
-    _write_atomically(path, contents.getbuffer())
+    write_atomically(path, contents.getbuffer())
 
 
 def check_writable(path):
@@ -319,19 +319,6 @@ def check_writable(path):
         tempfile.TemporaryFile(dir=path.absolute().parent).close()
     except OSError as error:
         raise ValueError(f"cannot write {path}: {error.strerror}") from error
-
-
-def _write_atomically(path, contents):
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(contents)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def scene_to_json(scene):

@@ -19,7 +19,6 @@ import copy
 import io
 import json
 import operator
-import os
 import pickle
 import warnings
 import zipfile
@@ -27,6 +26,8 @@ from pathlib import Path
 
 import torch
 from torch.utils import _pytree as pytree
+
+from envs.files import write_atomically
 
 FORMAT = "roboarm-nmp program"
 VERSION = 1
@@ -89,12 +90,7 @@ def save_program(path, module, example_inputs, metadata):
         raise ProgramError(f"{path}: this network cannot be saved: {error}") from error
     buffer = io.BytesIO()
     torch.save(content, buffer)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(buffer.getbuffer())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_atomically(path, buffer.getbuffer())
 
 
 def load_program(path, device="cpu"):

@@ -1,7 +1,7 @@
 """Random scenes: shelves, poles and walls around the arm (paper, section 4).
 
-The paper names the kinds of obstacles and how many there are; the distribution is ours, calibrated
-so that go-to-goal succeeds as often as there (docs/tasks.md).
+The paper names the kinds of obstacles and how many there are; the distribution is ours. It is
+provisional: go-to-goal does not yet succeed as often as in the paper.
 """
 
 import math

@@ -20,11 +20,11 @@ are is not checked here: the simulator says whether the arm touches them.
 """
 
 import math
-import os
 from pathlib import Path
 
 import yaml
 
+from envs.files import write_atomically
 from envs.scenes import FLOOR, FRICTION, IDENTITY, TABLE, Box, Cylinder, Scene, Sphere
 
 _NORM_TOLERANCE = 1e-6
@@ -75,16 +75,7 @@ def save_scene(scene, path):
     except _Mistake as mistake:
         line = text.splitlines()[mistake.line - 1].strip()
         raise SceneFileError(f"{path}: cannot be written, {mistake.reason}: {line}") from None
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(text.encode())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    write_atomically(path, text.encode())
 
 
 # --- Writing

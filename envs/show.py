@@ -10,6 +10,7 @@ position of its end-effector. A picture shows the start. The window shows the po
 after another, in real time, until it is closed, or Escape or Ctrl-C is pressed.
 """
 
+import io
 import itertools
 import math
 import os
@@ -38,6 +39,7 @@ from envs.datasets import (
     load_queries,
     query_path,
 )
+from envs.files import write_atomically
 
 SIZE = (640, 480)
 LARGEST_SIZE = 4096  # PyBullet gets slow long before
@@ -490,13 +492,9 @@ def _outcome(args, queries, number, steps, info):
 
 
 def _save(image, path, kind, **options):
-    """Write an image, atomically: at every moment `path` is the old file or the whole new one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        image.save(temporary, kind, **options)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    contents = io.BytesIO()
+    image.save(contents, kind, **options)
+    write_atomically(path, contents.getbuffer())
 
 
 def main(arguments=None):

@@ -375,12 +375,11 @@ def test_an_old_picture_stays_until_the_new_one_is_whole(tmp_path, capsys, monke
     path = tmp_path / "a.png"
     path.write_bytes(b"old")
 
-    def half(image, file, *arguments, **options):
-        Path(file).write_bytes(b"half")
+    def full(descriptor):
         raise OSError("the disk is full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Image.Image, "save", half)
+        patch.setattr(os, "fsync", full)  # after something was written, somewhere
         assert run("wall", "--output", path, *SIZE) == 2
     assert "the disk is full" in capsys.readouterr().err
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]

@@ -1,0 +1,22 @@
+"""Writing files whole."""
+
+import os
+from pathlib import Path
+
+
+def write_atomically(path, contents):
+    """Write bytes: at every moment, whatever happens, `path` is the old file or the whole new one.
+
+    Raises OSError if it cannot be written; an old file is left as it was, and no other.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(contents)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
