@@ -33,8 +33,6 @@ from tqdm import trange
 
 import envs
 from envs import arm_env, panda
-from envs.arm_env import RoboArmEnv
-from envs.random_boxes import RandomBoxes
 
 EPISODE = 100  # steps
 
@@ -118,8 +116,8 @@ def record_targets(env, episode):
 
 
 def seconds_per_scene(number, rng):
-    """Mean seconds for drawing a scene of 4 to 8 random boxes and putting the arm into it."""
-    env = RoboArmEnv(RandomBoxes(4, 8))
+    """Mean seconds for drawing a scene of `random_boxes_hard` and putting the arm into it."""
+    env = envs.make("random_boxes_hard")
     seconds = 0.0
     for _ in trange(number, unit="scene"):
         began = time.perf_counter()

@@ -1,7 +1,7 @@
 """Replay 1,000 episodes in shuffled order and in another process: the same, bit for bit.
 
     python benchmarks/exact_replay.py
-    python benchmarks/exact_replay.py --random-boxes   # each episode in a scene of its own
+    python benchmarks/exact_replay.py --task random_boxes_hard
 
 Prints how many episodes differ (it must be 0) and how many of them touched something. Exit code 1
 if any differs. The last line is JSON.
@@ -17,8 +17,6 @@ import numpy as np
 from tqdm import tqdm
 
 import envs
-from envs.arm_env import RoboArmEnv
-from envs.random_boxes import RandomBoxes
 
 
 def run_episode(env, seed, steps):
@@ -37,7 +35,7 @@ def run_episode(env, seed, steps):
 
 
 def run_all(task, seeds, steps):
-    env = RoboArmEnv(RandomBoxes(4, 8)) if task is None else envs.make(task)
+    env = envs.make(task)
     results = {seed: run_episode(env, seed, steps) for seed in tqdm(seeds, unit="episode")}
     env.close()
     return results
@@ -46,21 +44,18 @@ def run_all(task, seeds, steps):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--task", default="double_walls", choices=list(envs.TASKS))
-    parser.add_argument("--random-boxes", action="store_true", help="4 to 8 in each episode")
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=100)
     args = parser.parse_args()
     seeds = list(range(args.episodes))
-    task = None if args.random_boxes else args.task
-    first = run_all(task, seeds, args.steps)
+    first = run_all(args.task, seeds, args.steps)
     shuffled = np.random.default_rng(0).permutation(seeds).tolist()
-    again = run_all(task, shuffled, args.steps)
+    again = run_all(args.task, shuffled, args.steps)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        elsewhere = pool.apply(run_all, (task, shuffled[::-1], args.steps))
+        elsewhere = pool.apply(run_all, (args.task, shuffled[::-1], args.steps))
     different = sum(not first[s] == again[s] == elsewhere[s] for s in seeds)
     touched = sum(touched for _, touched in first.values())
-    what = task or "random boxes"
-    print(f"{args.episodes} episodes of {what}, {touched} with contacts: {different} differ")
+    print(f"{args.episodes} episodes of {args.task}, {touched} with contacts: {different} differ")
     print(json.dumps({"episodes": args.episodes, "touched": touched, "different": different}))
     sys.exit(different > 0)
 

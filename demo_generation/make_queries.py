@@ -7,6 +7,8 @@ With `--solvable` a query is kept only if a planner solved it: one of `SOLVE_ATT
 RRT-Connect, at most `SOLVE_CHECKS` collision checks each (together a few seconds), reached the goal
 without touching anything when it was followed in the simulator.
 
+Where scenes vary, `--queries-per-scene` queries in a row have the same one: smaller files.
+
 Query i of a split depends on the seed, the split and i only, so the file is the same whatever the
 number of workers. It is written at the end, in one piece: an interrupted run leaves what was there.
 """
@@ -34,6 +36,7 @@ HOLD_STEPS = 24
 # Not 0: NumPy makes the same stream of [seed, 0, 0] as of plain seed, so the first query would be
 # that of an environment's `reset(seed=seed)`.
 STREAMS = {"test": 1, "validation": 2}
+SCENE_STREAM = 1  # a fourth number, for the scenes of a split
 # A bound in seconds would make the file depend on the machine.
 SOLVE_ATTEMPTS, SOLVE_CHECKS = 3, 30_000
 
@@ -44,6 +47,8 @@ class Args:
     """Names of tasks, paths of scene files, or `all`."""
     solvable: bool = False
     """Keep only queries that a planner solved."""
+    queries_per_scene: int = 1
+    """Queries in each scene, where scenes vary."""
     seed: int = 0
     """Seed of the queries; 0 gives the packaged files."""
     num_test: int = 10_000
@@ -62,21 +67,23 @@ class Args:
 class Sampler:
     """Samples queries of a task; a job is (seed, split, index)."""
 
-    def __init__(self, task, solvable):
+    def __init__(self, task, solvable, queries_per_scene=1):
+        self.queries_per_scene = queries_per_scene
         self.env = envs.make(task)
         self.planner = Planner(self.env, max_checks=SOLVE_CHECKS) if solvable else None
 
     def __call__(self, job):
-        """`(job, start, goal, scene, rejected)`: query `index` of a split, in a scene of its own.
+        """`(job, start, goal, scene, rejected)`: query `index` of a split.
 
         `rejected` counts the samples that were not held for long enough (`unheld`), or that the
         planner did not solve (`unsolved`).
         """
         seed, split, index = job
+        scene = [seed, STREAMS[split], index // self.queries_per_scene]
+        self.env.sample_scene(np.random.default_rng([*scene, SCENE_STREAM]))
         rng = np.random.default_rng([seed, STREAMS[split], index])
         rejected = Counter()
         for _ in range(MAX_QUERIES):
-            self.env.sample_scene(rng)
             start, goal = self.env.sample_query(rng)
             if not all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal)):
                 rejected["unheld"] += 1
@@ -94,6 +101,7 @@ def make_queries(
     num_test,
     num_validation,
     solvable=False,
+    queries_per_scene=1,
     original=None,
     num_workers=1,
     progress=True,
@@ -106,6 +114,7 @@ def make_queries(
         seed: int >= 0.
         num_test, num_validation: numbers of queries, > 0.
         solvable: keep only queries that a planner solved.
+        queries_per_scene: queries in a row that have the same scene, where scenes vary.
         original: path of a JSON file of MotionBenchMaker problems for the split `original`.
         num_workers: number of processes.
         progress: show a progress bar.
@@ -124,7 +133,9 @@ def make_queries(
     bar = tqdm(desc=task, total=len(jobs), unit=" queries", disable=not progress)
     made, rejected = {}, Counter()
     with bar:
-        results = workers.run(Sampler, (task, solvable), jobs, num_workers, warn=bar.write)
+        results = workers.run(
+            Sampler, (task, solvable, queries_per_scene), jobs, num_workers, warn=bar.write
+        )
         for job, *query, more in results:
             made[job] = query
             rejected += more
@@ -146,6 +157,8 @@ def make_queries(
         parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
     made_by = f"python -m demo_generation.make_queries --task {task} --seed {seed} "
     made_by += f"--num-test {num_test} --num-validation {num_validation}" + " --solvable" * solvable
+    if queries_per_scene > 1:
+        made_by += f" --queries-per-scene {queries_per_scene}"
     if original is not None:
         made_by += f" --original {Path(original).name}"
     write_queries(path, task, seed, splits, made_by, parameters)
@@ -157,7 +170,7 @@ def _check(args):
     tasks = tuple(envs.TASKS) if args.task == ("all",) else tuple(dict.fromkeys(args.task))
     if not tasks:
         raise ValueError(f"--task: one or more of {', '.join(envs.TASKS)}, or all")
-    for name in ("seed", "num_test", "num_validation", "workers"):
+    for name in ("seed", "num_test", "num_validation", "queries_per_scene", "workers"):
         lowest = 0 if name == "seed" else 1
         if getattr(args, name) < lowest:
             raise ValueError(f"--{name.replace('_', '-')} must be at least {lowest}")
@@ -186,6 +199,7 @@ def main(args):
                 args.num_test,
                 args.num_validation,
                 args.solvable,
+                args.queries_per_scene,
                 args.original,
                 args.workers,
             )

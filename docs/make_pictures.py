@@ -2,8 +2,9 @@
 
     python docs/make_pictures.py
 
-For each task: one test query, the arm at its start and as a ghost at the goal; and the end-effector
-paths of the first demonstrations, from light (start) to dark (goal).
+For each task: one test query (where scenes vary, six draws), the arm at its start and as a ghost at
+the goal; and where the scene is fixed, the end-effector paths of the first demonstrations, from
+light (start) to dark (goal).
 """
 
 from pathlib import Path
@@ -15,11 +16,13 @@ from tqdm import tqdm
 
 import envs
 from envs import panda
-from envs.datasets import demo_path, load_demos, load_queries
+from envs.datasets import Query, demo_path, load_demos, load_queries
+from envs.scenes import Scene
 from envs.show import picture
 
 SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls
+ROWS, COLUMNS = 2, 3  # of scenes that vary
 NUM_DEMOS = 24
 COLOURS = ((0.85, 0.30, 0.25), (0.20, 0.45, 0.80), (0.95, 0.65, 0.15), (0.25, 0.60, 0.35))
 FOLDER = Path(__file__).parent / "pictures"
@@ -44,14 +47,25 @@ def draw_path(client, positions, colour):
 
 
 def main():
-    goal_generalisation = []
+    fixed = []
     for task in tqdm(envs.TASKS, unit="task"):
         env = envs.make(task, render_mode="rgb_array")
+        if not isinstance(envs.TASKS[task].scene, Scene):
+            pixels, rng = [], np.random.default_rng(0)
+            for _ in range(ROWS * COLUMNS):
+                env.sample_scene(rng)
+                query = Query(*env.sample_query(rng), env.scene)
+                pixels.append(picture(env, query, SIZE)[::2, ::2])
+            height, width, channels = pixels[0].shape
+            grid = np.reshape(pixels, (ROWS, COLUMNS, height, width, channels)).swapaxes(1, 2)
+            save(grid.reshape(ROWS * height, COLUMNS * width, channels), f"{task}.png")
+            env.close()
+            continue
         query = load_queries(task)[QUERY]
         pixels = picture(env, query, SIZE)
         save(pixels, f"{task}.png")
         if demo_path(task).exists():
-            goal_generalisation.append(pixels[::2, ::2])
+            fixed.append(pixels[::2, ::2])
             demos, everywhere = load_demos(task), []
             for i in range(NUM_DEMOS):
                 positions = panda.forward_kinematics(panda.denormalise(demos[i].states))
@@ -60,7 +74,7 @@ def main():
             pixels = picture(env, query, SIZE, np.concatenate(everywhere))
             save(pixels, f"{task}_demos.png")
         env.close()
-    save(np.concatenate(goal_generalisation, axis=1), "fixed_tasks.png")
+    save(np.concatenate(fixed, axis=1), "fixed_tasks.png")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Random scenes: shelves, poles and walls around the arm (paper, section 4).
 
-The paper names the kinds of obstacles and how many there are; the distribution is ours. It is
-provisional: go-to-goal does not yet succeed as often as in the paper.
+The paper names the kinds of obstacles and how many there are. The distribution is ours, calibrated
+so that go-to-goal succeeds as often as in the paper (docs/tasks.md).
 """
 
 import math
@@ -15,18 +15,18 @@ GRID = 2.0**-10
 TURN = 2 * math.pi / 256
 # Ranges, all uniform, in m: distance of the near side from the robot's axis (of the centre, for
 # poles), and sizes. A shelf is a board, wider than deep; walls and poles stand on the table.
-SHELVES, POLES = 0.2, 0.6  # shares of the obstacles; the rest are walls
-SHELF = {"near": (0.35, 0.5), "depth": (0.15, 0.3), "width": (0.3, 0.6), "thickness": (0.02, 0.04)}
+SHELVES, POLES = 0.33, 0.57  # shares of the obstacles; the rest are walls
+SHELF = {"near": (0.28, 0.42), "depth": (0.15, 0.3), "width": (0.3, 0.5), "thickness": (0.02, 0.04)}
 SHELF_HEIGHT = (0.3, 0.9)
-POLE = {"centre": (0.28, 0.53), "thickness": (0.03, 0.06), "height": (1.0, 1.5)}
+POLE = {"centre": (0.26, 0.45), "thickness": (0.02, 0.04), "height": (1.2, 1.5)}
 WALL = {
-    "near": (0.26, 0.48),
+    "near": (0.26, 0.4),
     "length": (0.1, 0.25),
-    "thickness": (0.02, 0.05),
-    "height": (1.0, 1.5),
+    "thickness": (0.01, 0.03),
+    "height": (1.2, 1.5),
 }
-# Obstacles are spread around the robot: each has its own sector and lies within this share of it.
-SPREAD = 0.22
+# Rough obstacles: along smooth ones the arm slides to its goal, however many there are.
+FRICTION = 3.0
 # Nothing comes nearer than this (m) to the robot's axis below the shoulder's top (m).
 KEEP_CLEAR, SHOULDER = 0.14, 0.45
 
@@ -37,7 +37,7 @@ class RandomBoxes:
 
     fewest: int
     most: int
-    base: Scene = Scene(friction=3.0)
+    base: Scene = Scene(friction=FRICTION)
 
     def sample(self, rng):
         """A `Scene` drawn with a NumPy Generator."""
@@ -46,7 +46,8 @@ class RandomBoxes:
         sector = 2 * math.pi / count
         boxes = []
         while len(boxes) < count:
-            azimuth = first + sector * (len(boxes) + SPREAD * rng.uniform(-0.5, 0.5))
+            # Each in a sector of its own, so that they stand all around the robot.
+            azimuth = first + sector * (len(boxes) + rng.uniform(-0.5, 0.5))
             box = _sample_box(rng, azimuth)
             if _distance_to_robot(box) >= KEEP_CLEAR:
                 boxes.append(box)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from envs.random_boxes import RandomBoxes
 from envs.scene_files import load_scene
-from envs.scenes import Box, Cylinder, Scene
+from envs.scenes import TABLE, Box, Cylinder, Scene
 
 SCENE_FILES = (".yaml", ".yml")
 
@@ -71,6 +71,36 @@ def _two_walls(gap):
     )
 
 
+# Racks behind the arm would stand beyond the standard table.
+_WIDE_TABLE = Box((0.0, 0.0, -0.02), (1.6, 1.6, 0.04))
+
+
+def _racks(quarters, near, width, heights, sides=True, table=_WIDE_TABLE):
+    """Racks of boards, all alike, around the robot.
+
+    Args:
+        quarters: where: 0 in front of the robot, 1 to its left, 2 behind it, 3 to its right.
+        near: distance of their fronts from the robot's axis, m.
+        width: m.
+        heights: of the boards' centres, m.
+        sides: closed sides as high as the rack; without them, four poles.
+        table: what they stand on.
+    """
+    depth, board, pole = 0.35, 0.03, 0.04
+    top = heights[-1] + board / 2
+    upright = (depth, board, top) if sides else (pole, pole, top)
+    y = (width + board) / 2 if sides else (width - pole) / 2
+    xs = (near + depth / 2,) if sides else (near + pole / 2, near + depth - pole / 2)
+    parts = [((near + depth / 2, 0.0, height), (depth, width, board)) for height in heights]
+    parts += [((x, side, top / 2), upright) for x in xs for side in (y, -y)]
+    obstacles = []
+    for quarter in range(4):
+        if quarter in quarters:
+            obstacles += [Box(*part) for part in parts]
+        parts = [((-y, x, z), (b, a, c)) for (x, y, z), (a, b, c) in parts]
+    return Scene(tuple(obstacles), table=table)
+
+
 # MotionBenchMaker's nominal scenes (Chamzas et al., RA-L 7(2), 2022), to the millimetre. They have
 # neither table nor floor: the shelves stand 0.7 m below the robot's base, and a floor at its height
 # would be in the way of 42 of the 100 original goals of the thin one (docs/tasks.md).
@@ -118,6 +148,26 @@ TASKS = {
             )
         ),
         "six boxes, standing and hanging, all around the arm",
+    ),
+    "random_boxes_easy": Task(
+        RandomBoxes(2, 4), "2 to 4 shelves, poles and walls around the arm, new in every episode"
+    ),
+    "random_boxes_medium": Task(RandomBoxes(3, 6), "the same, 3 to 6"),
+    "random_boxes_hard": Task(RandomBoxes(4, 8), "the same, 4 to 8"),
+    "three_shelves": Task(
+        _racks((0,), 0.34, 0.9, (0.2, 0.5, 0.8), table=TABLE),
+        "a rack of three shelves in front of the arm, closed at the sides",
+        trainable=False,
+    ),
+    "pole_shelves": Task(
+        _racks((0, 2), 0.39, 0.8, (0.2, 0.5, 0.8), sides=False),
+        "two racks of three shelves on poles, in front of the arm and behind it",
+        trainable=False,
+    ),
+    "narrow_shelves": Task(
+        _racks((0, 1, 2, 3), 0.39, 0.3, (0.2, 0.4, 0.6, 0.8, 1.0)),
+        "four narrow racks of five shelves, all around the arm",
+        trainable=False,
     ),
     "benchmaker_bookshelf_tall": Task(
         _bookshelf_tall(), "MotionBenchMaker's bookshelf_tall: four wide shelves", trainable=False

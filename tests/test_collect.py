@@ -362,10 +362,9 @@ def test_refused_before_any_work(tmp_path, arguments, complaint):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_task_for_testing_only_is_refused(output, monkeypatch):
-    task = dataclasses.replace(envs.TASKS[TASK], trainable=False)
-    monkeypatch.setitem(envs.TASKS, TASK, task)
-    assert "double_walls is for testing only" in refusal(collect.Args(TASK, output=output))
+@pytest.mark.parametrize("task", [name for name in envs.TASKS if not envs.TASKS[name].trainable])
+def test_a_task_for_testing_only_is_refused(task, output):
+    assert f"{task} is for testing only" in refusal(collect.Args(task, output=output))
 
 
 def test_the_command_says_it_in_one_line(tmp_path):

@@ -470,7 +470,8 @@ def test_make_queries_refuses_before_it_works(arguments, complaint):
 # --- The packaged files
 
 
-@pytest.mark.parametrize("task", envs.TASKS)
+# The random boxes' files wait for the end of their calibration (docs/tasks.md).
+@pytest.mark.parametrize("task", [name for name in envs.TASKS if "random" not in name])
 def test_packaged_queries(task):
     env = envs.make(task)
     client = p.connect(p.DIRECT)

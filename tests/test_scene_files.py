@@ -139,7 +139,7 @@ def test_round_trip_is_exact(tmp_path, seed):
     assert load_scene(tmp_path / "scene.yaml") == scene
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [name for name in TASKS if isinstance(TASKS[name].scene, Scene)])
 def test_scenes_of_the_tasks_make_the_round_trip(tmp_path, task):
     save_scene(TASKS[task].scene, tmp_path / "scene.yaml")
     assert load_scene(tmp_path / "scene.yaml") == TASKS[task].scene

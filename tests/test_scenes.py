@@ -13,9 +13,11 @@ from demo_generation.planning import Planner, PlanningError
 from envs import datasets, panda
 from envs.arm_env import RoboArmEnv
 from envs.datasets import DatasetError, load_demos, load_queries, write_queries
-from envs.random_boxes import GRID, KEEP_CLEAR, SHOULDER, RandomBoxes
+from envs.random_boxes import GRID, KEEP_CLEAR, SHOULDER
 from envs.scenes import Box, Cylinder, Scene, Sphere, from_array, to_array
-from envs.tasks import TASKS, Task
+from envs.tasks import TASKS
+
+HARD = "random_boxes_hard"
 
 
 class Shelves:
@@ -31,15 +33,8 @@ class Shelves:
 
 
 @pytest.fixture
-def hard(monkeypatch):
-    """A task with random scenes."""
-    monkeypatch.setitem(TASKS, "hard", Task(RandomBoxes(4, 8), ""))
-    return "hard"
-
-
-@pytest.fixture
 def env():
-    env = RoboArmEnv(RandomBoxes(4, 8))
+    env = envs.make(HARD)
     yield env
     env.close()
 
@@ -47,10 +42,11 @@ def env():
 # --- The distribution
 
 
-@pytest.mark.parametrize("fewest, most", [(2, 4), (3, 6), (4, 8)])
-def test_every_number_of_obstacles_is_equally_likely(fewest, most):
+@pytest.mark.parametrize("level, fewest, most", [("easy", 2, 4), ("medium", 3, 6), ("hard", 4, 8)])
+def test_every_number_of_obstacles_is_equally_likely(level, fewest, most):
     rng = np.random.default_rng(0)
-    counts = [len(RandomBoxes(fewest, most).sample(rng).obstacles) for _ in range(1500)]
+    scenes = TASKS[f"random_boxes_{level}"].scene
+    counts = [len(scenes.sample(rng).obstacles) for _ in range(1500)]
     values, found = np.unique(counts, return_counts=True)
     assert values.tolist() == list(range(fewest, most + 1))
     expected = 1500 / len(values)
@@ -59,7 +55,7 @@ def test_every_number_of_obstacles_is_equally_likely(fewest, most):
 
 def test_obstacles_are_shelves_poles_and_walls_that_leave_the_robot_its_place():
     rng = np.random.default_rng(1)
-    boxes = [box for _ in range(200) for box in RandomBoxes(4, 8).sample(rng).obstacles]
+    boxes = [box for _ in range(200) for box in TASKS[HARD].scene.sample(rng).obstacles]
     sizes = np.array([box.size for box in boxes])
     boards = (sizes[:, 2] < 0.05).mean()
     slender = (sizes[:, 2] > 1.0) & (sizes[:, :2].max(axis=1) < 0.09)
@@ -75,7 +71,7 @@ def test_obstacles_are_shelves_poles_and_walls_that_leave_the_robot_its_place():
 
 
 def test_scenes_differ_and_a_seed_fixes_them():
-    boxes = RandomBoxes(4, 8)
+    boxes = TASKS[HARD].scene
     assert boxes.sample(np.random.default_rng(3)) == boxes.sample(np.random.default_rng(3))
     rng = np.random.default_rng(3)
     assert len({boxes.sample(rng) for _ in range(20)}) == 20
@@ -133,7 +129,7 @@ def test_replay_is_exact_among_other_scenes(env):
     first = {seed: run(env, seed) for seed in range(8)}
     for seed in (5, 0, 7, 2):
         np.testing.assert_array_equal(run(env, seed), first[seed])
-    fresh = RoboArmEnv(RandomBoxes(4, 8))
+    fresh = envs.make(HARD)
     np.testing.assert_array_equal(run(fresh, 3), first[3])
     fresh.close()
 
@@ -197,7 +193,7 @@ def some_queries(n, rng):
 @pytest.fixture
 def scenes():
     rng = np.random.default_rng(4)
-    return [RandomBoxes(4, 8).sample(rng) for _ in range(3)]
+    return [TASKS[HARD].scene.sample(rng) for _ in range(3)]
 
 
 def write(path, scenes):
@@ -207,11 +203,11 @@ def write(path, scenes):
         "test": (*some_queries(7, rng), [scenes[i] for i in index]),
         "validation": (*some_queries(2, rng), scenes[:2]),
     }
-    write_queries(path, "hard", 0, splits, "made by a test", {})
+    write_queries(path, HARD, 0, splits, "made by a test", {})
     return index
 
 
-def test_queries_come_back_with_their_scenes(hard, tmp_path, scenes):
+def test_queries_come_back_with_their_scenes(tmp_path, scenes):
     index = write(tmp_path / "queries.h5", scenes)
     queries = load_queries(tmp_path / "queries.h5")
     assert [queries[i].scene for i in range(7)] == [scenes[i] for i in index]
@@ -221,29 +217,29 @@ def test_queries_come_back_with_their_scenes(hard, tmp_path, scenes):
     assert load_queries(tmp_path / "queries.h5", "validation")[1].scene == scenes[1]
 
 
-def test_queries_in_scenes_without_obstacles(hard, tmp_path):
-    empty = RandomBoxes(4, 8).base
+def test_queries_in_scenes_without_obstacles(tmp_path):
+    empty = TASKS[HARD].scene.base
     write(tmp_path / "queries.h5", [empty] * 3)
     assert load_queries(tmp_path / "queries.h5")[3].scene == empty
 
 
-def test_a_scene_with_another_table_is_refused(hard, tmp_path, scenes):
+def test_a_scene_with_another_table_is_refused(tmp_path, scenes):
     scenes[1] = replace(scenes[1], table=None)
     with pytest.raises(DatasetError, match="differs from the task's in more than its obstacles"):
         write(tmp_path / "queries.h5", scenes)
     assert not (tmp_path / "queries.h5").exists()
 
 
-def test_a_split_that_is_not_there(hard, tmp_path, scenes):
+def test_a_split_that_is_not_there(tmp_path, scenes):
     write(tmp_path / "queries.h5", scenes)
     with pytest.raises(DatasetError, match="queries.h5: has no original queries"):
         load_queries(tmp_path / "queries.h5", "original")
 
 
-def test_scenes_that_make_no_sense_are_refused(hard, tmp_path, scenes):
+def test_scenes_that_make_no_sense_are_refused(tmp_path, scenes):
     write(tmp_path / "queries.h5", scenes)
     path = tmp_path / "queries.h5"
-    attributes, arrays = datasets._read(path, datasets.QUERY_SCHEMA, "hard")
+    attributes, arrays = datasets._read(path, datasets.QUERY_SCHEMA, HARD)
     for name, change, complaint in [
         ("test/scene", lambda a: a + 1, "does not fit"),
         ("test/obstacle_count", lambda a: a + 1, "does not fit"),
@@ -264,8 +260,8 @@ def test_obstacle_arrays_round_trip():
     assert from_array(to_array(obstacles)) == obstacles
 
 
-def test_sampled_queries_are_solved_and_have_scenes_of_their_own(hard):
-    sampler = make_queries.Sampler(hard, solvable=True)
+def test_sampled_queries_are_solved_and_have_scenes_of_their_own():
+    sampler = make_queries.Sampler(HARD, solvable=True)
     made = [sampler((0, "validation", index)) for index in range(3)]
     again = sampler((0, "validation", 1))
     assert again[3] == made[1][3] and (again[1] == made[1][1]).all()
@@ -273,6 +269,14 @@ def test_sampled_queries_are_solved_and_have_scenes_of_their_own(hard):
     planner = Planner(RoboArmEnv())
     for _, start, goal, scene, _ in made:
         assert len(planner.plan(start, goal, scene, seed=1, caution=0.25)) >= 2
+
+
+def test_queries_in_a_row_share_a_scene_if_asked():
+    sampler = make_queries.Sampler(HARD, solvable=False, queries_per_scene=2)
+    made = [sampler((0, split, index)) for split in ("test", "validation") for index in range(4)]
+    scenes = [scene for _, _, _, scene, _ in made]
+    assert scenes[0::2] == scenes[1::2] and len(set(scenes)) == 4
+    assert len({start.tobytes() for _, start, *_ in made}) == 8
 
 
 def test_an_unsolvable_query_is_rejected_and_counted(monkeypatch):
@@ -292,8 +296,8 @@ def test_an_unsolvable_query_is_rejected_and_counted(monkeypatch):
     assert not any((start == other).all() for other in tried)
 
 
-def test_collected_demonstrations_have_their_scenes(hard, tmp_path):
-    options = {name: getattr(collect.Args(hard), name) for name in collect.OPTIONS}
+def test_collected_demonstrations_have_their_scenes(tmp_path):
+    options = {name: getattr(collect.Args(HARD), name) for name in collect.OPTIONS}
     collector = collect.Collector(options)
     journal = collect.Journal(collect.journal_of(tmp_path / "demos.h5"), options)
     for index in range(3):
@@ -304,6 +308,39 @@ def test_collected_demonstrations_have_their_scenes(hard, tmp_path):
     assert len({demos[i].scene for i in range(3)}) == 3
     verifier = verify.Verifier(tmp_path / "demos.h5", mend=False)
     assert [verifier(i)[1] for i in range(3)] == ["good"] * 3
+
+
+# --- The shelves
+
+
+@pytest.mark.parametrize("task, turns", [("pole_shelves", 2), ("narrow_shelves", 4)])
+def test_racks_stand_alike_around_the_arm(task, turns):
+    boxes = TASKS[task].scene.obstacles
+    found = np.array([(*box.position, *box.size) for box in boxes])
+    angle = 2 * math.pi / turns
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    turned = found.copy()
+    turned[:, :2] = found[:, :2] @ rotation.T
+    turned[:, 3:5] = np.abs(found[:, 3:5] @ rotation.T)
+    for row in turned:
+        assert np.abs(found - row).max(axis=1).min() < 1e-9
+
+
+@pytest.mark.parametrize("task", ["three_shelves", "pole_shelves", "narrow_shelves"])
+def test_racks_hold_together(task):
+    """Boards end at the inner faces of closed sides, or at the outer faces of poles."""
+    boxes = [box for box in TASKS[task].scene.obstacles if box.position[0] > 0.3]  # in front
+    boards = [box for box in boxes if box.size[2] < 0.05]
+    uprights = [box for box in boxes if box.size[2] > 0.05]
+    assert len(boards) == {"three": 3, "pole": 3, "narrow": 5}[task.split("_")[0]]
+    (depth, width), top = boards[0].size[:2], max(box.position[2] + 0.015 for box in boards)
+    for upright in uprights:
+        bottom = upright.position[2] - upright.size[2] / 2
+        assert bottom == pytest.approx(0) and upright.size[2] == pytest.approx(top)
+        inner, outer = (abs(upright.position[1]) + s * upright.size[1] / 2 for s in (-1, 1))
+        assert (outer if len(uprights) == 4 else inner) == pytest.approx(width / 2)
+        edge = abs(upright.position[0] - boards[0].position[0]) + upright.size[0] / 2
+        assert edge == pytest.approx(depth / 2)
 
 
 # --- MotionBenchMaker's scenes

@@ -1,0 +1,150 @@
+"""What to compare with, on every task: the floor, a little search, and the ceiling.
+
+    python benchmarks/baselines.py --workers 2                  # hours; what is done is skipped
+    python benchmarks/baselines.py --only wall --workers 2
+    python benchmarks/baselines.py --table                      # only writes the table
+
+Each cell is a call of `clean_rl_scripts/evaluate.py` (goal `ee`): `go-to-goal` on all test queries,
+`via-points` and `planner` on the first `--num`. Results go to docs/baselines.json at once, so an
+interrupted run goes on where it was; docs/baselines.md is the table of what is there. The planner's
+numbers depend on the machine, so nothing else should run beside it. Times are per query.
+"""
+
+import argparse
+import datetime
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import envs
+from envs.datasets import load_queries
+from envs.files import write_atomically
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS, TABLE = ROOT / "docs" / "baselines.json", ROOT / "docs" / "baselines.md"
+CELLS = {
+    "go-to-goal": ["--policy", "go-to-goal"],
+    "via-points, K = 16": ["--policy", "via-points", "--tries", "16"],
+    "via-points, K = 64": ["--policy", "via-points", "--tries", "64"],
+    "RRT-Connect, 0.5 s": ["--policy", "planner", "--time-limit", "0.5"],
+    "RRT-Connect, 5 s": ["--policy", "planner", "--time-limit", "5"],
+}
+# Success of go-to-goal in the paper, sections 5.2 to 5.4, which give none for the bookshelves.
+PAPER = {
+    "no_obstacles": 0.979,
+    "wall": 0.765,
+    "double_walls_wide_gap": 0.648,
+    "double_walls": 0.453,
+    "boxes": 0.806,
+    "random_boxes_easy": 0.491,
+    "random_boxes_medium": 0.370,
+    "random_boxes_hard": 0.289,
+    "three_shelves": 0.832,
+    "pole_shelves": 0.721,
+    "narrow_shelves": 0.539,
+}
+
+
+def run(results, tasks, names, num, workers):
+    """Fill in the cells that are missing, or had fewer queries."""
+    for task in tasks:
+        for name in names:
+            wanted = len(load_queries(task)) if name == "go-to-goal" else num
+            done = results.get(task, {}).get(name)
+            if done is not None and done["num_queries"] >= wanted:
+                continue
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "result.json"
+                command = [sys.executable, ROOT / "clean_rl_scripts" / "evaluate.py"]
+                command += ["--task", task, *CELLS[name], "--num-queries", str(wanted)]
+                command += ["--workers", str(workers), "--json", path]
+                subprocess.run(command, check=True)
+                result = json.loads(path.read_text())
+            result["date"] = datetime.date.today().isoformat()
+            results.setdefault(task, {})[name] = result
+            write_atomically(RESULTS, (json.dumps(results, indent=1) + "\n").encode())
+
+
+def table(results):
+    """The page, in Markdown."""
+    lines = [
+        "# What to compare with",
+        "",
+        "`python benchmarks/baselines.py` measures this and writes it (goal `ee`). What the",
+        "policies do: [tasks.md](tasks.md). In each cell: success, clean success [95 % interval of",
+        "success].",
+        "",
+        "| task | paper, `go-to-goal` | " + " | ".join(CELLS) + " |",
+        "|---" * (2 + len(CELLS)) + "|",
+    ]
+    for task in envs.TASKS:
+        row = [f"`{task}`", f"{PAPER[task]:.3f}" if task in PAPER else "none given"]
+        lines.append("| " + " | ".join(row + [_cell(results, task, name) for name in CELLS]) + " |")
+    lines += [
+        "",
+        "Path length (rad, mean over successes) and, of those that search, mean planning time (s):",
+        "",
+        "| task | " + " | ".join(CELLS) + " |",
+        "|---" * (1 + len(CELLS)) + "|",
+    ]
+    for task in envs.TASKS:
+        row = [_means(results, task, name) for name in CELLS]
+        lines.append("| " + " | ".join([f"`{task}`", *row]) + " |")
+    lines += ["", *_conditions(results), ""]
+    return "\n".join(lines)
+
+
+def _cell(results, task, name):
+    result = results.get(task, {}).get(name)
+    if result is None:
+        return "not run"
+    low, high = result["success_rate_interval"]
+    rates = f"{result['success_rate']:.3f}, {result['clean_success_rate']:.3f}"
+    return f"{rates} [{low:.3f}, {high:.3f}]"
+
+
+def _means(results, task, name):
+    result = results.get(task, {}).get(name)
+    if result is None:
+        return "not run"
+    length = "-" if result["path_length"] is None else f"{result['path_length']:.2f}"
+    seconds = result["planning_seconds"]
+    return length if seconds is None else f"{length}; {seconds:.3f}"
+
+
+def _conditions(results):
+    done = [(name, result) for cells in results.values() for name, result in cells.items()]
+    if not done:
+        return []
+    dates = sorted({result["date"] for _, result in done})
+    counts = {name: {r["num_queries"] for other, r in done if other == name} for name in CELLS}
+    said = [
+        f"{name}: {' or '.join(f'{n:,}' for n in sorted(numbers))}"
+        for name, numbers in counts.items()
+        if numbers
+    ]
+    return [f"Test queries per task: {'; '.join(said)}. Measured {dates[0]} to {dates[-1]}."]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--only", nargs="+", choices=list(envs.TASKS), metavar="TASK")
+    parser.add_argument("--policies", nargs="+", default=list(CELLS), choices=list(CELLS))
+    parser.add_argument("--num", type=int, default=1000, help="queries for those that search")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    args = parser.parse_args()
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    if not args.table:
+        run(results, args.only or list(envs.TASKS), args.policies, args.num, args.workers)
+    write_atomically(TABLE, table(results).encode())
+    print(f"{TABLE} written")
+
+
+if __name__ == "__main__":
+    main()
