@@ -38,6 +38,7 @@ class Args:
     # The run
     exp_name: str = "sac_her_mp"
     """name of the experiment, part of the run's folder"""
+    # SHARED: the run and the task
     seed: int = 1
     """seed of everything random; the same seed gives the same run on the same machine and device"""
     runs_dir: Path = Path("runs")
@@ -66,6 +67,7 @@ class Args:
     """joint velocities in the observation"""
     num_envs: int = 4
     """environments stepped together; every one of their steps counts"""
+    # END SHARED
 
     # The algorithm
     total_timesteps: int = 1_000_000
@@ -121,6 +123,7 @@ class Args:
     """train with hidden layers in bfloat16 (first layer, head and weights stay in float32); by
     default where the hardware has it"""
 
+    # SHARED: flags of the evaluation
     # Evaluation and bookkeeping
     eval_every: int = 25_000
     """environment steps between evaluations on validation queries; the best policy is kept"""
@@ -130,8 +133,10 @@ class Args:
     """test queries for the best policy at the end"""
     stop_at_success: float = 1.0
     """stop as soon as a validation success rate is this high, e.g. 0.9"""
+    # END SHARED
 
 
+# SHARED: arguments
 def configuration_of(args):
     """The fields that define what is computed: a run can only be resumed with the same."""
     free = {"resume", "runs_dir", "threads", "total_timesteps", "test_queries", "stop_at_success"}
@@ -144,7 +149,11 @@ def env_arguments(args):
     return {name: getattr(args, name) for name in names}
 
 
+# END SHARED
+
+
 # ALGO LOGIC: networks
+# SHARED: features and layers
 class Features(nn.Module):
     """Network inputs: observation, desired goal, and functions of them that speed up learning."""
 
@@ -195,7 +204,11 @@ class MLP(nn.Module):
         return self.head(x.float())
 
 
-class SoftQNetwork(nn.Module):
+# END SHARED
+
+
+# SHARED: critic
+class QNetwork(nn.Module):
     def __init__(self, args):
         super().__init__()
         self.features = Features(args)
@@ -206,6 +219,9 @@ class SoftQNetwork(nn.Module):
         """(N, o), (N, g), (N, 7) -> (N,)."""
         inputs = [self.features(observation, desired_goal), action / self.action_scale]
         return self.mlp(torch.cat(inputs, dim=1)).squeeze(-1)
+
+
+# END SHARED
 
 
 LOG_STD_MAX = 2
@@ -236,6 +252,7 @@ class Actor(nn.Module):
         return self.action_scale * torch.tanh(mean)
 
 
+# SHARED: replay buffer and demonstrations
 # ALGO LOGIC: replay buffer
 class HerReplayBuffer:
     """Transitions of finished episodes in a ring; goals are relabelled when they are sampled.
@@ -344,12 +361,16 @@ def demonstration_episode(demo, env, args):
     ]
 
 
+# END SHARED
+
+
 def td_target(reward, terminated, next_q1, next_q2, next_log_prob, alpha, gamma):
     """The critics' target r + gamma (1 - terminated) (min(Q1', Q2') - alpha log pi'), all (N,)."""
     next_value = torch.minimum(next_q1, next_q2) - alpha * next_log_prob
     return reward + gamma * (1.0 - terminated) * next_value
 
 
+# SHARED: averaging, evaluation, files and resuming
 def polyak_update(target_parameters, parameters, tau):
     """target <- (1 - tau) target + tau parameter, all tensors at once."""
     with torch.no_grad():
@@ -443,7 +464,11 @@ def parse_args():
     return args
 
 
+# END SHARED
+
+
 if __name__ == "__main__":
+    # SHARED: checks, folder, seeds and environments
     args = parse_args()
     if args.device == "cuda" and not torch.cuda.is_available():
         sys.exit("--device cuda: PyTorch sees no CUDA device here")
@@ -495,14 +520,16 @@ if __name__ == "__main__":
     eval_envs = [roboarm.make(args.task, **kwargs) for _ in range(8)]
     picture_env = roboarm.make(args.task, **kwargs, render_mode="rgb_array", render_size=(240, 180))
 
+    # END SHARED
+
     # ALGO LOGIC: networks and optimisers
     actor = Actor(args).to(device)
     actor_average = Actor(args).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
     actor_parameters = list(actor.parameters())
     average_parameters = list(actor_average.parameters())
-    qf1, qf2 = SoftQNetwork(args).to(device), SoftQNetwork(args).to(device)
-    qf1_target, qf2_target = SoftQNetwork(args).to(device), SoftQNetwork(args).to(device)
+    qf1, qf2 = QNetwork(args).to(device), QNetwork(args).to(device)
+    qf1_target, qf2_target = QNetwork(args).to(device), QNetwork(args).to(device)
     qf1_target.load_state_dict(qf1.state_dict())
     qf2_target.load_state_dict(qf2.state_dict())
     q_parameters = [*qf1.parameters(), *qf2.parameters()]
@@ -553,6 +580,7 @@ if __name__ == "__main__":
             torch.cuda.set_rng_state(state["cuda_rng"].cpu())
         del state
 
+    # SHARED: episodes
     writer = SummaryWriter(run, purge_step=progress["global_step"] + 1)
     writer.add_text(
         "hyperparameters",
@@ -594,6 +622,8 @@ if __name__ == "__main__":
         mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
     )
 
+    # END SHARED
+
     stop = False
     while progress["global_step"] < args.total_timesteps and not stop:
         # ALGO LOGIC: act
@@ -607,6 +637,7 @@ if __name__ == "__main__":
                 actor.train()
                 actions = actions.cpu().numpy()
 
+        # SHARED: a step in every environment
         for i, env in enumerate(envs):
             next_observation, reward, terminated, truncated, info = env.step(actions[i])
             staged[i].append(
@@ -640,8 +671,10 @@ if __name__ == "__main__":
                 observations[i] = begin_episode(i)
         progress["global_step"] += args.num_envs
         bar.update(args.num_envs)
+        # END SHARED
 
         # ALGO LOGIC: learn
+        # SHARED: batches
         due = (progress["global_step"] - args.learning_starts) * args.updates_per_step
         updates = max(0, int(due) - progress["updates"]) if buffer.size > 0 else 0
         if updates > 0:
@@ -652,6 +685,7 @@ if __name__ == "__main__":
         for update in range(updates):
             batch = {name: tensors[update] for name, tensors in batches.items()}
             goal = batch["desired_goal"]
+            # END SHARED
             alpha = log_alpha.detach().exp()
 
             with torch.no_grad():
@@ -705,7 +739,7 @@ if __name__ == "__main__":
                 sps = (step - steps_before) / (time.time() - started)
                 writer.add_scalar("charts/SPS", int(sps), step)
 
-        # Evaluate, keep the best policy, checkpoint
+        # SHARED: evaluate, keep the best policy, checkpoint
         step = progress["global_step"]
         if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
             result = evaluate(actor_average, eval_envs, validation, device)
@@ -747,3 +781,4 @@ if __name__ == "__main__":
         f"{progress['global_step']} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
     )
     writer.close()
+    # END SHARED

@@ -1,44 +1,19 @@
-"""sac_her_mp.py: its numbers against independent formulas, real short runs, kill and resume."""
+"""sac_her_mp.py: its numbers against independent formulas, and what only it does in a run."""
 
-import importlib.util
-import json
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainers import load, run_script
 
 import envs
 from demo_generation import collect
 from envs import panda
-from envs.datasets import Demos, Scenes, demo_path, load_demos
-from envs.programs import load_program
+from envs.datasets import Demos, Scenes, load_demos
 
-SCRIPT = Path(__file__).parents[1] / "clean_rl_scripts" / "sac_her_mp.py"
-spec = importlib.util.spec_from_file_location("sac_her_mp", SCRIPT)
-sac = importlib.util.module_from_spec(spec)
-sys.modules["sac_her_mp"] = sac
-spec.loader.exec_module(sac)
-
-TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
-TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1800"
-
-
-def command(folder, *flags):
-    return [sys.executable, str(SCRIPT), "--runs-dir", str(folder), *TINY.split(), *flags]
-
-
-def run_script(folder, *flags):
-    done = subprocess.run(command(folder, *flags), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return next(folder.iterdir())
+sac = load("sac_her_mp")
 
 
 # --- Numbers
@@ -104,7 +79,7 @@ def test_networks_fit_every_observation(goal_type, velocities):
     batch = sac.stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
     action = sac.Actor(args)(**batch)
     assert action.shape == (2, 7)
-    value = sac.SoftQNetwork(args)(batch["observation"], batch["desired_goal"], action)
+    value = sac.QNetwork(args)(batch["observation"], batch["desired_goal"], action)
     assert value.shape == (2,)
 
 
@@ -189,7 +164,7 @@ def test_a_million_transitions_fit_into_400_mb():
 def test_bfloat16_products_stay_close_to_float32():
     torch.manual_seed(0)
     args = sac.Args(bf16=True)
-    q = sac.SoftQNetwork(args)
+    q = sac.QNetwork(args)
     inputs = torch.randn(256, 10), torch.randn(256, 3), torch.rand(256, 7) * 0.06
     in_training, exact = q.train()(*inputs), q.eval()(*inputs)
     assert 0 < (in_training - exact).abs().max() < 0.02
@@ -301,7 +276,7 @@ def test_a_run_trains_on_the_demonstrations_queries_and_injects(tmp_path, prob):
     options = {name: getattr(collect.Args("no_obstacles"), name) for name in collect.OPTIONS}
     collect.collect(path, 4, options, progress=False)
     demos = load_demos(path)
-    run = run_script(tmp_path / "runs", "--demo-prob", prob, "--demos", str(path))
+    run = run_script("sac_her_mp", tmp_path / "runs", "--demo-prob", prob, "--demos", str(path))
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     rows, remaining = state["buffer"]["rows"].numpy(), state["buffer"]["remaining"].numpy()
     first = np.concatenate([[True], remaining[:-1] == 0])
@@ -326,138 +301,12 @@ def test_a_run_trains_on_the_demonstrations_queries_and_injects(tmp_path, prob):
 # --- Real runs
 
 
-@pytest.fixture(scope="module")
-def finished_run(tmp_path_factory):
-    return run_script(tmp_path_factory.mktemp("runs"), "--goal-type", "combined", "--velocities")
-
-
-def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run):
-    result = json.loads((finished_run / "result.json").read_text())
-    assert result["steps"] == 1800 and result["num_queries"] == 4
-    assert 0 <= result["clean_success_rate"] <= result["success_rate"] <= 1
-    assert result["args"]["goal_type"] == "combined"
-
-    events = EventAccumulator(str(finished_run))
-    events.Reload()
-    scalars = set(events.Tags()["scalars"])
-    for tag in ("episodic_return", "episodic_length", "success"):
-        assert f"charts/{tag}" in scalars
-    for tag in ("success_rate", "clean_success_rate", "episode_length", "collision_rate"):
-        assert [event.step for event in events.Scalars(f"eval/{tag}")] == [600, 1200, 1800]
-    assert "eval/rollout" in events.Tags()["images"]
-    assert "hyperparameters/text_summary" in events.Tags()["tensors"]
-
-
-def test_the_saved_policy_acts_without_the_script(finished_run):
-    policy = load_program(finished_run / "policy.pt")
-    assert policy.metadata["kind"] == "policy" and policy.metadata["task"] == "no_obstacles"
-    env = envs.make(policy.metadata["task"], **policy.metadata["env"])
-    observation, _ = env.reset(seed=0)
-    action = policy(**sac.stack([observation], "cpu"))[0].numpy()
-    assert action.shape == (7,) and np.abs(action).max() <= 0.06
-    env.step(action)
-
-
-def test_the_running_average_of_the_policy_is_what_is_saved(tmp_path):
-    run = run_script(tmp_path, "--total-timesteps", "600", "--policy-average", "0.1")
-    state = torch.load(run / "checkpoint.pt", weights_only=True)
-    args = sac.Args(hidden_size=16, bf16=False)
-    actor, average = sac.Actor(args).eval(), sac.Actor(args).eval()
-    actor.load_state_dict(state["actor"])
-    average.load_state_dict(state["actor_average"])
-    observation, goal = torch.randn(8, 10), torch.randn(8, 3)
-    saved = load_program(run / "policy.pt")(
-        observation=observation, achieved_goal=goal, desired_goal=goal
-    )
-    torch.testing.assert_close(saved, average(observation, goal, goal))
-    assert (saved - actor(observation, goal, goal)).abs().max() > 1e-4
-
-
 def test_losses_are_logged_subgoal_actions_train_and_alpha_can_stay(tmp_path):
     flags = "--action-mode subgoal --updates-per-step 1 --goal-type config --no-autotune"
-    run = run_script(tmp_path, *flags.split())
+    run = run_script("sac_her_mp", tmp_path, *flags.split())
     events = EventAccumulator(str(run))
     events.Reload()
     for tag in ("qf1_values", "qf1_loss", "qf2_loss", "qf_loss", "actor_loss", "alpha"):
         assert np.isfinite([event.value for event in events.Scalars(f"losses/{tag}")]).all()
     assert events.Scalars("losses/alpha")[-1].value == pytest.approx(0.2)
     assert events.Scalars("charts/SPS")[-1].value > 0
-
-
-def same(a, b):
-    if isinstance(a, dict):
-        assert a.keys() == b.keys()
-        for key in a.keys() - {"seconds"}:
-            same(a[key], b[key])
-    elif isinstance(a, list):
-        for one, other in zip(a, b, strict=True):
-            same(one, other)
-    elif isinstance(a, torch.Tensor):
-        assert torch.equal(a, b)
-    else:
-        assert a == b
-
-
-def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path):
-    whole = run_script(tmp_path / "whole")
-    process = subprocess.Popen(
-        command(tmp_path / "killed"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    deadline = time.time() + 120
-    while not list((tmp_path / "killed").glob("*/checkpoint.pt")) and time.time() < deadline:
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    killed = next((tmp_path / "killed").iterdir())
-    assert not (killed / "result.json").exists()
-    (killed / "checkpoint.pt.part").write_bytes(b"half a checkpoint")  # must not be read
-
-    done = subprocess.run(
-        [sys.executable, str(SCRIPT), "--resume", str(killed)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    same(*(torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed)))
-    results = [json.loads((run / "result.json").read_text()) for run in (whole, killed)]
-    assert results[0]["success_rate"] == results[1]["success_rate"]
-
-
-# --- Bad input
-
-
-@pytest.mark.parametrize(
-    "flags, message",
-    [
-        (["--task", "walls"], "unknown task 'walls': one of no_obstacles, wall"),
-        (["--resume", "nowhere"], "nowhere is no run's folder"),
-        (["--goal-type", "pose"], "goal-type"),
-        (["--buffer-size", "49"], "--buffer-size 49: an episode has 50 transitions"),
-        (["--demo-prob", "1.5"], "--demo-prob 1.5: a probability is in [0, 1]"),
-        (["--demo-prob", "1", "--velocities"], "demonstrations have no velocities"),
-        (["--demo-prob", "1", "--max-step", "0.02"], "steps up to 0.03"),
-        (["--demo-prob", "1", "--demos", "nowhere.h5"], "nowhere.h5: no such file"),
-        (
-            ["--demo-prob", "1", "--demos", str(demo_path("wall"))],
-            "this file is for the task 'wall', not 'no_obstacles'",
-        ),
-        (["--demos", "some.h5"], "--demos goes with --demo-prob"),
-    ],
-)
-def test_bad_flags(tmp_path, flags, message):
-    done = subprocess.run(command(tmp_path, *flags), capture_output=True, text=True)
-    assert done.returncode != 0 and message in done.stderr + done.stdout
-    assert "Traceback" not in done.stderr and not list(tmp_path.iterdir())
-
-
-def test_resuming_refuses_another_configuration_and_a_damaged_checkpoint(finished_run, tmp_path):
-    resume = [sys.executable, str(SCRIPT), "--resume", str(finished_run)]
-    done = subprocess.run([*resume, "--gamma", "0.9"], capture_output=True, text=True)
-    assert done.returncode != 0
-    assert "--gamma is 0.9 now, the run had 0.95" in done.stderr and "task" not in done.stderr
-
-    (tmp_path / "args.json").write_bytes((finished_run / "args.json").read_bytes())
-    checkpoint = (finished_run / "checkpoint.pt").read_bytes()
-    (tmp_path / "checkpoint.pt").write_bytes(checkpoint[: len(checkpoint) // 2])
-    resume[-1] = str(tmp_path)
-    done = subprocess.run(resume, capture_output=True, text=True)
-    assert done.returncode != 0 and "checkpoint.pt is damaged" in done.stderr
-    assert "Traceback" not in done.stderr

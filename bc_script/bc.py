@@ -1,0 +1,465 @@
+"""Behavioural cloning (BC) of demonstrations. One file: read it top to bottom.
+
+    python bc_script/bc.py --task no_obstacles --goal-type combined
+    python bc_script/bc.py --task double_walls --goal-type config --demos a.h5 b.h5
+
+Maximum likelihood of the demonstrated actions under a Gaussian policy, or with `--num-modes` a
+mixture of Gaussians (paper, sections 2 and 5, appendix "Parameter sweeps"). To make an algorithm of
+your own, copy this file and change the parts under `# ALGO LOGIC`. Parts between `# SHARED` and
+`# END SHARED` are those of `clean_rl_scripts/sac_her_mp.py`.
+"""
+
+import json
+import math
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+import envs as roboarm
+from envs import panda
+from envs.datasets import MAX_STEP, DatasetError, load_demos, load_queries
+from envs.programs import load_program, save_program
+from envs.tasks import task_name
+
+
+@dataclass
+class Args:
+    # The run
+    exp_name: str = "bc"
+    """name of the experiment, part of the run's folder"""
+    seed: int = 1
+    """seed of everything random; the same seed gives the same run on the same machine and device"""
+    runs_dir: Path = Path("runs")
+    """the run's folder is made in here: TensorBoard events, checkpoint, policy.pt, result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint; its own flags are used"""
+    device: str = "cpu"
+    """`cpu` or `cuda`; the demonstrations go there too"""
+    threads: int = 1
+    """torch threads; one is fastest for networks of this size, and leaves the other cores alone"""
+
+    # The task (the paper's MDP; `docs/environment.md`)
+    task: str = "no_obstacles"
+    """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
+    goal_type: Literal["ee", "config", "combined"] = "combined"
+    """what the goal is: end-effector position, configuration, or both"""
+    demos: tuple[Path, ...] = ()
+    """demonstration files of the task; by default the task's own"""
+    num_demos: int | None = None
+    """only the first so many demonstrations of each file"""
+
+    # The algorithm
+    total_updates: int = 1_000_000
+    """batches of the whole run (paper: 1,000,000)"""
+    batch_size: int = 256
+    """transitions per batch"""
+    learning_rate: float = 1e-3
+    """learning rate (Adam) at the start"""
+    anneal: bool = True
+    """let the learning rate fall linearly, to zero at the end"""
+    num_modes: int = 1
+    """Gaussians of the policy's mixture; the most likely one's mean is the action in evaluation"""
+    policy_average: float = 0.001
+    """share of the policy that moves into its running average per update; the average is what is
+    evaluated and saved (1: no averaging)"""
+    hidden_size: int = 256
+    """width of the hidden layers"""
+    num_hidden_layers: int = 2
+    """number of hidden layers"""
+    relative_goal: bool = True
+    """add goal minus end-effector position, times 5, to the network's inputs"""
+    trigonometric: bool = True
+    """add the joint angles' sines and cosines to the network's inputs"""
+    bf16: bool = False
+    """train with hidden layers in bfloat16 (first layer, head and weights stay in float32)"""
+    velocities: ClassVar[bool] = False  # demonstrations have none
+
+    # Evaluation and bookkeeping
+    eval_every: int = 50_000
+    """updates between evaluations on validation queries; the best policy is kept"""
+    eval_queries: int = 200
+    """validation queries per evaluation"""
+    test_queries: int = 1_000
+    """test queries for the best policy at the end"""
+
+
+def configuration_of(args):
+    """The fields that define what is computed: a run can only be resumed with the same."""
+    free = {"resume", "runs_dir", "threads", "test_queries"}
+    values = {k: v for k, v in asdict(args).items() if k not in free}
+    return values | {"demos": [str(path) for path in args.demos]}
+
+
+# ALGO LOGIC: the policy
+# SHARED: features and layers
+class Features(nn.Module):
+    """Network inputs: observation, desired goal, and functions of them that speed up learning."""
+
+    def __init__(self, args):
+        super().__init__()
+        self.goal_type, self.relative_goal = args.goal_type, args.relative_goal
+        self.trigonometric = args.trigonometric
+        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        self.register_buffer("middle", ((high + low) / 2).float())
+        self.register_buffer("half_range", ((high - low) / 2).float())
+        goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
+        self.size = 10 + 7 * args.velocities + goal_size
+        self.size += 14 * args.trigonometric
+        self.size += 3 * (args.relative_goal and args.goal_type != "config")
+
+    def forward(self, observation, desired_goal):
+        """(N, o), (N, g) -> (N, size)."""
+        inputs = [observation, desired_goal]
+        if self.trigonometric:
+            angles = observation[:, :7] * self.half_range + self.middle
+            inputs += [torch.sin(angles), torch.cos(angles)]
+        if self.relative_goal and self.goal_type != "config":
+            inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, -3:]))
+        return torch.cat(inputs, dim=1)
+
+
+class MLP(nn.Module):
+    def __init__(self, num_inputs, num_outputs, args, layer_norm):
+        super().__init__()
+        sizes = [num_inputs] + [args.hidden_size] * args.num_hidden_layers
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        norm = nn.LayerNorm if layer_norm else lambda _: nn.Identity()
+        self.norms = nn.ModuleList(norm(args.hidden_size) for _ in self.layers)
+        self.head = nn.Linear(args.hidden_size, num_outputs)
+        self.bf16 = args.bf16
+
+    def forward(self, x):
+        bf16 = self.bf16 and self.training
+        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
+            # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
+            if not bf16:
+                x = layer(x)
+            elif i == 0:
+                x = layer(x).bfloat16()
+            else:
+                x = F.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16())
+            x = F.relu(norm(x))
+        return self.head(x.float())
+
+
+# END SHARED
+
+
+LOG_STD_MAX = 2
+LOG_STD_MIN = -5
+
+
+class Actor(nn.Module):
+    """A mixture of Gaussians with diagonal covariances over the action, in units of `MAX_STEP`."""
+
+    def __init__(self, args):
+        super().__init__()
+        self.features = Features(args)
+        self.num_modes = args.num_modes
+        self.mlp = MLP(self.features.size, 15 * args.num_modes, args, layer_norm=False)
+
+    def modes(self, observation, desired_goal):
+        """Means and log standard deviations (N, K, 7), log weights (N, K)."""
+        outputs = self.mlp(self.features(observation, desired_goal))
+        outputs = outputs.unflatten(1, (self.num_modes, 15))
+        log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (
+            torch.tanh(outputs[..., 7:14]) + 1
+        )
+        return outputs[..., :7], log_std, F.log_softmax(outputs[..., 14], dim=1)
+
+    def log_likelihood(self, observation, desired_goal, action):
+        """Of actions (N, 7), in units of `MAX_STEP`: (N,)."""
+        mean, log_std, log_weight = self.modes(observation, desired_goal)
+        standard = (action.unsqueeze(1) - mean) * torch.exp(-log_std)
+        log_density = -0.5 * standard.square() - log_std - 0.5 * math.log(2 * math.pi)
+        return torch.logsumexp(log_weight + log_density.sum(2), dim=1)
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        """The most likely mode's mean (N, 7), as an action; this is what policy.pt contains."""
+        mean, _, log_weight = self.modes(observation, desired_goal)
+        likeliest = log_weight.argmax(1).reshape(-1, 1, 1).expand(-1, 1, 7)
+        return MAX_STEP * mean.gather(1, likeliest).squeeze(1)
+
+
+# ALGO LOGIC: demonstrations
+def transitions(demos, goal_type, num_demos=None):
+    """The observations, goals and actions of demonstrations: float32 (n, 10), (n, g), (n, 7).
+
+    All of a demonstration, beyond where its goal counts as reached: it goes on to the very goal.
+    Actions are in units of `MAX_STEP`.
+    """
+    number = len(demos) if num_demos is None else min(num_demos, len(demos))
+    rows = slice(demos.offsets[number])
+    which = np.repeat(np.arange(number), np.diff(demos.offsets[: number + 1]))
+    goal_position = panda.forward_kinematics(demos.goal[:number])
+    goal = {
+        "ee": goal_position,
+        "config": panda.normalise(demos.goal[:number]),
+        "combined": np.hstack([panda.normalise(demos.goal[:number]), goal_position]),
+    }[goal_type]
+    commanded = np.ones(len(which), bool)
+    commanded[demos.offsets[1 : number + 1] - 1] = False  # from the last, nothing was
+    states = demos.states[rows][commanded]
+    positions = panda.forward_kinematics(panda.denormalise(states))
+    arrays = np.hstack([states, positions]), goal[which[commanded]]
+    return *(a.astype(np.float32) for a in arrays), demos.actions[rows][commanded] / MAX_STEP
+
+
+# SHARED: averaging, evaluation, files and resuming
+def polyak_update(target_parameters, parameters, tau):
+    """target <- (1 - tau) target + tau parameter, all tensors at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(target_parameters, parameters, tau)
+
+
+# Evaluation
+def stack(observations, device):
+    """List of observation dicts -> dict of float32 tensors (N, ...)."""
+    return {
+        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
+        for name in observations[0]
+    }
+
+
+@torch.no_grad()
+def evaluate(policy, envs, queries, device):
+    """Run a deterministic policy on every query, each env one at a time; mean results."""
+    waiting = iter(range(len(queries)))
+    running, results = {}, []
+
+    def start(env):
+        i = next(waiting, None)
+        running.pop(env, None)
+        if i is not None:
+            running[env] = env.reset_specific(*queries[i])[0]
+
+    for env in envs:
+        start(env)
+    while running:
+        actions = policy(**stack(list(running.values()), device)).cpu().numpy()
+        for env, action in zip(list(running), actions, strict=True):
+            running[env], _, terminated, truncated, info = env.step(action)
+            if terminated or truncated:
+                results.append(
+                    (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
+                )
+                start(env)
+    success, touched, steps = np.array(results, dtype=np.float64).T
+    return {
+        "success_rate": float(success.mean()),
+        "clean_success_rate": float((success * (1 - touched)).mean()),
+        "collision_rate": float(touched.mean()),
+        "episode_length": float(steps.mean()),
+    }
+
+
+@torch.no_grad()
+def picture_of_rollout(policy, env, queries, device, frames=8):
+    """An image strip (height, frames * width, 3), uint8, of the policy on the first query."""
+    observation, _ = env.reset_specific(*queries[0])
+    pictures, done = [env.render()], False
+    while not done:
+        action = policy(**stack([observation], device))[0].cpu().numpy()
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        if info["elapsed_steps"] % 10 == 0 or done:
+            pictures.append(env.render())
+    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
+    return np.concatenate([pictures[i] for i in chosen], axis=1)
+
+
+def write_atomically(path, write):
+    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
+    temporary = path.with_name(path.name + ".part")
+    write(temporary)
+    with open(temporary, "rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def parse_args():
+    """Flags, or with --resume those of the run, which must not be contradicted."""
+    args = tyro.cli(Args)
+    if args.resume is None:
+        return args
+    saved_file = args.resume / "args.json"
+    if not saved_file.exists():
+        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
+    saved = json.loads(saved_file.read_text())
+    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
+    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
+    args = tyro.cli(Args, default=defaults)
+    contradicted = [
+        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
+        for name, value in configuration_of(args).items()
+        if value != saved.get(name)
+    ]
+    if contradicted:
+        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
+    return args
+
+
+# END SHARED
+
+
+if __name__ == "__main__":
+    args = parse_args()
+    if args.device == "cuda" and not torch.cuda.is_available():
+        sys.exit("--device cuda: PyTorch sees no CUDA device here")
+    try:
+        if not roboarm.get_task(args.task).trainable:
+            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
+        validation = load_queries(args.task, "validation")[: args.eval_queries]
+        test = load_queries(args.task, "test")[: args.test_queries]
+    except ValueError as error:
+        sys.exit(f"--task: {error}")
+    for name in ("num_modes", "batch_size", "total_updates", "eval_every"):
+        if getattr(args, name) < 1:
+            sys.exit(f"--{name.replace('_', '-')} must be at least 1")
+    if args.num_demos is not None and args.num_demos < 1:
+        sys.exit("--num-demos must be at least 1")
+    try:
+        files = [load_demos(file, args.task) for file in args.demos or (args.task,)]
+    except DatasetError as error:
+        sys.exit(f"--demos: {error}")
+    if args.resume is not None:
+        run = args.resume
+    else:
+        name = f"{task_name(args.task)}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        run = args.runs_dir / name
+        run.mkdir(parents=True)
+        text = json.dumps(asdict(args), indent=2, default=str)
+        write_atomically(run / "args.json", lambda path: path.write_text(text))
+
+    # TRY NOT TO MODIFY: seeding
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
+    torch.use_deterministic_algorithms(True)
+    device = torch.device(args.device)
+
+    # data and env setup
+    parts = [transitions(demos, args.goal_type, args.num_demos) for demos in files]
+    data = [
+        torch.as_tensor(np.concatenate(arrays), device=device)
+        for arrays in zip(*parts, strict=True)
+    ]
+    del files, parts
+    env_arguments = {"goal_type": args.goal_type}
+    eval_envs = [roboarm.make(args.task, **env_arguments) for _ in range(8)]
+    picture_env = roboarm.make(
+        args.task, **env_arguments, render_mode="rgb_array", render_size=(240, 180)
+    )
+    example = stack([env.reset(seed=0)[0] for env in eval_envs[:2]], device)
+
+    # ALGO LOGIC: network and optimiser
+    actor = Actor(args).to(device)
+    actor_average = Actor(args).to(device).eval()  # evaluated and saved
+    actor_average.load_state_dict(actor.state_dict())
+    parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
+    optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
+    saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
+    progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_update": 0}
+
+    def save_checkpoint():
+        state = {name: part.state_dict() for name, part in saved_parts.items()}
+        state |= {"progress": progress, "torch_rng": torch.get_rng_state()}
+        if device.type == "cuda":
+            state["cuda_rng"] = torch.cuda.get_rng_state()
+        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
+
+    if args.resume is not None and (run / "checkpoint.pt").exists():
+        try:
+            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
+        except Exception as error:  # whatever a damaged file leads to
+            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
+        for name, part in saved_parts.items():
+            part.load_state_dict(state[name])
+        progress.update(state["progress"])
+        torch.set_rng_state(state["torch_rng"].cpu())
+        if device.type == "cuda":
+            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
+        del state
+
+    writer = SummaryWriter(run, purge_step=progress["updates"] + 1)
+    writer.add_text(
+        "hyperparameters",
+        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
+    )
+    started, seconds_before = time.time(), progress["seconds"]
+    updates_before = progress["updates"]
+    bar = tqdm(
+        total=args.total_updates,
+        initial=updates_before,
+        unit="update",
+        smoothing=0.05,
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
+    )
+
+    while progress["updates"] < args.total_updates:
+        # ALGO LOGIC: learn
+        if args.anneal:
+            remaining = 1.0 - progress["updates"] / args.total_updates
+            optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
+        rows = torch.randint(len(data[0]), (args.batch_size,), device=device)
+        observation, goal, action = (tensor[rows] for tensor in data)
+        loss = -actor.log_likelihood(observation, goal, action).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        polyak_update(average_parameters, parameters, args.policy_average)
+        progress["updates"] += 1
+        bar.update()
+
+        step = progress["updates"]
+        if step % 1000 == 0:
+            writer.add_scalar("losses/negative_log_likelihood", loss.item(), step)
+            writer.add_scalar("charts/learning_rate", optimizer.param_groups[0]["lr"], step)
+            ups = (step - updates_before) / (time.time() - started)
+            writer.add_scalar("charts/SPS", int(ups), step)
+
+        # Evaluate, keep the best policy, checkpoint
+        if step % args.eval_every == 0 or step == args.total_updates:
+            result = evaluate(actor_average, eval_envs, validation, device)
+            for name, value in result.items():
+                writer.add_scalar(f"eval/{name}", value, step)
+            picture = picture_of_rollout(actor_average, picture_env, validation, device)
+            writer.add_image("eval/rollout", picture, step, dataformats="HWC")
+            if result["success_rate"] > progress["best_success"]:
+                progress["best_success"], progress["best_update"] = result["success_rate"], step
+                metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
+                metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
+                save_program(run / "policy.pt", actor_average, example, metadata)
+            bar.set_postfix(
+                eval=f"{result['success_rate']:.3f}", best=f"{progress['best_success']:.3f}"
+            )
+            progress["seconds"] = seconds_before + time.time() - started
+            save_checkpoint()
+    bar.close()
+
+    # The best policy (by validation) on test queries
+    best = load_program(run / "policy.pt").to(device)
+    result = evaluate(best, eval_envs, test, device)
+    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(test)}
+    result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_update"]}
+    result |= {"validation_success_rate": progress["best_success"]}
+    result |= {"steps": progress["updates"], "seconds": round(progress["seconds"])}
+    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
+    write_atomically(run / "result.json", lambda path: path.write_text(text))
+    print(
+        f"{args.task}, goal {args.goal_type}, {len(test)} test queries: "
+        f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
+        f"{progress['updates']} updates in {progress['seconds']:.0f} s. {run / 'result.json'}"
+    )
+    writer.close()

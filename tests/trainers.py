@@ -1,0 +1,39 @@
+"""Trainers as modules and as commands, for the tests."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PATHS = {
+    "sac_her_mp": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
+    "td3_her_mp": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
+    "bc": ROOT / "bc_script" / "bc.py",
+}
+TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
+TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1800"
+TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --eval-queries 3"
+TINY_BC += " --test-queries 4 --total-updates 1800"
+
+
+def load(trainer):
+    """A trainer's script as a module."""
+    spec = importlib.util.spec_from_file_location(trainer, PATHS[trainer])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[trainer] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def command(trainer, folder, *flags):
+    """A run of seconds; later flags win."""
+    tiny = (TINY_BC if trainer == "bc" else TINY).split()
+    return [sys.executable, str(PATHS[trainer]), "--runs-dir", str(folder), *tiny, *flags]
+
+
+def run_script(trainer, folder, *flags):
+    """The folder of such a run."""
+    done = subprocess.run(command(trainer, folder, *flags), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return next(folder.iterdir())
