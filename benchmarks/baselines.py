@@ -22,7 +22,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import envs
-from envs.datasets import load_queries
+from envs.datasets import load_queries, query_path
 from envs.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -141,7 +141,9 @@ def main():
     args = parser.parse_args()
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     if not args.table:
-        run(results, args.only or list(envs.TASKS), args.policies, args.num, args.workers)
+        # A task without a packaged query file has no cells.
+        tasks = args.only or [task for task in envs.TASKS if query_path(task).exists()]
+        run(results, tasks, args.policies, args.num, args.workers)
     write_atomically(TABLE, table(results).encode())
     print(f"{TABLE} written")
 

@@ -6,7 +6,7 @@
 Soft Actor-Critic (Haarnoja et al., 2018) in CleanRL's form, goals relabelled with the `future`
 strategy (Andrychowicz et al., 2017), demonstrations injected upon failure (SAC-MP), as in the
 paper's sections 2 and 5. To make an algorithm of your own, copy this file and change the parts
-under `# ALGO LOGIC`.
+under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are those of `td3_her_mp.py`.
 """
 
 import json

@@ -1,7 +1,7 @@
 """Random scenes: shelves, poles and walls around the arm (paper, section 4).
 
-The paper names the kinds of obstacles and how many there are. The distribution is ours, calibrated
-so that go-to-goal succeeds as often as in the paper (docs/tasks.md).
+The paper names the kinds of obstacles and how many there are. The distribution is ours. It
+is provisional: it is still being calibrated to go-to-goal's success in the paper (docs/tasks.md).
 """
 
 import math
