@@ -2,13 +2,14 @@
 
 import json
 import subprocess
+import sys
 
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
-from trainers import command, load, run_script
+from trainers import PATHS, command, load, run_script
 
 import envs
 from envs import panda
@@ -91,7 +92,9 @@ def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path):
     events.Reload()
     losses = [event.value for event in events.Scalars("losses/negative_log_likelihood")]
     assert len(losses) == 1 and np.isfinite(losses).all()
-    assert json.loads((run / "args.json").read_text())["demos"] != []
+    assert json.loads((run / "args.json").read_text())["demos"] == [path, path]
+    resumed = subprocess.run([sys.executable, PATHS["bc"], "--resume", run], capture_output=True)
+    assert resumed.returncode == 0, resumed.stderr
 
 
 @pytest.mark.parametrize(
