@@ -11,10 +11,7 @@ goes on from there when it is started again.
 import base64
 import collections
 import contextlib
-import fcntl
 import importlib.util
-import json
-import os
 import re
 import socket
 import sys
@@ -28,12 +25,12 @@ from tqdm import tqdm
 import envs
 from demo_generation import workers
 from demo_generation.following import follow
+from demo_generation.journal import Journal, journal_of
 from demo_generation.planning import Planner, PlanningError
 from envs.datasets import (
     check_writable,
     demo_path,
     query_path,
-    scene_to_json,
     validate,
     write_demos,
 )
@@ -41,7 +38,6 @@ from envs.scenes import Scene, from_array, to_array
 
 # Streams 1 and 2 of random numbers are those of the test and validation queries.
 STREAM = 3
-JOURNAL_VERSION = 2
 MAX_QUERIES = 100  # tried for one demonstration
 REASONS = ("no_plan", "missed", "collided", "too_long")
 
@@ -173,86 +169,6 @@ def _decode(text):
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 7)
 
 
-class Journal:
-    """The demonstrations so far: JSON lines, the first one saying which collection it is.
-
-    Lines are appended and flushed one at a time, so whatever happens only the last can be damaged;
-    it is dropped when the journal is opened again. One process at a time holds it.
-    """
-
-    def __init__(self, path, options):
-        self.path = path
-        self.demos = {}
-        """Index -> demonstration."""
-        scene = scene_to_json(envs.get_task(options["task"]).base_scene)
-        header = {"journal": JOURNAL_VERSION, **options, "scene": scene}
-        self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise ValueError(f"{path}: another collection is writing to it") from error
-        if not path.exists() or not os.path.samestat(os.fstat(self._file.fileno()), path.stat()):
-            raise ValueError(f"{path}: another collection has just finished with it")
-        self._file.seek(0)
-        contents = self._file.read()
-        lines = contents.split(b"\n")
-        good = 0
-        for number, line in enumerate(lines[:-1]):  # what follows the last line's end is damaged
-            try:
-                entry = json.loads(line)
-            except ValueError:
-                if number == 0:
-                    raise ValueError(_difference(path, None, header)) from None
-                break
-            if number == 0:
-                if entry != header:
-                    raise ValueError(_difference(path, entry, header))
-            else:
-                self.demos[entry["index"]] = entry
-            good += len(line) + 1
-        if good == 0 and not json.dumps(header).encode().startswith(contents):
-            raise ValueError(_difference(path, None, header))  # and not a torn first line either
-        self._file.truncate(good)
-        if good == 0:
-            self._write(header)
-
-    def append(self, demo):
-        self._write(demo)
-        self.demos[demo["index"]] = demo
-
-    def _write(self, entry):
-        line = json.dumps(entry).encode() + b"\n"
-        end = self._file.seek(0, 2)
-        try:
-            if self._file.write(line) != len(line):  # the disk is full
-                raise OSError("No space left on device")
-        except OSError:
-            self._file.truncate(end)
-            raise
-
-    def close(self):
-        self._file.close()
-
-
-def _difference(path, found, wanted):
-    if not isinstance(found, dict) or found.get("journal") != JOURNAL_VERSION:
-        return f"{path}: not a journal that this version can continue; move it away"
-    names = [name for name in wanted if found.get(name) != wanted[name]]
-    differences = ", ".join(
-        "another scene" if name == "scene" else f"{name} {found.get(name)!r}, not {wanted[name]!r}"
-        for name in names
-    )
-    return (
-        f"{path}: the journal of another collection ({differences}): use its flags to continue it, "
-        f"or delete it"
-    )
-
-
-def journal_of(path):
-    """Where the unfinished collection of a file is kept."""
-    return path.with_name(path.name + ".journal")
-
-
 def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
     """Collect demonstrations into the journal of `path`, write the file, delete the journal.
 
@@ -275,7 +191,7 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
         Whatever is raised, what is in the journal is safe.
     """
     with contextlib.closing(Journal(journal_of(path), options)) as journal:
-        missing = [index for index in range(num) if index not in journal.demos]
+        missing = [index for index in range(num) if index not in journal.entries]
         bar = tqdm(
             desc=options["task"],
             total=num,
@@ -292,7 +208,7 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             for demo in results:
                 journal.append(demo)
                 bar.update()
-        demos = [journal.demos[index] for index in range(num)]
+        demos = [journal.entries[index] for index in range(num)]
         counts = collections.Counter(attempts=num, queries_given_up=0)
         for reason in REASONS:
             counts[reason] = sum(demo["rejected"].get(reason, 0) for demo in demos)

@@ -10,12 +10,14 @@ without touching anything when it was followed in the simulator.
 Where scenes vary, `--queries-per-scene` queries in a row have the same one: smaller files.
 
 Query i of a split depends on the seed, the split and i only, so the file is the same whatever the
-number of workers. It is written at the end, in one piece: an interrupted run leaves what was there.
+number of workers. It is written at the end, in one piece; until then queries go to a journal beside
+it, and an interrupted run goes on from there when it is started again.
 """
 
+import contextlib
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +27,12 @@ from tqdm import tqdm
 import envs
 from demo_generation import workers
 from demo_generation.collect import MAX_QUERIES, demonstrate
+from demo_generation.journal import Journal, journal_of
 from demo_generation.motionbenchmaker import read_problems
 from demo_generation.planning import Planner
 from envs.arm_env import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 from envs.datasets import ORIGINAL, check_writable, query_path, write_queries
-from envs.scenes import Scene
+from envs.scenes import Scene, from_array, to_array
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
 HOLD_STEPS = 24
@@ -65,7 +68,7 @@ class Args:
 
 
 class Sampler:
-    """Samples queries of a task; a job is (seed, split, index)."""
+    """Samples queries of a task; a job is (seed, split, number)."""
 
     def __init__(self, task, solvable, queries_per_scene=1):
         self.queries_per_scene = queries_per_scene
@@ -73,15 +76,15 @@ class Sampler:
         self.planner = Planner(self.env, max_checks=SOLVE_CHECKS) if solvable else None
 
     def __call__(self, job):
-        """`(job, start, goal, scene, rejected)`: query `index` of a split.
+        """Query `number` of a split, as a JSON-ready dict.
 
-        `rejected` counts the samples that were not held for long enough (`unheld`), or that the
+        Its `rejected` counts the samples that were not held for long enough (`unheld`), or that the
         planner did not solve (`unsolved`).
         """
-        seed, split, index = job
-        scene = [seed, STREAMS[split], index // self.queries_per_scene]
+        seed, split, number = job
+        scene = [seed, STREAMS[split], number // self.queries_per_scene]
         self.env.sample_scene(np.random.default_rng([*scene, SCENE_STREAM]))
-        rng = np.random.default_rng([seed, STREAMS[split], index])
+        rng = np.random.default_rng([seed, STREAMS[split], number])
         rejected = Counter()
         for _ in range(MAX_QUERIES):
             start, goal = self.env.sample_query(rng)
@@ -90,7 +93,13 @@ class Sampler:
             elif self.planner and not demonstrate(self.planner, start, goal, rng, SOLVE_ATTEMPTS):
                 rejected["unsolved"] += 1
             else:
-                return job, start, goal, self.env.scene, rejected
+                return {
+                    "index": f"{split}/{number}",
+                    "start": start.tolist(),
+                    "goal": goal.tolist(),
+                    "obstacles": to_array(self.env.scene.obstacles).tolist(),
+                    "rejected": rejected,
+                }
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
 
 
@@ -123,45 +132,65 @@ def make_queries(
         A Counter of the samples rejected: `unheld`, `unsolved`.
 
     Raises:
-        ValueError: unknown task.
+        ValueError: unknown task; the journal belongs to other queries, or is in use.
+        RuntimeError: no query can be found, or workers keep dying.
         DatasetError, OSError: as `envs.datasets.write_queries` does.
+        Whatever is raised, what is in the journal is safe.
     """
     query_path(task)  # refuses an unknown task
     splits = {} if original is None else {ORIGINAL: read_problems(original)}
-    jobs = [(seed, "test", i) for i in range(num_test)]
-    jobs += [(seed, "validation", i) for i in range(num_validation)]
-    bar = tqdm(desc=task, total=len(jobs), unit=" queries", disable=not progress)
-    made, rejected = {}, Counter()
-    with bar:
-        results = workers.run(
-            Sampler, (task, solvable, queries_per_scene), jobs, num_workers, warn=bar.write
+    path, distribution, base = Path(path), envs.get_task(task).scene, envs.get_task(task).base_scene
+    options = {"task": str(task), "seed": seed, "solvable": solvable}
+    options |= {"queries_per_scene": queries_per_scene}
+    with contextlib.closing(Journal(journal_of(path), options)) as journal:
+        jobs = [(seed, "test", number) for number in range(num_test)]
+        jobs += [(seed, "validation", number) for number in range(num_validation)]
+        missing = [job for job in jobs if f"{job[1]}/{job[2]}" not in journal.entries]
+        bar = tqdm(
+            desc=task,
+            total=len(jobs),
+            initial=len(jobs) - len(missing),
+            unit=" queries",
+            mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+            disable=not progress,
         )
-        for job, *query, more in results:
-            made[job] = query
-            rejected += more
-            bar.update()
-    for split in STREAMS:
-        start, goal, scenes = zip(*(made[job] for job in jobs if job[1] == split), strict=True)
-        splits[split] = (np.stack(start), np.stack(goal))
-        if not isinstance(envs.get_task(task).scene, Scene):
-            splits[split] += (scenes,)
-    parameters = {
-        "hold_steps": HOLD_STEPS,
-        "hold_drift": HOLD_DRIFT,
-        "time_step": TIME_STEP,
-        "substeps": SUBSTEPS,
-        "rejected": rejected["unheld"],
-    }
-    if solvable:
-        parameters |= {"unsolved": rejected["unsolved"], "solve_checks": SOLVE_CHECKS}
-        parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
-    made_by = f"python -m demo_generation.make_queries --task {task} --seed {seed} "
-    made_by += f"--num-test {num_test} --num-validation {num_validation}" + " --solvable" * solvable
-    if queries_per_scene > 1:
-        made_by += f" --queries-per-scene {queries_per_scene}"
-    if original is not None:
-        made_by += f" --original {Path(original).name}"
-    write_queries(path, task, seed, splits, made_by, parameters)
+        arguments = (task, solvable, queries_per_scene)
+        results = workers.run(Sampler, arguments, missing, num_workers, warn=bar.write)
+        with bar, contextlib.closing(results):
+            for query in results:
+                journal.append(query)
+                bar.update()
+        rejected = Counter()
+        for split, num in (("test", num_test), ("validation", num_validation)):
+            made = [journal.entries[f"{split}/{number}"] for number in range(num)]
+            for query in made:
+                rejected.update(query["rejected"])
+            start, goal, rows = (
+                [query[name] for query in made] for name in ("start", "goal", "obstacles")
+            )
+            splits[split] = (np.array(start, np.float32), np.array(goal, np.float32))
+            if not isinstance(distribution, Scene):
+                scenes = [replace(base, obstacles=from_array(row)) for row in rows]
+                splits[split] += (scenes,)
+        parameters = {
+            "hold_steps": HOLD_STEPS,
+            "hold_drift": HOLD_DRIFT,
+            "time_step": TIME_STEP,
+            "substeps": SUBSTEPS,
+            "rejected": rejected["unheld"],
+        }
+        if solvable:
+            parameters |= {"unsolved": rejected["unsolved"], "solve_checks": SOLVE_CHECKS}
+            parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
+        made_by = f"python -m demo_generation.make_queries --task {task} --seed {seed} "
+        made_by += f"--num-test {num_test} --num-validation {num_validation}"
+        made_by += " --solvable" * solvable
+        if queries_per_scene > 1:
+            made_by += f" --queries-per-scene {queries_per_scene}"
+        if original is not None:
+            made_by += f" --original {Path(original).name}"
+        write_queries(path, task, seed, splits, made_by, parameters)
+        journal_of(path).unlink()
     return rejected
 
 
@@ -210,10 +239,10 @@ def main(args):
                 )
                 text += f", {rejected['unsolved']} not solved by the planner ({share:.3f})"
             print(text)
-    except (OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
-        print("interrupted: the file being made was not written", file=sys.stderr)
+        print("interrupted; the same command goes on from here", file=sys.stderr)
         sys.exit(130)
 
 

@@ -26,7 +26,7 @@ WALL = {
     "height": (1.2, 1.5),
 }
 # Rough obstacles: along smooth ones the arm slides to its goal, however many there are.
-FRICTION = 3.0
+FRICTION = 2.25
 # Nothing comes nearer than this (m) to the robot's axis below the shoulder's top (m).
 KEEP_CLEAR, SHOULDER = 0.14, 0.45
 

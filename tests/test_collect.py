@@ -21,6 +21,7 @@ import pytest
 import envs
 from demo_generation import collect, workers
 from demo_generation.following import follow
+from demo_generation.journal import VERSION
 from demo_generation.planning import Planner
 from demo_generation.verify import VERDICTS, Verifier, verify
 from envs import panda
@@ -226,7 +227,7 @@ def test_control_c_and_on_again(whole, output):
 def journal():
     """The journal of a collection that was stopped just before it wrote its file."""
     scene = scene_to_json(envs.TASKS[TASK].scene)
-    lines = [json.dumps({"journal": collect.JOURNAL_VERSION, **options(), "scene": scene})]
+    lines = [json.dumps({"journal": VERSION, **options(), "scene": scene})]
     collector = collect.Collector(options())
     lines += [json.dumps(collector(index)) for index in reversed(range(NUM))]
     return "".join(line + "\n" for line in lines).encode()
@@ -256,7 +257,7 @@ def test_a_journal_goes_on_after_a_torn_line(journal, output):
     path.write_bytes(b"".join(lines[:4]) + lines[4][:100])
     for expected in (3, 4, 5):  # torn, whole, whole
         with contextlib.closing(collect.Journal(path, options())) as opened:
-            assert len(opened.demos) == expected
+            assert len(opened.entries) == expected
             opened.append(json.loads(lines[expected + 1]))
     assert path.read_bytes() == b"".join(lines[:7])
 
@@ -319,7 +320,7 @@ def test_two_collections_at_once(whole, output):
         second = run(output)
         process.send_signal(signal.SIGCONT)
         assert second.returncode == 1
-        expected = f"error: {collect.journal_of(output)}: another collection is writing to it\n"
+        expected = f"error: {collect.journal_of(output)}: another process is writing to it\n"
         assert second.stderr.endswith(expected) and "Traceback" not in second.stderr
         assert process.wait(60) == 0
     assert output.read_bytes() == whole.read_bytes()

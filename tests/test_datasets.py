@@ -102,13 +102,41 @@ def test_made_again_the_file_has_the_same_bytes(made, tmp_path, workers):
     assert again.read_bytes() == made.read_bytes()
 
 
+def test_interrupted_it_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch):
+    again, done = tmp_path / "again.h5", []
+
+    def die(journal, entry):
+        if len(done) == 17:
+            raise OSError("the disk is full")
+        done.append(entry["index"])
+        append(journal, entry)
+
+    append = make_queries.Journal.append
+    monkeypatch.setattr(make_queries.Journal, "append", die)
+    with pytest.raises(OSError, match="disk is full"):
+        make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
+    with pytest.raises(ValueError, match="seed 0, not 1"):
+        make_queries.make_queries(again, "wall", 1, 30, 10, progress=False)
+    monkeypatch.undo()
+    sampled = []
+    monkeypatch.setattr(
+        make_queries.Journal,
+        "append",
+        lambda journal, entry: sampled.append(entry["index"]) or append(journal, entry),
+    )
+    make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
+    assert len(sampled) == 40 - 17 and not set(sampled) & set(done)
+    assert again.read_bytes() == made.read_bytes()
+    assert list(tmp_path.iterdir()) == [again]
+
+
 def test_a_query_does_not_depend_on_the_others(made):
     queries = load_queries(made)
     sampler = make_queries.Sampler("wall", solvable=False)
     for index in (29, 3):
-        _, start, goal, _, _ = sampler((0, "test", index))
-        np.testing.assert_array_equal(queries.start[index], start)
-        np.testing.assert_array_equal(queries.goal[index], goal)
+        query = sampler((0, "test", index))
+        np.testing.assert_array_equal(queries.start[index], query["start"])
+        np.testing.assert_array_equal(queries.goal[index], query["goal"])
     sampler.env.close()
 
 

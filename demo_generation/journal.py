@@ -1,0 +1,100 @@
+"""What long jobs have made so far, kept beside the file that they will write."""
+
+import fcntl
+import json
+import os
+
+import envs
+from envs.datasets import scene_to_json
+
+VERSION = 2
+
+
+def journal_of(path):
+    """Where what was made for a file is kept until the file is written."""
+    return path.with_name(path.name + ".journal")
+
+
+class Journal:
+    """What was made so far: JSON lines, the first one saying of what.
+
+    Lines are appended and flushed one at a time, so whatever happens only the last can be damaged;
+    it is dropped when the journal is opened again. One process at a time holds it.
+
+    Args:
+        path: file to go on with, or to begin.
+        options: JSON-ready dict of what the results depend on, `task` among them. The task's scene
+            is added to it.
+
+    Raises:
+        ValueError: the file is the journal of something else, no journal, or in use.
+        OSError: it cannot be written.
+    """
+
+    def __init__(self, path, options):
+        self.path = path
+        self.entries = {}
+        """Index -> entry."""
+        scene = scene_to_json(envs.get_task(options["task"]).base_scene)
+        header = {"journal": VERSION, **options, "scene": scene}
+        self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ValueError(f"{path}: another process is writing to it") from error
+        if not path.exists() or not os.path.samestat(os.fstat(self._file.fileno()), path.stat()):
+            raise ValueError(f"{path}: another process has just finished with it")
+        self._file.seek(0)
+        contents = self._file.read()
+        lines = contents.split(b"\n")
+        good = 0
+        for number, line in enumerate(lines[:-1]):  # what follows the last line's end is damaged
+            try:
+                entry = json.loads(line)
+            except ValueError:
+                if number == 0:
+                    raise ValueError(_difference(path, None, header)) from None
+                break
+            if number == 0:
+                if entry != header:
+                    raise ValueError(_difference(path, entry, header))
+            else:
+                self.entries[entry["index"]] = entry
+            good += len(line) + 1
+        if good == 0 and not json.dumps(header).encode().startswith(contents):
+            raise ValueError(_difference(path, None, header))  # and not a torn first line either
+        self._file.truncate(good)
+        if good == 0:
+            self._write(header)
+
+    def append(self, entry):
+        """Keep a JSON-ready dict under its `index`, safely when this returns."""
+        self._write(entry)
+        self.entries[entry["index"]] = entry
+
+    def _write(self, entry):
+        line = json.dumps(entry).encode() + b"\n"
+        end = self._file.seek(0, 2)
+        try:
+            if self._file.write(line) != len(line):  # the disk is full
+                raise OSError("No space left on device")
+        except OSError:
+            self._file.truncate(end)
+            raise
+
+    def close(self):
+        self._file.close()
+
+
+def _difference(path, found, wanted):
+    if not isinstance(found, dict) or found.get("journal") != VERSION:
+        return f"{path}: not a journal that this version can continue; move it away"
+    names = [name for name in wanted if found.get(name) != wanted[name]]
+    differences = ", ".join(
+        "another scene" if name == "scene" else f"{name} {found.get(name)!r}, not {wanted[name]!r}"
+        for name in names
+    )
+    return (
+        f"{path}: the journal of something else ({differences}): use its flags to continue it, or "
+        f"delete it"
+    )
