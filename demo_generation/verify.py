@@ -20,7 +20,7 @@ from demo_generation import workers
 from demo_generation.following import follow
 from demo_generation.planning import Planner, PlanningError
 from envs.arm_env import RoboArmEnv
-from envs.datasets import QUANTUM, DatasetError, demo_path, load_demos, write_demos
+from envs.datasets import DatasetError, demo_path, load_demos, write_demos
 from envs.tasks import is_task
 
 VERDICTS = ("good", "changed", "missed", "collided", "refused")
@@ -86,7 +86,7 @@ class Verifier:
         # The digest is exact; the stored states are rounded.
         if execution.digest != demo.digest or execution.states.shape != demo.states.shape:
             return "changed"
-        close = np.abs(execution.states - demo.states).max() <= 0.51 * QUANTUM
+        close = np.abs(execution.states - demo.states).max() <= 0.51 * self.demos.quantum
         return "good" if close else "changed"
 
 

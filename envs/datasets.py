@@ -305,7 +305,8 @@ def _write(path, schema, task, seed, arrays, made_by, parameters):
             # Shuffled in one chunk, sign and exponent bytes compress: 13% off a query file.
             packing = {"shuffle": True, "compression": "gzip", "compression_opts": 9}
             packing |= {"chunks": array.shape}
-            if name.endswith("obstacles"):  # whole numbers repeat down a column: 37% off
+            # Neighbours in a column are alike: 37% off obstacles, a quarter off executions.
+            if name.endswith("obstacles") or name == "residual":
                 packing |= {"shuffle": False, "chunks": (len(array), 1)}
             file.create_dataset(
                 name, data=array, track_times=False, **(packing if array.size else {})
@@ -335,7 +336,8 @@ def scene_to_json(scene):
     return json.dumps(fields, sort_keys=True)
 
 
-def _scene_from_json(text):
+def scene_from_json(text):
+    """The inverse of `scene_to_json`."""
     fields = json.loads(text)
     table = fields["table"] and scenes.from_array([fields["table"]])[0]
     rows = np.array(fields["obstacles"]).reshape(-1, scenes.ROW)
@@ -363,7 +365,7 @@ def _scene_arrays(path, scenes_of, base, prefix=""):
 
 def _scenes_from(path, attributes, arrays, prefix=""):
     """The inverse of `_scene_arrays`: `Scenes`. Raises DatasetError where they make no sense."""
-    base = _scene_from_json(attributes["scene"])
+    base = scene_from_json(attributes["scene"])
     if f"{prefix}scene" not in arrays:
         return Scenes(base)
     index, counts, rows = (arrays[f"{prefix}{name}"] for name in _SCENE_ARRAYS)
@@ -567,8 +569,8 @@ def _simulate(path, queries, hold_steps, progress):
 MAX_STEP = 0.03
 SUBGOAL_SPACING = 0.95 * MAX_STEP
 # Resolution of the stored configurations, normalised: they are off by half of it at most, which
-# moves the end-effector by less than 0.5 mm.
-QUANTUM = 2e-4
+# moves the end-effector by less than 0.5 mm. Where scenes vary, these need the space: twice that.
+QUANTUM, QUANTUM_IN_SCENES = 2e-4, 4e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -582,7 +584,7 @@ class Demo:
         states: float32 (m, 7), the executed configurations, normalised.
         actions: float32 (m - 1, 7), the displacement commanded in each, clipped to `MAX_STEP` as
             the environment does.
-        digest: CRC-32 of the bytes of the exact states, before rounding to `QUANTUM`.
+        digest: CRC-32 of the bytes of the exact states, before they were rounded.
     """
 
     start: np.ndarray
@@ -631,6 +633,11 @@ class Demos:
     collided: np.ndarray
     made_by: str
     parameters: dict
+
+    @property
+    def quantum(self):
+        """What `states` were rounded to multiples of, measured from where a plan puts them."""
+        return self.parameters.get("quantum", QUANTUM)
 
     def __len__(self):
         return len(self.start)
@@ -683,7 +690,8 @@ def load_demos(task_or_path, task=None):
     _check_configurations(path, "plan", arrays["plan"])
     parameters = json.loads(attributes["parameters"])
     before, here, after = _schedule(arrays["plan"], plan_offsets, offsets)
-    states = here - parameters["lag"] * (here - before) + arrays["residual"] * QUANTUM
+    quantum = parameters.get("quantum", QUANTUM)
+    states = here - parameters["lag"] * (here - before) + arrays["residual"] * quantum
     states = states.astype(np.float32)
     actions = after - states
     length = np.maximum(np.linalg.norm(actions, axis=1, keepdims=True), 1e-9)
@@ -754,7 +762,8 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
     moved = here - before
     lag = ((here - states) * moved).sum(0) / np.maximum(np.square(moved).sum(0), 1e-9)
     lag = [round(value, 6) for value in lag.tolist()]
-    residual = np.round((states - (here - lag * moved)) / QUANTUM)
+    quantum = QUANTUM if scenes_of is None else QUANTUM_IN_SCENES
+    residual = np.round((states - (here - lag * moved)) / quantum)
     arrays = {
         **_scene_arrays(path, scenes_of, get_task(task).base_scene),
         "plan": plan,
@@ -764,7 +773,10 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
         **{name: np.array(columns[name], _DEMO_ARRAYS[name][0]) for name in columns},
     }
     _check_format(path, DEMO_SCHEMA, arrays)
-    _write(path, DEMO_SCHEMA, task, seed, arrays, made_by, {**parameters, "lag": lag})
+    parameters = {**parameters, "lag": lag}
+    if quantum != QUANTUM:
+        parameters["quantum"] = quantum
+    _write(path, DEMO_SCHEMA, task, seed, arrays, made_by, parameters)
 
 
 def subgoals(path):

@@ -542,7 +542,7 @@ def test_packaged_demonstrations(file):
     assert len(demos) == 10_000 and not demos.collided.any()
     env = envs.make(file.stem)
     for i in np.random.default_rng(0).choice(len(demos), 8, replace=False):
-        execution = follow(env, demos[i].plan)
+        execution = follow(env, demos[i].plan, demos[i].scene)
         assert execution.reached and not execution.collided
-        np.testing.assert_allclose(execution.states, demos[i].states, rtol=0, atol=QUANTUM)
+        np.testing.assert_allclose(execution.states, demos[i].states, rtol=0, atol=demos.quantum)
     env.close()
