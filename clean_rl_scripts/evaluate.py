@@ -77,6 +77,7 @@ from envs.tasks import get_task, task_name
 # they decide what a success is.
 ENV_ARGUMENTS = ("action_mode", "max_step", "velocities")
 LOOKING = ("via-points", "planner")  # policies that look for a motion before they move
+ROOT = Path(__file__).resolve().parent.parent
 NAMED = ("go-to-goal", "random", *LOOKING)
 # `via-points` checks a motion at points this far apart in the normalised space, as the planner
 # does; it is less than one step of the arm. It keeps no margin, which would reject more than it
@@ -91,8 +92,8 @@ FRAMES = 8  # of a picture
 @dataclass
 class Args:
     policy: str
-    """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy program, or a run's
-    folder with a `policy.pt` in it"""
+    """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy program, a run's folder
+    with a `policy.pt` in it, or the name of a policy of docs/results.md"""
     task: str
     """the task, one of `envs.TASKS`, or a scene file (.yaml)"""
     goal_type: Literal["ee", "config", "combined"] | None = None
@@ -439,8 +440,9 @@ def evaluate(
 
     Args:
         policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy program or of
-            a folder with a `policy.pt`, or a function from an observation (dict of `RoboArmEnv`) to
-            an action (7,); with several workers, one that can be pickled.
+            a folder with a `policy.pt`, the name of a policy in a `policies` folder, or a function
+            from an observation (dict of `RoboArmEnv`) to an action (7,); with several workers, one
+            that can be pickled.
         task: name of the task, or path of a scene file.
         goal_type: `ee`, `config`, `combined`; None for the policy's own, or else `ee`.
         queries: what to use instead of the task's own queries: the path of a query file, or an
@@ -483,6 +485,22 @@ def evaluate(
     return _summary(job, _run(job, progress))
 
 
+def _policy_file(policy):
+    """The program that is meant: of a file, a run's folder, or a name in `policies/`."""
+    path = Path(policy)
+    if path.is_dir():
+        path = path / "policy.pt"
+    if path.exists():
+        return path
+    named = {found.stem: found for found in sorted(ROOT.glob("*/policies/*.pt"))}
+    if str(policy) not in named:
+        raise EvaluationError(
+            f"no such policy: {path} (expected {', '.join(NAMED)}, a policy program, a folder with "
+            f"a policy.pt in it, or a name: {', '.join(named) or 'there are none'})"
+        )
+    return named[str(policy)]
+
+
 def _prepare(
     policy,
     task,
@@ -512,14 +530,7 @@ def _prepare(
     if policy == "planner":
         _import_planning()
     if not callable(policy) and policy not in NAMED:
-        policy = Path(policy)
-        if policy.is_dir():
-            policy = policy / "policy.pt"
-        if not policy.exists():
-            raise EvaluationError(
-                f"no such policy: {policy} (expected {', '.join(NAMED)}, a policy program or a "
-                f"folder with a policy.pt in it)"
-            )
+        policy = _policy_file(policy)
         program, trained = _load_policy(policy)
         env = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
         if goal_type not in (None, trained["goal_type"]):

@@ -1,0 +1,372 @@
+"""The paper's tables, cell by cell: run any of them, and see ours beside the paper's.
+
+    python benchmarks/paper_tables.py --list                        # the cells, and which are done
+    python benchmarks/paper_tables.py --only 'bc-*-double_walls' --steps 150000
+    python benchmarks/paper_tables.py --only sac-ee-wall-p1 --seeds 1 2 3 4
+    python benchmarks/paper_tables.py                               # only writes the page
+
+A cell is a run: algorithm, goal type, task, p of the demo injection. It is trained with its script
+(flags that differ from the defaults: `RECIPES`) in `--runs-dir`, where one that was stopped goes
+on, and its best policy by validation is evaluated on test queries. Policy and result then go to
+`policies/` beside the script: what is there is done, with as many steps or more. The page,
+docs/results.md, and its pictures are made of those results and of the paper's numbers
+(`paper_cells.csv`: sections 5.2 and 5.3 and the tables of the appendix; means and standard
+deviations of four seeds).
+"""
+
+import argparse
+import csv
+import datetime
+import fnmatch
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from envs.files import write_atomically
+
+ROOT = Path(__file__).resolve().parent.parent
+CELLS = Path(__file__).with_name("paper_cells.csv")
+PAGE, PICTURES = ROOT / "docs" / "results.md", ROOT / "docs" / "pictures"
+SCRIPTS = {
+    "bc": ROOT / "bc_script" / "bc.py",
+    "sac": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
+    "td3": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
+}
+STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
+# Settings for long runs (docs/training.md).
+RECIPES = {
+    "bc": [],
+    "sac": ["--gamma", "0.98", "--target-entropy", "-14"],
+    "td3": ["--gamma", "0.98"],
+}
+GOALS = {"ee": "end-effector", "config": "configuration", "combined": "combined"}
+ENCODERS = {"vae": "VAE", "vqvae": "VQ-VAE", "pointnet2": "PointNet++"}
+FAR_BELOW = 0.05  # of the paper's mean: worth an explanation
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number of the paper's tables, and the run that gives ours."""
+
+    algorithm: str
+    goal_type: str
+    trained_on: str
+    task: str
+    demo_prob: str
+    hindsight: str
+    encoder: str
+    mean: float | None  # None: the paper has no such cell
+    std: float | None
+
+    @property
+    def name(self):
+        parts = [self.algorithm, self.goal_type, self.encoder, self.trained_on]
+        parts.append(self.demo_prob and f"p{self.demo_prob}")
+        parts.append("no_hindsight" if self.hindsight == "no" else "")
+        parts.append("" if self.task == self.trained_on else f"on-{self.task}")
+        return "-".join(filter(None, parts))
+
+    @property
+    def label(self):
+        """The algorithm as in the paper."""
+        name = self.algorithm.upper()
+        if self.demo_prob:
+            name += " (p = 0)" if self.demo_prob == "0" else f"-MP (p = {self.demo_prob})"
+        return name
+
+    @property
+    def paper(self):
+        return "not in the paper" if self.mean is None else f"{self.mean:.3f} ± {self.std:.3f}"
+
+    def flags(self):
+        """Of the trainer, but for the seed and the number of steps."""
+        flags = ["--task", self.trained_on, "--goal-type", self.goal_type, *RECIPES[self.algorithm]]
+        if self.demo_prob:
+            flags += ["--demo-prob", self.demo_prob]
+        if self.hindsight == "no":
+            flags += ["--her-probability", "0"]
+        return flags
+
+
+def read_cells(path=CELLS):
+    """All `Cell`s, in the paper's order."""
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        row |= {key: float(row[key]) if row[key] else None for key in ("mean", "std")}
+    return [Cell(**row) for row in rows]
+
+
+# --- Running
+
+
+def policies_of(algorithm):
+    """The folder of an algorithm's policies and results."""
+    return SCRIPTS[algorithm].parent / "policies"
+
+
+def run(cell, seed, steps, num_queries, runs_dir):
+    """Train, evaluate and keep one cell's policy with one seed; what was done is not done again."""
+    script, name = SCRIPTS[cell.algorithm], f"{cell.name}-s{seed}"
+    kept = policies_of(cell.algorithm) / f"{name}.json"
+    if kept.exists() and json.loads(kept.read_text())["steps"] >= steps:
+        print(f"{name}: done before")
+        return
+    folder = runs_dir / name
+    folder.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, script, STEPS[cell.algorithm], str(steps), "--test-queries", "10"]
+    begun = sorted(folder.glob("*/args.json"))
+    if begun:
+        command += ["--resume", begun[-1].parent]
+    else:
+        command += [*cell.flags(), "--seed", str(seed), "--runs-dir", folder]
+    print(f"{name}: {' '.join(map(str, command[1:]))}", flush=True)
+    subprocess.run(command, check=True)
+    trained = max(folder.glob("*/result.json"))
+    evaluated = folder / "evaluation.json"
+    command = [sys.executable, ROOT / "clean_rl_scripts" / "evaluate.py"]
+    command += ["--policy", trained.parent, "--task", cell.task, "--json", evaluated]
+    subprocess.run([*command, "--num-queries", str(num_queries)], check=True)
+    keep(name, cell, trained.parent, json.loads(evaluated.read_text()), kept.parent)
+
+
+def keep(name, cell, run, evaluation, folder):
+    """Copy a run's policy to `folder`, and write beside it how it was made and what it reached."""
+    training = json.loads((run / "result.json").read_text())
+    names = ("success_rate", "success_rate_interval", "clean_success_rate", "num_queries")
+    result = {
+        "cell": cell.name,
+        "seed": training["args"]["seed"],
+        **{name: evaluation[name] for name in names},
+        "steps": training["steps"],
+        "policy_step": training["policy_step"],
+        "validation_success_rate": training["validation_success_rate"],
+        "training_seconds": training["seconds"],
+        "date": datetime.date.today().isoformat(),
+        "commit": commit(),
+        "curve": curve(run),
+        "args": {k: v for k, v in training["args"].items() if k not in ("runs_dir", "resume")},
+    }
+    folder.mkdir(exist_ok=True)
+    shutil.copyfile(run / "policy.pt", folder / f"{name}.pt")
+    write_atomically(folder / f"{name}.json", (json.dumps(result, indent=1) + "\n").encode())
+
+
+def commit():
+    """The commit that is checked out, with a `+` if files were changed since."""
+    git = ["git", "-C", ROOT]
+    head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD"]).returncode
+    return head.stdout.strip() + "+" * (changed != 0)
+
+
+def curve(run):
+    """[[step, validation success], ...] of a run, from TensorBoard's events."""
+    events = EventAccumulator(str(run), size_guidance={"scalars": 0}).Reload()
+    points = {event.step: round(event.value, 4) for event in events.Scalars("eval/success_rate")}
+    return sorted(points.items())
+
+
+# --- The page
+
+
+def load_results(folders):
+    """Cell's name -> list of results (dicts), by seed."""
+    results = {}
+    for folder in folders:
+        for path in sorted(folder.glob("*.json")):
+            result = json.loads(path.read_text())
+            results.setdefault(result["cell"], []).append(result)
+    return {name: sorted(found, key=lambda r: r["seed"]) for name, found in results.items()}
+
+
+def ours(found):
+    """Success of a cell's results: with its interval, or over seeds mean ± standard deviation."""
+    if len(found) == 1:
+        low, high = found[0]["success_rate_interval"]
+        return f"{found[0]['success_rate']:.3f} [{low:.3f}, {high:.3f}]"
+    rates = [result["success_rate"] for result in found]
+    return f"{statistics.mean(rates):.3f} ± {statistics.stdev(rates):.3f} ({len(rates)} seeds)"
+
+
+def table(cells, results, column):
+    """Markdown: a row per algorithm, a column per `column(cell)`; ours, and the paper's below."""
+    rows, columns = {}, []
+    for cell in cells:
+        if column(cell) not in columns:
+            columns.append(column(cell))
+        found = results.get(cell.name)
+        text = f"**{ours(found)}**" if found else "not run"
+        label = cell.label + (f", {ENCODERS[cell.encoder]}" if cell.encoder else "")
+        rows.setdefault(label, {})[column(cell)] = f"{text}<br>{cell.paper}"
+    lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    for label, texts in rows.items():
+        lines.append("| " + " | ".join([label, *(texts.get(name, "") for name in columns)]) + " |")
+    return lines
+
+
+def runs_table(cells, results):
+    """Markdown: what was run, a row per policy."""
+    lines = [
+        "| policy | success [95 %] | clean | steps (best at) | test queries | training | made |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for cell in cells:
+        for result in results.get(cell.name, []):
+            minutes = result["training_seconds"] / 60
+            lines.append(
+                f"| `{cell.name}-s{result['seed']}` | {ours([result])} "
+                f"| {result['clean_success_rate']:.3f} "
+                f"| {result['steps']:,} ({result['policy_step']:,}) | {result['num_queries']:,} "
+                f"| {minutes:.0f} min | {result['date']}, {result['commit']} |"
+            )
+    return lines
+
+
+def page(cells, results):
+    """docs/results.md."""
+    goals = [cell for cell in cells if not cell.encoder and cell.hindsight != "no"]
+    lines = [
+        "# Results",
+        "",
+        "Success on test queries: in bold ours, below it the paper's (mean ± standard deviation of",
+        "four seeds, after 1,000,000 steps; 7,000,000 for random boxes). Ours: one seed with its",
+        "95 % interval, or mean ± standard deviation over seeds.",
+        "`python benchmarks/paper_tables.py` runs cells and writes this page;",
+        "`clean_rl_scripts/evaluate.py --policy NAME` runs any of the policies below.",
+    ]
+    for goal_type, text in GOALS.items():
+        chosen = [cell for cell in goals if cell.goal_type == goal_type]
+        lines += ["", f"## Goal: {text} (`{goal_type}`)", ""]
+        lines += table(chosen, results, lambda cell: f"`{cell.task}`")
+    hindsight = [
+        cell
+        for cell in cells
+        if (cell.algorithm, cell.goal_type, cell.task) == ("sac", "combined", "no_obstacles")
+    ]
+    lines += ["", "## Hindsight: `no_obstacles`, goal `combined`", ""]
+    lines += table(
+        hindsight, results, lambda cell: "no hindsight" if cell.hindsight == "no" else "hindsight"
+    )
+    lines += ["", "## Encoders: trained on `random_boxes_hard`, goal `combined`", ""]
+    lines += ["No trainer here takes an encoder yet, so none of these can be run.", ""]
+    encoded = [cell for cell in cells if cell.encoder]
+    lines += table(encoded, results, lambda cell: f"`{cell.task}`")
+    lines += ["", "## The runs", ""]
+    done = [cell for cell in cells if cell.name in results]
+    if not done:
+        return "\n".join([*lines, "None yet.", ""])
+    lines += runs_table(cells, results)
+    lines += ["", "Flags that are not the scripts' defaults, beside task, goal and p: "]
+    lines[-1] += "; ".join(
+        f"{name}: `{' '.join(flags)}`" for name, flags in RECIPES.items() if flags
+    )
+    lines[-1] += ". Each policy's JSON has all of its flags."
+    below = []
+    for cell in done:
+        mean = statistics.mean(result["success_rate"] for result in results[cell.name])
+        if cell.mean is not None and mean < cell.mean - FAR_BELOW:
+            below.append(f"`{cell.name}` ({mean:.3f}, paper {cell.mean:.3f})")
+    lines += ["", f"Below the paper by more than {FAR_BELOW}: {', '.join(below) or 'none'}."]
+    lines += ["", "![success over steps](pictures/results_curves.png)"]
+    lines += ["", "![success per task](pictures/results_bars.png)", ""]
+    return "\n".join(lines)
+
+
+def draw_curves(cells, results, path):
+    """Validation success over steps, one line per run."""
+    figure, axes = plt.subplots(figsize=(9, 5), layout="constrained")
+    for cell in cells:
+        for result in results.get(cell.name, []):
+            name = f"{cell.name}-s{result['seed']}"
+            axes.plot(*zip(*result["curve"], strict=True), marker=".", label=name)
+    axes.set(xlabel="environment steps (BC: batches)", ylabel="validation success", ylim=(0, 1))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def draw_bars(cells, results, path):
+    """Test success per task: ours and the paper's, for all cells that were run."""
+    done = [cell for cell in cells if cell.name in results]
+    tasks = list(dict.fromkeys(cell.task for cell in done))
+    figure, all_axes = plt.subplots(
+        len(tasks), figsize=(9, 1 + 0.45 * len(done)), squeeze=False, layout="constrained",
+        height_ratios=[sum(cell.task == task for cell in done) for task in tasks],
+    )  # fmt: skip
+    for task, axes in zip(tasks, all_axes[:, 0], strict=True):
+        chosen = [cell for cell in done if cell.task == task][::-1]
+        for i, cell in enumerate(chosen):
+            mean = statistics.mean(result["success_rate"] for result in results[cell.name])
+            axes.barh(i + 0.2, mean, 0.4, color="tab:blue", label="ours")
+            if cell.mean is not None:
+                axes.barh(i - 0.2, cell.mean, 0.4, xerr=cell.std, color="tab:gray", label="paper")
+        axes.set_yticks(range(len(chosen)), [_bar_label(cell) for cell in chosen])
+        axes.set(title=task, xlim=(0, 1))
+    handles, labels = all_axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles[:2], labels[:2], loc="outside lower center", ncols=2)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def _bar_label(cell):
+    return f"{cell.label}, {cell.goal_type}" + ", no hindsight" * (cell.hindsight == "no")
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", metavar="PATTERN", help="run these cells")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="(1)")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="or batches (1,000,000)")
+    parser.add_argument("--num-queries", type=int, default=10_000, help="test queries (10,000)")
+    parser.add_argument("--runs-dir", type=Path, default=Path("runs/paper_tables"))
+    parser.add_argument("--list", action="store_true", help="list cells and what is done; run none")
+    args = parser.parse_args()
+    cells = read_cells()
+    folders = sorted({policies_of(algorithm) for algorithm in SCRIPTS})
+    if args.list:
+        results = load_results(folders)
+        for cell in cells:
+            found = results.get(cell.name)
+            print(f"{cell.name:60} {cell.paper}   {ours(found) if found else 'not run'}")
+        return
+    chosen = []
+    for pattern in args.only or []:
+        found = [cell for cell in cells if fnmatch.fnmatch(cell.name, pattern)]
+        if not found:
+            sys.exit(f"error: no cell is called {pattern}; --list shows them")
+        chosen += found
+    if any(cell.encoder for cell in chosen):
+        sys.exit("error: no trainer takes an encoder yet")
+    for cell in dict.fromkeys(chosen):
+        for seed in args.seeds:
+            try:
+                run(cell, seed, args.steps, args.num_queries, args.runs_dir)
+            except subprocess.CalledProcessError as error:
+                sys.exit(f"error: {cell.name}, seed {seed}: exit code {error.returncode}")
+    results = load_results(folders)
+    if results:
+        draw_curves(cells, results, PICTURES / "results_curves.png")
+        draw_bars(cells, results, PICTURES / "results_bars.png")
+    write_atomically(PAGE, page(cells, results).encode())
+    print(f"{PAGE} written")
+
+
+if __name__ == "__main__":
+    main()

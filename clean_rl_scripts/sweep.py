@@ -1,0 +1,312 @@
+"""Search over the flags of a trainer, with Optuna on this machine or Ray Tune on a cluster.
+
+    python clean_rl_scripts/sweep.py clean_rl_scripts/td3_her_mp.py \\
+        --folder sweeps/td3 --trials 20 --search policy-lr=1e-6..5e-3:log q-lr=1e-6..5e-3:log \\
+        -- --task double_walls_wide_gap --total-timesteps 100000
+
+What is searched over: `NAME=LOW..HIGH` (whole numbers if both are; `:log` for equally likely orders
+of magnitude) or `NAME=a,b,c` (`NAME=true,false` for flags that are on or off). Flags after `--` are
+given to every trial as they are. A trial's value is the trainer's best validation success.
+
+The folder holds each trial's run, the search itself (`study.log`) and `trials.csv`; `tensorboard
+--logdir FOLDER` shows curves and, under HPARAMS, the comparison. The same command goes on with a
+search that was stopped or killed; trials that were running go on from their checkpoints. (With one
+worker, and uninterrupted, a search repeats itself; otherwise its samples depend on who ends first.)
+
+(Paper, appendix "Parameter sweeps": learning rates from 1e-6 to 5e-3; for SAC, entropy tuning on
+and off, and alpha from 1e-5 to 10.)
+"""
+
+import argparse
+import csv
+import fcntl
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import optuna
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
+from torch.utils.tensorboard import SummaryWriter
+
+METRIC = "validation_success_rate"
+
+
+def parse_search(text):
+    """`NAME=...` -> (name, Optuna distribution). Raises ValueError if it is neither form."""
+    name, equals, values = text.partition("=")
+    if not (name and equals and values):
+        raise ValueError(f"{text!r} is neither NAME=LOW..HIGH nor NAME=a,b,c")
+    name = name.lstrip("-").replace("_", "-")
+    if ".." not in values:
+        return name, CategoricalDistribution(values.split(","))
+    values, _, scale = values.partition(":")
+    if scale not in ("", "log"):
+        raise ValueError(f"{text!r}: after the colon there can only be `log`")
+    low, _, high = values.partition("..")
+    try:
+        whole = low.lstrip("-").isdigit() and high.lstrip("-").isdigit()
+        low, high = (int(low), int(high)) if whole else (float(low), float(high))
+        kind = IntDistribution if whole else FloatDistribution
+        return name, kind(low, high, log=scale == "log")
+    except ValueError as error:
+        raise ValueError(f"{text!r}: {error}") from error
+
+
+def suggest(trial, name, space):
+    """Optuna's value of one flag for a trial."""
+    if isinstance(space, CategoricalDistribution):
+        return trial.suggest_categorical(name, space.choices)
+    kind = trial.suggest_int if isinstance(space, IntDistribution) else trial.suggest_float
+    return kind(name, space.low, space.high, log=space.log)
+
+
+def flags_of(params):
+    """`{"policy-lr": 1e-3, "autotune": "false"}` -> `--policy-lr 0.001 --no-autotune`, a list."""
+    flags = []
+    for name, value in params.items():
+        if value in ("true", "false"):
+            flags.append(f"--{name}" if value == "true" else f"--no-{name}")
+        else:
+            flags += [f"--{name}", str(value)]
+    return flags
+
+
+class Stopped(Exception):
+    """A trial ended before its time; the next call of the search goes on with it."""
+
+
+def train(trainer, flags, folder):
+    """The result (dict) of one run of the trainer in `folder`, which goes on if it was stopped.
+
+    Raises:
+        RuntimeError: it failed; the message has the end of what it said.
+        Stopped: it was killed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "log.txt", "ab") as log:
+        # The trainer inherits the lock: one that outlived its killed sweep is waited for.
+        fcntl.flock(log, fcntl.LOCK_EX)
+        if not any(folder.glob("*/result.json")):
+            begun = sorted(folder.glob("*/checkpoint.pt"))
+            which = ["--resume", begun[-1].parent] if begun else ["--runs-dir", folder, *flags]
+            command = [sys.executable, trainer, *which]
+            code = subprocess.run(command, stdout=log, stderr=log).returncode
+            if code < 0:  # a signal: Ctrl-C, or too little memory
+                raise Stopped(f"the trainer was stopped by signal {-code}")
+            if code > 0:
+                end = (folder / "log.txt").read_text(errors="replace").strip()[-500:]
+                raise RuntimeError(f"the trainer ended with {code}: {end}")
+    return json.loads(next(folder.glob("*/result.json")).read_text())
+
+
+def folder_of(trial):
+    """Name of a trial's folder: that of the trial that it goes on with, if there was one."""
+    return trial.user_attrs.get("folder", f"trial_{trial.number:03d}")
+
+
+def sweep(trainer, search, trials, folder, flags, seed, workers):
+    """Run the search to its end; returns the Optuna study.
+
+    Args:
+        trainer: path of a script with the flags `--runs-dir` and `--resume` that writes
+            `result.json` into its run's folder.
+        search: dict of flag -> Optuna distribution.
+        trials: number of trials, those already there included.
+        folder: path; what a search needs to go on is in here.
+        flags: list of flags given to every trial.
+        seed: of the search, >= 0.
+        workers: trials at a time.
+
+    Raises:
+        ValueError: the folder is that of another search.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    study = optuna.create_study(
+        study_name="sweep",
+        direction="maximize",
+        storage=JournalStorage(JournalFileBackend(str(folder / "study.log"))),
+        load_if_exists=True,
+    )
+    described = {"trainer": str(trainer), "flags": list(flags), "seed": seed}
+    described["search"] = {name: str(distribution) for name, distribution in search.items()}
+    if study.user_attrs.get("search", described) != described:
+        raise ValueError(f"{folder} holds another search: {study.user_attrs['search']}")
+    study.set_user_attr("search", described)
+    # Another stream of random numbers each time, or the samples would be the first ones again.
+    study.sampler = optuna.samplers.TPESampler(
+        seed=seed + len(study.trials), constant_liar=workers > 1
+    )
+
+    latest = {folder_of(trial): trial for trial in study.trials}
+    for name, trial in latest.items():
+        stopped = trial.state in (TrialState.RUNNING, TrialState.FAIL)
+        if stopped and "error" not in trial.user_attrs:
+            if trial.state == TrialState.RUNNING:
+                study.tell(trial.number, state=TrialState.FAIL)
+            study.enqueue_trial(trial.params, user_attrs={"folder": name})
+    done = sum(
+        trial.state == TrialState.COMPLETE or "error" in trial.user_attrs
+        for trial in latest.values()
+    )
+    lock = threading.Lock()
+
+    def objective(trial):
+        params = {name: suggest(trial, name, space) for name, space in search.items()}
+        try:
+            result = train(trainer, [*flags, *flags_of(params)], folder / folder_of(trial))
+        except RuntimeError as error:
+            trial.set_user_attr("error", str(error))
+            raise
+        return result[METRIC]
+
+    def report(study, trial):
+        with lock:
+            write_report(study, search, folder)
+        failed = "failed" if "error" in trial.user_attrs else "stopped"
+        value = failed if trial.value is None else f"{trial.value:.3f}"
+        print(f"{folder_of(trial)}: {value} {trial.params}", flush=True)
+
+    if done < trials:
+        study.optimize(
+            objective,
+            n_trials=trials - done,
+            n_jobs=workers,
+            catch=(RuntimeError, Stopped),
+            callbacks=[report],
+        )
+    write_report(study, search, folder)
+    return study
+
+
+def write_report(study, search, folder):
+    """`trials.csv`, and for TensorBoard the flags and the value of each finished trial."""
+    rows = []
+    for trial in {folder_of(trial): trial for trial in study.trials}.values():
+        seconds = trial.duration.total_seconds() if trial.duration is not None else None
+        error = trial.user_attrs.get("error", "").splitlines()
+        row = {"trial": folder_of(trial), "state": trial.state.name.lower(), METRIC: trial.value}
+        row |= {name: trial.params.get(name) for name in search}
+        if trial.state == TrialState.FAIL and not error:
+            row["state"] = "stopped"
+        rows.append(row | {"seconds": seconds, "error": error[-1] if error else ""})
+        where = folder / folder_of(trial)
+        if trial.state == TrialState.COMPLETE and not (where / "hparams").exists():
+            with SummaryWriter(where) as writer:
+                value = {f"sweep/{METRIC}": trial.value}
+                writer.add_hparams(trial.params, value, run_name="hparams")
+    write_csv(folder / "trials.csv", rows)
+
+
+def write_csv(path, rows):
+    """Rows (dicts with the same keys), written in one piece."""
+    temporary = path.with_name(path.name + ".part")
+    with open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0] if rows else [])
+        writer.writeheader()
+        writer.writerows(rows)
+    os.replace(temporary, path)
+
+
+def sweep_on_ray(address, trainer, search, trials, folder, flags, seed):
+    """The same with Ray Tune on an existing cluster, whose machines share this folder.
+
+    Raises ConnectionError if there is no cluster at the address.
+    """
+    import ray
+    from ray import tune
+    from ray.tune.search.optuna import OptunaSearch
+
+    trainer, folder = trainer.resolve(), folder.resolve()
+
+    def trial(params):
+        where = folder / "runs" / tune.get_context().get_trial_id()
+        tune.report({METRIC: train(trainer, [*flags, *flags_of(params)], where)[METRIC]})
+
+    ray.init(address=address, log_to_driver=False, logging_level="warning")
+    try:
+        path = str(folder / "tune")
+        if tune.Tuner.can_restore(path):
+            tuner = tune.Tuner.restore(path, trial, resume_unfinished=True, restart_errored=True)
+        else:
+            tuner = tune.Tuner(
+                tune.with_resources(trial, {"cpu": 1}),
+                tune_config=tune.TuneConfig(
+                    num_samples=trials,
+                    search_alg=OptunaSearch(search, metric=METRIC, mode="max", seed=seed),
+                ),
+                run_config=tune.RunConfig(
+                    name="tune",
+                    storage_path=str(folder),
+                    failure_config=tune.FailureConfig(max_failures=3),
+                ),
+            )
+        rows = [
+            {"trial": result.metrics.get("trial_id"), METRIC: result.metrics.get(METRIC)}
+            | {name: (result.config or {}).get(name) for name in search}
+            | {"error": str(result.error or "")}
+            for result in tuner.fit()
+        ]
+    finally:
+        ray.shutdown()
+    write_csv(folder / "trials.csv", rows)
+    return rows
+
+
+def main(arguments=None):
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("trainer", type=Path, help="a trainer's script")
+    parser.add_argument("--search", nargs="+", required=True, metavar="NAME=", help="see above")
+    parser.add_argument("--trials", type=int, default=20, help="number of trials (20)")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("sweep"), help="where it all is (sweep)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the search (0)")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="trials at a time, one core each (1)"
+    )
+    parser.add_argument(
+        "--ray-address", help="search on the Ray cluster at this address (`auto`, `HOST:PORT`)"
+    )
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    cut = arguments.index("--") if "--" in arguments else len(arguments)
+    args, flags = parser.parse_args(arguments[:cut]), arguments[cut + 1 :]
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        if not args.trainer.is_file():
+            raise ValueError(f"no such trainer: {args.trainer}")
+        for name, lowest in (("trials", 1), ("seed", 0), ("workers", 1)):
+            if getattr(args, name) < lowest:
+                raise ValueError(f"--{name} must be at least {lowest}")
+        search = dict(parse_search(text) for text in args.search)
+        if args.ray_address is not None:
+            rows = sweep_on_ray(
+                args.ray_address, args.trainer, search, args.trials, args.folder, flags, args.seed
+            )
+            values = [row[METRIC] for row in rows if row[METRIC] is not None]
+        else:
+            study = sweep(
+                args.trainer, search, args.trials, args.folder, flags, args.seed, args.workers
+            )
+            values = [t.value for t in study.trials if t.state == TrialState.COMPLETE]
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    if not values:
+        sys.exit(f"error: every trial failed; see {args.folder / 'trials.csv'}")
+    print(
+        f"best of {len(values)}: {max(values):.3f}; all of them are in {args.folder / 'trials.csv'}"
+    )
+
+
+if __name__ == "__main__":
+    main()

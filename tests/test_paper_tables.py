@@ -1,0 +1,134 @@
+"""The results page: from the paper's cells and a folder of results, and from a run."""
+
+import importlib.util
+import json
+import re
+import statistics
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+import envs
+from envs.programs import load_program
+
+ROOT = Path(__file__).resolve().parent.parent
+spec = importlib.util.spec_from_file_location(
+    "paper_tables", ROOT / "benchmarks" / "paper_tables.py"
+)
+paper_tables = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(paper_tables)
+
+CELLS = {cell.name: cell for cell in paper_tables.read_cells()}
+
+
+def result(name, seed, success, **more):
+    made_up = {
+        "cell": name,
+        "seed": seed,
+        "success_rate": success,
+        "success_rate_interval": [success - 0.01, success + 0.01],
+        "clean_success_rate": success / 2,
+        "num_queries": 10_000,
+        "steps": 300_000,
+        "policy_step": 275_000,
+        "training_seconds": 600,
+        "date": "2026-01-02",
+        "commit": "abc1234",
+        "curve": [[100_000, success / 2], [300_000, success]],
+    }
+    return made_up | more
+
+
+@pytest.fixture
+def results(tmp_path):
+    made_up = [
+        result("sac-ee-wall-p1", 1, 0.95),
+        result("sac-ee-double_walls-p1", 1, 0.83),
+        *(result("bc-combined-no_obstacles", seed, 0.98 + seed / 1000) for seed in (1, 2, 3)),
+        result("sac-combined-no_obstacles-p0-no_hindsight", 1, 0.002),
+    ]
+    for number, one in enumerate(made_up):
+        (tmp_path / f"{number}.json").write_text(json.dumps(one))
+    return paper_tables.load_results([tmp_path, tmp_path / "missing"])
+
+
+def test_the_papers_cells():
+    assert len(CELLS) == 3 * 9 * 5 + 4 + 3 + 9 * 6  # goals, hindsight, encoders with BC and SAC
+    assert {cell.task for cell in CELLS.values()} <= set(envs.TASKS)
+    for name, mean, std in [  # as in the issue's table, and the ends of each of the paper's
+        ("bc-ee-no_obstacles", 0.073, 0.036),
+        ("bc-config-double_walls", 0.500, 0.009),
+        ("td3-ee-double_walls-p1", 0.848, 0.027),
+        ("td3-config-boxes-p1", 0.822, 0.014),
+        ("sac-combined-no_obstacles-p0", 0.990, 0.002),
+        ("sac-combined-no_obstacles-p0-no_hindsight", 0.001, 0.0),
+        ("bc-combined-vqvae-random_boxes_hard", 0.150, 0.045),
+        ("sac-combined-pointnet2-random_boxes_hard-p1-on-narrow_shelves", 0.441, 0.019),
+    ]:
+        assert (CELLS[name].mean, CELLS[name].std) == (mean, std)
+
+
+def test_a_cell_is_a_command():
+    flags = CELLS["sac-combined-no_obstacles-p0-no_hindsight"].flags()
+    assert flags[:4] == ["--task", "no_obstacles", "--goal-type", "combined"]
+    assert flags[-4:] == ["--demo-prob", "0", "--her-probability", "0"]
+    assert "--demo-prob" not in CELLS["bc-ee-wall"].flags()
+
+
+def test_the_page_shows_what_was_run_and_what_was_not(results):
+    page = paper_tables.page(list(CELLS.values()), results)
+    assert "**0.950 [0.940, 0.960]**<br>0.971 ± 0.003" in page
+    deviation = statistics.stdev([0.981, 0.982, 0.983])
+    assert f"**0.982 ± {deviation:.3f} (3 seeds)**<br>0.986 ± 0.002" in page
+    assert "not run<br>0.848 ± 0.027" in page
+    # The `combined` cells on `no_obstacles` with p stand in two tables.
+    assert page.count("<br>") == len(CELLS) + 4
+    assert page.count("not run<br>") == page.count("<br>") - 4
+    assert (
+        "Below the paper by more than 0.05: `sac-ee-double_walls-p1` (0.830, paper 0.916)." in page
+    )
+    assert "| `bc-combined-no_obstacles-s2` | 0.982 [0.972, 0.992] | 0.491 |" in page
+    assert "300,000 (275,000) | 10,000 | 10 min | 2026-01-02, abc1234 |" in page
+    for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
+        assert len({line.count("|") for line in table.splitlines()}) == 1
+
+
+def test_an_algorithm_of_ones_own(results, tmp_path):
+    header, *rows = paper_tables.CELLS.read_text().splitlines()
+    (tmp_path / "cells.csv").write_text("\n".join([header, *rows, "mine,ee,wall,wall,1,yes,,,"]))
+    cells = paper_tables.read_cells(tmp_path / "cells.csv")
+    results["mine-ee-wall-p1"] = [result("mine-ee-wall-p1", 1, 0.5)]
+    page = paper_tables.page(cells, results)
+    assert "| MINE-MP (p = 1) |  | **0.500 [0.490, 0.510]**<br>not in the paper |" in page
+    assert "`mine-ee-wall-p1` (" not in page
+    paper_tables.draw_bars(cells, results, tmp_path / "bars.png")
+
+
+def test_the_page_without_any_result():
+    page = paper_tables.page(list(CELLS.values()), {})
+    assert "**" not in page and page.rstrip().endswith("None yet.")
+
+
+def test_the_pictures(results, tmp_path):
+    for draw in (paper_tables.draw_curves, paper_tables.draw_bars):
+        draw(list(CELLS.values()), results, tmp_path / "picture.png")
+        with Image.open(tmp_path / "picture.png") as picture:
+            assert len(picture.convert("RGB").getcolors(1_000_000)) > 10
+
+
+def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(paper_tables, "policies_of", lambda algorithm: tmp_path / "policies")
+    few = ["--eval-queries", "2", "--num-demos", "20", "--eval-every", "20"]
+    monkeypatch.setitem(paper_tables.RECIPES, "bc", few)
+    cell = CELLS["bc-config-wall"]
+    paper_tables.run(cell, 5, 60, 4, tmp_path / "runs")
+    kept = json.loads((tmp_path / "policies" / "bc-config-wall-s5.json").read_text())
+    assert kept["cell"] == cell.name and kept["seed"] == kept["args"]["seed"] == 5
+    assert kept["steps"] == 60 and kept["num_queries"] == 4
+    assert [step for step, _ in kept["curve"]] == [20, 40, 60]
+    assert re.fullmatch(r"[0-9a-f]{7,}\+?", kept["commit"])
+    load_program(tmp_path / "policies" / "bc-config-wall-s5.pt")
+    capfd.readouterr()
+    paper_tables.run(cell, 5, 60, 4, tmp_path / "runs")
+    assert capfd.readouterr().out == "bc-config-wall-s5: done before\n"
