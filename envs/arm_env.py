@@ -177,9 +177,12 @@ class RoboArmEnv(gym.Env):
             fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self.client
         )
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
-        self.robot = panda.load(self.client)
+        self.robot = self._load_robot()
         self._parts, self._bodies, self._bodies_made = [], [], 0
         self._goal_marker = None
+
+    def _load_robot(self):
+        return panda.load(self.client)
 
     def set_scene(self, scene):
         """Put the arm into another `Scene`. That ends the episode; an equal one changes nothing."""

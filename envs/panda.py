@@ -4,6 +4,9 @@ A configuration `c` is 7 joint angles in radians; `s` is the same in the normali
 configuration space [-1, 1]^7 (paper, appendix "Extended NMP goal-conditioned MDP description").
 """
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pybullet as p
 import pybullet_data
@@ -74,10 +77,13 @@ def forward_kinematics(configuration):
     return position + _FLANGE_TO_EE * rotation[..., :, 2]
 
 
+_FOLDER = Path(pybullet_data.getDataPath(), "franka_panda")
+
+
 def load(client):
     """Load the arm with its base fixed at the origin; returns its body id. Fingers stay open."""
     robot = p.loadURDF(
-        pybullet_data.getDataPath() + "/franka_panda/panda.urdf",
+        str(_FOLDER / "panda.urdf"),
         useFixedBase=True,
         flags=p.URDF_USE_SELF_COLLISION,
         physicsClientId=client,
@@ -95,6 +101,22 @@ def load(client):
         forces=[20.0] * 2,
         physicsClientId=client,
     )
+    return robot
+
+
+def load_coarse(client, colour):
+    """Load the arm as `load` does, but only to be looked at: its collision meshes, in one colour.
+
+    They have a tenth of the faces. `colour`: (red, green, blue, alpha) in [0, 1].
+    """
+    urdf = (_FOLDER / "panda.urdf").read_text()
+    urdf = urdf.replace("package://meshes/visual", "package://meshes/collision")
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
+        file.write(urdf.replace("package://", f"{_FOLDER}/"))
+        file.flush()
+        robot = p.loadURDF(file.name, useFixedBase=True, physicsClientId=client)
+    for link in range(-1, p.getNumJoints(robot, physicsClientId=client)):
+        p.changeVisualShape(robot, link, rgbaColor=colour, physicsClientId=client)
     return robot
 
 

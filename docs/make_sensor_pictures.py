@@ -1,0 +1,83 @@
+"""Render the pictures of the sensors in docs/pictures.
+
+    python docs/make_sensor_pictures.py
+
+Where the four default sensors are (purple balls), and what each kind puts out for the same scene:
+one column per place; from above: RGB, depth (near is bright), segmentation, point cloud. Classes:
+robot red, table and floor orange, obstacles yellow (as in the paper's figure).
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pybullet as p
+from PIL import Image
+
+import envs
+from envs.datasets import load_queries
+from envs.sensors import (
+    NOTHING,
+    OUTPUTS,
+    Camera,
+    PointCloud,
+    SensorWorld,
+    cardinal,
+)
+
+FOLDER = Path(__file__).parent / "pictures"
+COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [255, 255, 255]], np.uint8)
+
+
+def placement(query):
+    """The scene with a purple ball where each sensor is."""
+    env = envs.make("random_boxes_hard", render_mode="rgb_array")
+    env.reset_specific(*query)
+    for sensor in cardinal().values():
+        ball = p.createVisualShape(
+            p.GEOM_SPHERE, radius=0.07, rgbaColor=(0.5, 0.1, 0.7, 1), physicsClientId=env.client
+        )
+        p.createMultiBody(
+            baseVisualShapeIndex=ball, basePosition=sensor.eye, physicsClientId=env.client
+        )
+    view = p.computeViewMatrixFromYawPitchRoll((0.0, 0.0, 0.2), 5.0, 40, -30, 0, 2)
+    projection = p.computeProjectionMatrixFOV(45, 4 / 3, 0.1, 20)
+    _, _, pixels, _, _ = p.getCameraImage(
+        640, 480, view, projection, lightDirection=(1, 1, 2.5), physicsClientId=env.client
+    )
+    env.close()
+    return np.reshape(pixels, (480, 640, 4))[..., :3].astype(np.uint8)
+
+
+def cloud_picture(cloud, size=224):
+    """Points from above, x up and y to the left as the robot sees it, coloured by class."""
+    picture = np.full((size, size, 3), 255, np.uint8)
+    hit = cloud["labels"] != NOTHING
+    points, labels = cloud["points"][hit], cloud["labels"][hit]
+    order = np.argsort(points[:, 2])  # the highest is drawn last
+    pixels = ((1.2 - points[order, :2]) / 2.4 * size).astype(int)
+    inside = ((pixels >= 0) & (pixels < size - 1)).all(1)
+    for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        picture[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
+    return picture
+
+
+def main():
+    query = load_queries("random_boxes_hard")[0]
+    Image.fromarray(placement(query)).quantize(64).save(FOLDER / "sensors_placement.png")
+    world = SensorWorld()
+    world.show(query.scene, query.start)
+    columns = []
+    for name, camera in cardinal(Camera, outputs=OUTPUTS).items():
+        seen = camera.observe(world)
+        depth = 255 * (1 - seen["depth"] / camera.far)
+        column = [seen["rgb"], np.repeat(depth[..., None], 3, 2).astype(np.uint8)]
+        column += [COLOURS[seen["segmentation"]]]
+        column += [cloud_picture(cardinal(PointCloud)[name].observe(world))]
+        columns.append(np.concatenate(column))
+    world.close()
+    pictures = Image.fromarray(np.concatenate(columns, axis=1))
+    pictures.quantize(128).save(FOLDER / "sensors_outputs.png", optimize=True)
+
+
+if __name__ == "__main__":
+    main()

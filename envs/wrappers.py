@@ -1,0 +1,107 @@
+"""Wrappers that add to the observation what sensors see, or what an encoder makes of it."""
+
+import gymnasium as gym
+import numpy as np
+
+from envs import panda
+from envs.sensors import SensorWorld, cardinal
+
+
+class SensorWrapper(gym.Wrapper):
+    """Adds `sensors` to the observation: a dict of sensor's name -> its observation (a dict).
+
+    Args:
+        env: a `RoboArmEnv`, possibly wrapped.
+        sensors: dict of name -> `envs.sensors.Camera`, `PointCloud` or anything with their `space`
+            and `observe`; by default four cameras (`cardinal()`).
+        every_step: look in every step; otherwise once per episode, at its start, with the arm in
+            the start configuration (paper, appendix "Prediction times investigation").
+    """
+
+    def __init__(self, env, sensors=None, every_step=False):
+        super().__init__(env)
+        self.sensors = cardinal() if sensors is None else dict(sensors)
+        self.every_step = every_step
+        spaces = {name: sensor.space for name, sensor in self.sensors.items()}
+        self.observation_space = gym.spaces.Dict(
+            {**env.observation_space.spaces, "sensors": gym.spaces.Dict(spaces)}
+        )
+        self._world = SensorWorld()
+        self._seen = None
+
+    def _look(self, observation):
+        configuration = panda.denormalise(observation["observation"][: panda.NUM_JOINTS])
+        self._world.show(self.unwrapped.scene, configuration)
+        self._seen = {name: sensor.observe(self._world) for name, sensor in self.sensors.items()}
+
+    def _with_sensors(self, observation):
+        seen = {  # copies: an observation is its owner's to change
+            name: {output: array.copy() for output, array in outputs.items()}
+            for name, outputs in self._seen.items()
+        }
+        return {**observation, "sensors": seen}
+
+    def _begin(self, observation, info):
+        self._look(observation)
+        return self._with_sensors(observation), info
+
+    def reset(self, *, seed=None, options=None):
+        """As `RoboArmEnv.reset`."""
+        return self._begin(*self.env.reset(seed=seed, options=options))
+
+    def reset_specific(self, start, goal, scene=None):
+        """As `RoboArmEnv.reset_specific`."""
+        return self._begin(*self.env.get_wrapper_attr("reset_specific")(start, goal, scene))
+
+    def step(self, action):
+        """As `RoboArmEnv.step`."""
+        observation, *rest = self.env.step(action)
+        if self.every_step:
+            self._look(observation)
+        return self._with_sensors(observation), *rest
+
+    def close(self):
+        self._world.close()
+        super().close()
+
+
+class SceneEncodingWrapper(gym.Wrapper):
+    """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
+
+    It is encoded once per scene. Otherwise this is its `RoboArmEnv`, methods for relabelling
+    included.
+
+    Args:
+        env: a `RoboArmEnv`.
+        encoder: an `envs.encoders.SceneEncoder`; several environments may share it.
+    """
+
+    def __init__(self, env, encoder):
+        super().__init__(env)
+        self.encoder = encoder
+        spaces = dict(env.observation_space.spaces)
+        size = spaces["observation"].shape[0] + encoder.size
+        spaces["observation"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.observation_space = gym.spaces.Dict(spaces)
+        self.compute_reward = env.compute_reward
+        self.compute_terminated = env.compute_terminated
+        self.compute_truncated = env.compute_truncated
+
+    def _with_scene(self, observation):
+        z = self.encoder(self.unwrapped.scene)
+        return {**observation, "observation": np.concatenate([observation["observation"], z])}
+
+    def reset(self, *, seed=None, options=None):
+        """As `RoboArmEnv.reset`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._with_scene(observation), info
+
+    def reset_specific(self, start, goal, scene=None):
+        """As `RoboArmEnv.reset_specific`."""
+        observation, info = self.env.reset_specific(start, goal, scene)
+        return self._with_scene(observation), info
+
+    def step(self, action):
+        """As `RoboArmEnv.step`."""
+        observation, *rest = self.env.step(action)
+        return self._with_scene(observation), *rest

@@ -1,0 +1,167 @@
+"""Collect what sensors see of random scenes, to train encoders on.
+
+    python -m scene_embedding_train.collect --num 20000 --image-size 64 --output observations
+    python -m scene_embedding_train.collect --num 200000 --ray-address auto   # the paper's number
+
+Paper: appendix "Training and verifying the encoders": four sensors around the robot, images and
+point clouds of 200,000 environments. Scene i, with the arm in a feasible configuration, depends on
+the seed and i only, so the files are the same whatever the number of workers. They are written a
+shard at a time, each in one piece; a run that was interrupted or killed goes on when it is started
+again, and one that is finished can be continued with a larger `--num`.
+"""
+
+import contextlib
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+import envs
+from demo_generation import workers
+from envs.files import write_atomically
+from envs.observations import (
+    Observations,
+    attribute,
+    observe,
+    open_shard,
+    shard_bytes,
+    shard_path,
+)
+from envs.sensors import Camera, PointCloud, SensorWorld, cardinal
+
+# Streams 1 to 3 of random numbers are those of the queries and demonstrations.
+STREAM = 4
+
+
+@dataclass
+class Args:
+    task: str = "random_boxes_hard"
+    """Name of a task, or path of a scene file."""
+    num: int = 20_000
+    """Number of scenes."""
+    sensors: Literal["images", "clouds", "both"] = "both"
+    """Cameras, point clouds, or both in the same places."""
+    image_size: int = 224
+    """Width and height of the images in pixels."""
+    num_samples: int = 10_000
+    """Rays of a point cloud, a square number."""
+    shard_size: int = 500
+    """Scenes in each file."""
+    seed: int = 0
+    """Seed of scenes and configurations."""
+    workers: int = 2
+    """Number of processes. The files do not depend on it."""
+    output: Path = Path("observations")
+    """Folder to write to."""
+    ray_address: str | None = None
+    """Work on the Ray cluster at this address (`auto`, `HOST:PORT`) and not in local processes."""
+
+
+def sensors_of(args):
+    """The sensors that are asked for: dict of name -> sensor."""
+    sensors = {}
+    if args.sensors != "clouds":
+        sensors |= cardinal(Camera, size=(args.image_size, args.image_size))
+    if args.sensors != "images":
+        clouds = cardinal(PointCloud, num_samples=args.num_samples)
+        sensors |= {f"{name}_cloud": sensor for name, sensor in clouds.items()}
+    return sensors
+
+
+class Collector:
+    """Makes shards; a job is (number of the shard, first scene, scene after the last)."""
+
+    def __init__(self, task, seed, sensors, made_by):
+        self.task, self.seed, self.sensors, self.made_by = task, seed, sensors, made_by
+        self.env, self.world = envs.make(task), SensorWorld()
+
+    def __call__(self, job):
+        """`(number, contents of the file)`."""
+        number, first, end = job
+        seen, configurations, observations = [], [], []
+        for index in range(first, end):
+            rng = np.random.default_rng([self.seed, STREAM, index])
+            self.env.sample_scene(rng)
+            configurations.append(self.env.sample_feasible(rng))
+            seen.append(self.env.scene)
+            self.world.show(self.env.scene, configurations[-1])
+            observations.append(observe(self.world, self.sensors))
+        arguments = (self.sensors, seen, configurations, observations, self.made_by)
+        return number, shard_bytes(self.task, self.seed, first, *arguments)
+
+
+def _is_there(folder, job, made_by):
+    """Whether a shard was made before. Raises ValueError if it is damaged or another one."""
+    number, first, end = job
+    path = shard_path(folder, number)
+    if not path.exists():
+        return False
+    with open_shard(path) as file:
+        if attribute(file, "made_by") != made_by:
+            raise ValueError(f"{path} was made by another command: {attribute(file, 'made_by')}")
+        return len(file["configuration"]) >= end - first  # the last one may have had fewer
+
+
+def collect(args, progress=True):
+    """Make the shards that are missing.
+
+    Raises:
+        ValueError: arguments that cannot work; the folder holds other observations.
+        ConnectionError: there is no Ray cluster.
+        OSError: the folder cannot be written. What was written is safe.
+    """
+    for name, lowest in (("num", 1), ("shard_size", 1), ("seed", 0), ("workers", 1)):
+        if getattr(args, name) < lowest:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least {lowest}")
+    if not envs.get_task(args.task).trainable:
+        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
+    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
+        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+    sensors = sensors_of(args)
+    args.output.mkdir(parents=True, exist_ok=True)
+    names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
+    flags = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
+    made_by = " ".join(["python -m scene_embedding_train.collect", *flags])
+    firsts = range(0, args.num, args.shard_size)
+    jobs = [(i, k, min(k + args.shard_size, args.num)) for i, k in enumerate(firsts)]
+    missing = [job for job in jobs if not _is_there(args.output, job, made_by)]
+    there = args.num - sum(end - first for _, first, end in missing)
+    bar = tqdm(
+        desc=args.task,
+        total=args.num,
+        initial=there,
+        unit=" scenes",
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+        disable=not progress,
+    )
+    arguments = (args.task, args.seed, sensors, made_by)
+    if args.ray_address is None:
+        results = workers.run(Collector, arguments, missing, args.workers, warn=bar.write)
+    else:
+        results = workers.run_on_ray(args.ray_address, Collector, arguments, missing)
+    with bar, contextlib.closing(results):
+        for number, contents in results:
+            write_atomically(shard_path(args.output, number), contents)
+            bar.update(jobs[number][2] - jobs[number][1])
+    return Observations(args.output)
+
+
+def main(args):
+    try:
+        made = collect(args)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
+    print(f"{args.output}: {len(made)} scenes, {size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m scene_embedding_train.collect", description=__doc__))
