@@ -1,0 +1,98 @@
+"""Scene encoders as something to call: a `Scene` -> z_E, the numbers a policy sees of it.
+
+    encoder = SceneEncoder("runs/.../encoder.pt")     # trained: scene_embedding_train
+    encoder = SceneEncoder("oracle")                  # the obstacles themselves
+    env = SceneEncodingWrapper(envs.make("random_boxes_hard"), encoder)
+
+Paper: sections 5.1 and 5.3. `SceneEncodingWrapper` is in `envs.wrappers`.
+"""
+
+import functools
+
+import numpy as np
+import torch
+
+from envs.observations import sensors_from_json
+from envs.programs import ProgramError, load_program
+from envs.scenes import ROW, to_array
+from envs.sensors import PointCloud, SensorWorld
+
+ORACLE = "oracle"
+# Obstacles that the oracle has room for: `narrow_shelves` has 28.
+MAX_OBSTACLES = 32
+# Of the arm when an encoder looks, rad: always the same, so that z_E depends on the scene alone.
+# It stands upright, where it hides little.
+POSE = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
+CACHED_SCENES = 20_000
+
+
+def oracle(scene):
+    """The obstacles' true parameters, padded: float32 (MAX_OBSTACLES * 12,).
+
+    Of each obstacle 1 and its row of `envs.scenes.to_array`; zeros where there is none. Raises
+    ValueError if there are more than `MAX_OBSTACLES`.
+    """
+    count = len(scene.obstacles)
+    if count > MAX_OBSTACLES:
+        raise ValueError(f"the oracle has room for {MAX_OBSTACLES} obstacles, not for {count}")
+    rows = np.zeros((MAX_OBSTACLES, 1 + ROW), np.float32)
+    rows[:count, 0] = 1.0
+    rows[:count, 1:] = to_array(scene.obstacles)
+    return rows.ravel()
+
+
+class SceneEncoder:
+    """Encodes scenes; an equal scene is encoded once.
+
+    Args:
+        name: path of an encoder's program (`encoder.pt`), or `oracle`.
+
+    Attributes:
+        name: as given, a string.
+        size: of z_E.
+
+    Raises:
+        ProgramError: the file cannot be used.
+    """
+
+    def __init__(self, name):
+        self.name = str(name)
+        self._world = None
+        if self.name == ORACLE:
+            self._encode, self.size = oracle, MAX_OBSTACLES * (1 + ROW)
+        else:
+            self._program = load_program(name)
+            if self._program.metadata.get("kind") != "encoder":
+                raise ProgramError(f"{name}: not an encoder, but {self._program.metadata!r}")
+            try:
+                self.sensors = sensors_from_json(self._program.metadata["sensors"])
+            except (KeyError, TypeError, ValueError) as error:
+                raise ProgramError(f"{name}: its sensors make no sense: {error!r}") from error
+            self._world = SensorWorld()
+            self._encode = self._look_and_encode
+            self.size = len(self(self._world.scene))
+
+    @functools.cached_property
+    def _cached(self):
+        return functools.lru_cache(CACHED_SCENES)(self._encode)
+
+    def __call__(self, scene):
+        """z_E of a `Scene`, float32 (size,); not to be changed."""
+        return self._cached(scene)
+
+    def _look_and_encode(self, scene):
+        self._world.show(scene, POSE)
+        inputs = {}
+        for name, sensor in self.sensors.items():
+            seen = sensor.observe(self._world)
+            if isinstance(sensor, PointCloud):
+                inputs |= {f"{name}_{output}": array for output, array in seen.items()}
+            else:
+                inputs[name] = seen["rgb"]
+        batch = {name: torch.from_numpy(array)[None] for name, array in inputs.items()}
+        return self._program(**{name: batch[name] for name in self._program.inputs})[0].numpy()
+
+    def close(self):
+        """Close the world it looks into."""
+        if self._world is not None:
+            self._world.close()

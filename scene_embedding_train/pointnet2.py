@@ -1,0 +1,510 @@
+"""PointNet++ of four point clouds: a scene latent z_E of 64 numbers. Read it from the top.
+
+    python -m scene_embedding_train.collect --sensors clouds --num 20000
+    python scene_embedding_train/pointnet2.py --observations observations
+
+PointNet++ (Qi et al., 2017) as in the paper's appendix "Training and verifying the encoders": a
+network per sensor says of each point what it lies on: robot, table or floor, or another obstacle.
+Set abstraction (farthest point sampling, ball query) makes 16 numbers of a cloud; feature
+propagation classifies the points from these numbers and the points' places alone, without the
+usual skip connections, which would lead around them. What is saved, `encoder.pt`, is a program
+(`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an encoder
+of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
+`# END SHARED` are those of `vae.py`.
+"""
+
+import json
+import math
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from envs.datasets import DatasetError
+from envs.observations import Observations, sensors_to_json
+from envs.programs import save_program
+from envs.sensors import NOTHING, PointCloud
+
+
+@dataclass
+class Args:
+    # The run
+    exp_name: str = "pointnet2"
+    """name of the experiment, part of the run's folder"""
+    # SHARED: the run and the data
+    seed: int = 1
+    """seed of everything random; the same seed gives the same run on the same machine and device"""
+    runs_dir: Path = Path("runs")
+    """the run's folder is made in here: TensorBoard events, checkpoint, encoder.pt, result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint; its own flags are used"""
+    device: str = "cpu"
+    """`cpu` or `cuda`"""
+    threads: int = 1
+    """torch threads"""
+
+    # The data
+    observations: Path = Path("observations")
+    """folder that `scene_embedding_train.collect` wrote"""
+    validation_share: float = 0.05
+    """share of the scenes, the last ones, that is not trained on"""
+    # END SHARED
+
+    # The algorithm
+    total_updates: int = 10_000
+    """batches of the whole run"""
+    batch_size: int = 16
+    """scenes per batch"""
+    learning_rate: float = 1e-3
+    """learning rate (Adam) at the start; it falls linearly to zero"""
+    latent_size: int = 16
+    """numbers per sensor (paper: 16)"""
+    num_points: int = 1024
+    """points of a cloud that the network gets, evenly spaced among those that hit something"""
+    num_centres: tuple[int, int] = (128, 32)
+    """points that farthest point sampling leaves, level by level"""
+    radii: tuple[float, float] = (0.15, 0.4)
+    """radius (m) of the ball query around each of them"""
+    num_neighbours: int = 16
+    """points that a ball query finds at most"""
+    width: int = 32
+    """features at the first level; each further one has twice as many"""
+
+    # SHARED: bookkeeping
+    eval_every: int = 2_000
+    """batches between evaluations on validation scenes; the best encoder is kept"""
+    eval_scenes: int = 512
+    """validation scenes per evaluation"""
+    # END SHARED
+
+
+# SHARED: arguments
+def configuration_of(args):
+    """The fields that define what is computed: a run can only be resumed with the same."""
+    free = {"resume", "runs_dir", "threads", "observations"}
+    return {k: v for k, v in asdict(args).items() if k not in free}
+
+
+# END SHARED
+
+
+def load_clouds(observations):
+    """What the point cloud sensors saw, and the sensors' names.
+
+    Returns:
+        `depth` uint16 and `segmentation` uint8, both (scenes, sensors, edge, edge), unpacked once
+        into files beside the shards and mapped into memory; and the names.
+    """
+    names = [name for name, one in observations.sensors.items() if isinstance(one, PointCloud)]
+    if not names:
+        sys.exit(f"--observations: {observations.folder} has no clouds (collect with --sensors)")
+    if len({observations.sensors[name].num_samples for name in names}) > 1:
+        sys.exit(f"--observations: {observations.folder}: the sensors differ in num_samples")
+    edge = math.isqrt(observations.sensors[names[0]].num_samples)
+    arrays = []
+    for output, dtype in (("depth", np.uint16), ("segmentation", np.uint8)):
+        path = observations.folder / f"{output}_{len(observations)}.npy"
+        if not path.exists():
+            temporary = path.with_suffix(".part")
+            shape = (len(observations), len(names), edge, edge)
+            unpacked = np.lib.format.open_memmap(temporary, "w+", dtype, shape)
+            for shard in tqdm(range(len(observations.offsets) - 1), desc=output, unit="shard"):
+                rows = slice(*observations.offsets[shard : shard + 2])
+                for i, name in enumerate(names):
+                    unpacked[rows, i] = observations.read(shard, f"{name}/{output}")
+            unpacked.flush()
+            os.replace(temporary, path)
+        arrays.append(np.load(path, mmap_mode="r"))
+    return *arrays, names
+
+
+def batch_of(clouds, rows, sensors, device):
+    """Rows of `load_clouds`'s arrays as the sensors give them, by name: points and labels.
+
+    Each float32 (n, samples, 3), m, and int64 (n, samples); see `envs.sensors.PointCloud.points`.
+    """
+    depths, segmentations, names = clouds
+    batch, rows = {}, np.sort(rows)
+    for i, name in enumerate(names):
+        sensor = sensors[name]
+        depth = depths[rows, i] * (sensor.far / 65_535)
+        seen = [sensor.points(*one) for one in zip(depth, segmentations[rows, i], strict=True)]
+        points, labels = (np.stack([one[key] for one in seen]) for key in ("points", "labels"))
+        batch[name] = (
+            torch.as_tensor(points, device=device),
+            torch.as_tensor(labels, device=device).long(),
+        )
+    return batch
+
+
+# MODEL
+def gather(values, indices):
+    """Rows of values (n, p, f) at indices (n, ...), each row with its own: (n, ..., f)."""
+    flat = indices.flatten(1).unsqueeze(-1).expand(-1, -1, values.shape[2])
+    return torch.gather(values, 1, flat).unflatten(1, indices.shape[1:])
+
+
+def thin_out(labels, num_points):
+    """Indices (n, num_points) of points evenly spaced among those that hit something.
+
+    `labels` (n, samples): these come first. If there are fewer, points are repeated.
+    """
+    counts = (labels != NOTHING).sum(1, keepdim=True).clamp(min=1)
+    steps = torch.arange(num_points, device=labels.device)
+    return (steps * counts).div(num_points, rounding_mode="floor")
+
+
+def farthest_point_sampling(points, number):
+    """Indices (n, number) of points (n, p, 3): the first, then always the one farthest from all."""
+    chosen = [torch.zeros_like(points[:, 0, 0], dtype=torch.int64)]
+    distance = torch.full_like(points[:, :, 0], math.inf)
+    for _ in range(number - 1):
+        latest = gather(points, chosen[-1].unsqueeze(1))
+        distance = torch.minimum(distance, (points - latest).square().sum(2))
+        chosen.append(distance.argmax(1))
+    return torch.stack(chosen, dim=1)
+
+
+def ball_query(points, centres, radius, number):
+    """Indices (n, c, number) of points (n, p, 3) within `radius` of each centre (n, c, 3).
+
+    The nearest ones; where there are fewer, the nearest is repeated.
+    """
+    distances, indices = torch.cdist(centres, points).topk(number, dim=2, largest=False)
+    return torch.where(distances <= radius, indices, indices[:, :, :1])
+
+
+def interpolate(values, centres, points):
+    """Values (n, c, f) at centres (n, c, 3) -> at points (n, p, 3): of the three nearest centres.
+
+    Weighted by the inverse of the distance: (n, p, f).
+    """
+    distances, indices = torch.cdist(points, centres).topk(3, dim=2, largest=False)
+    weights = 1.0 / (distances + 1e-6)
+    weights = weights / weights.sum(2, keepdim=True)
+    return (gather(values, indices) * weights.unsqueeze(-1)).sum(2)
+
+
+def mlp(*sizes):
+    layers = []
+    for a, b in zip(sizes, sizes[1:], strict=False):
+        layers += [nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+class Encoder(nn.Module):
+    """Set abstraction: a cloud (n, p, 3), m -> its latent (n, latent), and each level's points."""
+
+    def __init__(self, args):
+        super().__init__()
+        self.args, width = args, args.width
+        self.levels = nn.ModuleList(
+            [mlp(3, width, width, 2 * width), mlp(2 * width + 3, 2 * width, 4 * width)]
+        )
+        self.top = mlp(4 * width + 3, 4 * width, 8 * width)
+        self.head = nn.Linear(8 * width, args.latent_size)
+
+    def forward(self, points):
+        features, places = None, [points]
+        for level, number, radius in zip(
+            self.levels, self.args.num_centres, self.args.radii, strict=True
+        ):
+            centres = gather(points, farthest_point_sampling(points, number))
+            neighbours = ball_query(points, centres, radius, self.args.num_neighbours)
+            # Places relative to the centre, in units of the radius.
+            inputs = (gather(points, neighbours) - centres.unsqueeze(2)) / radius
+            if features is not None:
+                inputs = torch.cat([inputs, gather(features, neighbours)], dim=3)
+            features, points = level(inputs).amax(2), centres
+            places.append(points)
+        features = self.top(torch.cat([points, features], dim=2)).amax(1)
+        return self.head(features), places
+
+
+class Decoder(nn.Module):
+    """Feature propagation: a latent (n, latent), the levels' points -> logits (n, p, classes)."""
+
+    def __init__(self, args):
+        super().__init__()
+        width = args.width
+        self.top = mlp(args.latent_size + 3, 4 * width, 4 * width)
+        self.levels = nn.ModuleList(
+            [mlp(4 * width + 3, 4 * width, 2 * width), mlp(2 * width + 3, 2 * width, 2 * width)]
+        )
+        self.head = nn.Linear(2 * width, NOTHING)
+
+    def forward(self, latent, places):
+        *finer, points = places
+        spread = latent.unsqueeze(1).expand(-1, points.shape[1], -1)
+        features = self.top(torch.cat([points, spread], dim=2))
+        for level, onto in zip(self.levels, reversed(finer), strict=True):
+            features = level(torch.cat([onto, interpolate(features, points, onto)], dim=2))
+            points = onto
+        return self.head(features)
+
+
+class PointNet2(nn.Module):
+    """An encoder and a decoder per sensor."""
+
+    def __init__(self, num_sensors, args):
+        super().__init__()
+        self.num_points = args.num_points
+        self.encoders = nn.ModuleList(Encoder(args) for _ in range(num_sensors))
+        self.decoders = nn.ModuleList(Decoder(args) for _ in range(num_sensors))
+
+    def forward(self, clouds):
+        """A list of (points, labels) per sensor -> lists of logits (n, p, 3) and labels (n, p)."""
+        logits, truth = [], []
+        for (points, labels), encoder, decoder in zip(
+            clouds, self.encoders, self.decoders, strict=True
+        ):
+            chosen = thin_out(labels, self.num_points)
+            latent, places = encoder(gather(points, chosen))
+            logits.append(decoder(latent, places))
+            truth.append(labels.gather(1, chosen))
+        return logits, truth
+
+
+class SceneEncoder(nn.Module):
+    """What is saved: each sensor's points and labels, `<sensor>_points` (n, samples, 3) and
+    `<sensor>_labels` (n, samples), uint8 -> z_E (n, 64). Of the labels it uses only which points
+    hit something."""
+
+    def __init__(self, model, names):
+        super().__init__()
+        self.encoders, self.num_points, self.names = model.encoders, model.num_points, names
+
+    def forward(self, **clouds):
+        latents = []
+        for name, encoder in zip(self.names, self.encoders, strict=True):
+            chosen = thin_out(clouds[f"{name}_labels"], self.num_points)
+            latents.append(encoder(gather(clouds[f"{name}_points"], chosen))[0])
+        return torch.cat(latents, dim=1)
+
+
+# SHARED: files and resuming
+def write_atomically(path, write):
+    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
+    temporary = path.with_name(path.name + ".part")
+    write(temporary)
+    with open(temporary, "rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def parse_args():
+    """Flags, or with --resume those of the run, which must not be contradicted."""
+    args = tyro.cli(Args)
+    if args.resume is None:
+        return args
+    saved_file = args.resume / "args.json"
+    if not saved_file.exists():
+        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
+    saved = json.loads(saved_file.read_text())
+    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
+    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
+    defaults.observations = Path(defaults.observations)
+    args = tyro.cli(Args, default=defaults)
+    contradicted = [
+        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
+        for name, value in configuration_of(args).items()
+        if value != saved.get(name)
+    ]
+    if contradicted:
+        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
+    return args
+
+
+# END SHARED
+
+
+@torch.no_grad()
+def evaluate(model, clouds, rows, sensors, batch_size, device):
+    """Accuracy, and intersection over union of each class, over all points of scenes `rows`."""
+    model.eval()
+    confusion = torch.zeros(NOTHING * NOTHING, dtype=torch.int64)
+    for start in range(0, len(rows), batch_size):
+        batch = batch_of(clouds, rows[start : start + batch_size], sensors, device)
+        for logits, truth in zip(*model(list(batch.values())), strict=True):
+            hit = truth != NOTHING  # an empty cloud has none
+            pairs = NOTHING * truth[hit] + logits.argmax(2)[hit]
+            confusion += torch.bincount(pairs, minlength=len(confusion)).cpu()
+    model.train()
+    confusion = confusion.reshape(NOTHING, NOTHING).double()  # truth, prediction
+    both = confusion.diagonal()
+    iou = both / (confusion.sum(0) + confusion.sum(1) - both).clamp(min=1)
+    result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
+    names = ("iou_robot", "iou_static", "iou_obstacle")
+    return result | dict(zip(names, iou.tolist(), strict=True))
+
+
+COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [255, 255, 255]], np.uint8)
+
+
+def comparison(points, truth, predicted, size=160):
+    """A picture, uint8: a sensor's points (p, 3) seen from above; true classes left, ours right.
+
+    Robot red, table and floor orange, obstacles yellow, as in the paper's figure.
+    """
+    pictures = []
+    for labels in (truth, predicted):
+        picture = np.full((size, size, 3), 255, np.uint8)
+        order = np.argsort(points[:, 2])  # the highest is drawn last
+        pixels = ((1.2 - points[order, :2]) / 2.4 * size).astype(int)
+        inside = ((pixels >= 0) & (pixels < size - 1)).all(1)
+        for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            picture[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
+        pictures.append(picture)
+    return np.concatenate(pictures, axis=1)
+
+
+if __name__ == "__main__":
+    # SHARED: checks
+    args = parse_args()
+    if args.device == "cuda" and not torch.cuda.is_available():
+        sys.exit("--device cuda: PyTorch sees no CUDA device here")
+    try:
+        observations = Observations(args.observations)
+    except DatasetError as error:
+        sys.exit(f"--observations: {error}")
+    # END SHARED
+    clouds = load_clouds(observations)
+    sensors = {name: observations.sensors[name] for name in clouds[2]}
+
+    # SHARED: folder and seeds
+    num_training = len(observations) - max(1, round(args.validation_share * len(observations)))
+    validation = np.arange(num_training, len(observations))[: args.eval_scenes]
+    if num_training < 1:
+        sys.exit(f"--observations: {len(observations)} scenes are too few")
+    if args.resume is not None:
+        run = args.resume
+    else:
+        name = f"{observations.task}__{args.exp_name}__{args.seed}__{int(time.time())}"
+        run = args.runs_dir / name
+        run.mkdir(parents=True)
+        text = json.dumps(asdict(args), indent=2, default=str)
+        write_atomically(run / "args.json", lambda path: path.write_text(text))
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
+    torch.use_deterministic_algorithms(True)
+    device = torch.device(args.device)
+    rng = np.random.default_rng(args.seed)
+    # END SHARED
+
+    # MODEL: network and optimiser
+    model = PointNet2(len(sensors), args).to(device)
+    optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
+
+    # SHARED: checkpoints
+    saved_parts = {"model": model, "optimizer": optimizer}
+    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0}
+    progress["best"] = {}
+
+    def save_checkpoint():
+        state = {name: part.state_dict() for name, part in saved_parts.items()}
+        state |= {"progress": progress, "torch_rng": torch.get_rng_state()}
+        state["rng"] = json.dumps(rng.bit_generator.state)
+        if device.type == "cuda":
+            state["cuda_rng"] = torch.cuda.get_rng_state()
+        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
+
+    if args.resume is not None and (run / "checkpoint.pt").exists():
+        try:
+            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
+        except Exception as error:  # whatever a damaged file leads to
+            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
+        for name, part in saved_parts.items():
+            part.load_state_dict(state[name])
+        progress.update(state["progress"])
+        rng.bit_generator.state = json.loads(state["rng"])
+        torch.set_rng_state(state["torch_rng"].cpu())
+        if device.type == "cuda":
+            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
+        del state
+
+    writer = SummaryWriter(run, purge_step=progress["updates"] + 1)
+    writer.add_text(
+        "hyperparameters",
+        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
+    )
+    started, seconds_before = time.time(), progress["seconds"]
+    updates_before = progress["updates"]
+    bar = tqdm(
+        total=args.total_updates,
+        initial=updates_before,
+        unit="update",
+        smoothing=0.05,
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
+    )
+    # END SHARED
+
+    while progress["updates"] < args.total_updates:
+        # MODEL: learn
+        remaining = 1.0 - progress["updates"] / args.total_updates
+        optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
+        rows = rng.integers(num_training, size=args.batch_size)
+        logits, truth = model(list(batch_of(clouds, rows, sensors, device).values()))
+        loss = F.cross_entropy(
+            torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=NOTHING
+        )
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        progress["updates"] += 1
+        bar.update()
+
+        step = progress["updates"]
+        if step % 100 == 0:
+            writer.add_scalar("losses/loss", loss.item(), step)
+            ups = (step - updates_before) / (time.time() - started)
+            writer.add_scalar("charts/updates_per_second", ups, step)
+
+        # Evaluate, keep the best encoder
+        if step % args.eval_every == 0 or step == args.total_updates:
+            result = evaluate(model, clouds, validation, sensors, args.batch_size, device)
+            for name, value in result.items():
+                writer.add_scalar(f"eval/{name}", value, step)
+            shown = batch_of(clouds, validation[:2], sensors, device)
+            with torch.no_grad():
+                logits, truth = model(list(shown.values()))
+            first = next(iter(shown.values()))
+            points = gather(first[0], thin_out(first[1], args.num_points))[0]
+            predicted = torch.where(truth[0] != NOTHING, logits[0].argmax(2), NOTHING)
+            picture = comparison(*(a.cpu().numpy() for a in (points, truth[0][0], predicted[0])))
+            writer.add_image("eval/classification", picture, step, dataformats="HWC")
+            if 1 - result["iou_obstacle"] < progress["best_error"]:
+                progress["best_error"], progress["best_update"] = 1 - result["iou_obstacle"], step
+                example = {}
+                for name, (points, labels) in shown.items():
+                    example |= {f"{name}_points": points, f"{name}_labels": labels.byte()}
+                metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
+                metadata |= {"sensors": sensors_to_json(sensors)}
+                metadata |= {"seed": args.seed, "step": step, **result}
+                save_program(run / "encoder.pt", SceneEncoder(model, clouds[2]), example, metadata)
+                progress["best"] = result
+            bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}")
+            # SHARED: checkpoint
+            progress["seconds"] = seconds_before + time.time() - started
+            save_checkpoint()
+    bar.close()
+
+    result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}
+    result |= {"updates": progress["updates"], "best_update": progress["best_update"]}
+    result |= {"seconds": round(progress["seconds"])}
+    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
+    write_atomically(run / "result.json", lambda path: path.write_text(text))
+    # END SHARED
+    shown = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor {iou_static:.3f}, "
+    shown += "obstacles {iou_obstacle:.3f}"
+    print(f"{shown.format(**result)}. {run / 'result.json'}")
+    writer.close()

@@ -1,0 +1,408 @@
+"""The scene encoders' trainers: their mathematics, and runs on a few small pictures."""
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import envs
+from envs.encoders import MAX_OBSTACLES, SceneEncoder, oracle
+from envs.observations import Observations
+from envs.programs import ProgramError, load_program, save_program
+from envs.scenes import Scene, Sphere, from_array
+from envs.wrappers import SceneEncodingWrapper
+from scene_embedding_train import collect
+
+FOLDER = Path(__file__).parents[1] / "scene_embedding_train"
+SCRIPTS = ("vae", "vqvae", "pointnet2")
+TINY = ["--total-updates", "12", "--eval-every", "4", "--eval-scenes", "6", "--batch-size", "8"]
+TINY += ["--width", "4", "--validation-share", "0.3"]
+TINY_CLOUDS = ["--num-points", "64", "--num-centres", "16", "8", "--num-neighbours", "4"]
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+vae, vqvae, pointnet2 = (load(name) for name in SCRIPTS)
+
+
+@pytest.fixture(scope="module")
+def observations(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("observations")
+    options = {"num": 20, "shard_size": 8, "image_size": 16, "num_samples": 400, "workers": 1}
+    collect.collect(collect.Args(output=folder, **options), progress=False)
+    return folder
+
+
+def command(name, observations, folder, *flags):
+    script = [sys.executable, str(FOLDER / f"{name}.py"), "--observations", str(observations)]
+    tiny = [*TINY, *TINY_CLOUDS * (name == "pointnet2")]
+    return [*script, "--runs-dir", str(folder), *tiny, *flags]
+
+
+@pytest.fixture(scope="module", params=SCRIPTS)
+def run(request, observations, tmp_path_factory):
+    """(name, folder) of a finished run."""
+    folder = tmp_path_factory.mktemp(request.param)
+    done = subprocess.run(
+        command(request.param, observations, folder), capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return request.param, next(folder.iterdir())
+
+
+# --- Mathematics
+
+
+def test_kl_divergence():
+    mean, log_variance = torch.randn(5, 7), torch.randn(5, 7)
+    normal = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
+    expected = torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0))
+    torch.testing.assert_close(vae.kl_divergence(mean, log_variance), expected)
+
+
+def test_quantisation_takes_the_nearest_code():
+    codebook = vqvae.Codebook(vqvae.Args(num_codes=20, code_size=3))
+    vectors = torch.randn(4, 5, 3)
+    quantised, numbers = codebook(vectors)
+    for vector, code, number in zip(
+        vectors.flatten(0, 1), quantised.flatten(0, 1), numbers, strict=True
+    ):
+        distances = [float((vector - one).square().sum()) for one in codebook.codes]
+        assert number == np.argmin(distances)
+        torch.testing.assert_close(code, codebook.codes[number])
+
+
+def test_the_gradient_goes_straight_through():
+    latent = torch.randn(6, 3, requires_grad=True)
+    quantised = torch.randn(6, 3, requires_grad=True)
+    out = vqvae.straight_through(latent, quantised)
+    torch.testing.assert_close(out, quantised)
+    weights = torch.randn(6, 3)
+    (out * weights).sum().backward()
+    torch.testing.assert_close(latent.grad, weights)
+    assert quantised.grad is None or not quantised.grad.any()
+
+
+def test_unused_codes_start_again_as_vectors():
+    codebook = vqvae.Codebook(vqvae.Args(num_codes=6, code_size=2))
+    before, vectors = codebook.codes.detach().clone(), torch.randn(50, 2)
+    codebook.uses += torch.tensor([1.0, 0, 2, 0, 0, 5])
+    codebook.restart(vectors)
+    for number in (0, 2, 5):
+        torch.testing.assert_close(codebook.codes[number], before[number])
+    for number in (1, 3, 4):
+        assert (codebook.codes[number] == vectors).all(1).any()
+    assert not codebook.uses.any()
+
+
+@pytest.mark.parametrize(("size", "halvings"), [(224, 5), (64, 4), (112, 4), (16, 2), (8, 1)])
+def test_sizes(size, halvings):
+    assert vae.num_halvings(size) == halvings
+    args = vae.Args(width=2)
+    model = vae.VAE(4, size, args)
+    images = torch.rand(3, 4, 3, size, size)
+    assert model(images).shape == images.shape
+    assert model.encode(images)[0].shape == (3, 64)
+
+
+def test_each_decoder_of_the_vae_sees_all_cameras_and_of_the_vqvae_its_own():
+    images = torch.rand(1, 4, 3, 16, 16)
+    changed = images.clone()
+    changed[:, 2] = torch.rand(3, 16, 16)
+    for module, kind in ((vae, vae.VAE), (vqvae, vqvae.VQVAE)):
+        torch.manual_seed(0)
+        model = kind(4, 16, module.Args(width=4))
+        different = (model(images) != model(changed)).flatten(2).any(2)[0].tolist()
+        expected = [True] * 4 if kind is vae.VAE else [False, False, True, False]
+        assert different == expected
+
+
+def test_errors_of_the_evaluation(observations):
+    images, cameras = vae.load_images(Observations(observations))
+    assert images.shape == (20, 4, 16, 16, 3) and cameras == ["front", "left", "back", "right"]
+    rows = np.arange(3, 10)
+    truth = torch.from_numpy(images[rows]).permute(0, 1, 4, 2, 3) / 255.0
+    mean_image = torch.rand(4, 3, 16, 16)
+    model = torch.nn.Module()
+    model.forward = lambda batch: batch * 0.5
+    found = vae.evaluate(model, images, rows, mean_image, 2, "cpu")
+    unlike = (truth - mean_image).abs().amax(2) > 0.1
+    for name, guess in (("error", truth * 0.5), ("mean_image_error", mean_image)):
+        error = (truth - guess).square().mean(2)
+        assert found[name] == pytest.approx(error.mean().item(), rel=1e-5)
+        assert found[f"{name}_foreground"] == pytest.approx(error[unlike].mean().item(), rel=1e-5)
+
+
+def test_images_are_those_of_the_shards(observations):
+    read = Observations(observations)
+    images, cameras = vae.load_images(read)
+    for shard in range(3):
+        rows = slice(*read.offsets[shard : shard + 2])
+        for i, name in enumerate(cameras):
+            np.testing.assert_array_equal(images[rows, i], read.read(shard, f"{name}/rgb"))
+
+
+def test_points_are_thinned_out_evenly():
+    labels = torch.full((3, 50), pointnet2.NOTHING)
+    labels[0, :40], labels[1, :4] = 1, 2
+    chosen = pointnet2.thin_out(labels, 8)
+    assert chosen.tolist() == [[0, 5, 10, 15, 20, 25, 30, 35], [0, 0, 1, 1, 2, 2, 3, 3], [0] * 8]
+
+
+def test_farthest_point_sampling_against_a_loop():
+    points = torch.rand(3, 40, 3)
+    found = pointnet2.farthest_point_sampling(points, 12)
+    for row, cloud in zip(found.tolist(), points, strict=True):
+        expected = [0]
+        while len(expected) < 12:
+            nearest = [min(float((p - cloud[i]).norm()) for i in expected) for p in cloud]
+            expected.append(int(np.argmax(nearest)))
+        assert row == expected
+
+
+def test_ball_query_against_a_loop():
+    points, centres = torch.rand(2, 60, 3), torch.rand(2, 9, 3)
+    centres[:, 0] = 5.0  # nothing is near it
+    found = pointnet2.ball_query(points, centres, 0.3, 6)
+    for cloud, middles, rows in zip(points, centres, found.tolist(), strict=True):
+        for middle, row in zip(middles, rows, strict=True):
+            distances = [float((p - middle).norm()) for p in cloud]
+            order = np.argsort(distances)
+            inside = [int(i) for i in order if distances[i] <= 0.3][:6]
+            assert row == inside + [int(order[0])] * (6 - len(inside))
+
+
+def test_interpolation_is_exact_at_centres_and_a_mean_between():
+    centres = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 9, 0], [0, 0, 99]]])
+    values = torch.tensor([[[1.0], [3.0], [5.0], [7.0]]])
+    at = torch.tensor([[[0.0, 0, 0], [0.5, 0, 0], [0.0, 9, 0]]])
+    found = pointnet2.interpolate(values, centres, at)[0, :, 0]
+    assert found[0] == pytest.approx(1, abs=1e-3) and found[2] == pytest.approx(5, abs=1e-3)
+    weights = 1 / np.array([0.5, 0.5, np.hypot(0.5, 9)])
+    assert found[1] == pytest.approx(weights @ [1, 3, 5] / weights.sum(), rel=1e-4)
+
+
+def test_scores_of_the_classification(observations):
+    read = Observations(observations)
+    clouds = pointnet2.load_clouds(read)
+
+    class Guess(torch.nn.Module):
+        """Says `obstacle` of every third point, and the truth of the others."""
+
+        def forward(self, batch):
+            logits, truth = [], []
+            for _, labels in batch:
+                guess = labels.clamp(max=2)
+                guess[:, ::3] = 2
+                logits.append(torch.nn.functional.one_hot(guess, 3).float())
+                truth.append(labels)
+            return logits, truth
+
+    found = pointnet2.evaluate(Guess(), clouds, np.arange(5), read.sensors, 2, "cpu")
+    batch = pointnet2.batch_of(clouds, np.arange(5), read.sensors, "cpu")
+    truth = torch.stack([labels for _, labels in batch.values()])
+    guess = truth.clone()
+    guess[:, :, ::3] = 2
+    hit = truth != 3
+    assert found["accuracy"] == pytest.approx((guess == truth)[hit].float().mean().item())
+    for number, name in enumerate(("robot", "static", "obstacle")):
+        both = ((guess == number) & (truth == number))[hit].sum()
+        either = ((guess == number) | (truth == number))[hit].sum()
+        assert found[f"iou_{name}"] == pytest.approx((both / either).item())
+
+
+# --- Runs
+
+
+def shared_blocks(name):
+    blocks, block = {}, None
+    for line in (FOLDER / f"{name}.py").read_text().splitlines():
+        if line.strip().startswith("# SHARED: "):
+            assert block is None
+            block = blocks.setdefault(line.strip(), [])
+        elif line.strip() == "# END SHARED":
+            block = None
+        elif block is not None:
+            block.append(line)
+    return blocks
+
+
+def test_shared_blocks_have_not_drifted_apart():
+    blocks = shared_blocks("vae")
+    assert shared_blocks("vqvae") == blocks and len(blocks) == 14
+    clouds = shared_blocks("pointnet2")
+    assert len(clouds) == 8 and all(blocks[name] == lines for name, lines in clouds.items())
+
+
+def test_a_run_leaves_an_encoder_a_result_and_events(run):
+    name, folder = run
+    result = json.loads((folder / "result.json").read_text())
+    assert result["updates"] == 12 and result["scenes"] == 14
+    assert result["best_update"] in (4, 8, 12)
+    events = EventAccumulator(str(folder), size_guidance={"images": 0}).Reload()
+    scalars = set(events.Tags()["scalars"])
+    (picture,) = events.Tags()["images"]
+    image = events.Images(picture)[0]
+    if name == "pointnet2":
+        figures = {"accuracy", "iou_robot", "iou_static", "iou_obstacle"}
+        assert (image.width, image.height) == (2 * 160, 160)
+    else:
+        figures = {"error", "error_foreground", "mean_image_error", "mean_image_error_foreground"}
+        assert (image.width, image.height) == (4 * 16, 2 * 16)
+    assert {f"eval/{figure}" for figure in figures} <= scalars
+    assert all(0 <= result[figure] <= 1 for figure in figures)
+    assert [event.step for event in events.Scalars(f"eval/{min(figures)}")] == [4, 8, 12]
+
+
+def test_the_saved_encoder_needs_no_script(run, observations):
+    name, folder = run
+    encoder = load_program(folder / "encoder.pt")
+    assert encoder.metadata["kind"] == "encoder"
+    read = Observations(observations)
+    if name == "pointnet2":
+        clouds = pointnet2.load_clouds(read)
+        inputs = {}
+        for sensor, (points, labels) in pointnet2.batch_of(
+            clouds, np.arange(20), read.sensors, "cpu"
+        ).items():
+            inputs |= {f"{sensor}_points": points, f"{sensor}_labels": labels.byte()}
+    else:
+        images, cameras = vae.load_images(read)
+        inputs = {one: torch.from_numpy(images[:, i].copy()) for i, one in enumerate(cameras)}
+    together = encoder(**inputs)
+    assert together.shape == (20, 64) and together.dtype == torch.float32
+    alone = [encoder(**{key: value[i : i + 1] for key, value in inputs.items()}) for i in range(20)]
+    torch.testing.assert_close(torch.cat(alone), together, rtol=1e-4, atol=1e-5)
+    assert together.std(0).max() > 0
+
+
+def test_killed_and_resumed_is_bit_identical_to_uninterrupted(run, observations, tmp_path):
+    name, finished = run
+    process = subprocess.Popen(
+        command(name, observations, tmp_path), start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    until = time.time() + 120
+    while not list(tmp_path.glob("*/checkpoint.pt")):
+        assert time.time() < until
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    folder = next(tmp_path.iterdir())
+    resume = [sys.executable, str(FOLDER / f"{name}.py"), "--resume", str(folder)]
+    done = subprocess.run(resume, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    one, other = (
+        torch.load(path / "checkpoint.pt", weights_only=True)["model"]
+        for path in (folder, finished)
+    )
+    for key in one:
+        assert torch.equal(one[key], other[key]), key
+    refused = subprocess.run([*resume, "--width", "8"], capture_output=True, text=True)
+    assert refused.returncode == 1 and "--width is 8 now, the run had 4" in refused.stderr
+
+
+# --- In an environment
+
+
+def test_the_oracle_knows_the_obstacles():
+    scene = envs.TASKS["boxes"].scene
+    rows = oracle(scene).reshape(MAX_OBSTACLES, 12)
+    assert rows[:, 0].tolist() == [1.0] * 6 + [0.0] * (MAX_OBSTACLES - 6)
+    assert from_array(rows[:6, 1:].astype(np.float64))[2].position == pytest.approx(
+        scene.obstacles[2].position
+    )
+    assert not rows[6:].any()
+    with pytest.raises(ValueError, match="room for 32"):
+        oracle(Scene((Sphere((0.0, 0.0, 2.0), 0.1),) * 33))
+
+
+def check_wrapped(encoder, calls):
+    """An environment with the encoder; `calls()` counts what was encoded."""
+    env = SceneEncodingWrapper(envs.make("random_boxes_easy", horizon=6), encoder)
+    plain = envs.make("random_boxes_easy", horizon=6)
+    check_env(env, skip_render_check=True)
+    scenes = []
+    for seed in (1, 2, 1):
+        before = calls()
+        expected, _ = plain.reset(seed=seed)
+        observation, _ = env.reset(seed=seed)
+        for _ in range(4):
+            assert env.observation_space.contains(observation)
+            np.testing.assert_array_equal(
+                observation["observation"], [*expected["observation"], *encoder(plain.scene)]
+            )
+            np.testing.assert_array_equal(observation["desired_goal"], expected["desired_goal"])
+            observation = env.step(np.zeros(7, np.float32))[0]
+            expected = plain.step(np.zeros(7, np.float32))[0]
+        assert calls() - before == (plain.scene not in scenes)  # once for each scene
+        scenes.append(plain.scene)
+    query = (plain.start_configuration, plain.goal_configuration, plain.scene)
+    for one, other in zip(
+        env.reset_specific(*query)[0].items(), env.reset(seed=1)[0].items(), strict=True
+    ):
+        np.testing.assert_array_equal(one[1], other[1])
+    goals = observation["achieved_goal"], observation["desired_goal"]
+    assert env.compute_reward(*goals, {}) == plain.compute_reward(*goals, {}) == -1
+    env.close()
+    plain.close()
+
+
+def test_the_oracle_in_an_environment(monkeypatch):
+    encoder = SceneEncoder("oracle")
+    assert encoder.size == 384
+    check_wrapped(encoder, lambda: encoder._cached.cache_info().misses)
+
+
+def test_a_trained_encoder_in_an_environment(run, observations):
+    name, folder = run
+    encoder = SceneEncoder(folder / "encoder.pt")
+    assert encoder.size == 64
+    check_wrapped(encoder, lambda: encoder._cached.cache_info().misses)
+    scenes = Observations(observations).scenes(0)
+    fresh = SceneEncoder(folder / "encoder.pt")
+    for scene in reversed(scenes):
+        encoder(scene)
+    for scene in scenes:
+        np.testing.assert_array_equal(fresh(scene), encoder(scene))
+    encoder.close()
+    fresh.close()
+
+
+def test_what_is_no_encoder_is_refused(tmp_path):
+    with pytest.raises(ProgramError, match="cannot be read"):
+        SceneEncoder(tmp_path / "encoder.pt")
+    inputs = {"x": torch.zeros(2, 3)}
+    save_program(tmp_path / "policy.pt", Double(), inputs, {"kind": "policy"})
+    with pytest.raises(ProgramError, match="not an encoder"):
+        SceneEncoder(tmp_path / "policy.pt")
+    save_program(tmp_path / "e.pt", Double(), inputs, {"kind": "encoder", "sensors": "[1"})
+    with pytest.raises(ProgramError, match="sensors make no sense"):
+        SceneEncoder(tmp_path / "e.pt")
+
+
+class Double(torch.nn.Module):
+    def forward(self, x):
+        return 2 * x
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_what_cannot_be_trained_on_is_refused(name, tmp_path):
+    done = subprocess.run(command(name, tmp_path, tmp_path), capture_output=True, text=True)
+    assert done.returncode == 1 and "no observations" in done.stderr
+    assert "Traceback" not in done.stderr
