@@ -48,7 +48,7 @@ SCRIPTS = {
 STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
 # Settings for long runs (docs/training.md).
 RECIPES = {
-    "bc": [],
+    "bc": ["--eval-every", "25000"],
     "sac": ["--gamma", "0.98", "--target-entropy", "-14"],
     "td3": ["--gamma", "0.98"],
 }
