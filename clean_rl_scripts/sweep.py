@@ -20,6 +20,7 @@ and off, and alpha from 1e-5 to 10.)
 import argparse
 import csv
 import fcntl
+import importlib.util
 import json
 import os
 import subprocess
@@ -27,12 +28,16 @@ import sys
 import threading
 from pathlib import Path
 
-import optuna
-from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
-from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
-from optuna.trial import TrialState
 from torch.utils.tensorboard import SummaryWriter
+
+try:
+    import optuna
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+    from optuna.trial import TrialState
+except ImportError:
+    sys.exit('sweep.py needs the extra `sweep`: pip install -c constraints.txt -e ".[sweep]"')
 
 METRIC = "validation_success_rate"
 
@@ -286,6 +291,8 @@ def main(arguments=None):
             if getattr(args, name) < lowest:
                 raise ValueError(f"--{name} must be at least {lowest}")
         search = dict(parse_search(text) for text in args.search)
+        if args.ray_address is not None and importlib.util.find_spec("ray") is None:
+            raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
         if args.ray_address is not None:
             rows = sweep_on_ray(
                 args.ray_address, args.trainer, search, args.trials, args.folder, flags, args.seed
