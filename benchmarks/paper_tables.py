@@ -360,6 +360,8 @@ def main():
                 run(cell, seed, args.steps, args.num_queries, args.runs_dir)
             except subprocess.CalledProcessError as error:
                 sys.exit(f"error: {cell.name}, seed {seed}: exit code {error.returncode}")
+            except KeyboardInterrupt:
+                sys.exit("interrupted; the same command goes on from the last checkpoint")
     results = load_results(folders)
     if results:
         draw_curves(cells, results, PICTURES / "results_curves.png")
