@@ -83,7 +83,11 @@ class Args:
     """add the joint angles' sines and cosines to the network's inputs"""
     bf16: bool = False
     """train with hidden layers in bfloat16 (first layer, head and weights stay in float32)"""
+    encoder: str | None = None
+    """what the policy sees of the scene, appended to the observation: path of an encoder's program
+    (`encoder.pt`, docs/sensors.md), or `oracle`, the obstacles themselves; by default nothing"""
     velocities: ClassVar[bool] = False  # demonstrations have none
+    scene_size: ClassVar[int] = 0  # numbers of the encoded scene; set when the encoder is there
 
     # Evaluation and bookkeeping
     eval_every: int = 50_000
@@ -114,7 +118,8 @@ class Features(nn.Module):
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
-        self.size = 10 + 7 * args.velocities + goal_size
+        self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
+        self.size = self.ee.stop + args.scene_size + goal_size
         self.size += 14 * args.trigonometric
         self.size += 3 * (args.relative_goal and args.goal_type != "config")
 
@@ -125,7 +130,7 @@ class Features(nn.Module):
             angles = observation[:, :7] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
         if self.relative_goal and self.goal_type != "config":
-            inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, -3:]))
+            inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
         return torch.cat(inputs, dim=1)
 
 
@@ -196,6 +201,7 @@ class Actor(nn.Module):
 def transitions(demos, goal_type, num_demos=None):
     """The observations, goals and actions of demonstrations: float32 (n, 10), (n, g), (n, 7).
 
+    And the number of the demonstration that each is of: int64 (n,).
     All of a demonstration, beyond where its goal counts as reached: it goes on to the very goal.
     Actions are in units of `MAX_STEP`.
     """
@@ -213,7 +219,8 @@ def transitions(demos, goal_type, num_demos=None):
     states = demos.states[rows][commanded]
     positions = panda.forward_kinematics(panda.denormalise(states))
     arrays = np.hstack([states, positions]), goal[which[commanded]]
-    return *(a.astype(np.float32) for a in arrays), demos.actions[rows][commanded] / MAX_STEP
+    actions = demos.actions[rows][commanded] / MAX_STEP
+    return *(a.astype(np.float32) for a in arrays), actions, which[commanded]
 
 
 # SHARED: averaging, evaluation, files and resuming
@@ -355,13 +362,27 @@ if __name__ == "__main__":
         torch.as_tensor(np.concatenate(arrays), device=device)
         for arrays in zip(*parts, strict=True)
     ]
-    del files, parts
-    env_arguments = {"goal_type": args.goal_type}
+    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
+    try:
+        roboarm.make(args.task, **env_arguments).close()
+    except ValueError as error:
+        sys.exit(f"--encoder: {error}" if args.encoder is not None else str(error))
     eval_envs = [roboarm.make(args.task, **env_arguments) for _ in range(8)]
     picture_env = roboarm.make(
         args.task, **env_arguments, render_mode="rgb_array", render_size=(240, 180)
     )
     example = stack([env.reset(seed=0)[0] for env in eval_envs[:2]], device)
+    args.scene_size = eval_envs[0].observation_space["observation"].shape[0] - 10
+    codes = None  # the encoded scene of each demonstration
+    if args.encoder is not None:
+        numbers, shown = [], []
+        for demos, part in zip(files, parts, strict=True):
+            numbers.append(part[3] + len(shown))
+            for i in tqdm(range(part[3].max() + 1), desc="encoding scenes", unit="demo"):
+                shown.append(eval_envs[0].encoder(demos[i].scene))
+        codes = torch.as_tensor(np.stack(shown), device=device)
+        data[3] = torch.as_tensor(np.concatenate(numbers), device=device)
+    del files, parts
 
     # ALGO LOGIC: network and optimiser
     actor = Actor(args).to(device)
@@ -413,7 +434,9 @@ if __name__ == "__main__":
             remaining = 1.0 - progress["updates"] / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         rows = torch.randint(len(data[0]), (args.batch_size,), device=device)
-        observation, goal, action = (tensor[rows] for tensor in data)
+        observation, goal, action, number = (tensor[rows] for tensor in data)
+        if codes is not None:
+            observation = torch.cat([observation, codes[number]], dim=1)
         loss = -actor.log_likelihood(observation, goal, action).mean()
         optimizer.zero_grad()
         loss.backward()

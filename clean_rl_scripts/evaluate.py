@@ -75,7 +75,7 @@ from envs.tasks import get_task, task_name
 
 # What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
 # they decide what a success is.
-ENV_ARGUMENTS = ("action_mode", "max_step", "velocities")
+ENV_ARGUMENTS = ("action_mode", "max_step", "velocities", "encoder")
 LOOKING = ("via-points", "planner")  # policies that look for a motion before they move
 ROOT = Path(__file__).resolve().parent.parent
 NAMED = ("go-to-goal", "random", *LOOKING)

@@ -16,7 +16,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -65,8 +65,12 @@ class Args:
     """end an episode at the first touch"""
     velocities: bool = False
     """joint velocities in the observation"""
+    encoder: str | None = None
+    """what the policy sees of the scene, appended to the observation: path of an encoder's program
+    (`encoder.pt`, docs/sensors.md), or `oracle`, the obstacles themselves; by default nothing"""
     num_envs: int = 4
     """environments stepped together; every one of their steps counts"""
+    scene_size: ClassVar[int] = 0  # numbers of the encoded scene; set when the encoder is there
     # END SHARED
 
     # The algorithm
@@ -146,7 +150,7 @@ def configuration_of(args):
 
 def env_arguments(args):
     names = ("goal_type", "action_mode", "max_step", "horizon", "stop_on_collision", "velocities")
-    return {name: getattr(args, name) for name in names}
+    return {name: getattr(args, name) for name in (*names, "encoder")}
 
 
 # END SHARED
@@ -165,7 +169,8 @@ class Features(nn.Module):
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
-        self.size = 10 + 7 * args.velocities + goal_size
+        self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
+        self.size = self.ee.stop + args.scene_size + goal_size
         self.size += 14 * args.trigonometric
         self.size += 3 * (args.relative_goal and args.goal_type != "config")
 
@@ -176,7 +181,7 @@ class Features(nn.Module):
             angles = observation[:, :7] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
         if self.relative_goal and self.goal_type != "config":
-            inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, -3:]))
+            inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
         return torch.cat(inputs, dim=1)
 
 
@@ -259,11 +264,13 @@ class HerReplayBuffer:
 
     One float32 row per transition. `remaining` counts the transitions that follow in the same
     episode, so a goal reached later in it is found without storing episodes. New episodes
-    overwrite the oldest rows from an episode's start on, so what a row points to outlives it.
+    overwrite the oldest rows from an episode's start on, so what a row points to outlives it. The
+    encoded scene at the end of observations is stored once per scene, in `codes`.
     """
 
     def __init__(self, env, capacity, her_probability, rng):
-        spaces = env.observation_space
+        spaces = env.unwrapped.observation_space
+        scene_size = env.observation_space["observation"].shape[0] - spaces["observation"].shape[0]
         sizes = {
             "observation": spaces["observation"].shape[0],
             "action": 7,
@@ -278,6 +285,8 @@ class HerReplayBuffer:
         }
         self.rows = np.zeros((capacity, ends[-1]), np.float32)
         self.remaining = np.zeros(capacity, np.int32)
+        self.codes, self.numbers = np.zeros((1, scene_size), np.float32), {}
+        self.scene = np.zeros(capacity, np.int32)  # row of `codes`
         self.env, self.rng = env, rng
         self.capacity, self.her_probability = capacity, her_probability
         self.position, self.size = 0, 0
@@ -286,10 +295,23 @@ class HerReplayBuffer:
         """`transitions`: a list of dicts with the columns' names as keys."""
         index = (self.position + np.arange(len(transitions))) % self.capacity
         for name, columns in self.columns.items():
-            self.rows[index, columns] = np.stack([np.atleast_1d(t[name]) for t in transitions])
+            width = columns.stop - columns.start  # without the encoded scene
+            self.rows[index, columns] = np.stack(
+                [np.atleast_1d(t[name])[:width] for t in transitions]
+            )
+        self.scene[index] = self.number_of(transitions[0]["observation"])
         self.remaining[index] = np.arange(len(transitions))[::-1]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
+
+    def number_of(self, observation):
+        """The row of `codes` that has the encoded scene of an observation."""
+        code = np.float32(observation[len(observation) - self.codes.shape[1] :])
+        number = self.numbers.setdefault(code.tobytes(), len(self.numbers))
+        if number == len(self.codes):
+            self.codes = np.concatenate([self.codes, np.zeros_like(self.codes)])
+        self.codes[number] = code
+        return number
 
     def sample(self, batch_size):
         """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
@@ -305,12 +327,18 @@ class HerReplayBuffer:
         info = {"collision": batch["collision"][:, 0] > 0}
         batch["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
         batch["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
+        if self.codes.shape[1] > 0:
+            code = self.codes[self.scene[index]]
+            for name in ("observation", "next_observation"):
+                batch[name] = np.hstack([batch[name], code])
         return batch
 
     def state_dict(self):
         return {
             "rows": torch.from_numpy(self.rows[: self.size]),
             "remaining": torch.from_numpy(self.remaining[: self.size]),
+            "scene": torch.from_numpy(self.scene[: self.size]),
+            "codes": torch.from_numpy(self.codes[: len(self.numbers)]),
             "position": self.position,
             "rng": json.dumps(self.rng.bit_generator.state),
         }
@@ -319,6 +347,9 @@ class HerReplayBuffer:
         self.size, self.position = len(state["rows"]), state["position"]
         self.rows[: self.size] = state["rows"].numpy()
         self.remaining[: self.size] = state["remaining"].numpy()
+        self.scene[: self.size] = state["scene"].numpy()
+        for code in state["codes"].numpy():
+            self.number_of(code)
         self.rng.bit_generator.state = json.loads(state["rng"])
 
 
@@ -343,6 +374,9 @@ def demonstration_episode(demo, env, args):
         "combined": (np.hstack([demo.states, positions]), np.hstack([goal_state, goal_position])),
     }[args.goal_type]
     observations = np.hstack([demo.states, positions])
+    if args.encoder is not None:
+        code = env.encoder(demo.scene)
+        observations = np.hstack([observations, np.tile(code, (len(observations), 1))])
     actions = demo.actions
     if args.action_mode == "subgoal":
         actions = demo.states[:-1] + demo.actions
@@ -516,9 +550,15 @@ if __name__ == "__main__":
 
     # env setup
     kwargs = env_arguments(args)
+    try:
+        roboarm.make(args.task, **kwargs).close()
+    except ValueError as error:
+        sys.exit(f"--encoder: {error}" if args.encoder is not None else str(error))
     envs = [roboarm.make(args.task, **kwargs) for _ in range(args.num_envs)]
     eval_envs = [roboarm.make(args.task, **kwargs) for _ in range(8)]
     picture_env = roboarm.make(args.task, **kwargs, render_mode="rgb_array", render_size=(240, 180))
+    observation_size = eval_envs[0].observation_space["observation"].shape[0]
+    args.scene_size = observation_size - 10 - 7 * args.velocities
 
     # END SHARED
 

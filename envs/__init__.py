@@ -8,17 +8,26 @@ from envs.tasks import TASKS, get_task
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
 
 
-def make(task, **kwargs):
+def make(task, encoder=None, **kwargs):
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
     Args:
         task: name of a task (`TASKS`), or path of a scene file (docs/your_own_scene.md).
+        encoder: what is appended to `observation` about the scene: path of an encoder's program, or
+            `oracle` (`envs.encoders`); None for nothing.
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:
-        ValueError: unknown task, malformed scene file, or an argument out of its range.
+        ValueError: unknown task, malformed scene file, an argument out of its range, or a file
+            that is no encoder.
     """
-    return RoboArmEnv(get_task(task).scene, **kwargs)
+    env = RoboArmEnv(get_task(task).scene, **kwargs)
+    if encoder is None:
+        return env
+    from envs.encoders import scene_encoder  # here, because it imports torch
+    from envs.wrappers import SceneEncodingWrapper
+
+    return SceneEncodingWrapper(env, scene_encoder(encoder))
 
 
 def gymnasium_id(task):

@@ -41,6 +41,12 @@ def oracle(scene):
     return rows.ravel()
 
 
+@functools.lru_cache
+def scene_encoder(name):
+    """The `SceneEncoder` of a name, one for the whole process."""
+    return SceneEncoder(name)
+
+
 class SceneEncoder:
     """Encodes scenes; an equal scene is encoded once.
 

@@ -11,8 +11,9 @@ evaluates strings of the file as Python expressions.)
 
 A **policy** is a program from `observation` (N, 10 or 17), `achieved_goal` and `desired_goal`
 (N, 3, 7 or 10), float32 as `RoboArmEnv` gives them, to the deterministic action (N, 7), float32 in
-[-1, 1]. Its metadata hold `kind` ("policy"), `task`, and `env`, a dict of the `RoboArmEnv`
-arguments it was trained with (`goal_type`, `action_mode`, `max_step`, `velocities`).
+[-1, 1]. Its metadata hold `kind` ("policy"), `task`, and `env`, a dict of the arguments of
+`envs.make` it was trained with (`goal_type`, `action_mode`, `max_step`, `velocities`, `encoder`).
+With an encoder, `observation` is longer by z_E.
 """
 
 import copy

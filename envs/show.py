@@ -29,7 +29,6 @@ from tqdm import tqdm
 
 import envs
 from envs import panda, scenes
-from envs.arm_env import RoboArmEnv
 from envs.datasets import (
     Demos,
     Query,
@@ -60,7 +59,7 @@ MAX_FRAMES, COLOURS = 60, 128
 PAUSE = 1.5  # s, at the end of an episode
 
 # What a policy's metadata may say about its environment, as in clean_rl_scripts/evaluate.py.
-ENV_ARGUMENTS = ("goal_type", "action_mode", "max_step", "velocities")
+ENV_ARGUMENTS = ("goal_type", "action_mode", "max_step", "velocities", "encoder")
 
 
 @dataclass
@@ -399,7 +398,7 @@ def _show(args):
         raise ShowError(f"no {queries.name} {last}: the numbers are 0 to {queries.count - 1}")
     try:
         mode = "human" if suffix is None else "rgb_array"
-        env = RoboArmEnv(envs.get_task(args.task).scene, render_mode=mode, **arguments)
+        env = envs.make(args.task, render_mode=mode, **arguments)
     except (TypeError, ValueError) as error:
         raise ShowError(f"{args.policy}: its environment cannot be made: {error}") from error
     try:

@@ -68,8 +68,7 @@ class SensorWrapper(gym.Wrapper):
 class SceneEncodingWrapper(gym.Wrapper):
     """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
 
-    It is encoded once per scene. Otherwise this is its `RoboArmEnv`, methods for relabelling
-    included.
+    It is encoded once per scene. Otherwise this is its `RoboArmEnv`, with all of its attributes.
 
     Args:
         env: a `RoboArmEnv`.
@@ -83,9 +82,11 @@ class SceneEncodingWrapper(gym.Wrapper):
         size = spaces["observation"].shape[0] + encoder.size
         spaces["observation"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.observation_space = gym.spaces.Dict(spaces)
-        self.compute_reward = env.compute_reward
-        self.compute_terminated = env.compute_terminated
-        self.compute_truncated = env.compute_truncated
+
+    def __getattr__(self, name):
+        if name == "env":  # before there is one
+            raise AttributeError(name)
+        return getattr(self.env, name)
 
     def _with_scene(self, observation):
         z = self.encoder(self.unwrapped.scene)

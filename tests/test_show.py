@@ -279,18 +279,18 @@ def test_scenes_that_vary(tmp_path, monkeypatch):
 def window(monkeypatch):
     """The window's loop without a window; returns the sleeps that it makes between episodes."""
     sleeps = []
-    make = show.RoboArmEnv
+    make = show.envs.make
 
-    def without_window(scene, render_mode, **arguments):
+    def without_window(task, render_mode, **arguments):
         assert render_mode == "human"
-        sleeps.append(make(scene, **arguments))
+        sleeps.append(make(task, **arguments))
         return sleeps[0]
 
     def camera(physicsClientId):
         return [640, 480, None, np.eye(4).ravel().tolist()]
 
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr(show, "RoboArmEnv", without_window)
+    monkeypatch.setattr(show.envs, "make", without_window)
     monkeypatch.setattr(show.p, "getDebugVisualizerCamera", camera)
     return sleeps
 

@@ -1,0 +1,128 @@
+"""Policies that see the scene through an encoder: buffer, demonstrations, training, evaluation."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from trainers import PATHS, ROOT, command, load, run_script
+
+import envs
+from envs.datasets import load_demos
+from envs.encoders import oracle, scene_encoder
+
+HARD = "random_boxes_hard"
+SIZE = len(oracle(envs.TASKS["wall"].scene))
+
+
+@pytest.fixture
+def env():
+    env = envs.make(HARD, encoder="oracle")
+    yield env
+    env.close()
+
+
+def steps(env, length):
+    """An episode of random steps as transitions."""
+    observation, _ = env.reset()
+    transitions = []
+    for _ in range(length):
+        action = env.action_space.sample()
+        following = env.step(action)[0]
+        transitions.append(
+            {
+                "observation": observation["observation"],
+                "action": action,
+                "next_observation": following["observation"],
+                "next_achieved_goal": following["achieved_goal"],
+                "desired_goal": following["desired_goal"],
+                "collision": False,
+            }
+        )
+        observation = following
+    return transitions
+
+
+def test_the_buffer_gives_each_transition_the_code_of_its_scene(env):
+    sac = load("sac_her_mp")
+    env.reset(seed=0)
+    buffer = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
+    assert buffer.rows.shape[1] < 50  # codes are not in the rows
+    known = {}
+    for _ in range(8):  # the oldest ones are overwritten
+        episode = steps(env, 10)
+        known |= {t["observation"][:10].tobytes(): t for t in episode}
+        buffer.add_episode(episode)
+    copy = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
+    copy.load_state_dict(buffer.state_dict())
+    for one in (buffer, copy):
+        batch = one.sample(200)
+        assert batch["observation"].shape == (200, 10 + SIZE)
+        assert batch["observation"].dtype == np.float32
+        for row, following in zip(batch["observation"], batch["next_observation"], strict=True):
+            transition = known[row[:10].tobytes()]
+            np.testing.assert_array_equal(row, transition["observation"])
+            np.testing.assert_array_equal(following, transition["next_observation"])
+
+
+def test_demonstrations_have_the_code_of_their_scene(env):
+    sac, demos = load("sac_her_mp"), load_demos(HARD)
+    args = sac.Args(task=HARD, encoder="oracle")
+    for i in (0, 7):
+        for transition in sac.demonstration_episode(demos[i], env, args):
+            for name in ("observation", "next_observation"):
+                np.testing.assert_array_equal(transition[name][10:], oracle(demos[i].scene))
+
+
+def flags(trainer):
+    more = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
+    return more if trainer == "bc" else [*more, "--demo-prob", "1"]
+
+
+@pytest.mark.parametrize("trainer", PATHS)
+def test_trained_resumed_and_evaluated(trainer, tmp_path):
+    run = run_script(trainer, tmp_path / "whole", *flags(trainer), "--goal-type", "combined")
+    program = torch.load(run / "policy.pt", weights_only=True)
+    assert program["metadata"]["env"]["encoder"] == "oracle"
+    evaluate = [sys.executable, str(ROOT / "clean_rl_scripts" / "evaluate.py"), "--task", HARD]
+    evaluate += [
+        "--policy",
+        str(run),
+        "--num-queries",
+        "3",
+        "--json",
+        str(tmp_path / "result.json"),
+    ]
+    subprocess.run(evaluate, check=True, capture_output=True)
+    assert json.loads((tmp_path / "result.json").read_text())["goal_type"] == "combined"
+    if trainer == "bc":
+        show = [sys.executable, "-m", "envs.show", HARD, "--policy", str(run)]
+        show += ["--size", "60", "40", "--output", str(tmp_path / "rollout.gif")]
+        subprocess.run(show, check=True, capture_output=True, cwd=ROOT)
+        assert (tmp_path / "rollout.gif").stat().st_size > 0
+        return
+    part = [*flags(trainer), "--goal-type", "combined", "--total-timesteps", "1200"]
+    again = run_script(trainer, tmp_path / "part", *part)
+    resume = [sys.executable, str(PATHS[trainer]), "--resume", str(again)]
+    subprocess.run([*resume, "--total-timesteps", "1800"], check=True, capture_output=True)
+    one, other = (
+        torch.load(path / "checkpoint.pt", weights_only=True)["actor"] for path in (run, again)
+    )
+    assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+@pytest.mark.parametrize("trainer", PATHS)
+def test_what_is_no_encoder_is_refused(trainer, tmp_path):
+    (tmp_path / "encoder.pt").write_text("nothing")
+    given = command(trainer, tmp_path / "runs", "--encoder", str(tmp_path / "encoder.pt"))
+    done = subprocess.run(given, capture_output=True, text=True)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "--encoder: " in done.stderr and "not a program file" in done.stderr
+
+
+def test_one_encoder_serves_all_environments_of_a_process(env):
+    other = envs.make(HARD, encoder="oracle")
+    assert env.encoder is other.encoder is scene_encoder("oracle")
+    other.close()
