@@ -1,7 +1,7 @@
 """Random scenes: shelves, poles and walls around the arm (paper, section 4).
 
-The paper names the kinds of obstacles and how many there are. The distribution is ours. It
-is provisional: it is still being calibrated to go-to-goal's success in the paper (docs/tasks.md).
+The paper names the kinds of obstacles and how many there are. The distribution is ours, calibrated
+to go-to-goal's success in the paper (docs/tasks.md).
 """
 
 import math
@@ -26,7 +26,7 @@ WALL = {
     "height": (1.2, 1.5),
 }
 # Rough obstacles: along smooth ones the arm slides to its goal, however many there are.
-FRICTION = 2.25
+FRICTION = 2.45
 # Nothing comes nearer than this (m) to the robot's axis below the shoulder's top (m).
 KEEP_CLEAR, SHOULDER = 0.14, 0.45
 

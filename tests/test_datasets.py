@@ -498,8 +498,7 @@ def test_make_queries_refuses_before_it_works(arguments, complaint):
 # --- The packaged files
 
 
-# The random boxes' files wait for the end of their calibration (docs/tasks.md).
-@pytest.mark.parametrize("task", [name for name in envs.TASKS if "random" not in name])
+@pytest.mark.parametrize("task", envs.TASKS)
 def test_packaged_queries(task):
     env = envs.make(task)
     client = p.connect(p.DIRECT)
@@ -522,3 +521,29 @@ def test_packaged_queries(task):
             np.testing.assert_allclose(position, link[4], rtol=0, atol=1e-6)
     p.disconnect(physicsClientId=client)
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "fewest", "most"),
+    [
+        ("random_boxes_easy", 2, 4),
+        ("random_boxes_medium", 3, 6),
+        ("random_boxes_hard", 4, 8),
+    ],
+)
+def test_packaged_random_scenes(task, fewest, most):
+    queries = load_queries(task)
+    with h5py.File(datasets.query_path(task)) as file:
+        parameters = json.loads(file.attrs["parameters"].decode())
+        counts = file["test/obstacle_count"][()]
+        scene = file["test/scene"][()]
+    assert parameters["solve_attempts"] > 0  # a planner solved them all
+    # Five queries in each of 2,000 scenes, all counts equally often.
+    np.testing.assert_array_equal(scene, np.arange(10_000) // 5)
+    assert len({queries[i].scene for i in range(0, 10_000, 5)}) == 2000
+    shares = np.bincount(counts, minlength=9) / 2000
+    expected = np.zeros(9)
+    expected[fewest : most + 1] = 1 / (most + 1 - fewest)
+    np.testing.assert_allclose(shares, expected, atol=0.04)
+    validation = {query.scene for query in load_queries(task, "validation")}
+    assert len(validation) == 40 and not validation & {queries[i].scene for i in range(10_000)}
