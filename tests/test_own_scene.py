@@ -297,7 +297,7 @@ def test_a_collection_does_not_go_on_in_a_changed_scene(inside):
     with contextlib.closing(collect.Journal(journal, options)):
         pass  # the same collection
     Path("my_scene.yaml").write_text(YAML.replace("radius: 0.1}", "radius: 0.11}"))
-    with pytest.raises(ValueError, match="the journal of another collection"):
+    with pytest.raises(ValueError, match="the journal of something else"):
         collect.Journal(journal, options)
 
 
