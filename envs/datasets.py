@@ -442,7 +442,7 @@ def _read(path, schema, task):
         raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
 
 
-def _attribute(file, name):
+def attribute(file, name):
     """An attribute of the file as a Python object; None if there is none."""
     value = file.attrs.get(name)
     value = value.item() if isinstance(value, np.generic) else value
@@ -452,7 +452,7 @@ def _attribute(file, name):
 def _read_open(path, file, schema, task):
     attributes = {}
     for name, kind in _ATTRIBUTES.items():
-        value = _attribute(file, name)
+        value = attribute(file, name)
         if name == "schema" and value != schema:
             kind_of_file = {QUERY_SCHEMA: "query", DEMO_SCHEMA: "demonstration"}[schema]
             raise DatasetError(
@@ -470,7 +470,7 @@ def _read_open(path, file, schema, task):
             raise DatasetError(f"{path}: array {name} is missing or damaged")
     _check_format(path, schema, datasets)
     arrays = {name: dataset[()] for name, dataset in datasets.items()}
-    if _attribute(file, "checksum") != _checksum(attributes, arrays):
+    if attribute(file, "checksum") != _checksum(attributes, arrays):
         raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
 
     made_for = attributes["task"]

@@ -21,7 +21,6 @@ ORACLE = "oracle"
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
 # Of the arm when an encoder looks, rad: always the same, so that z_E depends on the scene alone.
-# It stands upright, where it hides little.
 POSE = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
 CACHED_SCENES = 20_000
 

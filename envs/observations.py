@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 
 from envs import scenes
-from envs.datasets import DatasetError, scene_from_json, scene_to_json
+from envs.datasets import DatasetError, attribute, scene_from_json, scene_to_json
 from envs.sensors import Camera, PointCloud
 from envs.tasks import get_task, task_name
 
@@ -134,13 +134,6 @@ def open_shard(path):
         file.close()
         raise DatasetError(f"{path}: not observations of version {SCHEMA_VERSION}: {schema}")
     return file
-
-
-def attribute(file, name):
-    """An attribute of a shard as a Python object; None if there is none."""
-    value = file.attrs.get(name)
-    value = value.item() if isinstance(value, np.generic) else value
-    return value.decode() if isinstance(value, bytes) else value
 
 
 class Observations:

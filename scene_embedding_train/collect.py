@@ -23,10 +23,10 @@ from tqdm import tqdm
 
 import envs
 from demo_generation import workers
+from envs.datasets import attribute
 from envs.files import write_atomically
 from envs.observations import (
     Observations,
-    attribute,
     observe,
     open_shard,
     shard_bytes,

@@ -349,7 +349,7 @@ def test_simulating_finds_infeasible_queries(made, tmp_path):
 def test_simulating_finds_wrong_positions(path):
     with h5py.File(path, "r+") as file:
         file["test/goal_position"][4, 0] += np.float32(0.001)
-        attributes = {name: datasets._attribute(file, name) for name in datasets._ATTRIBUTES}
+        attributes = {name: datasets.attribute(file, name) for name in datasets._ATTRIBUTES}
         names = datasets._arrays_of(datasets.QUERY_SCHEMA, file)
         arrays = {name: file[name][()] for name in names}
         file.attrs["checksum"] = np.bytes_(datasets._checksum(attributes, arrays))

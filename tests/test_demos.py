@@ -442,7 +442,7 @@ def wrong_shape(path):
 def sign_again(path):
     """Give a changed file the checksum it should have."""
     with h5py.File(path, "r+") as file:
-        attributes = {name: datasets._attribute(file, name) for name in datasets._ATTRIBUTES}
+        attributes = {name: datasets.attribute(file, name) for name in datasets._ATTRIBUTES}
         arrays = {name: file[name][()] for name in datasets._DEMO_ARRAYS}
         file.attrs["checksum"] = np.bytes_(datasets._checksum(attributes, arrays))
 
