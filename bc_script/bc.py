@@ -375,12 +375,10 @@ if __name__ == "__main__":
     args.scene_size = eval_envs[0].observation_space["observation"].shape[0] - 10
     codes = None  # the encoded scene of each demonstration
     if args.encoder is not None:
-        numbers, shown = [], []
-        for demos, part in zip(files, parts, strict=True):
-            numbers.append(part[3] + len(shown))
-            for i in tqdm(range(part[3].max() + 1), desc="encoding scenes", unit="demo"):
-                shown.append(eval_envs[0].encoder(demos[i].scene))
-        codes = torch.as_tensor(np.stack(shown), device=device)
+        shown = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
+        firsts = np.cumsum([0, *map(len, shown)])
+        numbers = [first + part[3] for first, part in zip(firsts, parts, strict=False)]
+        codes = torch.as_tensor(np.concatenate(shown), device=device)
         data[3] = torch.as_tensor(np.concatenate(numbers), device=device)
     del files, parts
 

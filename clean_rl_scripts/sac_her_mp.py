@@ -559,6 +559,8 @@ if __name__ == "__main__":
     picture_env = roboarm.make(args.task, **kwargs, render_mode="rgb_array", render_size=(240, 180))
     observation_size = eval_envs[0].observation_space["observation"].shape[0]
     args.scene_size = observation_size - 10 - 7 * args.velocities
+    if args.encoder is not None and demos is not None:
+        eval_envs[0].encoder.encode_demos(demos)  # once, not in the loop
 
     # END SHARED
 

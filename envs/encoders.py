@@ -8,10 +8,17 @@ Paper: sections 5.1 and 5.3. `SceneEncodingWrapper` is in `envs.wrappers`.
 """
 
 import functools
+import hashlib
+import io
+import sys
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
+from envs.files import write_atomically
 from envs.observations import sensors_from_json
 from envs.programs import ProgramError, load_program
 from envs.scenes import ROW, to_array
@@ -40,6 +47,15 @@ def oracle(scene):
     return rows.ravel()
 
 
+def _read_codes(path, key):
+    """What `SceneEncoder.encode_demos` kept; None if it is not there, damaged or out of date."""
+    try:
+        with np.load(path) as file:
+            return file["codes"] if file["key"] == key else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
 @functools.lru_cache
 def scene_encoder(name):
     """The `SceneEncoder` of a name, one for the whole process."""
@@ -63,6 +79,7 @@ class SceneEncoder:
     def __init__(self, name):
         self.name = str(name)
         self._world = None
+        self._of_demos = {}  # scene -> z_E
         if self.name == ORACLE:
             self._encode, self.size = oracle, MAX_OBSTACLES * (1 + ROW)
         else:
@@ -83,7 +100,30 @@ class SceneEncoder:
 
     def __call__(self, scene):
         """z_E of a `Scene`, float32 (size,); not to be changed."""
-        return self._cached(scene)
+        z = self._of_demos.get(scene)
+        return self._cached(scene) if z is None else z
+
+    def encode_demos(self, demos):
+        """z_E of the scenes of `envs.datasets.Demos`: float32 (n, size). Later calls know them.
+
+        A trained encoder looks at them once, with a progress bar: they are kept in a file beside it,
+        `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others.
+        """
+        scenes = [demos.scenes[i] for i in range(len(demos))]
+        if self.name == ORACLE:
+            return np.stack([self(scene) for scene in scenes])
+        path = Path(self.name).with_suffix(f".{demos.task}.npz")
+        key = hashlib.sha256(Path(self.name).read_bytes() + repr(scenes).encode()).hexdigest()
+        codes = _read_codes(path, key)
+        if codes is None:
+            quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
+            bar = tqdm(scenes, desc=f"encoding {demos.task}", unit="scene", mininterval=quiet)
+            codes = np.stack([self(scene) for scene in bar])
+            file = io.BytesIO()
+            np.savez(file, key=key, codes=codes)
+            write_atomically(path, file.getvalue())
+        self._of_demos |= zip(scenes, codes, strict=True)
+        return codes
 
     def _look_and_encode(self, scene):
         self._world.show(scene, POSE)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import envs
+from envs.datasets import load_demos
 from envs.encoders import MAX_OBSTACLES, SceneEncoder, oracle
 from envs.observations import Observations
 from envs.programs import ProgramError, load_program, save_program
@@ -382,6 +384,37 @@ def test_a_trained_encoder_in_an_environment(run, observations):
         np.testing.assert_array_equal(fresh(scene), encoder(scene))
     encoder.close()
     fresh.close()
+
+
+def test_demonstrations_are_encoded_once(run, tmp_path, monkeypatch):
+    path = tmp_path / "encoder.pt"
+    path.write_bytes((run[1] / "encoder.pt").read_bytes())
+    demos = replace(load_demos("random_boxes_hard"), start=np.zeros((5, 7)))  # the first 5
+    encoder = SceneEncoder(path)
+    codes = encoder.encode_demos(demos)
+    assert codes.shape == (5, 64) and len(np.unique(codes, axis=0)) == 5
+    kept = tmp_path / "encoder.random_boxes_hard.npz"
+    look, looked = SceneEncoder._look_and_encode, []
+    monkeypatch.setattr(
+        SceneEncoder, "_look_and_encode", lambda self, scene: looked.append(1) or look(self, scene)
+    )
+    again = SceneEncoder(path)
+    looked.clear()
+    np.testing.assert_array_equal(again.encode_demos(demos), codes)
+    np.testing.assert_array_equal(again(demos.scenes[3]), codes[3])
+    assert not looked
+    fresh = SceneEncoder(path)
+    looked.clear()
+    fresh.encode_demos(replace(demos, start=np.zeros((4, 7))))  # other scenes: looked at again
+    assert len(looked) == 4
+    kept.write_bytes(kept.read_bytes()[:-40])  # damaged: the same
+    fresh = SceneEncoder(path)
+    looked.clear()
+    np.testing.assert_array_equal(fresh.encode_demos(demos), codes)
+    assert len(looked) == 5
+    np.testing.assert_array_equal(
+        SceneEncoder("oracle").encode_demos(demos)[2], oracle(demos.scenes[2])
+    )
 
 
 def test_what_is_no_encoder_is_refused(tmp_path):
