@@ -485,7 +485,7 @@ def evaluate(
     return _summary(job, _run(job, progress))
 
 
-def _policy_file(policy):
+def policy_file(policy):
     """The program that is meant: of a file, a run's folder, or a name in `policies/`."""
     path = Path(policy)
     if path.is_dir():
@@ -530,7 +530,7 @@ def _prepare(
     if policy == "planner":
         _import_planning()
     if not callable(policy) and policy not in NAMED:
-        policy = _policy_file(policy)
+        policy = policy_file(policy)
         program, trained = _load_policy(policy)
         env = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
         if goal_type not in (None, trained["goal_type"]):

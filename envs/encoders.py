@@ -91,7 +91,7 @@ class SceneEncoder:
             except (KeyError, TypeError, ValueError) as error:
                 raise ProgramError(f"{name}: its sensors make no sense: {error!r}") from error
             self._world = SensorWorld()
-            self._encode = self._look_and_encode
+            self._encode = lambda scene: self.encode(self.look(scene))
             self.size = len(self(self._world.scene))
 
     @functools.cached_property
@@ -106,7 +106,7 @@ class SceneEncoder:
     def encode_demos(self, demos):
         """z_E of the scenes of `envs.datasets.Demos`: float32 (n, size). Later calls know them.
 
-        A trained encoder looks at them once, with a progress bar: they are kept in a file beside it,
+        A trained encoder looks at them once, with a progress bar: z_E is kept in a file beside it,
         `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others.
         """
         scenes = [demos.scenes[i] for i in range(len(demos))]
@@ -125,7 +125,8 @@ class SceneEncoder:
         self._of_demos |= zip(scenes, codes, strict=True)
         return codes
 
-    def _look_and_encode(self, scene):
+    def look(self, scene):
+        """Its program's inputs, a batch of 1: what the sensors see of a `Scene`."""
         self._world.show(scene, POSE)
         inputs = {}
         for name, sensor in self.sensors.items():
@@ -134,8 +135,11 @@ class SceneEncoder:
                 inputs |= {f"{name}_{output}": array for output, array in seen.items()}
             else:
                 inputs[name] = seen["rgb"]
-        batch = {name: torch.from_numpy(array)[None] for name, array in inputs.items()}
-        return self._program(**{name: batch[name] for name in self._program.inputs})[0].numpy()
+        return {name: torch.from_numpy(inputs[name])[None] for name in self._program.inputs}
+
+    def encode(self, seen):
+        """z_E, float32 (size,), of what `look` returned."""
+        return self._program(**seen)[0].numpy()
 
     def close(self):
         """Close the world it looks into."""

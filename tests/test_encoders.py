@@ -394,9 +394,9 @@ def test_demonstrations_are_encoded_once(run, tmp_path, monkeypatch):
     codes = encoder.encode_demos(demos)
     assert codes.shape == (5, 64) and len(np.unique(codes, axis=0)) == 5
     kept = tmp_path / "encoder.random_boxes_hard.npz"
-    look, looked = SceneEncoder._look_and_encode, []
+    look, looked = SceneEncoder.look, []
     monkeypatch.setattr(
-        SceneEncoder, "_look_and_encode", lambda self, scene: looked.append(1) or look(self, scene)
+        SceneEncoder, "look", lambda self, scene: looked.append(1) or look(self, scene)
     )
     again = SceneEncoder(path)
     looked.clear()

@@ -1,0 +1,165 @@
+"""What z_E knows of a scene: how well a small network predicts from it which cells are occupied.
+
+    python benchmarks/scene_knowledge.py                       # the packaged encoders, oracle, mean
+    python benchmarks/scene_knowledge.py runs/.../encoder.pt --json knowledge.json
+
+The space around the robot is divided into cells of 0.2 m; one is occupied if an obstacle reaches
+into it. The network has two layers of 256; the oracle is a set, so there it looks at one obstacle
+at a time, and a cell is occupied if one of them says so. It learns from the scenes of the
+demonstrations of `random_boxes_hard` and is tested on those of its test queries, 2,000 that
+neither it nor an encoder has seen. Two figures, over all cells that are not always empty:
+
+- information: the share of the uncertainty that z_E removes, 1 - (cross-entropy of the
+  prediction) / (cross-entropy of each cell's mean); the mean has 0, perfect knowledge 1;
+- IoU: of the cells predicted as occupied (probability over one half) and those that are.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+from tqdm import tqdm
+
+from envs.datasets import load_demos, load_queries
+from envs.encoders import MAX_OBSTACLES, ORACLE, scene_encoder
+from envs.scenes import ROW, to_array
+
+ROOT = Path(__file__).resolve().parent.parent
+TASK = "random_boxes_hard"
+CELL = 0.2  # m
+LOW, HIGH = np.array([-0.8, -0.8, 0.0]), np.array([0.8, 0.8, 1.6])
+SHAPE = tuple(np.round((HIGH - LOW) / CELL).astype(int))
+
+
+def occupied(obstacles):
+    """Which cells obstacles reach into: bool `SHAPE`.
+
+    By separating axes, the boxes' faces and the cells': exact for upright boxes, and a little too
+    many for others; cylinders and spheres count as their boxes.
+    """
+    centres = LOW + CELL * (np.stack(np.indices(SHAPE), axis=-1) + 0.5)
+    cells = np.zeros(SHAPE, bool)
+    for row in to_array(obstacles):
+        axes, half = _rotation(row[4:8]), row[8:11] / 2
+        if row[0] > 0:  # radii
+            half = row[8:11] * ([1, 1, 0.5] if row[0] == 1 else 1)
+        offset = centres - row[1:4]
+        along_cell = np.abs(offset) < CELL / 2 + np.abs(axes) @ half
+        along_box = np.abs(offset @ axes) < half + CELL / 2 * np.abs(axes).sum(0)
+        cells |= along_cell.all(-1) & along_box.all(-1)
+    return cells
+
+
+def _rotation(quaternion):
+    """(x, y, z, w) -> (3, 3), the box's axes as columns."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+class AnyObstacle(nn.Module):
+    """The oracle's numbers (n, 384) -> logits (n, cells), from those that `network` gives each."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, codes):
+        rows = codes.unflatten(1, (MAX_OBSTACLES, 1 + ROW))
+        rows = rows[:, : int(rows[..., 0].sum(1).max())]
+        free = (F.logsigmoid(-self.network(rows)) * rows[..., :1]).sum(1).clamp(max=-1e-6)
+        return torch.log(-torch.expm1(free)) - free
+
+
+def probe(codes, cells, test_codes, is_set=False, seed=0, epochs=60):
+    """Train the network; its probabilities (n, cells) on the test scenes.
+
+    A tenth of the training scenes decides when it is best.
+    """
+    torch.manual_seed(seed)
+    if not is_set:
+        mean, std = codes.mean(0), codes.std(0) + 1e-3
+        codes, test_codes = (codes - mean) / std, (test_codes - mean) / std
+    codes, test_codes = torch.as_tensor(codes), torch.as_tensor(test_codes)
+    cells = torch.as_tensor(cells).float()
+    split = len(codes) * 9 // 10
+    network = nn.Sequential(
+        nn.Linear(1 + ROW if is_set else codes.shape[1], 256), nn.ReLU(),
+        nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, cells.shape[1]),
+    )  # fmt: skip
+    if is_set:
+        network = AnyObstacle(network)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=0.1)
+    best, probabilities = np.inf, None
+    for _ in range(epochs):
+        for rows in torch.randperm(split).split(128):
+            loss = F.binary_cross_entropy_with_logits(network(codes[rows]), cells[rows])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        with torch.no_grad():
+            error = F.binary_cross_entropy_with_logits(network(codes[split:]), cells[split:])
+            if error < best:
+                best, probabilities = error, torch.sigmoid(network(test_codes))
+    return probabilities.numpy()
+
+
+def cross_entropy(probabilities, cells):
+    """Mean over scenes and cells, in nats."""
+    p = np.clip(probabilities, 1e-6, 1 - 1e-6)
+    return float(-np.where(cells, np.log(p), np.log(1 - p)).mean())
+
+
+def figures(probabilities, means, cells):
+    """The two figures of the module's docstring; `means` (cells,) are the training scenes'."""
+    guess = probabilities > 0.5
+    means = np.broadcast_to(means, cells.shape)
+    return {
+        "information": 1 - cross_entropy(probabilities, cells) / cross_entropy(means, cells),
+        "iou": float((guess & cells).sum() / (guess | cells).sum()),
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("encoders", nargs="*", help="programs (encoder.pt); default: the packaged")
+    parser.add_argument("--num", type=int, default=10_000, help="scenes to learn from (10,000)")
+    parser.add_argument("--json", type=Path, help="write the figures to this file too")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    demos, queries = load_demos(TASK), load_queries(TASK)
+    training = [demos.scenes[i] for i in range(min(args.num, len(demos)))]
+    testing = list(dict.fromkeys(queries.scenes[i] for i in range(len(queries))))
+    grids = [
+        np.stack([occupied(scene.obstacles).ravel() for scene in tqdm(scenes, desc="cells")])
+        for scenes in (training, testing)
+    ]
+    sometimes = grids[0].any(0)
+    cells, test_cells = (grid[:, sometimes] for grid in grids)
+    means = cells.mean(0)
+    results = {"mean": figures(means[None].repeat(len(test_cells), 0), means, test_cells)}
+    packaged = sorted(map(str, (ROOT / "scene_embedding_train" / "encoders").glob("*.pt")))
+    for name in [ORACLE, *(args.encoders or packaged)]:
+        encoder = scene_encoder(name)
+        codes = encoder.encode_demos(demos)[: len(training)]
+        test_codes = np.stack([encoder(scene) for scene in tqdm(testing, desc=name)])
+        results[name] = figures(probe(codes, cells, test_codes, name == ORACLE), means, test_cells)
+    print(f"{len(training)} scenes to learn from, {len(testing)} to test, {cells.shape[1]} cells,")
+    print(f"{test_cells.mean():.3f} of them occupied")
+    for name, result in results.items():
+        print(f"{name:40} information {result['information']:.3f}  IoU {result['iou']:.3f}")
+    if args.json is not None:
+        args.json.write_text(json.dumps(results, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
