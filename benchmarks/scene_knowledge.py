@@ -25,10 +25,9 @@ import torch.nn.functional as F
 from tqdm import tqdm
 
 from envs.datasets import load_demos, load_queries
-from envs.encoders import MAX_OBSTACLES, ORACLE, scene_encoder
+from envs.encoders import MAX_OBSTACLES, ORACLE, PACKAGED, scene_encoder
 from envs.scenes import ROW, to_array
 
-ROOT = Path(__file__).resolve().parent.parent
 TASK = "random_boxes_hard"
 CELL = 0.2  # m
 LOW, HIGH = np.array([-0.8, -0.8, 0.0]), np.array([0.8, 0.8, 1.6])
@@ -147,7 +146,7 @@ def main():
     cells, test_cells = (grid[:, sometimes] for grid in grids)
     means = cells.mean(0)
     results = {"mean": figures(means[None].repeat(len(test_cells), 0), means, test_cells)}
-    packaged = sorted(map(str, (ROOT / "scene_embedding_train" / "encoders").glob("*.pt")))
+    packaged = sorted(path.stem for path in PACKAGED.glob("*.pt"))
     for name in [ORACLE, *(args.encoders or packaged)]:
         encoder = scene_encoder(name)
         codes = encoder.encode_demos(demos)[: len(training)]

@@ -1,6 +1,7 @@
 """Scene encoders as something to call: a `Scene` -> z_E, the numbers a policy sees of it.
 
-    encoder = SceneEncoder("runs/.../encoder.pt")     # trained: scene_embedding_train
+    encoder = SceneEncoder("vae")                     # of `scene_embedding_train/encoders`
+    encoder = SceneEncoder("runs/.../encoder.pt")     # trained by a script of scene_embedding_train
     encoder = SceneEncoder("oracle")                  # the obstacles themselves
     env = SceneEncodingWrapper(envs.make("random_boxes_hard"), encoder)
 
@@ -25,6 +26,7 @@ from envs.scenes import ROW, to_array
 from envs.sensors import PointCloud, SensorWorld
 
 ORACLE = "oracle"
+PACKAGED = Path(__file__).resolve().parent.parent / "scene_embedding_train" / "encoders"
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
 # Of the arm when an encoder looks, rad: always the same, so that z_E depends on the scene alone.
@@ -66,10 +68,11 @@ class SceneEncoder:
     """Encodes scenes; an equal scene is encoded once.
 
     Args:
-        name: path of an encoder's program (`encoder.pt`), or `oracle`.
+        name: `oracle`, the name of an encoder in `PACKAGED`, or the path of a program (`encoder.pt`).
 
     Attributes:
         name: as given, a string.
+        path: of the program; None for the oracle.
         size: of z_E.
 
     Raises:
@@ -78,12 +81,14 @@ class SceneEncoder:
 
     def __init__(self, name):
         self.name = str(name)
-        self._world = None
+        self.path = self._world = None
         self._of_demos = {}  # scene -> z_E
         if self.name == ORACLE:
             self._encode, self.size = oracle, MAX_OBSTACLES * (1 + ROW)
         else:
-            self._program = load_program(name)
+            packaged = PACKAGED / f"{name}.pt"
+            self.path = packaged if packaged.exists() else Path(name)
+            self._program = load_program(self.path)
             if self._program.metadata.get("kind") != "encoder":
                 raise ProgramError(f"{name}: not an encoder, but {self._program.metadata!r}")
             try:
@@ -110,10 +115,10 @@ class SceneEncoder:
         `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others.
         """
         scenes = [demos.scenes[i] for i in range(len(demos))]
-        if self.name == ORACLE:
+        if self.path is None:
             return np.stack([self(scene) for scene in scenes])
-        path = Path(self.name).with_suffix(f".{demos.task}.npz")
-        key = hashlib.sha256(Path(self.name).read_bytes() + repr(scenes).encode()).hexdigest()
+        path = self.path.with_suffix(f".{demos.task}.npz")
+        key = hashlib.sha256(self.path.read_bytes() + repr(scenes).encode()).hexdigest()
         codes = _read_codes(path, key)
         if codes is None:
             quiet = 0.2 if sys.stderr.isatty() else 30  # seconds

@@ -4,6 +4,7 @@ import importlib.util
 import json
 import re
 import statistics
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -54,7 +55,9 @@ def results(tmp_path):
 
 
 def test_the_papers_cells():
-    assert len(CELLS) == 3 * 9 * 5 + 4 + 3 + 9 * 6  # goals, hindsight, encoders with BC and SAC
+    papers = [cell for cell in CELLS.values() if cell.mean is not None]
+    assert len(papers) == 3 * 9 * 5 + 4 + 3 + 9 * 6  # goals, hindsight, encoders with BC and SAC
+    assert {cell.encoder for cell in CELLS.values() if cell.mean is None} == {"oracle"}
     assert {cell.task for cell in CELLS.values()} <= set(envs.TASKS)
     for name, mean, std in [  # as in the table, and the ends of each of the paper's
         ("bc-ee-no_obstacles", 0.073, 0.036),
@@ -74,6 +77,9 @@ def test_a_cell_is_a_command():
     assert flags[:4] == ["--task", "no_obstacles", "--goal-type", "combined"]
     assert flags[-4:] == ["--demo-prob", "0", "--her-probability", "0"]
     assert "--demo-prob" not in CELLS["bc-ee-wall"].flags()
+    flags = CELLS["sac-combined-vae-random_boxes_hard-p1-on-three_shelves"].flags()
+    assert flags[:2] == ["--task", "random_boxes_hard"]
+    assert flags[-4:] == ["--encoder", "vae", "--num-hidden-layers", "4"]
 
 
 def test_the_page_shows_what_was_run_and_what_was_not(results):
@@ -132,3 +138,10 @@ def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
     capfd.readouterr()
     paper_tables.run(cell, 5, 60, 4, tmp_path / "runs")
     assert capfd.readouterr().out == "bc-config-wall-s5: done before\n"
+    elsewhere = replace(cell, task="double_walls")  # another task, the same policy
+    paper_tables.run(elsewhere, 5, 60, 3, tmp_path / "runs")
+    other = json.loads((tmp_path / "policies" / f"{elsewhere.name}-s5.json").read_text())
+    assert other["cell"] == "bc-config-wall-on-double_walls"
+    assert other["policy"] == "bc-config-wall-s5" and other["num_queries"] == 3
+    assert other["curve"] == kept["curve"]
+    assert "--total-updates" not in capfd.readouterr().out
