@@ -68,7 +68,7 @@ class SceneEncoder:
     """Encodes scenes; an equal scene is encoded once.
 
     Args:
-        name: `oracle`, the name of an encoder in `PACKAGED`, or the path of a program (`encoder.pt`).
+        name: `oracle`, the name of an encoder in `PACKAGED`, or the path of a program (encoder.pt).
 
     Attributes:
         name: as given, a string.
