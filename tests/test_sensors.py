@@ -24,6 +24,7 @@ from envs.sensors import (
     cardinal,
 )
 from envs.wrappers import SensorWrapper
+from scene_embedding_train import collect
 
 HOME = np.array([0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8])
 BALL = Sphere((0.4, 0.5, 0.9), 0.1)
@@ -181,7 +182,11 @@ def test_observed_once_per_episode_or_in_every_step():
         env.close()
 
 
-def test_the_code_of_the_docs():
+def test_the_code_of_the_docs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    collect.collect(
+        collect.Args(num=80, sensors="images", image_size=16, shard_size=50, workers=1), False
+    )
     page = (Path(__file__).parents[1] / "docs" / "sensors.md").read_text()
     names = {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
@@ -189,6 +194,11 @@ def test_the_code_of_the_docs():
     heights = names["env"].reset(seed=0)[0]["sensors"]["heights"]["heights"]
     assert heights.shape == (20, 20) and 0.25 < heights.max() < 1.6
     assert names["env"].observation_space["sensors"]["heights"]["heights"].contains(heights)
+    z = names["z"]
+    assert z.shape == (64,) and np.isfinite(z).all() and z.std() > 0
+    principal = names["PrincipalComponents"](names["pictures"])(**names["pictures"])
+    np.testing.assert_allclose(principal.mean(0), 0, atol=1e-3)
+    np.testing.assert_allclose(principal.std(0), 1, atol=0.05)
 
 
 def test_looking_changes_nothing_else():
