@@ -91,6 +91,9 @@ class Args:
     enters the replay buffer with this probability (the paper's p). Without it: random queries"""
     demos: Path | None = None
     """demonstration file to use with --demo-prob; by default the task's own"""
+    patience: int = 0
+    """end a training episode, as a failure, when the arm has hardly moved for so many steps: stuck
+    ones fill the replay buffer otherwise (0: never, the paper's MDP)"""
     gamma: float = 0.95
     """discount factor (CleanRL: 0.99)"""
     tau: float = 0.005
@@ -335,6 +338,14 @@ class HerReplayBuffer:
         for code in state["codes"].numpy():
             self.number_of(code)
         self.rng.bit_generator.state = json.loads(state["rng"])
+
+
+def is_stuck(transitions, patience):
+    """Whether the arm is where it was `patience` transitions ago, but for 0.1 (normalised)."""
+    if patience == 0 or len(transitions) < patience:
+        return False
+    moved = transitions[-1]["next_observation"][:7] - transitions[-patience]["observation"][:7]
+    return np.linalg.norm(moved) < 0.1
 
 
 # ALGO LOGIC: demonstrations
@@ -686,7 +697,7 @@ if __name__ == "__main__":
             )
             observations[i] = next_observation
             returns[i] += reward
-            if terminated or truncated:
+            if terminated or truncated or is_stuck(staged[i], args.patience):
                 buffer.add_episode(staged[i])
                 recent_success = [*recent_success[-99:], info["is_success"]]
                 step = progress["global_step"] + i + 1
