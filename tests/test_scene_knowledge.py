@@ -1,0 +1,105 @@
+"""What z_E knows of a scene: the cells by hand, the probe on codes that say everything."""
+
+import importlib.util
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from envs.encoders import oracle
+from envs.scenes import Box, Scene, Sphere
+
+ROOT = Path(__file__).resolve().parent.parent
+spec = importlib.util.spec_from_file_location(
+    "scene_knowledge", ROOT / "benchmarks" / "scene_knowledge.py"
+)
+knowledge = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(knowledge)
+
+
+def test_cells_by_hand():
+    # A pole inside one column of cells: from x, y = 0.2 to 0.4, five cells high.
+    pole = Box((0.3, 0.3, 0.45), (0.05, 0.05, 0.9))
+    cells = knowledge.occupied([pole])
+    assert cells.sum() == 5 and cells[5, 5, :5].all()
+    # A board of 0.6 x 0.1, turned by 45 degrees around the middle between cells.
+    turned = (0.0, 0.0, math.sin(math.pi / 8), math.cos(math.pi / 8))
+    board = knowledge.occupied([Box((0.0, 0.0, 0.5), (0.6, 0.1, 0.02), turned)])
+    assert board.sum(axis=(0, 1)).tolist() == [0, 0, board.sum(), 0, 0, 0, 0, 0]
+    # Its ends are at (0.18, 0.25) and (0.25, 0.18), and opposite.
+    expected = {(4, 4), (4, 5), (5, 4), (5, 5), (3, 3), (2, 3), (3, 2), (2, 2), (3, 4), (4, 3)}
+    assert set(zip(*board.any(2).nonzero(), strict=True)) == expected
+    ball = knowledge.occupied([Sphere((0.3, 0.3, 0.5), 0.09)])
+    assert ball.sum() == 1 and ball[5, 5, 2]
+    assert (knowledge.occupied([pole, Box((-0.5, 0, 0.1), (0.1, 0.1, 0.1))]) | ~cells).all()
+
+
+def test_against_points():
+    rng = np.random.default_rng(0)
+    half = rng.uniform(0, math.pi)
+    box = Box((0.1, -0.2, 0.7), (0.5, 0.3, 0.2), (0.0, 0.0, math.sin(half), math.cos(half)))
+    edges = [
+        np.linspace(-0.5, 0.5, number) * size
+        for number, size in zip((250, 150, 30), box.size, strict=True)
+    ]
+    points = np.stack(np.meshgrid(*edges), axis=-1).reshape(-1, 3)  # 2 mm apart, 7 in height
+    cos, sin = math.cos(2 * half), math.sin(2 * half)
+    points = points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + box.position
+    inside = np.zeros(knowledge.SHAPE, bool)
+    inside[tuple(((points - knowledge.LOW) / knowledge.CELL).astype(int).T)] = True
+    np.testing.assert_array_equal(knowledge.occupied([box]), inside)
+
+
+def test_figures_of_perfect_and_no_knowledge():
+    rng = np.random.default_rng(0)
+    cells = rng.random((100, 30)) < 0.3
+    means = cells.mean(0)
+    perfect = knowledge.figures(cells.astype(float), means, cells)
+    assert perfect["iou"] == 1 and perfect["information"] == pytest.approx(1, abs=1e-4)
+    none = knowledge.figures(np.tile(means, (100, 1)), means, cells)
+    assert none == {"information": 0, "iou": 0}
+
+
+@pytest.mark.parametrize("is_set", [False, True])
+def test_the_probe_finds_what_the_codes_say(is_set):
+    rng = np.random.default_rng(0)
+    if is_set:
+        places = [rng.uniform(-0.6, 0.6, (rng.integers(1, 4), 2)) for _ in range(1500)]
+        scenes = [Scene(tuple(Box((*xy, 0.1), (0.1, 0.1, 0.1)) for xy in one)) for one in places]
+        codes = np.stack([oracle(scene) for scene in scenes])
+        cells = np.stack([knowledge.occupied(scene.obstacles).ravel() for scene in scenes])
+        cells = cells[:, cells.any(0)]
+    else:
+        codes = rng.normal(size=(1500, 6)).astype(np.float32)
+        cells = codes > 0
+    probabilities = knowledge.probe(codes[:1200], cells[:1200], codes[1200:], is_set)
+    found = knowledge.figures(probabilities, cells[:1200].mean(0), cells[1200:])
+    assert found["information"] > 0.6 and found["iou"] > 0.5
+
+
+def test_a_set_of_obstacles_is_their_union():
+    class Fixed(torch.nn.Module):
+        def forward(self, rows):
+            return rows[..., 2:4]  # logits of two cells: the position's x and y
+
+    codes = torch.as_tensor(
+        oracle(Scene((Sphere((0.5, -1.0, 0), 0.1), Sphere((2.0, -0.5, 0), 0.1))))
+    )
+    logits = knowledge.AnyObstacle(Fixed())(codes[None])[0]
+    one, other = torch.sigmoid(torch.tensor([[0.5, -1.0], [2.0, -0.5]]))
+    torch.testing.assert_close(torch.sigmoid(logits), 1 - (1 - one) * (1 - other))
+
+
+def test_inference_times(tmp_path):
+    command = [sys.executable, str(ROOT / "benchmarks" / "inference_time.py"), "--num", "3"]
+    policy = "bc-combined-no_obstacles-s1"
+    done = subprocess.run([*command, policy], capture_output=True, text=True, check=True)
+    times = json.loads(done.stdout.splitlines()[-1])
+    assert times["num_queries"] == 3 and times[policy]["encoding"] == 0
+    assert 0 < times[policy]["action"] < times[policy]["total"] < 60
+    assert 0 < times["RRT-Connect"]["planning_seconds"] < 5.5
