@@ -68,10 +68,12 @@ class Verifier:
         for attempt in range(MEND_ATTEMPTS):
             seed = int(rng.integers(1, 2**32))
             try:
-                plan = self.planner.plan(demo.start, demo.goal, seed=seed, caution=0.5**attempt)
+                plan = self.planner.plan(
+                    demo.start, demo.goal, demo.scene, seed=seed, caution=0.5**attempt
+                )
             except PlanningError:
                 continue
-            execution = follow(self.env, plan)
+            execution = follow(self.env, plan, demo.scene)
             short = len(execution.states) - 1 <= self.env.horizon
             clean = self.allow_collisions or not execution.collided
             if execution.reached and clean and short:
