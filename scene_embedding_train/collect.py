@@ -1,6 +1,6 @@
 """Collect what sensors see of random scenes, to train encoders on.
 
-    python -m scene_embedding_train.collect --num 20000 --image-size 64 --output observations
+    python -m scene_embedding_train.collect --num 20000 --image-size 128 --output observations
     python -m scene_embedding_train.collect --num 200000 --ray-address auto   # the paper's number
 
 Paper: appendix "Training and verifying the encoders": four sensors around the robot, images and

@@ -1,6 +1,6 @@
 """VQ-VAE of what four cameras see: a scene latent z_E of 64 numbers. Read it from the top.
 
-    python -m scene_embedding_train.collect --sensors images --image-size 64 --num 20000
+    python -m scene_embedding_train.collect --sensors images --image-size 128 --num 20000
     python scene_embedding_train/vqvae.py --observations observations
 
 A vector-quantised autoencoder (van den Oord et al., 2017) as in the paper's appendix "Training and
@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn as nn
+import torch.nn.functional as F
 import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -59,13 +60,15 @@ class Args:
     # The algorithm
     total_updates: int = 20_000
     """batches of the whole run"""
-    batch_size: int = 64
+    batch_size: int = 32
     """scenes per batch"""
+    picture_size: int = 64
+    """width and height (pixels) that pictures are averaged down to, as part of the encoder"""
     learning_rate: float = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
     latent_size: int = 16
     """numbers per camera (paper: 16)"""
-    width: int = 24
+    width: int = 12
     """channels of the first convolution; each further one has twice as many"""
     code_size: int = 2
     """numbers in a vector of the codebook; a camera's latent is made of latent_size / code_size"""
@@ -98,8 +101,8 @@ def configuration_of(args):
 
 
 # SHARED: images
-def load_images(observations):
-    """What the cameras saw: uint8 (scenes, cameras, height, width, 3), and the cameras' names.
+def load_images(observations, size):
+    """What the cameras saw, averaged down: uint8 (scenes, cameras, size, size, 3); cameras' names.
 
     Unpacked once into a file beside the shards, which is then mapped into memory: it may be larger
     than the memory.
@@ -111,15 +114,19 @@ def load_images(observations):
     if len(sizes) > 1 or any("rgb" not in observations.sensors[name].outputs for name in cameras):
         sys.exit(f"--observations: {observations.folder}: the cameras differ in size, or lack rgb")
     width, height = sizes.pop()
-    path = observations.folder / f"images_{len(observations)}.npy"
+    if width != height or width % size:
+        sys.exit(f"--picture-size {size}: the pictures have {width} x {height} pixels")
+    path = observations.folder / f"images_{len(observations)}_{size}.npy"
     if not path.exists():
         temporary = path.with_suffix(".part")
-        shape = (len(observations), len(cameras), height, width, 3)
+        shape = (len(observations), len(cameras), size, size, 3)
         unpacked = np.lib.format.open_memmap(temporary, "w+", np.uint8, shape)
         for shard in tqdm(range(len(observations.offsets) - 1), desc="unpacking", unit="shard"):
             rows = slice(*observations.offsets[shard : shard + 2])
             for i, name in enumerate(cameras):
-                unpacked[rows, i] = observations.read(shard, f"{name}/rgb")
+                pictures = observations.read(shard, f"{name}/rgb")
+                blocks = pictures.reshape(-1, size, width // size, size, width // size, 3)
+                unpacked[rows, i] = blocks.mean((2, 4)).round()
         unpacked.flush()
         os.replace(temporary, path)
     return np.load(path, mmap_mode="r"), cameras
@@ -129,6 +136,12 @@ def batch_of(images, rows, device):
     """Rows of `load_images`'s array as float32 (n, cameras, 3, height, width) in [0, 1]."""
     chosen = torch.from_numpy(images[np.sort(rows)]).to(device)
     return chosen.permute(0, 1, 4, 2, 3).float() / 255.0
+
+
+def averaged(images, size):
+    """uint8 (n, cameras, height, width, 3) -> float32 (n, cameras, 3, size, size) in [0, 1]."""
+    pictures = images.flatten(0, 1).permute(0, 3, 1, 2).float() / 255.0
+    return F.avg_pool2d(pictures, images.shape[2] // size).unflatten(0, images.shape[:2])
 
 
 def pixel_weights(images, mean_image, foreground_weight):
@@ -248,15 +261,15 @@ class VQVAE(nn.Module):
 
 
 class SceneEncoder(nn.Module):
-    """What is saved: each camera's pictures uint8 (n, size, size, 3), by name -> z_E (n, 64)."""
+    """What is saved: each camera's pictures uint8 (n, height, width, 3), by name -> z_E."""
 
-    def __init__(self, vqvae, cameras):
+    def __init__(self, vqvae, cameras, size):
         super().__init__()
-        self.vqvae, self.cameras = vqvae, cameras
+        self.vqvae, self.cameras, self.size = vqvae, cameras, size
 
     def forward(self, **pictures):
-        images = torch.stack([pictures[name] for name in self.cameras], dim=1)
-        encoded = self.vqvae.encode(images.permute(0, 1, 4, 2, 3).float() / 255.0)
+        images = averaged(torch.stack([pictures[name] for name in self.cameras], 1), self.size)
+        encoded = self.vqvae.encode(images)
         return torch.cat([quantised.flatten(1) for _, quantised, _ in encoded], dim=1)
 
 
@@ -345,10 +358,10 @@ if __name__ == "__main__":
         sys.exit(f"--observations: {error}")
     # END SHARED
     # SHARED: images to train on
-    images, cameras = load_images(observations)
-    size = images.shape[2]
-    if images.shape[3] != size or num_halvings(size) == 0:
-        sys.exit(f"--observations: pictures must be square, of 8 pixels or more: {images.shape}")
+    size = args.picture_size
+    if num_halvings(size) == 0:
+        sys.exit(f"--picture-size {size}: 8, 16, 32, 64, 128, ... pixels")
+    images, cameras = load_images(observations, size)
     # END SHARED
 
     # SHARED: folder and seeds
@@ -470,18 +483,18 @@ if __name__ == "__main__":
             writer.add_image("eval/reconstruction", picture, step, dataformats="HWC")
             if result["error_foreground"] < progress["best_error"]:
                 progress["best_error"], progress["best_update"] = result["error_foreground"], step
+                last = len(observations.offsets) - 2
                 example = {
-                    name: torch.from_numpy(images[validation[:2], i])
-                    for i, name in enumerate(cameras)
+                    name: torch.from_numpy(observations.read(last, f"{name}/rgb")[:2])
+                    for name in cameras
                 }
                 metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
                 metadata |= {
                     "sensors": sensors_to_json({k: observations.sensors[k] for k in cameras})
                 }
                 metadata |= {"seed": args.seed, "step": step, **result}
-                save_program(
-                    run / "encoder.pt", SceneEncoder(model, tuple(cameras)), example, metadata
-                )
+                encoder = SceneEncoder(model, tuple(cameras), size)
+                save_program(run / "encoder.pt", encoder, example, metadata)
                 progress["best"] = result
             bar.set_postfix(error=f"{result['error_foreground']:.4f}")
             # END SHARED
