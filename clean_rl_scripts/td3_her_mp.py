@@ -92,8 +92,8 @@ class Args:
     demos: Path | None = None
     """demonstration file to use with --demo-prob; by default the task's own"""
     patience: int = 0
-    """end a training episode, as a failure, when the arm has hardly moved for so many steps: stuck
-    ones fill the replay buffer otherwise (0: never, the paper's MDP)"""
+    """when the arm has hardly moved for so many steps of a training episode, it makes 10 in a
+    random direction: of a stuck arm nothing is learned otherwise (0: never)"""
     gamma: float = 0.95
     """discount factor (CleanRL: 0.99)"""
     tau: float = 0.005
@@ -655,6 +655,7 @@ if __name__ == "__main__":
 
     observations = begin_episodes()
     staged = [[] for _ in envs]  # transitions of the running episodes
+    escapes = [[] for _ in envs]  # actions still to come of random motions of stuck arms
     returns = [0.0] * args.num_envs
     recent_success = []
     started, seconds_before = time.time(), progress["seconds"]
@@ -684,6 +685,13 @@ if __name__ == "__main__":
 
         # SHARED: a step in every environment
         for i, env in enumerate(envs):
+            if not escapes[i] and is_stuck(staged[i], args.patience):
+                direction = torch.randn(7).numpy()
+                escapes[i] = [args.max_step * direction / np.linalg.norm(direction)] * 10
+            if escapes[i]:
+                actions[i] = escapes[i].pop()
+                if args.action_mode == "subgoal":
+                    actions[i] += observations[i]["observation"][:7]
             next_observation, reward, terminated, truncated, info = env.step(actions[i])
             staged[i].append(
                 {
@@ -697,7 +705,7 @@ if __name__ == "__main__":
             )
             observations[i] = next_observation
             returns[i] += reward
-            if terminated or truncated or is_stuck(staged[i], args.patience):
+            if terminated or truncated:
                 buffer.add_episode(staged[i])
                 recent_success = [*recent_success[-99:], info["is_success"]]
                 step = progress["global_step"] + i + 1
@@ -712,7 +720,7 @@ if __name__ == "__main__":
                         buffer.add_episode(demonstration_episode(demo, env, args))
                         progress["demos_injected"] += 1
                     writer.add_scalar("charts/demos_injected", progress["demos_injected"], step)
-                staged[i], returns[i] = [], 0.0
+                staged[i], returns[i], escapes[i] = [], 0.0, []
                 observations[i] = begin_episode(i)
         progress["global_step"] += args.num_envs
         bar.update(args.num_envs)
@@ -797,6 +805,7 @@ if __name__ == "__main__":
             for episode in filter(None, staged):
                 buffer.add_episode(episode)
             staged, returns = [[] for _ in envs], [0.0] * args.num_envs
+            escapes = [[] for _ in envs]
             progress["seconds"] = seconds_before + time.time() - started
             save_checkpoint()
             observations = begin_episodes()
