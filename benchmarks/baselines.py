@@ -128,7 +128,11 @@ def _conditions(results):
         for name, numbers in counts.items()
         if numbers
     ]
-    return [f"Test queries per task: {'; '.join(said)}. Measured {dates[0]} to {dates[-1]}."]
+    measured = " to ".join(dict.fromkeys([dates[0], dates[-1]]))
+    return [
+        f"Test queries per task: {'; '.join(said)}. Measured {measured}, on the machine of "
+        "[benchmarks.md](benchmarks.md).",
+    ]
 
 
 def main():
