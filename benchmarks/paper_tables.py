@@ -49,8 +49,8 @@ STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-ti
 # Settings for long runs (docs/training.md).
 RECIPES = {
     "bc": ["--eval-every", "25000"],
-    "sac": ["--gamma", "0.99", "--target-entropy", "-14", "--patience", "40"],
-    "td3": ["--gamma", "0.99", "--patience", "40"],
+    "sac": ["--gamma", "0.98", "--target-entropy", "-14"],
+    "td3": ["--gamma", "0.98"],
 }
 GOALS = {"ee": "end-effector", "config": "configuration", "combined": "combined"}
 ENCODERS = {

@@ -91,10 +91,6 @@ class Args:
     enters the replay buffer with this probability (the paper's p). Without it: random queries"""
     demos: Path | None = None
     """demonstration file to use with --demo-prob; by default the task's own"""
-    patience: int = 0
-    """when the arm has hardly moved for so many steps of a training episode, it makes 10 in a
-    random direction, and after the third such motion the episode ends as a failure: of a stuck arm
-    nothing is learned otherwise (0: never)"""
     gamma: float = 0.95
     """discount factor (CleanRL: 0.99)"""
     tau: float = 0.005
@@ -339,17 +335,6 @@ class HerReplayBuffer:
         for code in state["codes"].numpy():
             self.number_of(code)
         self.rng.bit_generator.state = json.loads(state["rng"])
-
-
-MAX_ESCAPES = 3  # per episode
-
-
-def is_stuck(transitions, patience):
-    """Whether the arm is where it was `patience` transitions ago, but for 0.1 (normalised)."""
-    if patience == 0 or len(transitions) < patience:
-        return False
-    moved = transitions[-1]["next_observation"][:7] - transitions[-patience]["observation"][:7]
-    return np.linalg.norm(moved) < 0.1
 
 
 # ALGO LOGIC: demonstrations
@@ -659,8 +644,6 @@ if __name__ == "__main__":
 
     observations = begin_episodes()
     staged = [[] for _ in envs]  # transitions of the running episodes
-    escapes = [[] for _ in envs]  # random motions of stuck arms: actions still to come
-    num_escapes = [0] * args.num_envs  # in the running episodes
     returns = [0.0] * args.num_envs
     recent_success = []
     started, seconds_before = time.time(), progress["seconds"]
@@ -690,14 +673,6 @@ if __name__ == "__main__":
 
         # SHARED: a step in every environment
         for i, env in enumerate(envs):
-            if not escapes[i] and is_stuck(staged[i], args.patience):
-                direction = torch.randn(7).numpy()
-                escapes[i] = [args.max_step * direction / np.linalg.norm(direction)] * 10
-                num_escapes[i] += 1
-            if escapes[i]:
-                actions[i] = escapes[i].pop()
-                if args.action_mode == "subgoal":
-                    actions[i] += observations[i]["observation"][:7]
             next_observation, reward, terminated, truncated, info = env.step(actions[i])
             staged[i].append(
                 {
@@ -711,7 +686,7 @@ if __name__ == "__main__":
             )
             observations[i] = next_observation
             returns[i] += reward
-            if terminated or truncated or (num_escapes[i] == MAX_ESCAPES and not escapes[i]):
+            if terminated or truncated:
                 buffer.add_episode(staged[i])
                 recent_success = [*recent_success[-99:], info["is_success"]]
                 step = progress["global_step"] + i + 1
@@ -726,7 +701,7 @@ if __name__ == "__main__":
                         buffer.add_episode(demonstration_episode(demo, env, args))
                         progress["demos_injected"] += 1
                     writer.add_scalar("charts/demos_injected", progress["demos_injected"], step)
-                staged[i], returns[i], escapes[i], num_escapes[i] = [], 0.0, [], 0
+                staged[i], returns[i] = [], 0.0
                 observations[i] = begin_episode(i)
         progress["global_step"] += args.num_envs
         bar.update(args.num_envs)
@@ -811,7 +786,6 @@ if __name__ == "__main__":
             for episode in filter(None, staged):
                 buffer.add_episode(episode)
             staged, returns = [[] for _ in envs], [0.0] * args.num_envs
-            escapes, num_escapes = [[] for _ in envs], [0] * args.num_envs
             progress["seconds"] = seconds_before + time.time() - started
             save_checkpoint()
             observations = begin_episodes()

@@ -78,7 +78,7 @@ def test_demonstrations_have_the_code_of_their_scene(env):
 
 def flags(trainer):
     more = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
-    return more if trainer == "bc" else [*more, "--demo-prob", "1", "--patience", "10"]
+    return more if trainer == "bc" else [*more, "--demo-prob", "1"]
 
 
 @pytest.mark.parametrize("trainer", PATHS)

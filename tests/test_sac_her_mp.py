@@ -310,20 +310,3 @@ def test_losses_are_logged_subgoal_actions_train_and_alpha_can_stay(tmp_path):
         assert np.isfinite([event.value for event in events.Scalars(f"losses/{tag}")]).all()
     assert events.Scalars("losses/alpha")[-1].value == pytest.approx(0.2)
     assert events.Scalars("charts/SPS")[-1].value > 0
-
-
-def test_a_stuck_arm_is_noticed():
-    def transitions(speed, number):
-        places = [
-            np.append(speed * t * np.ones(7) / 7**0.5, np.zeros(3)) for t in range(number + 1)
-        ]
-        return [
-            {"observation": here, "next_observation": there}
-            for here, there in zip(places[:-1], places[1:], strict=True)
-        ]
-
-    assert sac.is_stuck(transitions(0.0, 40), 40)
-    assert not sac.is_stuck(transitions(0.0, 39), 40)
-    assert not sac.is_stuck(transitions(0.0, 400), 0)
-    assert sac.is_stuck(transitions(0.002, 100), 40)  # 0.08 in 40 steps
-    assert not sac.is_stuck(transitions(0.003, 100), 40)
