@@ -49,8 +49,8 @@ STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-ti
 # Settings for long runs (docs/training.md).
 RECIPES = {
     "bc": ["--eval-every", "25000"],
-    "sac": ["--gamma", "0.98", "--target-entropy", "-14"],
-    "td3": ["--gamma", "0.98"],
+    "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3"],
+    "td3": ["--gamma", "0.98", "--num-hidden-layers", "3"],
 }
 GOALS = {"ee": "end-effector", "config": "configuration", "combined": "combined"}
 ENCODERS = {
@@ -101,7 +101,7 @@ class Cell:
         flags = ["--task", self.trained_on, "--goal-type", self.goal_type, *RECIPES[self.algorithm]]
         if self.demo_prob:
             flags += ["--demo-prob", self.demo_prob]
-        if self.encoder:  # paper, section 5.3
+        if self.encoder:  # paper, section 5.3; of a flag that is given twice, the later counts
             flags += ["--encoder", self.encoder, "--num-hidden-layers", "4"]
         if self.hindsight == "no":
             flags += ["--her-probability", "0"]

@@ -99,8 +99,9 @@ class Args:
     """learning rate of the policy (Adam; CleanRL: 3e-4)"""
     q_lr: float = 1e-3
     """learning rate of the critics (Adam)"""
-    exploration_noise: float = 0.1
-    """standard deviation of the noise on the actions in training, in units of action_scale"""
+    exploration_noise: float = 0.35
+    """standard deviation of the noise on the actions in training, in units of action_scale
+    (CleanRL: 0.1)"""
     policy_noise: float = 0.2
     """standard deviation of the noise that smooths the critics' target, in units of action_scale"""
     noise_clip: float = 0.5
