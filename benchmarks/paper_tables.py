@@ -189,10 +189,11 @@ def keep(name, cell, run, evaluation, folder):
 
 
 def commit():
-    """The commit that is checked out, with a `+` if files were changed since."""
+    """The commit that is checked out, with a `+` if code was changed since."""
     git = ["git", "-C", ROOT]
     head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
-    changed = subprocess.run([*git, "diff", "--quiet", "HEAD"]).returncode
+    code = ("*.py", "constraints.txt")  # not the page and its pictures, which the last cell wrote
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", *code]).returncode
     return head.stdout.strip() + "+" * (changed != 0)
 
 
