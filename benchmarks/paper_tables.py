@@ -297,7 +297,8 @@ def page(cells, results):
     lines[-1] += "; ".join(
         f"{name}: `{' '.join(flags)}`" for name, flags in RECIPES.items() if flags
     )
-    lines[-1] += ". Each policy's JSON has all of its flags."
+    lines[-1] += ". Each policy's JSON has all of its flags. (The paper's networks have two hidden"
+    lines[-1] += " layers, with encoders four.)"
     below = []
     for cell in done:
         mean = statistics.mean(result["success_rate"] for result in results[cell.name])
