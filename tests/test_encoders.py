@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import envs
@@ -280,6 +281,24 @@ def test_a_run_leaves_an_encoder_a_result_and_events(run):
     assert {f"eval/{figure}" for figure in figures} <= scalars
     assert all(0 <= result[figure] <= 1 for figure in figures)
     assert [event.step for event in events.Scalars(f"eval/{min(figures)}")] == [4, 8, 12]
+
+
+def test_a_run_is_kept_with_its_figures_and_picture(run, tmp_path):
+    name, folder = run
+    script = FOLDER.parent / "benchmarks" / "keep_encoders.py"
+    where = ["--encoders", str(tmp_path), "--pictures", str(tmp_path)]
+    command = [sys.executable, str(script), str(folder), *where]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    kept = (tmp_path / f"{name}.pt").read_bytes()
+    assert kept == (folder / "encoder.pt").read_bytes()
+    assert Image.open(tmp_path / f"encoder_{name}.png").height > 0
+    text = (tmp_path / f"{name}.json").read_text()
+    result = json.loads(text)
+    assert result["scenes"] == 14 and result["args"]["seed"] == 1 and str(folder.parent) not in text
+    assert "scene_embedding_train.collect" in result["observations"]
+    unfinished = subprocess.run([*command[:2], str(tmp_path)], capture_output=True, text=True)
+    assert unfinished.returncode != 0 and "no finished run" in unfinished.stderr
 
 
 def test_the_saved_encoder_needs_no_script(run, observations):

@@ -1,0 +1,74 @@
+"""Put trained scene encoders into the repository: program, how it was made, and a picture.
+
+    python benchmarks/keep_encoders.py runs/RUN ...    # of vae.py, vqvae.py, pointnet2.py
+
+Of each finished run, `encoder.pt` becomes `scene_embedding_train/encoders/<exp_name>.pt`, which is
+what `--encoder <exp_name>` finds; the JSON beside it has data, updates, figures on validation
+scenes and flags; `docs/pictures/encoder_<exp_name>.png` is TensorBoard's picture of a validation
+scene at the update whose encoder was kept.
+"""
+
+import argparse
+import datetime
+import io
+import json
+import shutil
+import sys
+from pathlib import Path
+
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from envs.datasets import attribute
+from envs.encoders import PACKAGED
+from envs.files import write_atomically
+from envs.observations import open_shard, shard_path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from paper_tables import PICTURES, commit
+
+ENLARGED = 2  # each pixel of TensorBoard's picture, in width and height
+PATHS = ("runs_dir", "resume", "observations")  # flags that say nothing about the encoder
+
+
+def picture(run, step):
+    """What TensorBoard has of a run at one evaluation, a PIL image."""
+    events = EventAccumulator(str(run), size_guidance={"images": 0}).Reload()
+    (tag,) = events.Tags()["images"]
+    shown = next(event for event in events.Images(tag) if event.step == step)
+    image = Image.open(io.BytesIO(shown.encoded_image_string))
+    return image.resize((image.width * ENLARGED, image.height * ENLARGED), Image.NEAREST)
+
+
+def keep(run, encoders, pictures):
+    """Copy one run's encoder, write its JSON and its picture; the JSON's dict is returned."""
+    trained = json.loads((run / "result.json").read_text())
+    name = trained["args"]["exp_name"]
+    result = {key: value for key, value in trained.items() if key not in ("args", "encoder")}
+    result |= {"date": datetime.date.today().isoformat(), "commit": commit()}
+    with open_shard(shard_path(trained["args"]["observations"], 0)) as shard:
+        result["observations"] = attribute(shard, "made_by")
+    result["args"] = {key: value for key, value in trained["args"].items() if key not in PATHS}
+    encoders.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(run / "encoder.pt", encoders / f"{name}.pt")
+    write_atomically(encoders / f"{name}.json", (json.dumps(result, indent=1) + "\n").encode())
+    picture(run, trained["best_update"]).save(pictures / f"encoder_{name}.png", optimize=True)
+    return result
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a finished run's folder")
+    parser.add_argument("--encoders", type=Path, default=PACKAGED, help="where programs go")
+    parser.add_argument("--pictures", type=Path, default=PICTURES, help="where pictures go")
+    args = parser.parse_args()
+    for run in args.runs:
+        if not (run / "result.json").exists():
+            parser.error(f"{run} is no finished run (it has no result.json)")
+    for run in args.runs:
+        result = keep(run, args.encoders, args.pictures)
+        print(f"{run}: { ({k: v for k, v in result.items() if k != 'args'}) }")
+
+
+if __name__ == "__main__":
+    main()
