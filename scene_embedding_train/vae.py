@@ -69,8 +69,9 @@ class Args:
     """numbers per camera (paper: 16)"""
     width: int = 12
     """channels of the first convolution; each further one has twice as many"""
-    kl_weight: float = 0.05
-    """weight of the KL divergence, per latent number, beside the squared error of a picture"""
+    kl_weight: float = 0.001
+    """weight of the KL divergence, per latent number, beside the squared error of a picture (with
+    50 times as much, obstacles are not seen)"""
     foreground_weight: float = 10.0
     """weight of pixels that differ from the mean picture, beside 1 for the others: obstacles are
     few pixels (0: all pixels count the same)"""
