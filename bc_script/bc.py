@@ -84,8 +84,9 @@ class Args:
     bf16: bool = False
     """train with hidden layers in bfloat16 (first layer, head and weights stay in float32)"""
     encoder: str | None = None
-    """what the policy sees of the scene, appended to the observation: path of an encoder's program
-    (`encoder.pt`, docs/sensors.md), or `oracle`, the obstacles themselves; by default nothing"""
+    """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
+    `vqvae`, `pointnet2`, or the path of your own `encoder.pt`, docs/sensors.md), or `oracle`, the
+    obstacles themselves; by default nothing"""
     velocities: ClassVar[bool] = False  # demonstrations have none
     scene_size: ClassVar[int] = 0  # numbers of the encoded scene; set when the encoder is there
 

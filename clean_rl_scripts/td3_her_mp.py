@@ -66,8 +66,9 @@ class Args:
     velocities: bool = False
     """joint velocities in the observation"""
     encoder: str | None = None
-    """what the policy sees of the scene, appended to the observation: path of an encoder's program
-    (`encoder.pt`, docs/sensors.md), or `oracle`, the obstacles themselves; by default nothing"""
+    """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
+    `vqvae`, `pointnet2`, or the path of your own `encoder.pt`, docs/sensors.md), or `oracle`, the
+    obstacles themselves; by default nothing"""
     num_envs: int = 4
     """environments stepped together; every one of their steps counts"""
     scene_size: ClassVar[int] = 0  # numbers of the encoded scene; set when the encoder is there

@@ -18,8 +18,8 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import envs
-from envs.datasets import load_demos
-from envs.encoders import MAX_OBSTACLES, SceneEncoder, oracle
+from envs.datasets import load_demos, load_queries
+from envs.encoders import MAX_OBSTACLES, PACKAGED, SceneEncoder, oracle
 from envs.observations import Observations
 from envs.programs import ProgramError, load_program, save_program
 from envs.scenes import Scene, Sphere, from_array
@@ -413,6 +413,25 @@ def test_a_trained_encoder_in_an_environment(run, observations):
         np.testing.assert_array_equal(fresh(scene), encoder(scene))
     encoder.close()
     fresh.close()
+
+
+def test_packaged_encoders_are_found_by_name():
+    programs = sorted(PACKAGED.glob("*.pt"))
+    assert [path.stem for path in programs] == sorted(SCRIPTS)
+    assert sum(path.stat().st_size for path in PACKAGED.glob("*.[pj]*")) < 6e6
+    queries = load_queries("random_boxes_hard")
+    for path in programs:
+        encoder = SceneEncoder(path.stem)
+        codes = np.stack([encoder(queries.scenes[i]) for i in (0, 9_999)])
+        assert codes.shape == (2, 64) and np.isfinite(codes).all()
+        assert np.abs(codes[0] - codes[1]).max() > 0.1  # it sees the difference
+        result = json.loads(path.with_suffix(".json").read_text())
+        assert result["scenes"] >= 19_000
+        if path.stem == "pointnet2":
+            assert result["iou_obstacle"] >= 0.8
+        else:
+            assert result["error_foreground"] < result["mean_image_error_foreground"] / 3
+        encoder.close()
 
 
 def test_demonstrations_are_encoded_once(run, tmp_path, monkeypatch):
