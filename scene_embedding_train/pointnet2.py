@@ -7,7 +7,10 @@ PointNet++ (Qi et al., 2017) as in the paper's appendix "Training and verifying 
 network per sensor says of each point what it lies on: robot, table or floor, or another obstacle.
 Set abstraction (farthest point sampling, ball query) makes 16 numbers of a cloud; feature
 propagation classifies the points from these numbers and the points' places alone, without the
-usual skip connections, which would lead around them. What is saved, `encoder.pt`, is a program
+usual skip connections, which would lead around them. But places alone say most of that, so from
+classifying the 16 numbers learn next to nothing about the scene (docs/sensors.md). Therefore a map
+per sensor, which is not the paper's, learns to say from them and a place alone whether an obstacle
+was seen there (`--map-weight 0`: without). What is saved, `encoder.pt`, is a program
 (`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an encoder
 of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
 `# END SHARED` are those of `vae.py`.
@@ -32,7 +35,7 @@ from tqdm import tqdm
 from envs.datasets import DatasetError
 from envs.observations import Observations, sensors_to_json
 from envs.programs import save_program
-from envs.sensors import NOTHING, PointCloud
+from envs.sensors import NOTHING, OBSTACLE, PointCloud
 
 
 @dataclass
@@ -78,6 +81,11 @@ class Args:
     """points that a ball query finds at most"""
     width: int = 32
     """features at the first level; each further one has twice as many"""
+    map_weight: float = 1.0
+    """weight of the map's loss beside that of the classification"""
+    map_places: int = 64
+    """places per scene and sensor where the map is asked: obstacles' points; and as many of another
+    scene"""
 
     # SHARED: bookkeeping
     eval_every: int = 2_000
@@ -252,26 +260,71 @@ class Decoder(nn.Module):
         return self.head(features)
 
 
+NEAR = 0.1  # m: about as far apart as neighbouring points are after thinning out
+
+
+class Map(nn.Module):
+    """A latent (n, latent), places (n, q, 3), m -> logits (n, q) of an obstacle being there."""
+
+    def __init__(self, args):
+        super().__init__()
+        width = 4 * args.width
+        self.layers = mlp(args.latent_size + 3, width, width, width)
+        self.head = nn.Linear(width, 1)
+
+    def forward(self, latent, places):
+        spread = latent.unsqueeze(1).expand(-1, places.shape[1], -1)
+        return self.head(self.layers(torch.cat([places, spread], dim=2))).squeeze(2)
+
+
+def ask_map(points, labels, number):
+    """Where to ask a map, and the truth.
+
+    Args:
+        points, labels: of a sensor's clouds, (n, p, 3), m, and (n, p).
+        number: of points of obstacles to draw from each cloud.
+
+    Returns:
+        Places (n, 2 * number, 3), those drawn from this cloud and from the one before it; and
+        whether this cloud has a point of an obstacle within `NEAR`, bool (n, 2 * number).
+    """
+    is_obstacle = labels == OBSTACLE
+    drawn = torch.multinomial(is_obstacle + 1e-6, number, replacement=True)  # there may be none
+    own = gather(points, drawn)
+    places = torch.cat([own, own.roll(1, 0)], dim=1)
+    distances = torch.cdist(places, points).masked_fill(~is_obstacle.unsqueeze(1), math.inf)
+    return places, distances.amin(2) < NEAR
+
+
 class PointNet2(nn.Module):
-    """An encoder and a decoder per sensor."""
+    """An encoder, a decoder and a map per sensor."""
 
     def __init__(self, num_sensors, args):
         super().__init__()
         self.num_points = args.num_points
         self.encoders = nn.ModuleList(Encoder(args) for _ in range(num_sensors))
         self.decoders = nn.ModuleList(Decoder(args) for _ in range(num_sensors))
+        self.maps = nn.ModuleList(Map(args) for _ in range(num_sensors))
+
+    def encode(self, clouds):
+        """A list of (points, labels) per sensor -> lists of latents, places at each level, truth.
+
+        Truth are the labels (n, p) of the first level's points.
+        """
+        encoded = []
+        for (points, labels), encoder in zip(clouds, self.encoders, strict=True):
+            chosen = thin_out(labels, self.num_points)
+            encoded.append((*encoder(gather(points, chosen)), labels.gather(1, chosen)))
+        return zip(*encoded, strict=True)
+
+    def decode(self, latents, places):
+        """What `encode` returned -> logits (n, p, 3), a list."""
+        return [decoder(*one) for decoder, *one in zip(self.decoders, latents, places, strict=True)]
 
     def forward(self, clouds):
         """A list of (points, labels) per sensor -> lists of logits (n, p, 3) and labels (n, p)."""
-        logits, truth = [], []
-        for (points, labels), encoder, decoder in zip(
-            clouds, self.encoders, self.decoders, strict=True
-        ):
-            chosen = thin_out(labels, self.num_points)
-            latent, places = encoder(gather(points, chosen))
-            logits.append(decoder(latent, places))
-            truth.append(labels.gather(1, chosen))
-        return logits, truth
+        latents, places, truth = self.encode(clouds)
+        return self.decode(latents, places), truth
 
 
 class SceneEncoder(nn.Module):
@@ -453,10 +506,20 @@ if __name__ == "__main__":
         remaining = 1.0 - progress["updates"] / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         rows = rng.integers(num_training, size=args.batch_size)
-        logits, truth = model(list(batch_of(clouds, rows, sensors, device).values()))
-        loss = F.cross_entropy(
+        batch = list(batch_of(clouds, rows, sensors, device).values())
+        latents, places, truth = model.encode(batch)
+        logits = model.decode(latents, places)
+        classification = F.cross_entropy(
             torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=NOTHING
         )
+        mapping = 0.0
+        for of_sensor, latent, (points, *_), labels in zip(
+            model.maps, latents, places, truth, strict=True
+        ):
+            asked, answer = ask_map(points, labels, args.map_places)
+            error = F.binary_cross_entropy_with_logits(of_sensor(latent, asked), answer.float())
+            mapping = mapping + error / len(model.maps)
+        loss = classification + args.map_weight * mapping
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -465,6 +528,8 @@ if __name__ == "__main__":
 
         step = progress["updates"]
         if step % 100 == 0:
+            writer.add_scalar("losses/classification", classification.item(), step)
+            writer.add_scalar("losses/map", mapping.item(), step)
             writer.add_scalar("losses/loss", loss.item(), step)
             ups = (step - updates_before) / (time.time() - started)
             writer.add_scalar("charts/updates_per_second", ups, step)

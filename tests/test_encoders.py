@@ -211,6 +211,24 @@ def test_interpolation_is_exact_at_centres_and_a_mean_between():
     assert found[1] == pytest.approx(weights @ [1, 3, 5] / weights.sum(), rel=1e-4)
 
 
+def test_the_map_is_asked_about_obstacles_of_two_scenes():
+    torch.manual_seed(0)
+    points = torch.rand(3, 40, 3)
+    points[1] += 10.0  # far from the others; the third scene has no obstacles
+    labels = torch.tensor([0, 1, 2, 3]).repeat(10).repeat(3, 1)
+    labels[2] = 1
+    places, answers = pointnet2.ask_map(points, labels, 6)
+    assert places.shape == (3, 12, 3)
+    assert answers[:2, :6].all() and not answers[1, 6:].any() and not answers[2].any()
+    for scene, source in ((0, 0), (1, 1)):
+        obstacles = points[source][labels[source] == 2].tolist()
+        assert all(place in obstacles for place in places[scene, :6].tolist())
+    assert torch.equal(places[:, 6:], places[:, :6].roll(1, 0))
+    for place, answer in zip(places[0], answers[0], strict=True):
+        near = [(place - point).norm() < 0.1 for point in points[0][labels[0] == 2]]
+        assert bool(answer) == any(near)
+
+
 def test_scores_of_the_classification(observations):
     read = Observations(observations)
     clouds = pointnet2.load_clouds(read)
