@@ -9,8 +9,8 @@ Set abstraction (farthest point sampling, ball query) makes 16 numbers of a clou
 propagation classifies the points from these numbers and the points' places alone, without the
 usual skip connections, which would lead around them. But places alone say most of that, so from
 classifying the 16 numbers learn next to nothing about the scene (docs/sensors.md). Therefore a map
-per sensor, which is not the paper's, learns to say from them and a place alone whether an obstacle
-was seen there (`--map-weight 0`: without). What is saved, `encoder.pt`, is a program
+per sensor, which is not the paper's, learns to say from them alone in which cells of a grid around
+the robot an obstacle was seen (`--map-weight 0`: without). What is saved, `encoder.pt`, is a program
 (`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an encoder
 of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
 `# END SHARED` are those of `vae.py`.
@@ -81,11 +81,8 @@ class Args:
     """points that a ball query finds at most"""
     width: int = 32
     """features at the first level; each further one has twice as many"""
-    map_weight: float = 1.0
-    """weight of the map's loss beside that of the classification"""
-    map_places: int = 64
-    """places per scene and sensor where the map is asked: obstacles' points; and as many of another
-    scene"""
+    map_weight: float = 10.0
+    """weight of the map's loss, per cell, beside that of the classification, per point"""
 
     # SHARED: bookkeeping
     eval_every: int = 2_000
@@ -260,40 +257,29 @@ class Decoder(nn.Module):
         return self.head(features)
 
 
-NEAR = 0.1  # m: about as far apart as neighbouring points are after thinning out
+# The map: a grid of CELLS^3 cells of CELL (m), from LOW on (m).
+CELL, CELLS, LOW = 0.16, 10, (-0.8, -0.8, 0.0)
 
 
-class Map(nn.Module):
-    """A latent (n, latent), places (n, q, 3), m -> logits (n, q) of an obstacle being there."""
+def seen_cells(points, labels):
+    """Which of the map's cells hold a point of an obstacle: float (n, CELLS^3), 0 or 1.
+
+    `points` (n, p, 3), m, and `labels` (n, p).
+    """
+    cells = ((points - points.new_tensor(LOW)) / CELL).floor().long()
+    counts = ((cells >= 0) & (cells < CELLS)).all(2) & (labels == OBSTACLE)
+    numbers = (cells * cells.new_tensor([CELLS**2, CELLS, 1])).sum(2)
+    numbers = torch.where(counts, numbers, CELLS**3)  # all others: into one more cell
+    grid = points.new_zeros(len(points), CELLS**3 + 1)
+    return grid.scatter_(1, numbers, 1.0)[:, :-1]
+
+
+class Map(nn.Sequential):
+    """A latent (n, latent) -> logits (n, CELLS^3) of the cells in which an obstacle was seen."""
 
     def __init__(self, args):
-        super().__init__()
         width = 4 * args.width
-        self.layers = mlp(args.latent_size + 3, width, width, width)
-        self.head = nn.Linear(width, 1)
-
-    def forward(self, latent, places):
-        spread = latent.unsqueeze(1).expand(-1, places.shape[1], -1)
-        return self.head(self.layers(torch.cat([places, spread], dim=2))).squeeze(2)
-
-
-def ask_map(points, labels, number):
-    """Where to ask a map, and the truth.
-
-    Args:
-        points, labels: of a sensor's clouds, (n, p, 3), m, and (n, p).
-        number: of points of obstacles to draw from each cloud.
-
-    Returns:
-        Places (n, 2 * number, 3), those drawn from this cloud and from the one before it; and
-        whether this cloud has a point of an obstacle within `NEAR`, bool (n, 2 * number).
-    """
-    is_obstacle = labels == OBSTACLE
-    drawn = torch.multinomial(is_obstacle + 1e-6, number, replacement=True)  # there may be none
-    own = gather(points, drawn)
-    places = torch.cat([own, own.roll(1, 0)], dim=1)
-    distances = torch.cdist(places, points).masked_fill(~is_obstacle.unsqueeze(1), math.inf)
-    return places, distances.amin(2) < NEAR
+        super().__init__(mlp(args.latent_size, width, 2 * width), nn.Linear(2 * width, CELLS**3))
 
 
 class PointNet2(nn.Module):
@@ -512,13 +498,9 @@ if __name__ == "__main__":
         classification = F.cross_entropy(
             torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=NOTHING
         )
-        mapping = 0.0
-        for of_sensor, latent, (points, *_), labels in zip(
-            model.maps, latents, places, truth, strict=True
-        ):
-            asked, answer = ask_map(points, labels, args.map_places)
-            error = F.binary_cross_entropy_with_logits(of_sensor(latent, asked), answer.float())
-            mapping = mapping + error / len(model.maps)
+        cells = torch.cat([seen_cells(*cloud) for cloud in batch])
+        guess = torch.cat([one(latent) for one, latent in zip(model.maps, latents, strict=True)])
+        mapping = F.binary_cross_entropy_with_logits(guess, cells)
         loss = classification + args.map_weight * mapping
         optimizer.zero_grad()
         loss.backward()

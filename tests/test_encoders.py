@@ -211,22 +211,18 @@ def test_interpolation_is_exact_at_centres_and_a_mean_between():
     assert found[1] == pytest.approx(weights @ [1, 3, 5] / weights.sum(), rel=1e-4)
 
 
-def test_the_map_is_asked_about_obstacles_of_two_scenes():
-    torch.manual_seed(0)
-    points = torch.rand(3, 40, 3)
-    points[1] += 10.0  # far from the others; the third scene has no obstacles
-    labels = torch.tensor([0, 1, 2, 3]).repeat(10).repeat(3, 1)
-    labels[2] = 1
-    places, answers = pointnet2.ask_map(points, labels, 6)
-    assert places.shape == (3, 12, 3)
-    assert answers[:2, :6].all() and not answers[1, 6:].any() and not answers[2].any()
-    for scene, source in ((0, 0), (1, 1)):
-        obstacles = points[source][labels[source] == 2].tolist()
-        assert all(place in obstacles for place in places[scene, :6].tolist())
-    assert torch.equal(places[:, 6:], places[:, :6].roll(1, 0))
-    for place, answer in zip(places[0], answers[0], strict=True):
-        near = [(place - point).norm() < 0.1 for point in points[0][labels[0] == 2]]
-        assert bool(answer) == any(near)
+def test_seen_cells_against_a_loop():
+    points = torch.rand(3, 200, 3) * 2.4 - 1.0
+    labels = torch.randint(4, (3, 200))
+    labels[2] = 1  # no obstacles
+    expected = torch.zeros(3, 10, 10, 10)
+    for scene in range(3):
+        for place, label in zip(points[scene].tolist(), labels[scene].tolist(), strict=True):
+            x, y, z = (place[0] + 0.8) / 0.16, (place[1] + 0.8) / 0.16, place[2] / 0.16
+            if label == 2 and min(x, y, z) >= 0 and max(x, y, z) < 10:
+                expected[scene, int(x), int(y), int(z)] = 1
+    assert torch.equal(pointnet2.seen_cells(points, labels), expected.flatten(1))
+    assert expected[0].sum() > 10
 
 
 def test_scores_of_the_classification(observations):
