@@ -8,12 +8,12 @@ network per sensor says of each point what it lies on: robot, table or floor, or
 Set abstraction (farthest point sampling, ball query) makes 16 numbers of a cloud; feature
 propagation classifies the points from these numbers and the points' places alone, without the
 usual skip connections, which would lead around them. But places alone say most of that, so from
-classifying the 16 numbers learn next to nothing about the scene (docs/sensors.md). Therefore a map
-per sensor, which is not the paper's, learns to say from them alone in which cells of a grid around
-the robot an obstacle was seen (`--map-weight 0`: without). What is saved, `encoder.pt`, is a program
-(`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an encoder
-of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
-`# END SHARED` are those of `vae.py`.
+classifying, the 16 numbers learn next to nothing about the scene (docs/sensors.md). Therefore a
+map per sensor, which is not the paper's, learns to say from them alone in which cells of a grid
+around the robot an obstacle was seen (`--map-weight 0`: without). What is saved, `encoder.pt`, is
+a program (`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an
+encoder of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED`
+and `# END SHARED` are those of `vae.py`.
 """
 
 import json
