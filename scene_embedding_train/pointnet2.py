@@ -7,13 +7,10 @@ PointNet++ (Qi et al., 2017) as in the paper's appendix "Training and verifying 
 network per sensor says of each point what it lies on: robot, table or floor, or another obstacle.
 Set abstraction (farthest point sampling, ball query) makes 16 numbers of a cloud; feature
 propagation classifies the points from these numbers and the points' places alone, without the
-usual skip connections, which would lead around them. But places alone say most of that, so from
-classifying, the 16 numbers learn next to nothing about the scene (docs/sensors.md). Therefore a
-map per sensor, which is not the paper's, learns to say from them alone in which cells of a grid
-around the robot an obstacle was seen (`--map-weight 0`: without). What is saved, `encoder.pt`, is
-a program (`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an
-encoder of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED`
-and `# END SHARED` are those of `vae.py`.
+usual skip connections, which would lead around them. What is saved, `encoder.pt`, is a program
+(`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an encoder
+of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
+`# END SHARED` are those of `vae.py`.
 """
 
 import json
@@ -35,7 +32,7 @@ from tqdm import tqdm
 from envs.datasets import DatasetError
 from envs.observations import Observations, sensors_to_json
 from envs.programs import save_program
-from envs.sensors import NOTHING, OBSTACLE, PointCloud
+from envs.sensors import NOTHING, PointCloud
 
 
 @dataclass
@@ -81,8 +78,6 @@ class Args:
     """points that a ball query finds at most"""
     width: int = 32
     """features at the first level; each further one has twice as many"""
-    map_weight: float = 10.0
-    """weight of the map's loss, per cell, beside that of the classification, per point"""
 
     # SHARED: bookkeeping
     eval_every: int = 2_000
@@ -257,60 +252,26 @@ class Decoder(nn.Module):
         return self.head(features)
 
 
-# The map: a grid of CELLS^3 cells of CELL (m), from LOW on (m).
-CELL, CELLS, LOW = 0.16, 10, (-0.8, -0.8, 0.0)
-
-
-def seen_cells(points, labels):
-    """Which of the map's cells hold a point of an obstacle: float (n, CELLS^3), 0 or 1.
-
-    `points` (n, p, 3), m, and `labels` (n, p).
-    """
-    cells = ((points - points.new_tensor(LOW)) / CELL).floor().long()
-    counts = ((cells >= 0) & (cells < CELLS)).all(2) & (labels == OBSTACLE)
-    numbers = (cells * cells.new_tensor([CELLS**2, CELLS, 1])).sum(2)
-    numbers = torch.where(counts, numbers, CELLS**3)  # all others: into one more cell
-    grid = points.new_zeros(len(points), CELLS**3 + 1)
-    return grid.scatter_(1, numbers, 1.0)[:, :-1]
-
-
-class Map(nn.Sequential):
-    """A latent (n, latent) -> logits (n, CELLS^3) of the cells in which an obstacle was seen."""
-
-    def __init__(self, args):
-        width = 4 * args.width
-        super().__init__(mlp(args.latent_size, width, 2 * width), nn.Linear(2 * width, CELLS**3))
-
-
 class PointNet2(nn.Module):
-    """An encoder, a decoder and a map per sensor."""
+    """An encoder and a decoder per sensor."""
 
     def __init__(self, num_sensors, args):
         super().__init__()
         self.num_points = args.num_points
         self.encoders = nn.ModuleList(Encoder(args) for _ in range(num_sensors))
         self.decoders = nn.ModuleList(Decoder(args) for _ in range(num_sensors))
-        self.maps = nn.ModuleList(Map(args) for _ in range(num_sensors))
-
-    def encode(self, clouds):
-        """A list of (points, labels) per sensor -> lists of latents, places at each level, truth.
-
-        Truth are the labels (n, p) of the first level's points.
-        """
-        encoded = []
-        for (points, labels), encoder in zip(clouds, self.encoders, strict=True):
-            chosen = thin_out(labels, self.num_points)
-            encoded.append((*encoder(gather(points, chosen)), labels.gather(1, chosen)))
-        return zip(*encoded, strict=True)
-
-    def decode(self, latents, places):
-        """What `encode` returned -> logits (n, p, 3), a list."""
-        return [decoder(*one) for decoder, *one in zip(self.decoders, latents, places, strict=True)]
 
     def forward(self, clouds):
         """A list of (points, labels) per sensor -> lists of logits (n, p, 3) and labels (n, p)."""
-        latents, places, truth = self.encode(clouds)
-        return self.decode(latents, places), truth
+        logits, truth = [], []
+        for (points, labels), encoder, decoder in zip(
+            clouds, self.encoders, self.decoders, strict=True
+        ):
+            chosen = thin_out(labels, self.num_points)
+            latent, places = encoder(gather(points, chosen))
+            logits.append(decoder(latent, places))
+            truth.append(labels.gather(1, chosen))
+        return logits, truth
 
 
 class SceneEncoder(nn.Module):
@@ -492,16 +453,10 @@ if __name__ == "__main__":
         remaining = 1.0 - progress["updates"] / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         rows = rng.integers(num_training, size=args.batch_size)
-        batch = list(batch_of(clouds, rows, sensors, device).values())
-        latents, places, truth = model.encode(batch)
-        logits = model.decode(latents, places)
-        classification = F.cross_entropy(
+        logits, truth = model(list(batch_of(clouds, rows, sensors, device).values()))
+        loss = F.cross_entropy(
             torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=NOTHING
         )
-        cells = torch.cat([seen_cells(*cloud) for cloud in batch])
-        guess = torch.cat([one(latent) for one, latent in zip(model.maps, latents, strict=True)])
-        mapping = F.binary_cross_entropy_with_logits(guess, cells)
-        loss = classification + args.map_weight * mapping
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -510,8 +465,6 @@ if __name__ == "__main__":
 
         step = progress["updates"]
         if step % 100 == 0:
-            writer.add_scalar("losses/classification", classification.item(), step)
-            writer.add_scalar("losses/map", mapping.item(), step)
             writer.add_scalar("losses/loss", loss.item(), step)
             ups = (step - updates_before) / (time.time() - started)
             writer.add_scalar("charts/updates_per_second", ups, step)

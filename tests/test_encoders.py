@@ -211,20 +211,6 @@ def test_interpolation_is_exact_at_centres_and_a_mean_between():
     assert found[1] == pytest.approx(weights @ [1, 3, 5] / weights.sum(), rel=1e-4)
 
 
-def test_seen_cells_against_a_loop():
-    points = torch.rand(3, 200, 3) * 2.4 - 1.0
-    labels = torch.randint(4, (3, 200))
-    labels[2] = 1  # no obstacles
-    expected = torch.zeros(3, 10, 10, 10)
-    for scene in range(3):
-        for place, label in zip(points[scene].tolist(), labels[scene].tolist(), strict=True):
-            x, y, z = (place[0] + 0.8) / 0.16, (place[1] + 0.8) / 0.16, place[2] / 0.16
-            if label == 2 and min(x, y, z) >= 0 and max(x, y, z) < 10:
-                expected[scene, int(x), int(y), int(z)] = 1
-    assert torch.equal(pointnet2.seen_cells(points, labels), expected.flatten(1))
-    assert expected[0].sum() > 10
-
-
 def test_scores_of_the_classification(observations):
     read = Observations(observations)
     clouds = pointnet2.load_clouds(read)
