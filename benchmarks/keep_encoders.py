@@ -1,5 +1,6 @@
 """Put trained scene encoders into the repository: program, how it was made, and a picture.
 
+    pip install -c constraints.txt -e ".[bench]"
     python benchmarks/keep_encoders.py runs/RUN ...    # of vae.py, vqvae.py, pointnet2.py
 
 Of each finished run, `encoder.pt` becomes `scene_embedding_train/encoders/<exp_name>.pt`, which is
@@ -67,7 +68,7 @@ def main():
             parser.error(f"{run} is no finished run (it has no result.json)")
     for run in args.runs:
         result = keep(run, args.encoders, args.pictures)
-        print(f"{run}: { ({k: v for k, v in result.items() if k != 'args'}) }")
+        print(f"{run}:", {key: value for key, value in result.items() if key != "args"})
 
 
 if __name__ == "__main__":
