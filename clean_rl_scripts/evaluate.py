@@ -85,6 +85,7 @@ NAMED = ("go-to-goal", "random", *LOOKING)
 RESOLUTION = 0.021
 # The planner's attempts: share of the remaining time, and of its usual distance from obstacles.
 ATTEMPTS = ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25))
+PLANNER_OPTIONS = {"planner_range": 0, "simplify": 3}  # RRT-Connect with OMPL's own range
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
 
@@ -259,7 +260,7 @@ def _touches(env, configuration):
 def _planner(env, seed, time_limit):
     """`planner`, as described at the top of this file."""
     planning = _import_planning()
-    planner = planning.Planner(env, max_checks=math.inf)
+    planner = planning.Planner(env, max_checks=math.inf, **PLANNER_OPTIONS)
 
     def policy(index, query):
         rng = np.random.default_rng([seed, index])

@@ -49,7 +49,7 @@ class Args:
     num: int = 10_000
     """Number of demonstrations."""
     seed: int = 0
-    """Seed of queries and plans; 0 gives the packaged files."""
+    """Seed of queries and plans; 0, --planner-range 0, --simplify 3 give the packaged files."""
     workers: int = 2
     """Number of processes. The file does not depend on it."""
     planner: str = "RRTConnect"
@@ -60,6 +60,10 @@ class Args:
     """Collision checks for one plan (some 25 us each)."""
     clearance: float = 0.005
     """Metres that plans keep from the scene, where start and goal do."""
+    planner_range: float = 0.3
+    """Longest motion (normalised) that the planner tries at once; 0 for OMPL's choice."""
+    simplify: int = 1
+    """Rounds of removing vertices of a plan and cutting its corners."""
     attempts: int = 3
     """Plans tried on a query before it is given up for a new one (paper: 3)."""
     allow_collisions: bool = False
@@ -80,9 +84,20 @@ OPTIONS = (
     "time_limit",
     "max_checks",
     "clearance",
+    "planner_range",
+    "simplify",
     "attempts",
     "allow_collisions",
 )
+PLANNER_OPTIONS = ("planner", "time_limit", "max_checks", "clearance", "planner_range", "simplify")
+# Of files that were made before these were options, such as the packaged ones.
+EARLIER_OPTIONS = {"planner_range": 0.0, "simplify": 3}
+
+
+def make_planner(env, options):
+    """A `Planner` with the `PLANNER_OPTIONS` of a collection, or of the file that it made."""
+    options = EARLIER_OPTIONS | options
+    return Planner(env, **{name: options[name] for name in PLANNER_OPTIONS})
 
 
 class Collector:
@@ -91,8 +106,7 @@ class Collector:
     def __init__(self, options):
         self.options = options
         self.env = envs.make(options["task"])
-        limits = {name: options[name] for name in ("time_limit", "max_checks", "clearance")}
-        self.planner = Planner(self.env, options["planner"], **limits)
+        self.planner = make_planner(self.env, options)
 
     def __call__(self, index):
         """Demonstration `index`: a JSON-ready dict with its plan, execution and rejections."""
@@ -246,7 +260,7 @@ def _check(args):
             raise ValueError(f"--{name} must be at least {lowest}")
     with contextlib.closing(envs.make(args.task)) as env:
         # Refuses what a planner refuses, before any work is done.
-        Planner(env, args.planner, args.time_limit, args.max_checks, args.clearance).close()
+        make_planner(env, vars(args)).close()
     check_writable(path)
     if query_path(args.task).exists():
         validate(query_path(args.task), args.task)  # demonstrations must not be of its queries

@@ -51,9 +51,8 @@ MARGIN = 0.003
 # Around a start or goal that is nearer than that, the margin grows by this much (m) per unit of
 # normalised distance from it: all of it is kept again some three steps away.
 MARGIN_GROWTH = 0.03
-# Rounds of removing vertices and cutting corners. Three end 3% shorter than OMPL's simplifyMax on
-# `double_walls`, in the same time; bounded by iterations, not seconds, they are deterministic.
-SIMPLIFY_ROUNDS = 3
+# Trials of cutting a corner in one round of simplification, and how many may fail in a row. Bounded
+# by iterations, unlike OMPL's simplifyMax, which is bounded by seconds, they are deterministic.
 SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS = 50, 25
 
 
@@ -114,10 +113,13 @@ class Planner:
             Asymptotically optimal planners use all of it; FMT and BFMT need more than this.
         clearance: metres that a path keeps from the scene (by inflating it), in addition to
             `MARGIN`. A query that starts or ends nearer is planned without it.
-        simplify: remove vertices and cut corners.
+        planner_range: longest motion (L2, normalised) that the planner tries at once, if it is of
+            those that have such a range; 0 for OMPL's own choice, 1.06. (0.3 was chosen with
+            RRTConnect, docs/demonstrations.md.)
+        simplify: rounds of removing vertices and cutting corners; 0 for none.
 
     Raises:
-        ValueError: unknown planner, or a limit that is not positive.
+        ValueError: unknown planner, a limit that is not positive, or another number out of range.
     """
 
     def __init__(
@@ -127,7 +129,8 @@ class Planner:
         time_limit=10.0,
         max_checks=30_000,
         clearance=0.005,
-        simplify=True,
+        planner_range=0.3,
+        simplify=1,
     ):
         if not callable(planner) and planner not in PLANNERS:
             raise ValueError(f"unknown planner {planner!r}: one of {', '.join(PLANNERS)}")
@@ -136,9 +139,14 @@ class Planner:
                 raise ValueError(f"{name} must be positive, got {value!r}")
         if not 0 <= clearance < 0.5:
             raise ValueError(f"clearance must be in [0, 0.5) m, got {clearance!r}")
+        if not 0 <= planner_range < math.inf:
+            raise ValueError(f"planner_range must be 0 or positive, got {planner_range!r}")
+        if not (simplify >= 0 and simplify == int(simplify)):
+            raise ValueError(f"simplify must be a number of rounds, got {simplify!r}")
         self.env, self.planner = env, planner
         self.time_limit, self.max_checks = time_limit, max_checks
-        self.clearance, self.simplify = clearance, simplify
+        self.clearance = clearance
+        self.planner_range, self.simplify = planner_range, simplify
         self._inflated = RoboArmEnv(inflate(env.scene, clearance)) if clearance > 0 else None
         self.checks = 0
         """Collision checks of the last plan."""
@@ -179,9 +187,10 @@ class Planner:
             path = self.planner(is_valid, *states, np.random.default_rng(seed))
             path = None if path is None else _checked(path, *states)
         else:
-            path = _solve(getattr(og, self.planner), space, is_valid, *states)
+            kind = getattr(og, self.planner)
+            path = _solve(kind, self.planner_range, space, is_valid, *states)
         if path is not None and self.simplify:
-            path = _simplify(space, path)
+            path = _simplify(space, path, self.simplify)
         self.checks = is_valid.checks
         if path is None:
             raise PlanningError(
@@ -248,23 +257,25 @@ def _state(space, values):
     return state
 
 
-def _solve(kind, space, is_valid, start, goal):
+def _solve(kind, planner_range, space, is_valid, start, goal):
     """Normalised path (n, 7) by one of OMPL's planners; None if there was none in time."""
     problem = ob.ProblemDefinition(space)
     problem.setStartAndGoalStates(_state(space, start), _state(space, goal))
     planner = kind(space)
     planner.setProblemDefinition(problem)
+    if hasattr(planner, "setRange"):
+        planner.setRange(planner_range)
     planner.setup()
     planner.solve(ob.PlannerTerminationCondition(is_valid.exhausted))
     return _to_array(problem.getSolutionPath()) if problem.hasExactSolution() else None
 
 
-def _simplify(space, path):
+def _simplify(space, path, rounds):
     geometric = og.PathGeometric(space)
     for state in path:
         geometric.append(_state(space, state))
     simplifier = og.PathSimplifier(space)
-    for _ in range(SIMPLIFY_ROUNDS):
+    for _ in range(rounds):
         simplifier.reduceVertices(geometric, 0, 0)
         simplifier.partialShortcutPath(geometric, SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS)
     simplifier.collapseCloseVertices(geometric)

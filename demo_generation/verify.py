@@ -17,8 +17,9 @@ import tyro
 from tqdm import tqdm
 
 from demo_generation import workers
+from demo_generation.collect import make_planner
 from demo_generation.following import follow
-from demo_generation.planning import Planner, PlanningError
+from demo_generation.planning import PlanningError
 from envs.arm_env import RoboArmEnv
 from envs.datasets import DatasetError, demo_path, load_demos, write_demos
 from envs.tasks import is_task
@@ -46,8 +47,7 @@ class Verifier:
         self.env = RoboArmEnv(self.demos.scenes.base)
         options = self.demos.parameters["options"]
         self.allow_collisions = options["allow_collisions"]
-        limits = {name: options[name] for name in ("time_limit", "max_checks", "clearance")}
-        self.planner = Planner(self.env, options["planner"], **limits)
+        self.planner = make_planner(self.env, options)
 
     def __call__(self, index):
         """`(index, verdict, demo)`: one of `VERDICTS`, and, with `mend`, what to store.

@@ -164,6 +164,18 @@ def test_the_file_says_how_to_make_it_again(whole):
     assert demos.parameters["options"] == options()
 
 
+@pytest.mark.parametrize("task", ["double_walls", "random_boxes_hard"])
+def test_packaged_demonstrations_are_made_again_by_their_flags(task):
+    packaged = load_demos(task)
+    again = collect.Collector(options(task=task, planner_range=0.0, simplify=3))
+    assert {**collect.EARLIER_OPTIONS, **packaged.parameters["options"]} == again.options
+    for index in (0, 1, 4_321):
+        demo = again(index)
+        assert demo["digest"] == packaged[index].digest
+        assert demo["plan_seed"] == packaged.plan_seed[index]
+        assert collect._decode(demo["plan"]).tobytes() == packaged[index].plan.tobytes()
+
+
 def test_rejected_attempts_are_counted(output):
     tight = options(max_checks=300, attempts=1)
     counts = collect.collect(output, 4, tight, progress=False)
@@ -352,6 +364,8 @@ def refusal(args):
         ({"max_checks": 0}, "max_checks must be positive"),
         ({"time_limit": -1.0}, "time_limit must be positive"),
         ({"clearance": -0.1}, "clearance must be in"),
+        ({"planner_range": -1.0}, "planner_range must be 0 or positive"),
+        ({"simplify": -1}, "simplify must be a number of rounds"),
         ({"output": Path("missing/demos.h5")}, "cannot write .*missing/demos.h5: No such file"),
         ({"output": Path(".")}, "is a directory"),
     ],
@@ -591,7 +605,7 @@ def test_collisions_are_rejected_unless_allowed(output, straight):
     allowed, clean = (collect.Collector(options(allow_collisions=yes)) for yes in (True, False))
     for collector in (allowed, clean):
         collector.planner = Planner(collector.env, lambda _, *ends: np.stack(ends[:2]))
-        collector.planner.simplify = False
+        collector.planner.simplify = 0
     index = next(index for index in range(60) if allowed(index)["collided"])
     made = clean(index)
     assert not made["collided"] and made["given_up"] >= 1

@@ -26,6 +26,8 @@ OPTIONS = {
     "time_limit": 10.0,
     "max_checks": 100_000,
     "clearance": 0.005,
+    "planner_range": 0.3,
+    "simplify": 1,
     "attempts": 3,
     "allow_collisions": False,
 }
