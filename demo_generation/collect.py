@@ -60,7 +60,7 @@ class Args:
     """Collision checks for one plan (some 25 us each)."""
     clearance: float = 0.005
     """Metres that plans keep from the scene, where start and goal do."""
-    planner_range: float = 0.3
+    planner_range: float = 0.4
     """Longest motion (normalised) that the planner tries at once; 0 for OMPL's choice."""
     simplify: int = 1
     """Rounds of removing vertices of a plan and cutting its corners."""

@@ -76,8 +76,8 @@ class Validity:
 
     def __call__(self, state):
         self.checks += 1
-        state = np.array([state[i] for i in range(panda.NUM_JOINTS)])
-        nearest = clearance_at(self._env, panda.denormalise(state).tolist())
+        state = [state[i] for i in range(panda.NUM_JOINTS)]
+        nearest = clearance_at(self._env, panda.denormalise_one(state))
         return nearest >= self._margin or any(
             nearest >= clearance + MARGIN_GROWTH * math.dist(state, end)
             for end, clearance in self._ends
@@ -114,7 +114,7 @@ class Planner:
         clearance: metres that a path keeps from the scene (by inflating it), in addition to
             `MARGIN`. A query that starts or ends nearer is planned without it.
         planner_range: longest motion (L2, normalised) that the planner tries at once, if it is of
-            those that have such a range; 0 for OMPL's own choice, 1.06. (0.3 was chosen with
+            those that have such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with
             RRTConnect, docs/demonstrations.md.)
         simplify: rounds of removing vertices and cutting corners; 0 for none.
 
@@ -129,7 +129,7 @@ class Planner:
         time_limit=10.0,
         max_checks=30_000,
         clearance=0.005,
-        planner_range=0.3,
+        planner_range=0.4,
         simplify=1,
     ):
         if not callable(planner) and planner not in PLANNERS:

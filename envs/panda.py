@@ -46,6 +46,15 @@ def denormalise(state):
     return (np.asarray(state) * _RANGE + _MID) / 2.0
 
 
+_MID_AND_RANGE = list(zip(_MID.tolist(), _RANGE.tolist(), strict=True))
+
+
+def denormalise_one(state):
+    """`denormalise` of one configuration, seven floats, as a list: faster than NumPy."""
+    pairs = zip(state, _MID_AND_RANGE, strict=True)
+    return [(value * width + mid) / 2.0 for value, (mid, width) in pairs]
+
+
 # Fixed transforms between joint frames in the URDF: (x, y, z, roll about x), then the joint turns
 # about its own z.
 _JOINT_FRAMES = (

@@ -6,8 +6,11 @@
 PointNet++ (Qi et al., 2017) as in the paper's appendix "Training and verifying the encoders": a
 network per sensor says of each point what it lies on: robot, table or floor, or another obstacle.
 Set abstraction (farthest point sampling, ball query) makes 16 numbers of a cloud; feature
-propagation classifies the points from these numbers and the points' places alone, without the
-usual skip connections, which would lead around them. What is saved, `encoder.pt`, is a program
+propagation classifies points from these numbers and the points' places alone, without the usual
+skip connections, which would lead around them. A point's place says most of its class, so it would
+hardly need the numbers; that is why it is also asked about points of another scene's obstacles,
+and has to say that nothing is there. Places enter as waves too (sines and cosines, as in NeRF),
+without which it learns next to nothing in the time. What is saved, `encoder.pt`, is a program
 (`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an encoder
 of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
 `# END SHARED` are those of `vae.py`.
@@ -32,7 +35,11 @@ from tqdm import tqdm
 from envs.datasets import DatasetError
 from envs.observations import Observations, sensors_to_json
 from envs.programs import save_program
-from envs.sensors import NOTHING, PointCloud
+from envs.sensors import NOTHING, OBSTACLE, PointCloud
+
+TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
+APART = 0.05  # m between a cloud and what counts as not being in it
+IGNORED = -100  # label of points that have no class
 
 
 @dataclass
@@ -62,22 +69,26 @@ class Args:
     # The algorithm
     total_updates: int = 10_000
     """batches of the whole run"""
-    batch_size: int = 16
+    batch_size: int = 32
     """scenes per batch"""
     learning_rate: float = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
     latent_size: int = 16
     """numbers per sensor (paper: 16)"""
-    num_points: int = 1024
-    """points of a cloud that the network gets, evenly spaced among those that hit something"""
-    num_centres: tuple[int, int] = (128, 32)
+    num_points: int = 256
+    """points that the network gets, evenly spaced among those of a cloud above the table"""
+    num_queries: int = 192
+    """points that it classifies per cloud and batch"""
+    num_centres: tuple[int, int] = (32, 12)
     """points that farthest point sampling leaves, level by level"""
     radii: tuple[float, float] = (0.15, 0.4)
     """radius (m) of the ball query around each of them"""
     num_neighbours: int = 16
     """points that a ball query finds at most"""
+    num_waves: int = 4
+    """wavelengths with which places are described: 2 m, 1 m, ..."""
     width: int = 32
-    """features at the first level; each further one has twice as many"""
+    """features at the first level; further ones have more"""
 
     # SHARED: bookkeeping
     eval_every: int = 2_000
@@ -97,53 +108,63 @@ def configuration_of(args):
 # END SHARED
 
 
-def load_clouds(observations):
-    """What the point cloud sensors saw, and the sensors' names.
+def load_clouds(observations, num_points):
+    """Points of what the point cloud sensors saw, and the sensors' names.
 
     Returns:
-        `depth` uint16 and `segmentation` uint8, both (scenes, sensors, edge, edge), unpacked once
-        into files beside the shards and mapped into memory; and the names.
+        Points, float32 (scenes, sensors, 2, num_points, 3), m, and labels, uint8 (scenes, sensors,
+        2, num_points), chosen once, into files beside the shards, and mapped into memory: evenly
+        spaced among those that hit something, and among those of them above the table. And the
+        names.
     """
     names = [name for name, one in observations.sensors.items() if isinstance(one, PointCloud)]
     if not names:
         sys.exit(f"--observations: {observations.folder} has no clouds (collect with --sensors)")
-    if len({observations.sensors[name].num_samples for name in names}) > 1:
-        sys.exit(f"--observations: {observations.folder}: the sensors differ in num_samples")
-    edge = math.isqrt(observations.sensors[names[0]].num_samples)
-    arrays = []
-    for output, dtype in (("depth", np.uint16), ("segmentation", np.uint8)):
-        path = observations.folder / f"{output}_{len(observations)}.npy"
-        if not path.exists():
-            temporary = path.with_suffix(".part")
-            shape = (len(observations), len(names), edge, edge)
-            unpacked = np.lib.format.open_memmap(temporary, "w+", dtype, shape)
-            for shard in tqdm(range(len(observations.offsets) - 1), desc=output, unit="shard"):
-                rows = slice(*observations.offsets[shard : shard + 2])
-                for i, name in enumerate(names):
-                    unpacked[rows, i] = observations.read(shard, f"{name}/{output}")
-            unpacked.flush()
-            os.replace(temporary, path)
-        arrays.append(np.load(path, mmap_mode="r"))
-    return *arrays, names
+    start = observations.folder / f"clouds_{len(observations)}_{num_points}"
+    paths = [start.with_name(f"{start.name}_{output}.npy") for output in ("points", "labels")]
+    if not all(path.exists() for path in paths):
+        shape = (len(observations), len(names), 2, num_points)
+        temporary = [path.with_suffix(".part") for path in paths]
+        points = np.lib.format.open_memmap(temporary[0], "w+", np.float32, (*shape, 3))
+        labels = np.lib.format.open_memmap(temporary[1], "w+", np.uint8, shape)
+        for shard in tqdm(range(len(observations.offsets) - 1), desc="clouds", unit="shard"):
+            rows = slice(*observations.offsets[shard : shard + 2])
+            for i, name in enumerate(names):
+                cloud = whole_clouds(observations, shard, name)
+                chosen = torch.stack([thin_out(one, num_points) for one in hits(*cloud)], dim=1)
+                points[rows, i] = gather(cloud[0], chosen)
+                labels[rows, i] = gather(cloud[1].unsqueeze(2), chosen).squeeze(-1)
+        for array, old, new in zip((points, labels), temporary, paths, strict=True):
+            array.flush()
+            os.replace(old, new)
+    return *(np.load(path, mmap_mode="r") for path in paths), names
 
 
-def batch_of(clouds, rows, sensors, device):
-    """Rows of `load_clouds`'s arrays as the sensors give them, by name: points and labels.
+def whole_clouds(observations, shard, name):
+    """All that a sensor saw in the scenes of a shard, as `envs.sensors.PointCloud.points` has it.
 
-    Each float32 (n, samples, 3), m, and int64 (n, samples); see `envs.sensors.PointCloud.points`.
+    Points, float32 (n, samples, 3), and labels, uint8 (n, samples).
     """
-    depths, segmentations, names = clouds
-    batch, rows = {}, np.sort(rows)
-    for i, name in enumerate(names):
-        sensor = sensors[name]
-        depth = depths[rows, i] * (sensor.far / 65_535)
-        seen = [sensor.points(*one) for one in zip(depth, segmentations[rows, i], strict=True)]
-        points, labels = (np.stack([one[key] for one in seen]) for key in ("points", "labels"))
-        batch[name] = (
-            torch.as_tensor(points, device=device),
-            torch.as_tensor(labels, device=device).long(),
-        )
-    return batch
+    sensor = observations.sensors[name]
+    pictures = (
+        observations.read(shard, f"{name}/{output}") for output in ("depth", "segmentation")
+    )
+    seen = [
+        sensor.points(depth * (sensor.far / 65_535), segmentation)
+        for depth, segmentation in zip(*pictures, strict=True)
+    ]
+    return tuple(
+        torch.from_numpy(np.stack([one[key] for one in seen])) for key in ("points", "labels")
+    )
+
+
+def batch_of(clouds, rows, device):
+    """Rows of `load_clouds`'s arrays: a list of (points, labels) per sensor, labels int64."""
+    points, labels, names = clouds
+    rows = np.sort(rows)
+    points = torch.as_tensor(points[rows], device=device)
+    labels = torch.as_tensor(labels[rows], device=device).long()
+    return [(points[:, i], labels[:, i]) for i in range(len(names))]
 
 
 # MODEL
@@ -153,14 +174,22 @@ def gather(values, indices):
     return torch.gather(values, 1, flat).unflatten(1, indices.shape[1:])
 
 
-def thin_out(labels, num_points):
-    """Indices (n, num_points) of points evenly spaced among those that hit something.
+def hits(points, labels):
+    """Which points (n, p, 3), labels (n, p), hit something, and which of them above the table."""
+    hit = labels != NOTHING
+    return hit, hit & (points[:, :, 2] > TABLE_TOP)
 
-    `labels` (n, samples): these come first. If there are fewer, points are repeated.
+
+def thin_out(mask, number):
+    """Indices (n, number) evenly spaced among those where mask (n, p) is true.
+
+    If there are fewer, they are repeated; if there are none, it is the first index.
     """
-    counts = (labels != NOTHING).sum(1, keepdim=True).clamp(min=1)
-    steps = torch.arange(num_points, device=labels.device)
-    return (steps * counts).div(num_points, rounding_mode="floor")
+    index = torch.arange(mask.shape[1], device=mask.device)
+    order = (index + mask.shape[1] * ~mask).argsort(1)  # those first
+    steps = torch.arange(number, device=mask.device)
+    counts = mask.sum(1, keepdim=True).clamp(min=1)
+    return order.gather(1, (steps * counts).div(number, rounding_mode="floor"))
 
 
 def farthest_point_sampling(points, number):
@@ -201,20 +230,24 @@ def mlp(*sizes):
     return nn.Sequential(*layers)
 
 
+def waves(places, number):
+    """Places (..., 3), m, and their sines and cosines, wavelengths 2, 1, ... m: 3 + 6 number."""
+    angles = torch.cat([places * (math.pi * 2**k) for k in range(number)], dim=-1)
+    return torch.cat([places, angles.sin(), angles.cos()], dim=-1)
+
+
 class Encoder(nn.Module):
-    """Set abstraction: a cloud (n, p, 3), m -> its latent (n, latent), and each level's points."""
+    """Set abstraction: a cloud (n, p, 3), m -> its latent (n, latent)."""
 
     def __init__(self, args):
         super().__init__()
         self.args, width = args, args.width
-        self.levels = nn.ModuleList(
-            [mlp(3, width, width, 2 * width), mlp(2 * width + 3, 2 * width, 4 * width)]
-        )
-        self.top = mlp(4 * width + 3, 4 * width, 8 * width)
+        self.levels = nn.ModuleList([mlp(3, width, 2 * width), mlp(2 * width + 3, 4 * width)])
+        self.top = mlp(4 * width + 3 + 6 * args.num_waves, 8 * width)
         self.head = nn.Linear(8 * width, args.latent_size)
 
     def forward(self, points):
-        features, places = None, [points]
+        features = None
         for level, number, radius in zip(
             self.levels, self.args.num_centres, self.args.radii, strict=True
         ):
@@ -225,31 +258,59 @@ class Encoder(nn.Module):
             if features is not None:
                 inputs = torch.cat([inputs, gather(features, neighbours)], dim=3)
             features, points = level(inputs).amax(2), centres
-            places.append(points)
-        features = self.top(torch.cat([points, features], dim=2)).amax(1)
-        return self.head(features), places
+        places = waves(points, self.args.num_waves)
+        return self.head(self.top(torch.cat([places, features], dim=2)).amax(1))
 
 
 class Decoder(nn.Module):
-    """Feature propagation: a latent (n, latent), the levels' points -> logits (n, p, classes)."""
+    """Feature propagation: a latent (n, latent), points (n, p, 3) -> logits (n, p, classes + 1).
+
+    The last class: nothing is there. Its levels are made of the points that it is asked about;
+    those of the encoder would say where the cloud is.
+    """
 
     def __init__(self, args):
         super().__init__()
-        width = args.width
-        self.top = mlp(args.latent_size + 3, 4 * width, 4 * width)
+        self.args, width = args, args.width
+        given = args.latent_size + 3 + 6 * args.num_waves
+        self.top = mlp(given, 4 * width, 4 * width)
         self.levels = nn.ModuleList(
-            [mlp(4 * width + 3, 4 * width, 2 * width), mlp(2 * width + 3, 2 * width, 2 * width)]
+            [
+                mlp(given + 4 * width, 4 * width, 4 * width),
+                mlp(given + 4 * width, 4 * width, 2 * width),
+            ]
         )
-        self.head = nn.Linear(2 * width, NOTHING)
+        self.head = nn.Linear(2 * width, NOTHING + 1)
 
-    def forward(self, latent, places):
+    def forward(self, latent, points):
+        places = [points]
+        for number in self.args.num_centres:
+            places.append(gather(places[-1], farthest_point_sampling(places[-1], number)))
         *finer, points = places
-        spread = latent.unsqueeze(1).expand(-1, points.shape[1], -1)
-        features = self.top(torch.cat([points, spread], dim=2))
+        features = self.top(self.given(latent, points))
         for level, onto in zip(self.levels, reversed(finer), strict=True):
-            features = level(torch.cat([onto, interpolate(features, points, onto)], dim=2))
-            points = onto
+            near = interpolate(features, points, onto)
+            features, points = level(torch.cat([self.given(latent, onto), near], dim=2)), onto
         return self.head(features)
+
+    def given(self, latent, points):
+        spread = latent.unsqueeze(1).expand(-1, points.shape[1], -1)
+        return torch.cat([waves(points, self.args.num_waves), spread], dim=2)
+
+
+def queries_of(points, labels):
+    """Points to classify (n, 3p, 3) and their classes (n, 3p), of `batch_of`'s for one sensor.
+
+    The scene's own, (n, 2, p), and those above the table of the scene before it in the batch: where
+    these are of an obstacle, and nothing is near, they have the class `NOTHING`. Points without a
+    class are `IGNORED`.
+    """
+    own, classes = points.flatten(1, 2), labels.flatten(1, 2)
+    others = points[:, 1].roll(1, dims=0)
+    absent = (labels[:, 1].roll(1, dims=0) == OBSTACLE) & (torch.cdist(others, own).amin(2) > APART)
+    truth = [torch.where(classes == NOTHING, IGNORED, classes)]
+    truth.append(torch.where(absent, NOTHING, IGNORED))
+    return torch.cat([own, others], dim=1), torch.cat(truth, dim=1)
 
 
 class PointNet2(nn.Module):
@@ -261,16 +322,21 @@ class PointNet2(nn.Module):
         self.encoders = nn.ModuleList(Encoder(args) for _ in range(num_sensors))
         self.decoders = nn.ModuleList(Decoder(args) for _ in range(num_sensors))
 
-    def forward(self, clouds):
-        """A list of (points, labels) per sensor -> lists of logits (n, p, 3) and labels (n, p)."""
+    def forward(self, clouds, num_queries=None):
+        """Of `batch_of`'s list, per sensor: lists of logits (n, q, 4) and classes (n, q).
+
+        Of all of `queries_of`, or of `num_queries` of them, by chance.
+        """
         logits, truth = [], []
         for (points, labels), encoder, decoder in zip(
             clouds, self.encoders, self.decoders, strict=True
         ):
-            chosen = thin_out(labels, self.num_points)
-            latent, places = encoder(gather(points, chosen))
-            logits.append(decoder(latent, places))
-            truth.append(labels.gather(1, chosen))
+            queries, classes = queries_of(points, labels)
+            if num_queries is not None:
+                chosen = torch.randperm(queries.shape[1], device=queries.device)[:num_queries]
+                queries, classes = queries[:, chosen], classes[:, chosen]
+            logits.append(decoder(encoder(points[:, 1]), queries))
+            truth.append(classes)
         return logits, truth
 
 
@@ -286,8 +352,9 @@ class SceneEncoder(nn.Module):
     def forward(self, **clouds):
         latents = []
         for name, encoder in zip(self.names, self.encoders, strict=True):
-            chosen = thin_out(clouds[f"{name}_labels"], self.num_points)
-            latents.append(encoder(gather(clouds[f"{name}_points"], chosen))[0])
+            points = clouds[f"{name}_points"]
+            _, above = hits(points, clouds[f"{name}_labels"])
+            latents.append(encoder(gather(points, thin_out(above, self.num_points))))
         return torch.cat(latents, dim=1)
 
 
@@ -328,21 +395,33 @@ def parse_args():
 
 
 @torch.no_grad()
-def evaluate(model, clouds, rows, sensors, batch_size, device):
-    """Accuracy, and intersection over union of each class, over all points of scenes `rows`."""
+def evaluate(model, clouds, rows, batch_size, device):
+    """How well points of scenes `rows` are classified.
+
+    Returns:
+        `accuracy` and the intersection over union of each class, `iou_robot`, `iou_static`,
+        `iou_obstacle`, over points evenly spaced among those that hit something; and `absent`, the
+        share of other scenes' points of which it is said that nothing is there.
+    """
     model.eval()
-    confusion = torch.zeros(NOTHING * NOTHING, dtype=torch.int64)
+    number = clouds[0].shape[3]
+    confusion = torch.zeros(NOTHING, NOTHING + 1, dtype=torch.int64)  # truth, prediction
+    told = asked = 0
     for start in range(0, len(rows), batch_size):
-        batch = batch_of(clouds, rows[start : start + batch_size], sensors, device)
-        for logits, truth in zip(*model(list(batch.values())), strict=True):
-            hit = truth != NOTHING  # an empty cloud has none
-            pairs = NOTHING * truth[hit] + logits.argmax(2)[hit]
-            confusion += torch.bincount(pairs, minlength=len(confusion)).cpu()
+        batch = batch_of(clouds, rows[start : start + batch_size], device)
+        for logits, truth in zip(*model(batch), strict=True):
+            predicted = logits.argmax(2)
+            own, said = truth[:, :number], predicted[:, :number]
+            hit = own != IGNORED
+            pairs = (NOTHING + 1) * own[hit] + said[hit]
+            confusion += torch.bincount(pairs, minlength=confusion.numel()).cpu().view(NOTHING, -1)
+            absent = truth == NOTHING
+            asked, told = asked + absent.sum(), told + (predicted == NOTHING)[absent].sum()
     model.train()
-    confusion = confusion.reshape(NOTHING, NOTHING).double()  # truth, prediction
     both = confusion.diagonal()
-    iou = both / (confusion.sum(0) + confusion.sum(1) - both).clamp(min=1)
+    iou = both / (confusion[:, :NOTHING].sum(0) + confusion.sum(1) - both).clamp(min=1)
     result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
+    result["absent"] = float(told) / max(1.0, float(asked))
     names = ("iou_robot", "iou_static", "iou_obstacle")
     return result | dict(zip(names, iou.tolist(), strict=True))
 
@@ -377,7 +456,7 @@ if __name__ == "__main__":
     except DatasetError as error:
         sys.exit(f"--observations: {error}")
     # END SHARED
-    clouds = load_clouds(observations)
+    clouds = load_clouds(observations, args.num_points)
     sensors = {name: observations.sensors[name] for name in clouds[2]}
 
     # SHARED: folder and seeds
@@ -453,9 +532,9 @@ if __name__ == "__main__":
         remaining = 1.0 - progress["updates"] / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         rows = rng.integers(num_training, size=args.batch_size)
-        logits, truth = model(list(batch_of(clouds, rows, sensors, device).values()))
+        logits, truth = model(batch_of(clouds, rows, device), args.num_queries)
         loss = F.cross_entropy(
-            torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=NOTHING
+            torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=IGNORED
         )
         optimizer.zero_grad()
         loss.backward()
@@ -471,28 +550,31 @@ if __name__ == "__main__":
 
         # Evaluate, keep the best encoder
         if step % args.eval_every == 0 or step == args.total_updates:
-            result = evaluate(model, clouds, validation, sensors, args.batch_size, device)
+            result = evaluate(model, clouds, validation, args.batch_size, device)
             for name, value in result.items():
                 writer.add_scalar(f"eval/{name}", value, step)
-            shown = batch_of(clouds, validation[:2], sensors, device)
+            points, labels = batch_of(clouds, validation[:1], device)[0]
             with torch.no_grad():
-                logits, truth = model(list(shown.values()))
-            first = next(iter(shown.values()))
-            points = gather(first[0], thin_out(first[1], args.num_points))[0]
-            predicted = torch.where(truth[0] != NOTHING, logits[0].argmax(2), NOTHING)
-            picture = comparison(*(a.cpu().numpy() for a in (points, truth[0][0], predicted[0])))
+                own = points.flatten(1, 2)
+                predicted = model.decoders[0](model.encoders[0](points[:, 1]), own).argmax(2)
+            labels = labels.flatten(1, 2)
+            predicted = torch.where(labels != NOTHING, predicted, NOTHING)
+            picture = comparison(*(a[0].cpu().numpy() for a in (own, labels, predicted)))
             writer.add_image("eval/classification", picture, step, dataformats="HWC")
-            if 1 - result["iou_obstacle"] < progress["best_error"]:
-                progress["best_error"], progress["best_update"] = 1 - result["iou_obstacle"], step
+            error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
+            if error < progress["best_error"]:
+                progress["best_error"], progress["best_update"] = error, step
                 example = {}
-                for name, (points, labels) in shown.items():
-                    example |= {f"{name}_points": points, f"{name}_labels": labels.byte()}
+                for name in sensors:
+                    points, labels = (one[:2] for one in whole_clouds(observations, 0, name))
+                    example[f"{name}_points"] = points.to(device)
+                    example[f"{name}_labels"] = labels.to(device)
                 metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
                 metadata |= {"sensors": sensors_to_json(sensors)}
                 metadata |= {"seed": args.seed, "step": step, **result}
                 save_program(run / "encoder.pt", SceneEncoder(model, clouds[2]), example, metadata)
                 progress["best"] = result
-            bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}")
+            bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
             # SHARED: checkpoint
             progress["seconds"] = seconds_before + time.time() - started
             save_checkpoint()
@@ -505,6 +587,6 @@ if __name__ == "__main__":
     write_atomically(run / "result.json", lambda path: path.write_text(text))
     # END SHARED
     shown = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor {iou_static:.3f}, "
-    shown += "obstacles {iou_obstacle:.3f}"
+    shown += "obstacles {iou_obstacle:.3f}; of other scenes' obstacles {absent:.3f} told"
     print(f"{shown.format(**result)}. {run / 'result.json'}")
     writer.close()

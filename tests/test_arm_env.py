@@ -40,6 +40,8 @@ def test_normalisation_is_the_papers_formula_both_ways():
     m, M = panda.LOWER, panda.UPPER
     np.testing.assert_allclose(panda.normalise(c), (2 * c - (M + m)) / (M - m), atol=1e-12)
     np.testing.assert_allclose(panda.denormalise(panda.normalise(c)), c, atol=1e-12)
+    for one in panda.normalise(c):  # the same to the last bit
+        assert panda.denormalise_one(one.tolist()) == panda.denormalise(one).tolist()
     np.testing.assert_allclose(panda.normalise(m), -np.ones(7), atol=1e-12)
     np.testing.assert_allclose(panda.normalise(M), np.ones(7), atol=1e-12)
 
