@@ -23,6 +23,7 @@ from envs.encoders import MAX_OBSTACLES, PACKAGED, SceneEncoder, oracle
 from envs.observations import Observations
 from envs.programs import ProgramError, load_program, save_program
 from envs.scenes import Scene, Sphere, from_array
+from envs.sensors import PointCloud
 from envs.wrappers import SceneEncodingWrapper
 from scene_embedding_train import collect
 
@@ -31,6 +32,7 @@ SCRIPTS = ("vae", "vqvae", "pointnet2")
 TINY = ["--total-updates", "12", "--eval-every", "4", "--eval-scenes", "6", "--batch-size", "8"]
 TINY += ["--width", "4", "--validation-share", "0.3"]
 TINY_CLOUDS = ["--num-points", "64", "--num-centres", "16", "8", "--num-neighbours", "4"]
+TINY_CLOUDS += ["--num-queries", "50"]
 
 
 def load(name):
@@ -172,10 +174,50 @@ def test_images_are_those_of_the_shards(observations):
 
 
 def test_points_are_thinned_out_evenly():
-    labels = torch.full((3, 50), pointnet2.NOTHING)
-    labels[0, :40], labels[1, :4] = 1, 2
-    chosen = pointnet2.thin_out(labels, 8)
-    assert chosen.tolist() == [[0, 5, 10, 15, 20, 25, 30, 35], [0, 0, 1, 1, 2, 2, 3, 3], [0] * 8]
+    mask = torch.zeros(3, 50, dtype=torch.bool)
+    mask[0, 5:45], mask[1, [3, 9, 20, 40]] = True, True
+    chosen = pointnet2.thin_out(mask, 8)
+    assert chosen[:2].tolist() == [
+        [5, 10, 15, 20, 25, 30, 35, 40],
+        [3, 3, 9, 9, 20, 20, 40, 40],
+    ]
+    assert chosen[2].tolist() == [0] * 8
+
+
+def test_clouds_are_thinned_out_once(observations):
+    read = Observations(observations)
+    points, labels, names = pointnet2.load_clouds(read, 64)
+    assert points.shape == (20, 4, 2, 64, 3) and labels.shape == (20, 4, 2, 64)
+    for i, name in enumerate(names):
+        cloud, classes = (one[3].numpy() for one in pointnet2.whole_clouds(read, 1, name))
+        hit = classes != pointnet2.NOTHING
+        for half, mask in enumerate((hit, hit & (cloud[:, 2] > pointnet2.TABLE_TOP))):
+            chosen = np.flatnonzero(mask)[np.arange(64) * mask.sum() // 64]
+            np.testing.assert_array_equal(points[11, i, half], cloud[chosen])
+            np.testing.assert_array_equal(labels[11, i, half], classes[chosen])
+
+
+def test_what_is_asked_about():
+    points, labels = torch.rand(3, 2, 5, 3) + 1.0, torch.full((3, 2, 5), 1)
+    labels[0, 1, :3], labels[0, 0, 0] = pointnet2.OBSTACLE, pointnet2.NOTHING
+    points[0, 1, 0] = -4.0  # far from scene 1
+    points[0, 1, 1] = points[1, 1, 4] + torch.tensor([0.0, 0.03, 0.0])  # near it
+    points[0, 1, 2] = points[1, 0, 4] + torch.tensor([0.0, 9.0, 0.0])
+    queries, classes = pointnet2.queries_of(points, labels)
+    assert torch.equal(queries[:, :10], points.flatten(1, 2))
+    assert torch.equal(queries[1, 10:], points[0, 1]) and torch.equal(queries[0, 10:], points[2, 1])
+    nothing, ignored = pointnet2.NOTHING, pointnet2.IGNORED
+    assert classes[0].tolist() == [ignored, 1, 1, 1, 1, 2, 2, 2, 1, 1] + [ignored] * 5
+    assert classes[1].tolist() == [1] * 10 + [nothing, ignored, nothing, ignored, ignored]
+    assert classes[2].tolist() == [1] * 10 + [ignored] * 5
+
+
+def test_waves_of_places():
+    places = torch.tensor([[0.5, -0.25, 2.0]])
+    found = pointnet2.waves(places, 2)[0]
+    angles = np.concatenate([np.pi * places[0].numpy(), 2 * np.pi * places[0].numpy()])
+    expected = np.concatenate([places[0].numpy(), np.sin(angles), np.cos(angles)])
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_farthest_point_sampling_against_a_loop():
@@ -212,27 +254,35 @@ def test_interpolation_is_exact_at_centres_and_a_mean_between():
 
 
 def test_scores_of_the_classification(observations):
-    read = Observations(observations)
-    clouds = pointnet2.load_clouds(read)
+    clouds = pointnet2.load_clouds(Observations(observations), 64)
+    nothing, ignored = pointnet2.NOTHING, pointnet2.IGNORED
 
     class Guess(torch.nn.Module):
-        """Says `obstacle` of every third point, and the truth of the others."""
+        """Says `obstacle` of every third point, `nothing` of every fifth, of others the truth."""
 
         def forward(self, batch):
             logits, truth = [], []
-            for _, labels in batch:
-                guess = labels.clamp(max=2)
+            for points, labels in batch:
+                _, classes = pointnet2.queries_of(points, labels)
+                guess = classes.clamp(min=0)
+                guess[:, ::5] = nothing
                 guess[:, ::3] = 2
-                logits.append(torch.nn.functional.one_hot(guess, 3).float())
-                truth.append(labels)
+                logits.append(torch.nn.functional.one_hot(guess, 4).float())
+                truth.append(classes)
             return logits, truth
 
-    found = pointnet2.evaluate(Guess(), clouds, np.arange(5), read.sensors, 2, "cpu")
-    batch = pointnet2.batch_of(clouds, np.arange(5), read.sensors, "cpu")
-    truth = torch.stack([labels for _, labels in batch.values()])
-    guess = truth.clone()
-    guess[:, :, ::3] = 2
-    hit = truth != 3
+    found = pointnet2.evaluate(Guess(), clouds, np.arange(6), 3, "cpu")
+    truths, guesses = [], []
+    for rows in (np.arange(3), np.arange(3, 6)):
+        for one, truth in zip(*Guess()(pointnet2.batch_of(clouds, rows, "cpu")), strict=True):
+            guesses.append(one.argmax(2))
+            truths.append(truth)
+    truth, guess = torch.cat(truths), torch.cat(guesses)
+    absent = truth == nothing
+    assert 0 < found["absent"] < 1 and absent.sum() > 50
+    assert found["absent"] == pytest.approx((guess == nothing)[absent].float().mean().item())
+    truth, guess = truth[:, :64], guess[:, :64]
+    hit = truth != ignored
     assert found["accuracy"] == pytest.approx((guess == truth)[hit].float().mean().item())
     for number, name in enumerate(("robot", "static", "obstacle")):
         both = ((guess == number) & (truth == number))[hit].sum()
@@ -273,7 +323,7 @@ def test_a_run_leaves_an_encoder_a_result_and_events(run):
     (picture,) = events.Tags()["images"]
     image = events.Images(picture)[0]
     if name == "pointnet2":
-        figures = {"accuracy", "iou_robot", "iou_static", "iou_obstacle"}
+        figures = {"accuracy", "iou_robot", "iou_static", "iou_obstacle", "absent"}
         assert (image.width, image.height) == (2 * 160, 160)
     else:
         figures = {"error", "error_foreground", "mean_image_error", "mean_image_error_foreground"}
@@ -307,12 +357,12 @@ def test_the_saved_encoder_needs_no_script(run, observations):
     assert encoder.metadata["kind"] == "encoder"
     read = Observations(observations)
     if name == "pointnet2":
-        clouds = pointnet2.load_clouds(read)
         inputs = {}
-        for sensor, (points, labels) in pointnet2.batch_of(
-            clouds, np.arange(20), read.sensors, "cpu"
-        ).items():
-            inputs |= {f"{sensor}_points": points, f"{sensor}_labels": labels.byte()}
+        for sensor in read.sensors:
+            if isinstance(read.sensors[sensor], PointCloud):
+                shards = [pointnet2.whole_clouds(read, shard, sensor) for shard in range(3)]
+                points, labels = (torch.cat(one) for one in zip(*shards, strict=True))
+                inputs |= {f"{sensor}_points": points, f"{sensor}_labels": labels}
     else:
         images, cameras = vae.load_images(read, 32)
         inputs = {one: torch.from_numpy(images[:, i].copy()) for i, one in enumerate(cameras)}
