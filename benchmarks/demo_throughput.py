@@ -1,9 +1,10 @@
 """Verified demonstrations per second on one core, against planning and following the plain way.
 
     pip install -c constraints.txt -e .
-    python benchmarks/demo_throughput.py    # 3 minutes
+    python benchmarks/demo_throughput.py                                  # 5 minutes
+    python benchmarks/demo_throughput.py --planner-range 0 --simplify 3   # other options of ours
 
-Ours is `demo_generation.collect.Collector` with the default options. Both ways get the first
+Ours is `demo_generation.collect.Collector`. Both ways get the first
 queries that it draws, its planner seeds, its limits on a plan and its three attempts on a query,
 and the same scene and arm; a demonstration counts if it reaches its goal (0.02 m and 0.05
 normalised) and touched nothing in any physics step. Drawing the queries is not timed: it is the
@@ -62,12 +63,18 @@ class GivenUp(Exception):
     """All attempts on a query failed."""
 
 
+def length_of(path):
+    """Of a path (n, 7), rad: L2 in the normalised space."""
+    return np.linalg.norm(np.diff(panda.normalise(path), axis=0), axis=1).sum()
+
+
 class Ours:
-    """The collector, on given queries; `checks` has the collision checks of each plan."""
+    """The collector, on given queries; `checks` has the collision checks of each plan, `lengths`
+    the lengths of those that were found."""
 
     def __init__(self, options):
         self.collector = collect.Collector(options)
-        self.checks = []
+        self.checks, self.lengths = [], []
         self._draw = self.collector.env.sample_query
         self._plan = self.collector.planner.plan
         self.collector.env.sample_query = self._given
@@ -88,9 +95,11 @@ class Ours:
 
     def _counted(self, *query, **options):
         try:
-            return self._plan(*query, **options)
+            path = self._plan(*query, **options)
         finally:
             self.checks.append(self.collector.planner.checks)
+        self.lengths.append(length_of(path))
+        return path
 
     def __call__(self, query):
         """Whether a query could be solved."""
@@ -107,7 +116,7 @@ class Plain:
 
     def __init__(self, options):
         self.options = options
-        self.checks = []
+        self.checks, self.lengths = [], []
         self.client = client = p.connect(p.DIRECT)
         p.setGravity(0, 0, -9.81, physicsClientId=client)
         self.robot = p.loadURDF(
@@ -206,6 +215,7 @@ class Plain:
             path = problem.getSolutionPath()
             og.PathSimplifier(self.space).simplifyMax(path)
             path = np.array([[state[i] for i in range(7)] for state in path.getStates()])
+            self.lengths.append(length_of(path))
         self.checks.append(self.plan_checks)
         return path
 
@@ -243,9 +253,9 @@ class Plain:
         return False
 
 
-def measure(task, number, progress):
-    """Dict way -> (seconds (n,), solved (n,), checks); and the seconds for drawing a query."""
-    args = collect.Args(task)
+def measure(args, number, progress):
+    """With the collector's `Args`: dict way -> (seconds (n,), solved (n,), checks, length); and the
+    seconds for drawing a query."""
     options = {name: getattr(args, name) for name in collect.OPTIONS}
     ways = {"ours": Ours(options), "plain": Plain(options)}
     seconds, solved = {way: [] for way in ways}, {way: [] for way in ways}
@@ -262,15 +272,20 @@ def measure(task, number, progress):
                 seconds[way].append(time.process_time() - began)
         progress.update(len(block))
     measured = {
-        way: (np.array(seconds[way]), np.array(solved[way]), np.mean(ways[way].checks))
-        for way in ways
+        name: (
+            np.array(seconds[name]),
+            np.array(solved[name]),
+            np.mean(way.checks),
+            np.mean(way.lengths),
+        )
+        for name, way in ways.items()
     }
     return measured, drawing / number
 
 
 def ratio_of(measured, rows):
     """Our rate by the plain one, on the queries `rows`."""
-    (seconds, solved, _), (plain_seconds, plain_solved, _) = measured["ours"], measured["plain"]
+    (seconds, solved, *_), (plain_seconds, plain_solved, *_) = measured["ours"], measured["plain"]
     ours = solved[rows].sum(-1) / seconds[rows].sum(-1)
     return ours * plain_seconds[rows].sum(-1) / np.maximum(plain_solved[rows].sum(-1), 1)
 
@@ -279,6 +294,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--num", type=int, default=100, help="queries per task")
     parser.add_argument("--tasks", nargs="+", default=FIXED, choices=FIXED)
+    for name in ("planner_range", "simplify"):
+        default = getattr(collect.Args, name)
+        flag = f"--{name.replace('_', '-')}"
+        parser.add_argument(flag, type=type(default), default=default, help=f"of ours ({default})")
     args = parser.parse_args()
     if args.num < 1:
         parser.error("--num must be at least 1")
@@ -293,15 +312,18 @@ def main():
         "plain_solved",
         "checks_per_plan",
         "plain_checks_per_plan",
+        "length",
+        "plain_length",
     )
     result = {name: {} for name in names}
     resamples = np.random.default_rng(0).integers(0, args.num, (2000, args.num))
     with tqdm(total=args.num * len(args.tasks), unit=" queries") as progress:
         for task in args.tasks:
             progress.set_description(task)
-            measured, drawing = measure(task, args.num, progress)
-            seconds, solved, checks = measured["ours"]
-            plain_seconds, plain_solved, plain_checks = measured["plain"]
+            options = {"planner_range": args.planner_range, "simplify": args.simplify}
+            measured, drawing = measure(collect.Args(task, **options), args.num, progress)
+            seconds, solved, checks, length = measured["ours"]
+            plain_seconds, plain_solved, plain_checks, plain_length = measured["plain"]
             interval = np.percentile(ratio_of(measured, resamples), [5, 95])
             values = (
                 solved.sum() / seconds.sum(),
@@ -313,16 +335,19 @@ def main():
                 plain_solved.mean(),
                 checks,
                 plain_checks,
+                length,
+                plain_length,
             )
             for name, value in zip(names, values, strict=True):
                 result[name][task] = value
 
     print(
-        "\ndemonstrations per second and core; solved: share of queries; checks: mean of a plan\n"
+        "\ndemonstrations per second and core; solved: share of queries; checks, length: means of a "
+        "plan\n"
     )
     print(
         f"{'task':22}{'ours':>7}{'end to end':>12}{'plain':>7}{'ratio':>7}{'interval':>12}"
-        f"{'solved':>8}{'plain':>7}{'checks':>8}{'plain':>7}"
+        f"{'solved':>8}{'plain':>7}{'checks':>8}{'plain':>7}{'length':>8}{'plain':>7}"
     )
     for task in args.tasks:
         row = {name: result[name][task] for name in names}
@@ -332,6 +357,7 @@ def main():
             f"{row['plain_demos_per_second']:7.2f}{row['ratio_to_plain']:7.2f}"
             f"{f'{low:.1f} to {high:.1f}':>12}{row['solved']:8.2f}{row['plain_solved']:7.2f}"
             f"{row['checks_per_plan']:8.0f}{row['plain_checks_per_plan']:7.0f}"
+            f"{row['length']:8.2f}{row['plain_length']:7.2f}"
         )
     print()
     result |= {"queries_per_task": args.num, "python": platform.python_version()}
