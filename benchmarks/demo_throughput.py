@@ -342,8 +342,8 @@ def main():
                 result[name][task] = value
 
     print(
-        "\ndemonstrations per second and core; solved: share of queries; checks, length: means of a "
-        "plan\n"
+        "\ndemonstrations per second and core; solved: share of queries; checks, length: a plan's "
+        "mean\n"
     )
     print(
         f"{'task':22}{'ours':>7}{'end to end':>12}{'plain':>7}{'ratio':>7}{'interval':>12}"
