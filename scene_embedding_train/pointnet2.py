@@ -294,6 +294,7 @@ class Decoder(nn.Module):
         return self.head(features)
 
     def given(self, latent, points):
+        """What each point has: its place and the latent, (n, p, 3 + 6 waves + latent)."""
         spread = latent.unsqueeze(1).expand(-1, points.shape[1], -1)
         return torch.cat([waves(points, self.args.num_waves), spread], dim=2)
 
