@@ -427,13 +427,13 @@ def evaluate(model, clouds, rows, batch_size, device):
     return result | dict(zip(names, iou.tolist(), strict=True))
 
 
-COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [255, 255, 255]], np.uint8)
+COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [150, 150, 150]], np.uint8)
 
 
 def comparison(points, truth, predicted, size=160):
     """A picture, uint8: a sensor's points (p, 3) seen from above; true classes left, ours right.
 
-    Robot red, table and floor orange, obstacles yellow, as in the paper's figure.
+    Robot red, table and floor orange, obstacles yellow, as in the paper's figure; nothing grey.
     """
     pictures = []
     for labels in (truth, predicted):
@@ -484,6 +484,12 @@ if __name__ == "__main__":
     # MODEL: network and optimiser
     model = PointNet2(len(sensors), args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
+    # All that the first sensor saw of the first validation scene, for the picture.
+    shard = np.searchsorted(observations.offsets, validation[0], side="right") - 1
+    cloud = whole_clouds(observations, shard, clouds[2][0])
+    row = validation[0] - observations.offsets[shard]
+    hit = cloud[1][row] != NOTHING
+    shown, shown_labels = (one[row][hit].unsqueeze(0).to(device) for one in cloud)
 
     # SHARED: checkpoints
     saved_parts = {"model": model, "optimizer": optimizer}
@@ -554,13 +560,10 @@ if __name__ == "__main__":
             result = evaluate(model, clouds, validation, args.batch_size, device)
             for name, value in result.items():
                 writer.add_scalar(f"eval/{name}", value, step)
-            points, labels = batch_of(clouds, validation[:1], device)[0]
             with torch.no_grad():
-                own = points.flatten(1, 2)
-                predicted = model.decoders[0](model.encoders[0](points[:, 1]), own).argmax(2)
-            labels = labels.flatten(1, 2)
-            predicted = torch.where(labels != NOTHING, predicted, NOTHING)
-            picture = comparison(*(a[0].cpu().numpy() for a in (own, labels, predicted)))
+                seen = batch_of(clouds, validation[:1], device)[0][0]
+                predicted = model.decoders[0](model.encoders[0](seen[:, 1]), shown).argmax(2)
+            picture = comparison(*(a[0].cpu().numpy() for a in (shown, shown_labels, predicted)))
             writer.add_image("eval/classification", picture, step, dataformats="HWC")
             error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
             if error < progress["best_error"]:
