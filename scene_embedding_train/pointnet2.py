@@ -489,7 +489,7 @@ if __name__ == "__main__":
     cloud = whole_clouds(observations, shard, clouds[2][0])
     row = validation[0] - observations.offsets[shard]
     hit = cloud[1][row] != NOTHING
-    shown, shown_labels = (one[row][hit].unsqueeze(0).to(device) for one in cloud)
+    pictured, classes = (one[row][hit].unsqueeze(0).to(device) for one in cloud)
 
     # SHARED: checkpoints
     saved_parts = {"model": model, "optimizer": optimizer}
@@ -562,8 +562,8 @@ if __name__ == "__main__":
                 writer.add_scalar(f"eval/{name}", value, step)
             with torch.no_grad():
                 seen = batch_of(clouds, validation[:1], device)[0][0]
-                predicted = model.decoders[0](model.encoders[0](seen[:, 1]), shown).argmax(2)
-            picture = comparison(*(a[0].cpu().numpy() for a in (shown, shown_labels, predicted)))
+                predicted = model.decoders[0](model.encoders[0](seen[:, 1]), pictured).argmax(2)
+            picture = comparison(*(a[0].cpu().numpy() for a in (pictured, classes, predicted)))
             writer.add_image("eval/classification", picture, step, dataformats="HWC")
             error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
             if error < progress["best_error"]:
