@@ -85,7 +85,7 @@ NAMED = ("go-to-goal", "random", *LOOKING)
 RESOLUTION = 0.021
 # The planner's attempts: share of the remaining time, and of its usual distance from obstacles.
 ATTEMPTS = ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25))
-PLANNER_OPTIONS = {"planner_range": 0, "simplify": 3}  # RRT-Connect with OMPL's own range
+PLANNER_OPTIONS = {"planner_range": 0, "simplify": 3}  # those of docs/baselines.md
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
 
