@@ -59,6 +59,7 @@ ENCODERS = {
     "pointnet2": "PointNet++",
     "oracle": "the obstacles themselves",
 }
+LINES = {"bc": ":", "sac": "-", "td3": "--"}  # of the curves
 FAR_BELOW = 0.05  # of the paper's mean: worth an explanation
 
 
@@ -313,10 +314,12 @@ def page(cells, results):
 def draw_curves(cells, results, path):
     """Validation success over steps, one line per run."""
     figure, axes = plt.subplots(figsize=(9, 5), layout="constrained")
+    axes.set_prop_cycle(color=plt.colormaps["tab20"].colors)
     for cell in (cell for cell in cells if cell.task == cell.trained_on):
         for result in results.get(cell.name, []):
             name = f"{cell.name}-s{result['seed']}"
-            axes.plot(*zip(*result["curve"], strict=True), marker=".", label=name)
+            style = {"marker": ".", "linestyle": LINES[cell.algorithm], "label": name}
+            axes.plot(*zip(*result["curve"], strict=True), **style)
     axes.set(xlabel="environment steps (BC: batches)", ylabel="validation success", ylim=(0, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
