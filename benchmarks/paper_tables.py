@@ -21,6 +21,7 @@ import fnmatch
 import json
 import os
 import shutil
+import signal
 import statistics
 import subprocess
 import sys
@@ -380,6 +381,8 @@ def main():
         if not found:
             sys.exit(f"error: no cell is called {pattern}; --list shows them")
         chosen += found
+    # `kill` ends the trainer too: `subprocess.run` does that for whatever is raised.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("killed; the same command goes on"))
     for cell in dict.fromkeys(chosen):
         for seed in args.seeds:
             try:

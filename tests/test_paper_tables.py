@@ -4,9 +4,13 @@ import importlib.util
 import json
 import re
 import statistics
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 from PIL import Image
 
@@ -121,6 +125,20 @@ def test_the_pictures(results, tmp_path):
         draw(list(CELLS.values()), results, tmp_path / "picture.png")
         with Image.open(tmp_path / "picture.png") as picture:
             assert len(picture.convert("RGB").getcolors(1_000_000)) > 10
+
+
+def test_a_trainer_does_not_outlive_the_command(tmp_path):
+    script = ROOT / "benchmarks" / "paper_tables.py"
+    flags = ["--only", "bc-ee-boxes", "--steps", "1000000", "--runs-dir", str(tmp_path)]
+    process = subprocess.Popen([sys.executable, str(script), *flags], stderr=subprocess.PIPE)
+    until = time.time() + 60
+    while not list(tmp_path.glob("*/*/args.json")):
+        assert time.time() < until
+        time.sleep(0.05)
+    (trainer,) = psutil.Process(process.pid).children()
+    process.terminate()
+    assert b"killed" in process.communicate(timeout=20)[1] and process.returncode == 1
+    assert not trainer.is_running()
 
 
 def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
