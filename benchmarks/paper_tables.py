@@ -319,7 +319,7 @@ def draw_curves(cells, results, path):
     for cell in (cell for cell in cells if cell.task == cell.trained_on):
         for result in results.get(cell.name, []):
             name = f"{cell.name}-s{result['seed']}"
-            style = {"marker": ".", "linestyle": LINES[cell.algorithm], "label": name}
+            style = {"marker": ".", "linestyle": LINES.get(cell.algorithm, "-."), "label": name}
             axes.plot(*zip(*result["curve"], strict=True), **style)
     axes.set(xlabel="environment steps (BC: batches)", ylabel="validation success", ylim=(0, 1))
     axes.grid(alpha=0.3)

@@ -115,7 +115,7 @@ class Planner:
             `MARGIN`. A query that starts or ends nearer is planned without it.
         planner_range: longest motion (L2, normalised) that the planner tries at once, if it is of
             those that have such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with
-            RRTConnect, docs/demonstrations.md.)
+            RRTConnect, docs/benchmarks.md.)
         simplify: rounds of removing vertices and cutting corners; 0 for none.
 
     Raises:
