@@ -268,7 +268,7 @@ def test_the_planner_solves_double_walls_and_follows_its_plan():
     assert "ompl" in result["versions"] and "ompl" not in straight["versions"]
 
     env, rows = envs.make("double_walls"), []
-    planner = Planner(env)
+    planner = Planner(env, **evaluation.PLANNER_OPTIONS)
     for index, query in enumerate(queries):
         seed = int(np.random.default_rng([2, index]).integers(1, 2**32))
         states = panda.denormalise(follow(env, planner.plan(*query, seed=seed)).states)
