@@ -7,8 +7,9 @@
 
 A cell is a run: algorithm, goal type, task, p of the demo injection. It is trained with its script
 (flags that differ from the defaults: `RECIPES`) in `--runs-dir`, where one that was stopped goes
-on, and its best policy by validation is evaluated on test queries. Policy and result then go to
-`policies/` beside the script: what is there is done, with as many steps or more. The page,
+on. Its best policy by validation goes to `policies/` beside the script, in half precision, is
+evaluated on test queries as it is there, and gets its result beside it, in JSON: what has one is
+done, with as many steps or more. The page,
 docs/results.md, and its pictures are made of those results and of the paper's numbers
 (`paper_cells.csv`: sections 5.2 and 5.3 and the tables of the appendix; means and standard
 deviations of four seeds).
@@ -20,7 +21,6 @@ import datetime
 import fnmatch
 import json
 import os
-import shutil
 import signal
 import statistics
 import subprocess
@@ -37,6 +37,7 @@ import matplotlib.pyplot as plt
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from envs.files import write_atomically
+from envs.programs import halve_program
 
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = Path(__file__).with_name("paper_cells.csv")
@@ -155,8 +156,13 @@ def run(cell, seed, steps, num_queries, runs_dir):
     print(f"{name}: {' '.join(map(str, command[1:]))}", flush=True)
     subprocess.run(command, check=True)
     trained = max(folder.glob("*/result.json")).parent
-    evaluation = evaluate(trained, cell.task, num_queries, folder / "evaluation.json")
-    keep(name, cell, trained, evaluation, kept.parent)
+    kept.parent.mkdir(exist_ok=True)
+    kept.unlink(missing_ok=True)  # a result is never beside another's policy
+    policy = kept.with_suffix(".pt")
+    halve_program(trained / "policy.pt", policy)
+    evaluation = evaluate(policy, cell.task, num_queries, folder / "evaluation.json")
+    result = summary(cell, trained, evaluation)
+    write_atomically(kept, (json.dumps(result, indent=1) + "\n").encode())
 
 
 def evaluate(policy, task, num_queries, path):
@@ -169,10 +175,10 @@ def evaluate(policy, task, num_queries, path):
     return {name: evaluation[name] for name in names}
 
 
-def keep(name, cell, run, evaluation, folder):
-    """Copy a run's policy to `folder`, and write beside it how it was made and what it reached."""
+def summary(cell, run, evaluation):
+    """How a run's policy was made and what it reached, a dict."""
     training = json.loads((run / "result.json").read_text())
-    result = {
+    return {
         "cell": cell.name,
         "seed": training["args"]["seed"],
         **evaluation,
@@ -185,9 +191,6 @@ def keep(name, cell, run, evaluation, folder):
         "curve": curve(run),
         "args": {k: v for k, v in training["args"].items() if k not in ("runs_dir", "resume")},
     }
-    folder.mkdir(exist_ok=True)
-    shutil.copyfile(run / "policy.pt", folder / f"{name}.pt")
-    write_atomically(folder / f"{name}.json", (json.dumps(result, indent=1) + "\n").encode())
 
 
 def commit():

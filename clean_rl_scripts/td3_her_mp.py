@@ -112,6 +112,9 @@ class Args:
     policy_average: float = 0.001
     """share of the policy that moves into its running average per update of the policy; the average
     is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
+    preactivation_penalty: float = 0.0
+    """weight of the squared inputs of the policy's tanh in its loss, which keeps it from saturating
+    (Andrychowicz et al., 2017, appendix A)"""
     hidden_size: int = 256
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: int = 2
@@ -240,7 +243,14 @@ class Actor(nn.Module):
 
     def forward(self, observation, achieved_goal, desired_goal):
         """The action (N, 7) without noise; this is what policy.pt contains."""
-        return self.action_scale * torch.tanh(self.mlp(self.features(observation, desired_goal)))
+        return self.squashed(self.preactivation(observation, desired_goal))
+
+    def preactivation(self, observation, desired_goal):
+        """(N, o), (N, g) -> (N, 7), unbounded."""
+        return self.mlp(self.features(observation, desired_goal))
+
+    def squashed(self, preactivation):
+        return self.action_scale * torch.tanh(preactivation)
 
 
 # SHARED: replay buffer and demonstrations
@@ -744,8 +754,10 @@ if __name__ == "__main__":
             if progress["updates"] % args.policy_frequency == 0:
                 for parameter in q_parameters:  # the policy's gradient needs none into the critics
                     parameter.requires_grad_(False)
-                action = actor(batch["observation"], None, goal)
-                actor_loss = -qf1(batch["observation"], goal, action).mean()
+                preactivation = actor.preactivation(batch["observation"], goal)
+                q = qf1(batch["observation"], goal, actor.squashed(preactivation))
+                penalty = args.preactivation_penalty * preactivation.square().mean()
+                actor_loss = penalty - q.mean()
                 actor_optimizer.zero_grad()
                 actor_loss.backward()
                 actor_optimizer.step()
@@ -764,6 +776,7 @@ if __name__ == "__main__":
                 writer.add_scalar("losses/qf2_loss", qf2_loss.item(), step)
                 writer.add_scalar("losses/qf_loss", (qf1_loss + qf2_loss).item() / 2, step)
                 writer.add_scalar("losses/actor_loss", actor_loss.item(), step)
+                writer.add_scalar("losses/preactivation", preactivation.abs().mean().item(), step)
                 sps = (step - steps_before) / (time.time() - started)
                 writer.add_scalar("charts/SPS", int(sps), step)
 

@@ -8,6 +8,7 @@ evaluates strings of the file as Python expressions.)
 
     save_program("encoder.pt", encoder, {"points": points}, {"kind": "encoder"})
     code = load_program("encoder.pt")(points=points)
+    halve_program("encoder.pt", "smaller.pt")
 
 A **policy** is a program from `observation` (N, 10 or 17), `achieved_goal` and `desired_goal`
 (N, 3, 7 or 10), float32 as `RoboArmEnv` gives them, to the deterministic action (N, 7), float32 in
@@ -94,6 +95,33 @@ def save_program(path, module, example_inputs, metadata):
     write_atomically(path, buffer.getbuffer())
 
 
+def halve_program(path, output):
+    """Write a program again with its float32 tensors rounded to float16: half as large a file.
+
+    It computes in float32 as before, from the rounded numbers (11 significant bits), so its results
+    differ: evaluate what is written, not what was read.
+
+    Raises:
+        ProgramError: as `load_program`; or a number in it is too large for float16 (65,504).
+        OSError: the file cannot be written.
+    """
+    content = _read(path)
+    Program(content, path)  # or it raises
+    halved = {
+        name: tensor.half()
+        for name, tensor in content["tensors"].items()
+        if tensor.dtype == torch.float32
+    }
+    for name, tensor in halved.items():
+        if tensor.isinf().any() and not content["tensors"][name].isinf().any():
+            raise ProgramError(f"{path}: cannot be halved: {name} has numbers beyond float16")
+    tensors = content["tensors"] | halved
+    names = sorted({*halved, *content.get("halved", ())})
+    buffer = io.BytesIO()
+    torch.save(content | {"tensors": tensors, "halved": names}, buffer)
+    write_atomically(Path(output), buffer.getbuffer())
+
+
 def load_program(path, device="cpu"):
     """The `Program` in a file, its tensors on `device`.
 
@@ -101,6 +129,11 @@ def load_program(path, device="cpu"):
         ProgramError: no such file, not a program, damaged, or with something in it that a program
             may not have. Nothing of the file has been executed.
     """
+    return Program(_read(path), path, device)
+
+
+def _read(path):
+    """The content of a program file, of which only format and version are checked."""
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()  # torch.load does not compare the checksums
@@ -124,7 +157,7 @@ def load_program(path, device="cpu"):
         raise ProgramError(
             f"{path}: program version {content.get('version')!r}, this code reads {VERSION}"
         )
-    return Program(content, path, device)
+    return content
 
 
 class Program:
@@ -157,7 +190,11 @@ class Program:
         self.metadata = dict(copy.deepcopy(content["metadata"]))
         self.inputs = list(content["inputs"])
         # While it runs, its values lie in one list: tensors, inputs, the results of the nodes.
-        self._tensors = [tensor.to(device) for tensor in content["tensors"].values()]
+        halved = content.get("halved", ())  # names of tensors that are stored in float16
+        self._tensors = [
+            tensor.to(device, torch.float32 if name in halved else tensor.dtype)
+            for name, tensor in content["tensors"].items()
+        ]
         slots = {}
         for kind, names in (("tensor", content["tensors"]), ("input", self.inputs)):
             for name in names:

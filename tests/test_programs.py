@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from envs.programs import ProgramError, load_program, save_program
+from envs.programs import ProgramError, halve_program, load_program, save_program
 
 
 class Actor(nn.Module):
@@ -169,6 +169,34 @@ def test_a_file_holds_its_own_tensors_only(tmp_path):
     module.weight = nn.Parameter(torch.zeros(1_000_000)[:16].view(4, 4))
     save_program(tmp_path / "net.pt", module, {"input": torch.zeros(1, 4)}, {})
     assert (tmp_path / "net.pt").stat().st_size < 20_000
+
+
+def test_a_halved_program_computes_in_float32_from_rounded_numbers(tmp_path):
+    torch.manual_seed(0)
+    module, batch = Actor().eval(), _inputs(5)
+    save_program(tmp_path / "net.pt", module, batch, {"kind": "policy"})
+    for _ in range(2):  # the second time there is nothing left to do
+        halve_program(tmp_path / "net.pt", tmp_path / "half.pt")
+        (tmp_path / "half.pt").rename(tmp_path / "net.pt")
+    for name, tensor in module.state_dict().items():
+        module.state_dict()[name].copy_(tensor.half().float())
+    program = load_program(tmp_path / "net.pt")
+    with torch.no_grad():
+        assert torch.allclose(program(**batch), module(**batch), rtol=0, atol=1e-6)
+    assert program.metadata == {"kind": "policy"}
+
+
+def test_a_halved_program_has_half_the_size_or_is_an_error(tmp_path):
+    module, batch = nn.Linear(100, 1000), {"input": torch.zeros(1, 100)}
+    save_program(tmp_path / "net.pt", module, batch, {})
+    halve_program(tmp_path / "net.pt", tmp_path / "half.pt")
+    sizes = [(tmp_path / name).stat().st_size for name in ("half.pt", "net.pt")]
+    assert sizes[0] < 0.51 * sizes[1]
+    nn.init.constant_(module.bias, 1e5)
+    save_program(tmp_path / "large.pt", module, batch, {})
+    with pytest.raises(ProgramError, match=r"large.pt: cannot be halved"):
+        halve_program(tmp_path / "large.pt", tmp_path / "half2.pt")
+    assert not (tmp_path / "half2.pt").exists()
 
 
 class _Branches(nn.Module):

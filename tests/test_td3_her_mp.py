@@ -63,3 +63,20 @@ def test_exploration_adds_noise_of_the_size_asked_for(tmp_path):
         noise = rows[:, 10:17] - actor(rows[:, :10], None, rows[:, -4:-1])
     assert 0.19 < noise.std() / 0.06 < 0.21
     assert noise.mean().abs() < 0.02 * 0.06
+
+
+def test_the_penalty_keeps_the_tanh_from_saturating(tmp_path):
+    sizes = {}
+    for penalty in ("0", "100"):
+        flags = ["--updates-per-step", "0.5", "--preactivation-penalty", penalty]
+        run = run_script("td3_her_mp", tmp_path / penalty, *flags)
+        state = torch.load(run / "checkpoint.pt", weights_only=True)
+        actor = td3.Actor(td3.Args(hidden_size=16, bf16=False)).eval()
+        actor.load_state_dict(state["actor"])
+        rows = state["buffer"]["rows"]
+        with torch.no_grad():
+            preactivation = actor.preactivation(rows[:, :10], rows[:, -4:-1])
+            action = actor(rows[:, :10], None, rows[:, -4:-1])
+        torch.testing.assert_close(action, 0.06 * torch.tanh(preactivation))
+        sizes[penalty] = preactivation.square().mean()
+    assert sizes["100"] < 0.01 * sizes["0"]
