@@ -112,9 +112,9 @@ class Args:
     policy_average: float = 0.001
     """share of the policy that moves into its running average per update of the policy; the average
     is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
-    preactivation_penalty: float = 0.0
+    preactivation_penalty: float = 0.1
     """weight of the squared inputs of the policy's tanh in its loss, which keeps it from saturating
-    (Andrychowicz et al., 2017, appendix A)"""
+    (Andrychowicz et al., 2017, appendix A; CleanRL: 0)"""
     hidden_size: int = 256
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: int = 2
