@@ -47,8 +47,8 @@ from tqdm import tqdm
 
 import envs
 from demo_generation import collect
-from demo_generation.planning import RESOLUTION
 from envs import datasets, panda
+from envs.collision import RESOLUTION
 from envs.scenes import Box, Scene
 
 # The tasks that the plain way can do: with a fixed scene, and a table and a floor.
@@ -142,7 +142,8 @@ class Plain:
         space.setBounds(bounds)
         self.space = ob.SpaceInformation(space)
         self.space.setStateValidityChecker(self.is_valid)
-        self.space.setStateValidityCheckingResolution(RESOLUTION)
+        # A share of the longest motion: as far apart, in the normalised space, as ours.
+        self.space.setStateValidityCheckingResolution(RESOLUTION / (2 * panda.NUM_JOINTS**0.5))
         self.space.setup()
 
     def add(self, box):

@@ -21,7 +21,8 @@ Policies to compare a trained one with:
   failure of 0 steps. As the limit is wall-clock time, the numbers may depend on the machine, and on
   what else it is doing.
 
-The last two check collisions in the simulator's own world, which a trained policy does not see.
+The last two check collisions with the true obstacles (`envs.collision`), which a trained policy
+does not see.
 What comes out:
 
 - success: share of episodes that reached the goal, with a 95% Wilson interval;
@@ -59,7 +60,6 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import pybullet as p
 import torch
 import tyro
 from PIL import Image
@@ -79,13 +79,8 @@ ENV_ARGUMENTS = ("action_mode", "max_step", "velocities", "encoder")
 LOOKING = ("via-points", "planner")  # policies that look for a motion before they move
 ROOT = Path(__file__).resolve().parent.parent
 NAMED = ("go-to-goal", "random", *LOOKING)
-# `via-points` checks a motion at points this far apart in the normalised space, as the planner
-# does; it is less than one step of the arm. It keeps no margin, which would reject more than it
-# saves: with 3 mm, clean success was 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
-RESOLUTION = 0.021
-# The planner's attempts: share of the remaining time, and of its usual distance from obstacles.
-ATTEMPTS = ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25))
-PLANNER_OPTIONS = {"planner_range": 0, "simplify": 3}  # those of docs/baselines.md
+# `via-points` keeps no margin, which would reject more than it saves: with 3 mm, clean success was
+# 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
 
@@ -176,7 +171,7 @@ class _Decision(NamedTuple):
     """What a policy will do in an episode.
 
     act: act(observation) -> action (7,); None: it gives up.
-    found: whether it found a motion; None if it did not look for one. Looking moves the arm.
+    found: whether it found a motion; None if it did not look for one. Planning moves the arm.
     """
 
     act: Callable | None
@@ -217,63 +212,39 @@ def _run_program(program):
 
 def _via_points(env, seed, tries):
     """`via-points`, as described at the top of this file."""
+    from envs.collision import CollisionChecker  # here, because Numba takes a while to import
+
+    checker = None
 
     def policy(index, query):
-        start, goal = panda.normalise(query.start), panda.normalise(query.goal)
-        if _is_free(env, np.stack([start, goal])):
+        nonlocal checker
+        if checker is None or checker.scene is not env.scene:
+            checker = CollisionChecker(env.scene)
+        # float32 may round a limit to just beyond it.
+        start, goal = np.clip(panda.normalise(np.stack([query.start, query.goal])), -1.0, 1.0)
+        if checker.is_motion_free(start, goal):
             return _Decision(_go_to_goal(query.goal), found=True)
         for via in np.random.default_rng([seed, index]).uniform(-1.0, 1.0, (tries, 7)):
-            waypoints = np.stack([start, via, goal])
-            if _is_free(env, waypoints):
-                return _Decision(_follow(panda.denormalise(waypoints)), found=True)
+            if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
+                path = panda.denormalise(np.stack([start, via, goal]))
+                return _Decision(_follow(path), found=True)
         return _Decision(_go_to_goal(query.goal), found=False)
 
     return policy
 
 
-def _is_free(env, waypoints):
-    """Whether a motion through waypoints (n, 7), normalised, is free of collisions. Moves the arm.
-
-    It is checked from coarse to fine, because most motions that are not free are found out early
-    then: first at the waypoints, without the query's own, then between them at multiples of
-    ..., 4, 2, 1 times the resolution.
-    """
-    points, steps = [waypoints[1:-1]], [np.full(len(waypoints) - 2, np.inf)]
-    for here, there in zip(waypoints[:-1], waypoints[1:], strict=True):
-        count = max(1, math.ceil(math.dist(here, there) / RESOLUTION))
-        step = np.arange(1, count)
-        points.append(here + (there - here) * (step / count)[:, None])
-        steps.append(step & -step)  # the largest power of two that divides it
-    order = np.argsort(-np.concatenate(steps), kind="stable")
-    configurations = panda.denormalise(np.concatenate(points)[order])
-    return not any(_touches(env, configuration) for configuration in configurations)
-
-
-def _touches(env, configuration):
-    """`env.in_collision`, in half the time: an old contact point may survive within millimetres."""
-    panda.set_configuration(env.client, env.robot, configuration)
-    p.performCollisionDetection(physicsClientId=env.client)
-    contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
-    return any(contact[8] < 0.0 for contact in contacts)
-
-
 def _planner(env, seed, time_limit):
     """`planner`, as described at the top of this file."""
     planning = _import_planning()
-    planner = planning.Planner(env, max_checks=math.inf, **PLANNER_OPTIONS)
+    planner = planning.Planner(env, max_checks=math.inf)
 
     def policy(index, query):
         rng = np.random.default_rng([seed, index])
-        deadline = time.monotonic() + time_limit
-        for share, caution in ATTEMPTS:
-            planner.time_limit = share * (deadline - time.monotonic())
-            plan_seed = int(rng.integers(1, 2**32))
-            try:
-                path = planner.plan(*query, seed=plan_seed, caution=caution)
-            except planning.PlanningError:
-                continue
-            return _Decision(_follow(path), found=True)
-        return _Decision(None, found=False)
+        try:
+            path = planner.plan_within(time_limit, *query, rng=rng)
+        except planning.PlanningError:
+            return _Decision(None, found=False)
+        return _Decision(_follow(path), found=True)
 
     return policy
 

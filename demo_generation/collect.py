@@ -49,7 +49,7 @@ class Args:
     num: int = 10_000
     """Number of demonstrations."""
     seed: int = 0
-    """Seed of queries and plans; 0, --planner-range 0, --simplify 3 give the packaged files."""
+    """Seed of queries and plans. (The packaged files have 0, and plans of an earlier version.)"""
     workers: int = 2
     """Number of processes. The file does not depend on it."""
     planner: str = "RRTConnect"
@@ -57,7 +57,7 @@ class Args:
     time_limit: float = 10.0
     """Seconds for one plan, a safeguard: where it strikes, the result depends on the machine."""
     max_checks: int = 30_000
-    """Collision checks for one plan (some 25 us each)."""
+    """Configurations that one plan may look at (some 3 us each)."""
     clearance: float = 0.005
     """Metres that plans keep from the scene, where start and goal do."""
     planner_range: float = 0.4

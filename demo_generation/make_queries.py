@@ -42,7 +42,6 @@ STREAMS = {"test": 1, "validation": 2}
 SCENE_STREAM = 1  # a fourth number, for the scenes of a split
 # A bound in seconds would make the file depend on the machine.
 SOLVE_ATTEMPTS, SOLVE_CHECKS = 3, 30_000
-SOLVE_OPTIONS = {"planner_range": 0, "simplify": 3}  # with which the packaged files were made
 
 
 @dataclass
@@ -76,7 +75,7 @@ class Sampler:
         self.env = envs.make(task)
         self.planner = None
         if solvable:
-            self.planner = Planner(self.env, max_checks=SOLVE_CHECKS, **SOLVE_OPTIONS)
+            self.planner = Planner(self.env, max_checks=SOLVE_CHECKS)
 
     def __call__(self, job):
         """Query `number` of a split, as a JSON-ready dict.

@@ -8,23 +8,21 @@
     query = load_queries("double_walls")[0]  # start, goal, scene
     path = Planner(env).plan(*query, seed=1)  # float32 (n, 7), rad
 
-Collisions are checked in the environment's own PyBullet world, so planner and simulator agree.
-Planning happens in the normalised configuration space [-1, 1]^7.
+Collisions are checked by `envs.collision`, which agrees with the environment's PyBullet world to
+within a fraction of a millimetre and is some twenty times faster; the environment itself has the
+last word on start and goal. Planning happens in the normalised configuration space [-1, 1]^7.
 """
 
 import math
 import time
-from dataclasses import replace
 
 import numpy as np
-import pybullet as p
 from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 
 from envs import panda
-from envs.arm_env import RoboArmEnv
-from envs.scenes import Box, Cylinder, Scene
+from envs.collision import RESOLUTION, CollisionChecker
 
 # OMPL writes to the console; what a user should know is raised here.
 ou.setLogLevel(ou.LogLevel.LOG_NONE)
@@ -41,16 +39,14 @@ PLANNERS = tuple(
 )
 """Names of OMPL's planners that can be used."""
 
-# Motions are checked at points this far apart, as a fraction of the space's diagonal: 0.021 in the
-# normalised space, less than one step of the arm.
-RESOLUTION = 0.004
 # A configuration this close (m) to a collision counts as one, which absorbs most of the
 # controller's lag: without it, two of three plans on `double_walls` touch something when followed.
-# PyBullet reports contacts from about 0.0039 m on.
 MARGIN = 0.003
 # Around a start or goal that is nearer than that, the margin grows by this much (m) per unit of
 # normalised distance from it: all of it is kept again some three steps away.
 MARGIN_GROWTH = 0.03
+# Attempts of `plan_within`: share of the remaining time, and caution.
+ATTEMPTS = ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25))
 # Trials of cutting a corner in one round of simplification, and how many may fail in a row. Bounded
 # by iterations, unlike OMPL's simplifyMax, which is bounded by seconds, they are deterministic.
 SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS = 50, 25
@@ -61,58 +57,89 @@ class PlanningError(RuntimeError):
 
 
 class Validity:
-    """Whether a normalised configuration (7 numbers) is collision free; counts what it is asked.
+    """Which normalised configurations and motions are free; counts what it is asked.
 
-    `checks` is how often it was called, `exhausted()` whether the limits of this plan are reached:
-    a planner asks now and then, and gives up.
+    Call it with one configuration (7 numbers), or use `free` and `motions_free` for many at once.
+    `checks` is how many configurations were looked at so far, `exhausted()` whether the limits of
+    this plan are reached: a planner asks now and then, and gives up.
+
+    Args:
+        checker: a `CollisionChecker`.
+        rule: `margin`, `clearance` and `relaxed` of its methods.
+        time_limit, max_checks: as for `Planner`.
     """
 
-    def __init__(self, env, margin, ends, time_limit, max_checks):
-        self._env, self._margin = env, margin
-        # Less a hair, because the ends are checked again after normalising, which rounds.
-        self._ends = [(panda.normalise(end), clearance_at(env, end) - 1e-5) for end in ends]
+    def __init__(self, checker, rule, time_limit, max_checks):
+        self._checker, self._rule = checker, rule
+        self._check = checker.motion_checker(**rule)
         self._deadline, self._max_checks = time.monotonic() + time_limit, max_checks
         self.checks = 0
 
     def __call__(self, state):
-        self.checks += 1
-        state = [state[i] for i in range(panda.NUM_JOINTS)]
-        nearest = clearance_at(self._env, panda.denormalise_one(state))
-        return nearest >= self._margin or any(
-            nearest >= clearance + MARGIN_GROWTH * math.dist(state, end)
-            for end, clearance in self._ends
-        )
+        """Whether a configuration is free."""
+        return self.motion_free(state, state)
+
+    def motion_free(self, start, end):
+        """Whether the straight motion from a configuration that is free to another is free."""
+        checks = self._check(start, end)
+        self.checks += abs(checks)
+        return checks > 0
+
+    def free(self, states):
+        """Which configurations (..., 7) are free: bool (...)."""
+        free = self._checker.is_free(states, **self._rule)
+        self.checks += free.size
+        return free
+
+    def motions_free(self, starts, ends):
+        """Which straight motions from `starts` (..., 7) to `ends` (..., 7) are free: bool (...)."""
+        checks = self._checker.motion_checks(starts, ends, **self._rule)
+        self.checks += int(np.abs(checks).sum())
+        return checks > 0
 
     def exhausted(self):
         return self.checks >= self._max_checks or time.monotonic() > self._deadline
 
 
-def clearance_at(env, configuration):
-    """Distance (m) of the nearest contact at joint angles (7, rad), negative inside a collision.
+class _States(ob.StateValidityChecker):
+    """OMPL's question about one state."""
 
-    Infinite if PyBullet reports no contact, that is from about 0.0039 m on. Moves the arm.
-    """
-    client, robot = env.client, env.robot
-    panda.set_configuration(client, robot, configuration)
-    p.performCollisionDetection(physicsClientId=client)
-    contacts = p.getContactPoints(bodyA=robot, physicsClientId=client)
-    return min((contact[8] for contact in contacts), default=float("inf"))
+    def __init__(self, space, is_valid):
+        super().__init__(space)
+        self._is_valid = is_valid
+
+    def isValid(self, state):  # noqa: N802 (OMPL's name)
+        return self._is_valid([state[i] for i in _JOINTS])
+
+
+class _Motions(ob.MotionValidator):
+    """OMPL's question about a motion, the start of which it knows to be valid."""
+
+    def __init__(self, space, is_valid):
+        super().__init__(space)
+        self._is_valid = is_valid
+
+    def checkMotion(self, start, end):  # noqa: N802
+        return self._is_valid.motion_free([start[i] for i in _JOINTS], [end[i] for i in _JOINTS])
+
+
+_JOINTS = tuple(range(panda.NUM_JOINTS))
 
 
 class Planner:
     """Plans in the world of an environment.
 
     Args:
-        env: a `RoboArmEnv`; its scene may change between plans. Planning moves its arm: reset
-            before the next step.
+        env: a `RoboArmEnv`; its scene may change between plans. A plan begins by resetting it to
+            the query, so reset before the next step.
         planner: one of `PLANNERS`, or your own: a function `(is_valid, start, goal, rng)` that
             returns a path (n, 7) from start to goal, or None. `is_valid` is a `Validity`, start
             and goal are normalised configurations (7,), float64, `rng` is a NumPy Generator.
         time_limit: seconds for one plan.
-        max_checks: collision checks for one plan; unlike seconds, the same on every machine.
-            Asymptotically optimal planners use all of it; FMT and BFMT need more than this.
-        clearance: metres that a path keeps from the scene (by inflating it), in addition to
-            `MARGIN`. A query that starts or ends nearer is planned without it.
+        max_checks: configurations looked at for one plan; unlike seconds, the same on every
+            machine. Asymptotically optimal planners use all of it; FMT and BFMT need more.
+        clearance: metres that a path keeps from the scene, in addition to `MARGIN`. A query that
+            starts or ends nearer is planned without it.
         planner_range: longest motion (L2, normalised) that the planner tries at once, if it is of
             those that have such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with
             RRTConnect, docs/benchmarks.md.)
@@ -147,9 +174,9 @@ class Planner:
         self.time_limit, self.max_checks = time_limit, max_checks
         self.clearance = clearance
         self.planner_range, self.simplify = planner_range, simplify
-        self._inflated = RoboArmEnv(inflate(env.scene, clearance)) if clearance > 0 else None
+        self._checker = None
         self.checks = 0
-        """Collision checks of the last plan."""
+        """Configurations that the last plan has looked at."""
 
     def plan(self, start, goal, scene=None, *, seed, caution=1.0):
         """A path from start to goal: float32 (n, 7), rad; its ends are exactly start and goal.
@@ -201,38 +228,42 @@ class Planner:
         path[0], path[-1] = start, goal
         return path
 
+    def plan_within(self, seconds, start, goal, scene=None, *, rng):
+        """A path found in `seconds`, by attempts of less and less caution (`ATTEMPTS`).
+
+        `rng`, a NumPy Generator, gives the seeds; the rest is as for `plan`. Shortening a path that
+        was found in time may take a little longer.
+        """
+        deadline, limit = time.monotonic() + seconds, self.time_limit
+        try:
+            for share, caution in ATTEMPTS:
+                self.time_limit = share * (deadline - time.monotonic())
+                seed = int(rng.integers(1, 2**32))
+                try:
+                    return self.plan(start, goal, scene, seed=seed, caution=caution)
+                except PlanningError:
+                    continue
+        finally:
+            self.time_limit = limit
+        raise PlanningError(f"no path in {seconds} s")
+
     def _validity(self, start, goal, caution):
-        """In the inflated world, if start and goal are free there, or else in the plain one."""
-        world = self.env
-        if self._inflated is not None:
-            self._inflated.set_scene(inflate(self.env.scene, caution * self.clearance))
-            if not any(self._inflated.in_collision(end) for end in (start, goal)):
-                world = self._inflated
-        ends = start, goal
-        return Validity(world, caution * MARGIN, ends, self.time_limit, self.max_checks)
-
-    def close(self):
-        """Disconnect the inflated world from PyBullet; the environment stays open."""
-        if self._inflated is not None:
-            self._inflated.close()
-
-
-def inflate(scene, clearance):
-    """The scene with everything larger by `clearance` (m) on all sides."""
-
-    def grow(body):
-        if isinstance(body, Box):
-            return replace(body, size=tuple(edge + 2 * clearance for edge in body.size))
-        if isinstance(body, Cylinder):
-            return replace(body, radius=body.radius + clearance, length=body.length + 2 * clearance)
-        return replace(body, radius=body.radius + clearance)
-
-    return Scene(
-        tuple(grow(obstacle) for obstacle in scene.obstacles),
-        table=None if scene.table is None else grow(scene.table),
-        floor=None if scene.floor is None else scene.floor + clearance,
-        friction=scene.friction,
-    )
+        if self._checker is None or self._checker.scene is not self.env.scene:
+            self._checker = CollisionChecker(self.env.scene)
+        ends = np.clip(np.stack([panda.normalise(start), panda.normalise(goal)]), -1.0, 1.0)
+        near = self._checker.nearest(ends).distance.min(-1)
+        from_scene = self._checker.nearest(ends, self_collisions=False).distance.min(-1)
+        clearance = caution * self.clearance
+        if from_scene.min() < clearance:
+            clearance = 0.0
+        # Less a hair, because the ends are checked again after normalising, which rounds.
+        distances = np.minimum(near, from_scene - clearance) - 1e-5
+        rule = {
+            "margin": caution * MARGIN,
+            "clearance": clearance,
+            "relaxed": (ends, distances, MARGIN_GROWTH),
+        }
+        return Validity(self._checker, rule, self.time_limit, self.max_checks)
 
 
 def _space(is_valid):
@@ -243,8 +274,10 @@ def _space(is_valid):
     bounds.setHigh(1.0)
     space.setBounds(bounds)
     information = ob.SpaceInformation(space)
-    information.setStateValidityChecker(is_valid)
-    information.setStateValidityCheckingResolution(RESOLUTION)
+    information.setStateValidityChecker(_States(information, is_valid))
+    information.setMotionValidator(_Motions(information, is_valid))
+    # For the planners that count a motion's states themselves: a share of the longest motion.
+    information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
     information.setup()
     return information
 

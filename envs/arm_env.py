@@ -14,7 +14,7 @@ import numpy as np
 import pybullet as p
 
 from envs import panda
-from envs.scenes import FRICTION, Box, Cylinder, Scene
+from envs.scenes import FRICTION, Box, Cylinder, Scene, floor_box
 
 GOAL_TYPES = ("ee", "config", "combined")
 ACTION_MODES = ("relative", "subgoal")
@@ -195,7 +195,7 @@ class RoboArmEnv(gym.Env):
         before, self.scene = self._parts, scene
         self._parts = []
         if scene.floor is not None:
-            self._parts.append((Box((0.0, 0.0, scene.floor - 0.05), (6.0, 6.0, 0.1)), *FLOOR_LOOK))
+            self._parts.append((floor_box(scene.floor), *FLOOR_LOOK))
         if scene.table is not None:
             self._parts.append((scene.table, *TABLE_LOOK))
         look = (OBSTACLE_COLOUR, scene.friction)

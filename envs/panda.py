@@ -57,7 +57,7 @@ def denormalise_one(state):
 
 # Fixed transforms between joint frames in the URDF: (x, y, z, roll about x), then the joint turns
 # about its own z.
-_JOINT_FRAMES = (
+JOINT_FRAMES = (
     (0.0, 0.0, 0.333, 0.0),
     (0.0, 0.0, 0.0, -np.pi / 2),
     (0.0, -0.316, 0.0, np.pi / 2),
@@ -66,7 +66,11 @@ _JOINT_FRAMES = (
     (0.0, 0.0, 0.0, np.pi / 2),
     (0.088, 0.0, 0.0, np.pi / 2),
 )
-_FLANGE_TO_EE = 0.107 + 0.105  # m along the last joint's axis: link8, then the grasp target
+# What moves with joint 7: the hand, in m along that joint's axis and turned about it (rad); in the
+# hand's frame the fingers, which open along y; the grasp target, between the fingertips.
+FLANGE_LENGTH, HAND_YAW = 0.107, -np.pi / 4
+HAND_TO_FINGER = (0.0, 0.0, 0.0584)
+_FLANGE_TO_EE = FLANGE_LENGTH + 0.105
 
 
 def forward_kinematics(configuration):
@@ -74,7 +78,7 @@ def forward_kinematics(configuration):
     configuration = np.asarray(configuration, dtype=np.float64)
     position = np.zeros((*configuration.shape[:-1], 3))
     rotation = np.broadcast_to(np.eye(3), (*configuration.shape[:-1], 3, 3))
-    for joint, (x, y, z, roll) in enumerate(_JOINT_FRAMES):
+    for joint, (x, y, z, roll) in enumerate(JOINT_FRAMES):
         position = position + rotation @ np.array([x, y, z])
         cr, sr = np.cos(roll), np.sin(roll)
         c, s = np.cos(configuration[..., joint]), np.sin(configuration[..., joint])

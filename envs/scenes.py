@@ -45,6 +45,11 @@ FLOOR = -0.6
 FRICTION = 0.5  # PyBullet's default
 
 
+def floor_box(height):
+    """The floor as a `Box`; `height` (m) is that of its surface."""
+    return Box((0.0, 0.0, height - 0.05), (6.0, 6.0, 0.1))
+
+
 @dataclass(frozen=True)
 class Scene:
     """Everything the arm can hit apart from itself. `table=None` or `floor=None` leave them out.

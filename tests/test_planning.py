@@ -11,8 +11,9 @@ import pybullet as p
 import pytest
 
 import envs
-from demo_generation.planning import PLANNERS, Planner, PlanningError, clearance_at
+from demo_generation.planning import PLANNERS, Planner, PlanningError
 from envs import panda
+from envs.collision import CollisionChecker
 from envs.datasets import load_queries
 from envs.scenes import Scene
 
@@ -310,10 +311,12 @@ def test_less_caution_less_clearance(box):
 
 def test_a_query_that_nearly_touches_is_planned(worlds):
     env, rng = worlds["double_walls"], np.random.default_rng(3)
+    checker = CollisionChecker(env.scene)
     planned = 0
     while planned < 3:
         start = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
-        if not env.in_collision(start) and clearance_at(env, start) < 0.001:
+        near = checker.nearest(panda.normalise(start)).distance.min()
+        if not env.in_collision(start) and near < 0.001:
             goal = env.sample_feasible(rng)
             path = Planner(env).plan(start, goal, seed=1)
             assert is_path_of(path, start, goal)

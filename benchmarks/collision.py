@@ -1,0 +1,181 @@
+"""Compiled collision checks (`envs.collision`) against PyBullet's: do they agree, how fast are they?
+
+    pip install -c constraints.txt -e .
+    python benchmarks/collision.py                # 2 minutes
+    python benchmarks/collision.py --num 15000    # fewer configurations
+
+Agreement with `RoboArmEnv.in_collision`: `--num` configurations, as many for each of the thirteen
+tasks' scenes (random boxes: 40 scenes each, of the validation queries) and for the 100 original
+problems of each MotionBenchMaker shelf. Two thirds are uniform; the others were moved along a line
+between two of those until something is within 1 cm, inside or outside, uniformly.
+
+- disagreement: share of configurations with different answers;
+- deepest_mm: of these, the largest distance from contact, by whichever of the two says more.
+
+Speed: uniform configurations in 40 scenes of `random_boxes_hard`, processor time of one core, in
+turns, the median of `--rounds`. PyBullet's check is what planners used before: set the joints,
+detect collisions, read the contacts; `in_collision` also clears old contacts first.
+
+The last line is JSON.
+"""
+
+import argparse
+import json
+import os
+import platform
+import time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import pybullet as p
+from tqdm import tqdm
+
+import envs
+from envs import panda
+from envs.collision import CollisionChecker
+from envs.datasets import load_queries
+
+NEAR = 0.01  # m
+SCENES = 40  # of each distribution
+
+
+def scenes_of(task, split):
+    """Distinct scenes of a task's queries."""
+    scenes = load_queries(task, split).scenes
+    return list(dict.fromkeys(scenes[i] for i in range(len(load_queries(task, split)))))
+
+
+def nudge(checker, states, rng):
+    """Configurations (n, 7) moved to within `NEAR` of contact; fewer, where no line leads there."""
+    others = rng.uniform(-1.0, 1.0, states.shape)
+    wanted = rng.uniform(-NEAR, NEAR, len(states))
+
+    def beyond(shares):
+        there = states + shares[:, None] * (others - states)
+        return checker.nearest(there).distance.min(-1) - wanted
+
+    low, high = np.zeros(len(states)), np.ones(len(states))
+    below, above = beyond(low), beyond(high)
+    crossing = np.sign(below) != np.sign(above)
+    for _ in range(30):
+        middle = (low + high) / 2
+        same = np.sign(beyond(middle)) == np.sign(below)
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return (states + low[:, None] * (others - states))[crossing]
+
+
+def pybullet_distance(env):
+    """Least distance (m) that PyBullet reports after `in_collision`; NaN if it reports none."""
+    contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
+    return min((contact[8] for contact in contacts), default=np.nan)
+
+
+def compare(env, scenes, num, rng, progress):
+    """(configurations, depths in m of the disagreements) in the scenes, `num` in all."""
+    asked, depths = 0, []
+    shares = np.diff(np.linspace(0, num, len(scenes) + 1).round().astype(int))
+    for scene, count in zip(scenes, shares, strict=True):
+        env.set_scene(scene)
+        checker = CollisionChecker(scene)
+        nudged = np.empty((0, 7))
+        while len(nudged) < count // 3:
+            more = nudge(checker, rng.uniform(-1.0, 1.0, (count, 7)), rng)
+            nudged = np.concatenate([nudged, more])[: count // 3]
+        uniform = rng.uniform(-1.0, 1.0, (count - len(nudged), 7))
+        states = np.concatenate([uniform, nudged])
+        free = checker.is_free(states)
+        for state, is_free in zip(states, free, strict=True):
+            if env.in_collision(panda.denormalise(state)) == is_free:
+                ours = abs(checker.nearest(state).distance.min())
+                depths.append(np.nanmax([ours, abs(pybullet_distance(env))]))
+        asked += count
+        progress.update(int(count))
+    return asked, depths
+
+
+def pybullet_check(env, configuration):
+    panda.set_configuration(env.client, env.robot, configuration)
+    p.performCollisionDetection(physicsClientId=env.client)
+    contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
+    return any(contact[8] < 0.0 for contact in contacts)
+
+
+def timed(function, *arguments):
+    began = time.process_time()
+    function(*arguments)
+    return time.process_time() - began
+
+
+def speed(rounds, rng):
+    """Microseconds of processor time per configuration: dict way -> median over rounds."""
+    env, ours = envs.make("random_boxes_hard"), 10_000
+    scenes = scenes_of("random_boxes_hard", "validation")[:SCENES]
+    checkers = [CollisionChecker(scene) for scene in scenes]
+    checkers[0].is_free(np.zeros(7))  # compiles
+    checkers[0].nearest(np.zeros(7))
+    seconds = {name: [] for name in ("is_free", "nearest", "pybullet", "in_collision")}
+    for _ in range(rounds):
+        total = dict.fromkeys(seconds, 0.0)
+        for scene, checker in zip(scenes, checkers, strict=True):
+            states = rng.uniform(-1.0, 1.0, (ours, 7))
+            total["is_free"] += timed(checker.is_free, states) / ours
+            total["nearest"] += timed(checker.nearest, states[:500]) / 500
+            env.set_scene(scene)
+            configurations = panda.denormalise(states[:100]).tolist()
+            for name, check in (
+                ("pybullet", lambda c: pybullet_check(env, c)),
+                ("in_collision", env.in_collision),
+            ):
+                total[name] += timed(lambda check=check: [check(c) for c in configurations]) / 100
+        for name, value in total.items():
+            seconds[name].append(value / len(scenes))
+    env.close()
+    return {name: 1e6 * float(np.median(values)) for name, values in seconds.items()}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--num", type=int, default=100_000, help="configurations to compare")
+    parser.add_argument("--rounds", type=int, default=5, help="of timing")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    if args.num < 1000 or args.rounds < 1 or args.seed < 0:
+        parser.error("--num must be at least 1000, --rounds at least 1, --seed at least 0")
+    rng = np.random.default_rng(args.seed)
+    groups = [(task, "validation") for task in envs.TASKS]
+    groups += [(task, "original") for task in envs.TASKS if task.startswith("benchmaker")]
+    env, asked, depths = envs.RoboArmEnv(), 0, []
+    print(f"{'scenes':38}{'configurations':>15}{'disagree':>10}{'deepest':>12}")
+    with tqdm(total=args.num, unit=" configurations") as progress:
+        for i, (task, split) in enumerate(groups):
+            scenes = scenes_of(task, split)
+            if split == "validation":
+                scenes = scenes[:SCENES]
+            share = args.num * (i + 1) // len(groups) - args.num * i // len(groups)
+            count, found = compare(env, scenes, share, rng, progress)
+            deepest = f"{1e3 * max(found):.3f} mm" if found else "-"
+            progress.write(f"{task + ', ' + split:38}{count:15,}{len(found):10}{deepest:>12}")
+            asked += count
+            depths += found
+    env.close()
+    micros = speed(args.rounds, rng)
+    print()
+    for name, value in micros.items():
+        print(f"{name:14}{value:10.2f} us")
+    print()
+    result = {
+        "configurations": asked,
+        "disagreement": len(depths) / asked,
+        "deepest_mm": 1e3 * max(depths, default=0.0),
+        "checks_per_second": 1e6 / micros["is_free"],
+        "ratio_to_pybullet": micros["pybullet"] / micros["is_free"],
+        "ratio_to_in_collision": micros["in_collision"] / micros["is_free"],
+        "nearest_per_second": 1e6 / micros["nearest"],
+        "python": platform.python_version(),
+    }
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,923 @@
+"""Collision checks and distances, compiled: hundreds of thousands of configurations a second.
+
+    from envs.collision import CollisionChecker
+
+    checker = CollisionChecker(scene)
+    checker.is_free(states)                  # normalised (n, 7) -> bool (n,)
+    checker.is_motion_free(starts, ends)     # straight motions, checked every `RESOLUTION`
+    checker.nearest(states)                  # per link: how far, which way is out, from what
+
+The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`, but no PyBullet
+world is moved. They are: the convex hulls of the links' collision meshes, `BULLET_MARGIN` thicker
+on all sides; boxes and cylinders, with edges rounded by as much; spheres; the table and the floor;
+and `panda.SELF_COLLISION_PAIRS`. As in PyBullet, the base touches nothing but the arm itself. How
+often the two disagree: docs/benchmarks.md.
+
+Two shapes are looked at in three stages, each only if the one before could not tell them apart: the
+link's bounding sphere against the box around the obstacle; the link's bounding box against that
+box, by their faces; then GJK (Gilbert, Johnson, Keerthi, 1988) on the shapes themselves, which
+stops as soon as it knows on which side of the margin their distance is. Where shapes overlap,
+`nearest` needs the depth, which EPA (van den Bergen, 2001) finds.
+
+The functions below are compiled by Numba when they are first called, once per machine
+(docs/environment.md, "Collision checks"). They compute in float64, and an answer does not depend on
+the batch in which it was asked for.
+"""
+
+import functools
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import pybullet as p
+
+from envs import panda
+from envs.scenes import Cylinder, Scene, Sphere, floor_box, to_array
+
+RESOLUTION = 0.021
+"""Motions are checked at points at most this far apart, L2 in the normalised space: less than one
+step of the arm (0.03)."""
+BULLET_MARGIN = 0.001
+"""m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
+MAX_MARGIN = 0.5
+"""m. Larger margins are refused."""
+LINKS = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10)
+"""PyBullet's indices of the links that may touch something, in the order of `Nearest`: the seven
+that the joints move, the hand, the two fingers."""
+NOTHING, TABLE, FLOOR, ARM = -1, -2, -3, -4
+"""What `Nearest.thing` says where it is not the index of an obstacle."""
+
+_FAR = 1e9  # m: farther than anything
+# A row describes a convex shape: kind, centre 3, rotation 9 (row-major), half edges of its core 3,
+# rounding, and of a link which one. The shape is all that is within `rounding` of the core, which
+# is a box or a cylinder less its rounding, a sphere's centre, or a link's hull.
+_BOX, _CYLINDER, _SPHERE, _LINK = 0, 1, 2, 3
+_ROW = 18
+# Directions fall into this many cells squared on each face of a cube, see `_cells`.
+_CELLS = 8
+# GJK stops at this precision (m), after 3 to 10 iterations in nearly all cases; EPA at its own.
+_TOLERANCE, _MAX_ITERATIONS = 1e-8, 64
+_EPA_TOLERANCE, _EPA_VERTICES, _EPA_FACES = 1e-7, 128, 256
+
+
+class Nearest(NamedTuple):
+    """How near each of `LINKS` is to something, for a batch of configurations of shape (...).
+
+    Attributes:
+        distance: m, (..., 10); negative in a collision: minus the way that the link, or what it
+            hits, has to be moved. Infinite where there is nothing.
+        direction: unit vectors (..., 10, 3), in the base's frame: which way is out, the way to move
+            the link to get away. Zeros where there is nothing.
+        point: m, (..., 10, 3), in the base's frame: the point of the link's hull that is nearest,
+            or deepest. Zeros where there is nothing.
+        thing: (..., 10): the index of an obstacle, or `TABLE`, `FLOOR`, `ARM` (another link),
+            `NOTHING`.
+    """
+
+    distance: np.ndarray
+    direction: np.ndarray
+    point: np.ndarray
+    thing: np.ndarray
+
+
+class CollisionChecker:
+    """Collisions of the arm with a scene and with itself.
+
+    States are normalised configurations, shape (..., 7), floats in [-1, 1]; an answer has the
+    batch's shape, (...), and is empty for an empty batch. Safe to use from several threads.
+
+    Args:
+        scene: a `Scene`.
+
+    Raises:
+        TypeError: it is none.
+        ValueError: an obstacle, the table or the floor has a size that is not positive, or numbers
+            that are not finite. Of all methods: states of another shape, not finite, or outside
+            the limits; a margin out of its range.
+    """
+
+    def __init__(self, scene):
+        if not isinstance(scene, Scene):
+            raise TypeError(f"a scene must be an envs.scenes.Scene, got {scene!r}")
+        self.scene = scene
+        shapes, things = list(scene.obstacles), list(range(len(scene.obstacles)))
+        if scene.table is not None:
+            shapes.append(scene.table)
+            things.append(TABLE)
+        if scene.floor is not None:
+            shapes.append(floor_box(scene.floor))
+            things.append(FLOOR)
+        self._rows = _rows(shapes)
+        self._things = np.array([*things, ARM, NOTHING])
+
+    def is_free(self, states, margin=0.0, clearance=0.0, relaxed=None):
+        """Whether the arm is at least `margin` away from everything: bool (...).
+
+        Without a margin, it is free where `RoboArmEnv.in_collision` says that it does not collide.
+
+        Args:
+            states: (..., 7), normalised.
+            margin: m, in [0, `MAX_MARGIN`): from the scene, and between the links.
+            clearance: m, in [0, `MAX_MARGIN`): from the scene, in addition.
+            relaxed: None, or `(states (k, 7), distances (k,), growth)`. Near these states the
+                margin is smaller: `distance + growth * d` at most, where d is how far away they are
+                (L2, normalised). For queries that begin or end nearer to something than `margin`.
+        """
+        states = _states("states", states)
+        free = np.empty(states.shape[:-1], dtype=np.bool_)
+        rule = _rule(margin, clearance, relaxed)
+        _free_batch(states.reshape(-1, 7), rule, _arm(), self._rows, free.reshape(-1))
+        return free
+
+    def is_motion_free(
+        self, starts, ends, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION
+    ):
+        """Whether straight motions are free: bool (...).
+
+        Checked are both ends, then points between them that are no more than `resolution` apart:
+        first in the middle, then in the middle of each half, and so on, until one is not free.
+
+        Args:
+            starts, ends: (..., 7), normalised; one may be broadcast to the other.
+            margin, clearance, relaxed: as for `is_free`.
+            resolution: L2, normalised, > 0.
+        """
+        return self.motion_checks(starts, ends, margin, clearance, relaxed, resolution) > 0
+
+    def motion_checks(
+        self, starts, ends, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION
+    ):
+        """How many configurations `is_motion_free` looks at, int64 (...); negative: not free."""
+        starts, ends = np.broadcast_arrays(_states("starts", starts), _states("ends", ends))
+        rule = _motion_rule(margin, clearance, relaxed, resolution)
+        checks = np.empty(starts.shape[:-1], dtype=np.int64)
+        flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
+        _motion_batch(*flat, rule, _arm(), self._rows, checks.reshape(-1))
+        return checks
+
+    def motion_checker(self, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION):
+        """For planners, which ask for one motion at a time: a function of two sequences of 7.
+
+        It is `motion_checks` for one motion from a start that is known to be free, which is not
+        looked at again, and looks at nothing about its arguments but their length.
+        """
+        rest = (*_motion_rule(margin, clearance, relaxed, resolution), _arm(), self._rows)
+        motion = np.empty((2, 7))
+
+        def check(start, end):
+            motion[0], motion[1] = start, end
+            return _motion(motion, *rest)
+
+        return check
+
+    def nearest(self, states, self_collisions=True):
+        """How far each of `LINKS` is from the nearest thing, and which way is out: a `Nearest`.
+
+        Args:
+            states: (..., 7), normalised.
+            self_collisions: whether other links are things, too (`panda.SELF_COLLISION_PAIRS`).
+        """
+        states = _states("states", states)
+        batch = (*states.shape[:-1], len(LINKS))
+        distance, which = np.empty(batch), np.empty(batch, dtype=np.int64)
+        direction, point = np.empty((*batch, 3)), np.empty((*batch, 3))
+        _nearest_batch(
+            states.reshape(-1, 7),
+            bool(self_collisions),
+            _arm(),
+            self._rows,
+            distance.reshape(-1, len(LINKS)),
+            direction.reshape(-1, len(LINKS), 3),
+            point.reshape(-1, len(LINKS), 3),
+            which.reshape(-1, len(LINKS)),
+        )
+        return Nearest(distance, direction, point, self._things[which])
+
+
+def _states(name, states):
+    """Normalised configurations as a contiguous float64 array. Raises ValueError."""
+    try:
+        states = np.ascontiguousarray(states, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers of shape (..., 7)") from error
+    if states.ndim == 0 or states.shape[-1] != panda.NUM_JOINTS:
+        raise ValueError(f"{name} must have shape (..., 7), got {states.shape}")
+    # float32 may round a limit to just beyond it. NaN is not at most anything.
+    if states.size and not np.abs(states).max() <= 1.0 + 1e-6:
+        raise ValueError(f"{name} must be normalised configurations: finite, in [-1, 1]")
+    return states
+
+
+def _rule(margin, clearance, relaxed):
+    """What `is_free` is asked for, as the compiled functions take it. Raises ValueError."""
+    for name, value in (("margin", margin), ("clearance", clearance)):
+        if not 0 <= value < MAX_MARGIN:
+            raise ValueError(f"{name} must be in [0, {MAX_MARGIN}) m, got {value!r}")
+    if relaxed is None:
+        return float(margin), float(clearance), np.empty((0, 8)), 0.0
+    states, distances, growth = relaxed
+    states = _states("relaxed states", states)
+    distances = np.asarray(distances, dtype=np.float64)
+    if distances.shape != states.shape[:-1] or states.ndim != 2 or np.isnan(distances).any():
+        raise ValueError(f"relaxed: {states.shape} states and {distances.shape} distances")
+    if not 0 <= growth < math.inf:
+        raise ValueError(f"relaxed: growth must be finite and not negative, got {growth!r}")
+    return float(margin), float(clearance), np.c_[states, distances], float(growth)
+
+
+def _motion_rule(margin, clearance, relaxed, resolution):
+    if not 0 < resolution < math.inf:
+        raise ValueError(f"resolution must be positive, got {resolution!r}")
+    return float(resolution), _rule(margin, clearance, relaxed)
+
+
+# --- The arm and the scene as arrays
+
+
+@functools.cache
+def _arm():
+    """The links' hulls as PyBullet makes them: `(bodies, pairs, vertices, cells, candidates)`.
+
+    `bodies`: float64 (11, 8), the base and `LINKS`: the frame in which it moves (0: the base's, or
+    the number of a joint), the centre of its bounding box there 3, the radius of the sphere around
+    that, half edges 3. `pairs`: int64 (n, 2), the bodies that may touch each other. `vertices`:
+    float64 (v, 3), m, from their body's centre. `cells`, `candidates`: see `_cells`.
+    """
+    client = p.connect(p.DIRECT)
+    try:
+        robot = panda.load(client)
+        meshes = []
+        for link in (-1, *LINKS):
+            # PyBullet gives them relative to the link's centre of mass.
+            mass_centre = p.getDynamicsInfo(robot, link, physicsClientId=client)[3]
+            flags = p.MESH_DATA_SIMULATION_MESH
+            mesh = p.getMeshData(robot, link, flags=flags, physicsClientId=client)[1]
+            meshes.append(np.array(mesh) + mass_centre)
+    finally:
+        p.disconnect(physicsClientId=client)
+    # The hand and the open fingers move with joint 7.
+    for finger, side in ((9, 1.0), (10, -1.0)):
+        meshes[finger] += np.array(panda.HAND_TO_FINGER) + (0.0, side * panda.FINGER_OPENING, 0.0)
+    c, s = math.cos(panda.HAND_YAW), math.sin(panda.HAND_YAW)
+    for body in (8, 9, 10):
+        x, y, z = meshes[body].T
+        meshes[body] = np.stack([c * x - s * y, s * x + c * y, z + panda.FLANGE_LENGTH], axis=1)
+    bodies = np.zeros((len(meshes), 8))
+    for body, mesh in enumerate(meshes):
+        centre = (mesh.min(0) + mesh.max(0)) / 2
+        mesh -= centre
+        radius = np.linalg.norm(mesh, axis=1).max()
+        bodies[body] = (min(body, panda.NUM_JOINTS), *centre, radius, *mesh.max(0))
+    order = {link: body for body, link in enumerate((-1, *LINKS))}
+    pairs = np.array([[order[a], order[b]] for a, b in panda.SELF_COLLISION_PAIRS])
+    return bodies, pairs, np.concatenate(meshes), *_cells(meshes)
+
+
+def _cells(meshes):
+    """Which vertices can be the farthest one of their hull, for each cell of directions.
+
+    A cell's directions are mixtures of those of its four corners, so what another vertex beats in
+    all four of them is never the farthest: some five vertices of 150 are left.
+
+    Returns:
+        `cells`, int64 (bodies * 6 * `_CELLS`**2 + 1,): where a cell's candidates begin;
+        `candidates`, int64: indices of vertices.
+    """
+    steps = np.linspace(-1.0, 1.0, _CELLS + 1)
+    u, v = np.meshgrid(steps, steps, indexing="ij")
+    ends, candidates, first = [0], [], 0
+    for mesh in meshes:
+        for face in range(6):
+            directions = [None] * 3
+            directions[face // 2] = np.full_like(u, 1 - 2 * (face % 2))
+            directions[(face // 2 + 1) % 3], directions[(face // 2 + 2) % 3] = u, v
+            far = np.einsum("vi,iab->vab", mesh, np.stack(directions))
+            corners = np.stack([far[:, :-1, :-1], far[:, 1:, :-1], far[:, :-1, 1:], far[:, 1:, 1:]])
+            best = corners.min(0).argmax(0)
+            bests = np.take_along_axis(corners, best[None, None], axis=1)
+            possible = (corners >= bests).any(0)  # (v, cells, cells)
+            cell, vertex = np.nonzero(possible.reshape(len(mesh), -1).T)
+            candidates.append(vertex + first)
+            ends.append(ends[-1] + np.bincount(cell, minlength=_CELLS**2).cumsum())
+            ends = [*ends[:-1], *ends[-1].tolist()]
+        first += len(mesh)
+    return np.array(ends), np.concatenate(candidates)
+
+
+def _rows(obstacles):
+    """Obstacles -> float64 (n, `_ROW`). Raises ValueError for what is no obstacle."""
+    rows = np.zeros((len(obstacles), _ROW))
+    for obstacle, numbers, row in zip(obstacles, to_array(obstacles), rows, strict=True):
+        (kind,), position, quaternion, size = np.split(numbers, (1, 4, 8))
+        norm = math.sqrt(quaternion @ quaternion)
+        if not (np.isfinite(numbers).all() and size.min() > 0 and 0 < norm < math.inf):
+            raise ValueError(f"an obstacle needs finite numbers and positive sizes: {obstacle}")
+        half = np.array(size) if isinstance(obstacle, Sphere) else size / 2
+        if isinstance(obstacle, Cylinder):
+            half[:2] = obstacle.radius
+        rounding = half[0] if isinstance(obstacle, Sphere) else min(BULLET_MARGIN, half.min())
+        x, y, z, w = quaternion / norm
+        rotation = (
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        )
+        row[:] = (kind, *position, *rotation, *half - rounding, rounding, 0)
+    return rows
+
+
+# --- Compiled. Working memory is float64: `frames` (8, 12), a rotation (row-major) and a position
+# each; `centres` (11, 3), of the bodies; `pose` (12,), of a shape in a body's frame; `simplex`, see
+# `_gjk`; `other` (1, `_ROW`), a link as the shape that another link may hit.
+
+
+def _compiled(function):
+    """Numba's `njit`, cached on disk if there is a folder for that which can be written to."""
+    options = {"nogil": True, "error_model": "numpy"}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # neither beside this file nor in the user's own cache
+        return numba.njit(**options)(function)
+
+
+_LOWER, _SPAN = tuple(panda.LOWER.tolist()), tuple((panda.UPPER - panda.LOWER).tolist())
+_JOINTS = tuple(
+    (x, y, z, float(round(math.sin(roll))), float(round(math.cos(roll))))
+    for x, y, z, roll in panda.JOINT_FRAMES
+)
+
+
+@_compiled
+def _memory():
+    """(frames, centres, pose, simplex, other)"""
+    return (
+        np.zeros((8, 12)),
+        np.empty((11, 3)),
+        np.empty(12),
+        np.empty(31),
+        np.zeros((1, _ROW)),
+    )
+
+
+@_compiled
+def _place(q, bodies, frames, centres):
+    """Write the frames and the bodies' centres of a normalised configuration."""
+    frames[0, 0] = frames[0, 4] = frames[0, 8] = 1.0
+    for joint in range(7):
+        x, y, z, sr, cr = _JOINTS[joint]
+        angle = _LOWER[joint] + (q[joint] + 1.0) * 0.5 * _SPAN[joint]
+        c, s = math.cos(angle), math.sin(angle)
+        here, there = frames[joint], frames[joint + 1]
+        for i in range(0, 9, 3):
+            rx, ry, rz = here[i], here[i + 1], here[i + 2]
+            there[9 + i // 3] = here[9 + i // 3] + rx * x + ry * y + rz * z
+            # Turned by the roll about x, then by the joint about its z.
+            ty, tz = cr * ry + sr * rz, cr * rz - sr * ry
+            there[i] = c * rx + s * ty
+            there[i + 1] = c * ty - s * rx
+            there[i + 2] = tz
+    for body in range(bodies.shape[0]):
+        f = frames[int(bodies[body, 0])]
+        x, y, z = bodies[body, 1], bodies[body, 2], bodies[body, 3]
+        for i in range(3):
+            centres[body, i] = f[9 + i] + f[3 * i] * x + f[3 * i + 1] * y + f[3 * i + 2] * z
+
+
+@_compiled
+def _sphere_gap(rows, j, centres, k):
+    """Squared distance (m^2) of a body's centre from the box around a shape's core."""
+    x, y, z = centres[k, 0] - rows[j, 1], centres[k, 1] - rows[j, 2], centres[k, 2] - rows[j, 3]
+    u = max(abs(rows[j, 4] * x + rows[j, 7] * y + rows[j, 10] * z) - rows[j, 13], 0.0)
+    v = max(abs(rows[j, 5] * x + rows[j, 8] * y + rows[j, 11] * z) - rows[j, 14], 0.0)
+    w = max(abs(rows[j, 6] * x + rows[j, 9] * y + rows[j, 12] * z) - rows[j, 15], 0.0)
+    return u * u + v * v + w * w
+
+
+@_compiled
+def _relative(rows, j, frames, f, centres, k, pose):
+    """Write the pose of a shape as a body sees it: rotation (row-major) and place."""
+    x, y, z = rows[j, 1] - centres[k, 0], rows[j, 2] - centres[k, 1], rows[j, 3] - centres[k, 2]
+    for i in range(3):
+        a, b, c = frames[f, i], frames[f, 3 + i], frames[f, 6 + i]
+        pose[9 + i] = a * x + b * y + c * z
+        for n in range(3):
+            pose[3 * i + n] = a * rows[j, 4 + n] + b * rows[j, 7 + n] + c * rows[j, 10 + n]
+
+
+@_compiled
+def _boxes_apart(bodies, k, rows, j, pose, gap):
+    """Whether a face of the body's box, or of that around the core, lies between them by `gap`."""
+    for i in range(3):
+        reach = bodies[k, 5 + i]
+        for n in range(3):
+            reach += abs(pose[3 * i + n]) * rows[j, 13 + n]
+        if abs(pose[9 + i]) > reach + gap:
+            return True
+    for n in range(3):
+        reach, along = rows[j, 13 + n], 0.0
+        for i in range(3):
+            reach += abs(pose[3 * i + n]) * bodies[k, 5 + i]
+            along += pose[3 * i + n] * pose[9 + i]
+        if abs(along) > reach + gap:
+            return True
+    return False
+
+
+@_compiled
+def _begin(rows, j, pose, s):
+    """Write to s[28:31] a vector from a core towards a body, for `_gjk` to begin with."""
+    # From the nearest point of the box around the core to the body's centre, in the core's axes.
+    u = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
+    v = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
+    w = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
+    u = math.copysign(max(abs(u) - rows[j, 13], 0.0), u)
+    v = math.copysign(max(abs(v) - rows[j, 14], 0.0), v)
+    w = math.copysign(max(abs(w) - rows[j, 15], 0.0), w)
+    if u * u + v * v + w * w > 1e-12:
+        for i in range(3):
+            s[28 + i] = pose[3 * i] * u + pose[3 * i + 1] * v + pose[3 * i + 2] * w
+        return
+    s[28], s[29], s[30] = -pose[9], -pose[10], -pose[11]
+    if pose[9] * pose[9] + pose[10] * pose[10] + pose[11] * pose[11] < 1e-12:
+        s[28] = 1.0
+
+
+@_compiled
+def _farthest(arm, k, x, y, z):
+    """Index of the vertex of a body that is farthest along (x, y, z)."""
+    _, _, vertices, cells, candidates = arm
+    u, v, w = abs(x), abs(y), abs(z)
+    if u >= v and u >= w:
+        face, size, u, v = 0 if x > 0.0 else 1, u, y, z
+    elif v >= w:
+        face, size, u, v = 2 if y > 0.0 else 3, v, z, x
+    else:
+        face, size, u, v = 4 if z > 0.0 else 5, w, x, y
+    cell = 0
+    if size > 0.0:
+        i = min(int((u / size + 1.0) * (0.5 * _CELLS)), _CELLS - 1)
+        j = min(int((v / size + 1.0) * (0.5 * _CELLS)), _CELLS - 1)
+        cell = ((k * 6 + face) * _CELLS + i) * _CELLS + j
+    best, found = -_FAR, 0
+    for n in range(cells[cell], cells[cell + 1]):
+        i = candidates[n]
+        value = vertices[i, 0] * x + vertices[i, 1] * y + vertices[i, 2] * z
+        if value > best:
+            best, found = value, i
+    return found
+
+
+@_compiled
+def _support(arm, k, rows, j, pose, x, y, z):
+    """The point of body minus core that is farthest along (x, y, z), and the body's vertex."""
+    vertices = arm[2]
+    i = _farthest(arm, k, x, y, z)
+    # The core's point that is farthest the other way, in its own axes.
+    u = -(pose[0] * x + pose[3] * y + pose[6] * z)
+    v = -(pose[1] * x + pose[4] * y + pose[7] * z)
+    w = -(pose[2] * x + pose[5] * y + pose[8] * z)
+    if rows[j, 0] == _LINK:
+        n = _farthest(arm, int(rows[j, 17]), u, v, w)
+        u, v, w = vertices[n, 0], vertices[n, 1], vertices[n, 2]
+    elif rows[j, 0] == _CYLINDER:
+        across = math.sqrt(u * u + v * v)
+        scale = rows[j, 13] / across if across > 0.0 else 0.0
+        u, v, w = u * scale, v * scale, math.copysign(rows[j, 15], w)
+    else:  # a box, or a sphere, whose core has no size
+        u = math.copysign(rows[j, 13], u)
+        v = math.copysign(rows[j, 14], v)
+        w = math.copysign(rows[j, 15], w)
+    ax, ay, az = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+    return (
+        ax - (pose[9] + pose[0] * u + pose[1] * v + pose[2] * w),
+        ay - (pose[10] + pose[3] * u + pose[4] * v + pose[5] * w),
+        az - (pose[11] + pose[6] * u + pose[7] * v + pose[8] * w),
+        ax,
+        ay,
+        az,
+    )
+
+
+@_compiled
+def _triangle(s, a, b, c):
+    """The triangle of the points at s[a], s[b], s[c]: its point nearest to the origin.
+
+    Returns its squared distance and its barycentric coordinates (Ericson, Real-Time Collision
+    Detection, 2005, section 5.1.5).
+    """
+    abx, aby, abz = s[b] - s[a], s[b + 1] - s[a + 1], s[b + 2] - s[a + 2]
+    acx, acy, acz = s[c] - s[a], s[c + 1] - s[a + 1], s[c + 2] - s[a + 2]
+    d1 = -(abx * s[a] + aby * s[a + 1] + abz * s[a + 2])
+    d2 = -(acx * s[a] + acy * s[a + 1] + acz * s[a + 2])
+    d3 = -(abx * s[b] + aby * s[b + 1] + abz * s[b + 2])
+    d4 = -(acx * s[b] + acy * s[b + 1] + acz * s[b + 2])
+    d5 = -(abx * s[c] + aby * s[c + 1] + abz * s[c + 2])
+    d6 = -(acx * s[c] + acy * s[c + 1] + acz * s[c + 2])
+    in_a, in_b, in_c = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    if d1 <= 0.0 and d2 <= 0.0:
+        u, v, w = 1.0, 0.0, 0.0
+    elif d3 >= 0.0 and d4 <= d3:
+        u, v, w = 0.0, 1.0, 0.0
+    elif in_c <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        u, w = 1.0 - v, 0.0
+    elif d6 >= 0.0 and d5 <= d6:
+        u, v, w = 0.0, 0.0, 1.0
+    elif in_b <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        u, v = 1.0 - w, 0.0
+    elif in_a <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / (d4 - d3 + d5 - d6)
+        u, v = 0.0, 1.0 - w
+    else:
+        total = in_a + in_b + in_c
+        v, w = in_b / total, in_c / total
+        u = 1.0 - v - w
+    squared = 0.0
+    for i in range(3):
+        x = u * s[a + i] + v * s[b + i] + w * s[c + i]
+        squared += x * x
+    return squared, u, v, w
+
+
+@_compiled
+def _reduce(s, n):
+    """Keep of a simplex of `n` points those that span its point nearest to the origin.
+
+    Their weights go to s[24:28]. Returns how many are left; 4 if the origin is inside.
+    """
+    if n == 4:
+        best, without = _FAR, -1
+        u = v = w = 0.0
+        for face in range(4):  # the one without point `face`
+            a, b, c, d = 3 * ((face + 1) % 4), 3 * ((face + 2) % 4), 3 * ((face + 3) % 4), 3 * face
+            origin, point = 0.0, 0.0
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                normal = (s[b + j] - s[a + j]) * (s[c + k] - s[a + k])
+                normal -= (s[b + k] - s[a + k]) * (s[c + j] - s[a + j])
+                origin -= normal * s[a + i]
+                point += normal * (s[d + i] - s[a + i])
+            if origin * point > 0.0:
+                continue  # both are on one side
+            squared, x, y, z = _triangle(s, a, b, c)
+            if squared < best:
+                best, without, u, v, w = squared, face, x, y, z
+        if without < 0:
+            return 4
+        # In the order of `_triangle`: a, b, c are the points after `without`, around and around.
+        if without == 0:
+            s[24], s[25], s[26], s[27] = 0.0, u, v, w
+        elif without == 1:
+            s[24], s[25], s[26], s[27] = w, 0.0, u, v
+        elif without == 2:
+            s[24], s[25], s[26], s[27] = v, w, 0.0, u
+        else:
+            s[24], s[25], s[26], s[27] = u, v, w, 0.0
+    elif n == 3:
+        _, s[24], s[25], s[26] = _triangle(s, 0, 3, 6)
+    elif n == 2:
+        along = squared = 0.0
+        for i in range(3):
+            edge = s[3 + i] - s[i]
+            along -= edge * s[i]
+            squared += edge * edge
+        s[25] = min(max(along / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+        s[24] = 1.0 - s[25]
+    else:
+        s[24] = 1.0
+    left = 0
+    for i in range(n):
+        if s[24 + i] > 0.0:
+            for k in range(3):
+                s[3 * left + k], s[12 + 3 * left + k] = s[3 * i + k], s[12 + 3 * i + k]
+            s[24 + left] = s[24 + i]
+            left += 1
+    return left
+
+
+@_compiled
+def _gjk(arm, k, rows, j, pose, s, near, far):
+    """Distance (m) of a body's hull from a shape's core; 0 where they overlap.
+
+    It may stop early: at a lower bound of the distance that is at least `far`, or at an upper bound
+    that is below `near`, which it then returns. Writes to `s`: the simplex's points (3 x 4) of body
+    minus core, the body's vertices they come from (3 x 4), weights (4), and at the end the vector
+    from the core to the hull (3). On entry, that is any vector to begin with. `pose` is the core's.
+
+    Returns the distance and the number of points in the simplex.
+    """
+    x, y, z = s[28], s[29], s[30]
+    distance, bound, n = math.sqrt(x * x + y * y + z * z), _FAR, 0
+    for _ in range(_MAX_ITERATIONS):
+        px, py, pz, ax, ay, az = _support(arm, k, rows, j, pose, -x, -y, -z)
+        lower = (px * x + py * y + pz * z) / distance
+        if lower >= far:
+            return lower, n
+        if bound - lower <= _TOLERANCE:
+            break
+        i = 3 * n
+        s[i], s[i + 1], s[i + 2], s[12 + i], s[13 + i], s[14 + i] = px, py, pz, ax, ay, az
+        n = _reduce(s, n + 1)
+        if n == 4:
+            return 0.0, n
+        x = y = z = 0.0
+        for i in range(n):
+            x += s[24 + i] * s[3 * i]
+            y += s[24 + i] * s[3 * i + 1]
+            z += s[24 + i] * s[3 * i + 2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if distance < 1e-9:  # they touch, in a way that tells no direction
+            return 0.0, n
+        s[28], s[29], s[30] = x, y, z
+        if distance < near or distance >= bound:
+            return min(distance, bound), n
+        bound = distance
+    return bound, n
+
+
+@_compiled
+def _is_apart(arm, k, rows, j, frames, centres, pose, s, gap):
+    """Whether a body's hull is at least `gap` (m) away from a shape's core."""
+    bodies = arm[0]
+    _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
+    if _boxes_apart(bodies, k, rows, j, pose, gap):
+        return True
+    _begin(rows, j, pose, s)
+    return _gjk(arm, k, rows, j, pose, s, gap, gap)[0] >= gap
+
+
+@_compiled
+def _as_row(bodies, k, frames, centres, row):
+    """Write a body as a shape."""
+    row[0, 0], row[0, 16], row[0, 17] = _LINK, BULLET_MARGIN, k
+    for i in range(3):
+        row[0, 1 + i], row[0, 13 + i] = centres[k, i], bodies[k, 5 + i]
+    for i in range(9):
+        row[0, 4 + i] = frames[int(bodies[k, 0]), i]
+
+
+@_compiled
+def _is_free(q, rule, arm, rows, memory):
+    """`CollisionChecker.is_free` of one state."""
+    margin, clearance, ends, growth = rule
+    bodies, pairs, _, _, _ = arm
+    frames, centres, pose, s, other = memory
+    for i in range(ends.shape[0]):
+        squared = 0.0
+        for j in range(7):
+            squared += (q[j] - ends[i, j]) ** 2
+        margin = min(margin, ends[i, 7] + growth * math.sqrt(squared))
+    _place(q, bodies, frames, centres)
+    for k in range(bodies.shape[0] - 1, 0, -1):  # the hand first: it moves most
+        for j in range(rows.shape[0]):
+            gap = margin + clearance + rows[j, 16] + BULLET_MARGIN
+            reach = bodies[k, 4] + gap
+            if reach > 0.0 and _sphere_gap(rows, j, centres, k) >= reach * reach:
+                continue
+            if not _is_apart(arm, k, rows, j, frames, centres, pose, s, gap):
+                return False
+    gap = margin + 2 * BULLET_MARGIN
+    for i in range(pairs.shape[0]):
+        a, b = pairs[i, 0], pairs[i, 1]
+        reach = bodies[a, 4] + bodies[b, 4] + gap
+        x, y = centres[a, 0] - centres[b, 0], centres[a, 1] - centres[b, 1]
+        z = centres[a, 2] - centres[b, 2]
+        if reach > 0.0 and x * x + y * y + z * z >= reach * reach:
+            continue
+        _as_row(bodies, b, frames, centres, other)
+        if not _is_apart(arm, a, other, 0, frames, centres, pose, s, gap):
+            return False
+    return True
+
+
+@_compiled
+def _free_batch(states, rule, arm, rows, free):
+    memory = _memory()
+    for i in range(states.shape[0]):
+        free[i] = _is_free(states[i], rule, arm, rows, memory)
+
+
+@_compiled
+def _motion(motion, resolution, rule, arm, rows):
+    """How many states of a motion (2, 7) were looked at, but its start; negative: not free."""
+    memory, q = _memory(), np.empty(7)
+    squared = 0.0
+    for j in range(7):
+        squared += (motion[1, j] - motion[0, j]) ** 2
+    pieces = int(math.ceil(math.sqrt(squared) / resolution))
+    looked_at, parts, part = 0, 1, 1
+    while True:
+        i = part * pieces // parts  # of `pieces`: first the end, then the middle, ...
+        # Unless an earlier, coarser round has looked at that.
+        before, after = (part - 1) * pieces // parts, (part + 1) * pieces // parts
+        if parts == 1 or (i != before and i != after):
+            share = i / pieces if pieces > 0 else 1.0
+            for j in range(7):
+                q[j] = motion[0, j] + (motion[1, j] - motion[0, j]) * share
+            looked_at += 1
+            if not _is_free(q, rule, arm, rows, memory):
+                return -looked_at
+        part += 2
+        if part > parts:
+            if parts >= pieces:
+                return looked_at
+            parts, part = 2 * parts, 1
+
+
+@_compiled
+def _motion_batch(starts, stops, resolution, rule, arm, rows, checks):
+    motion, memory = np.empty((2, 7)), _memory()
+    for i in range(starts.shape[0]):
+        motion[0], motion[1] = starts[i], stops[i]
+        if not _is_free(starts[i], rule, arm, rows, memory):
+            checks[i] = -1
+            continue
+        more = _motion(motion, resolution, rule, arm, rows)
+        checks[i] = more + 1 if more > 0 else more - 1
+
+
+# --- Compiled: distances
+
+
+@_compiled
+def _add_face(s, faces, n, a, b, c):
+    """Append a face of EPA's polytope: its points, unit normal, distance from the origin."""
+    f = faces[n]
+    f[0], f[1], f[2] = a, b, c
+    squared = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        f[3 + i] = (s[b, j] - s[a, j]) * (s[c, k] - s[a, k])
+        f[3 + i] -= (s[b, k] - s[a, k]) * (s[c, j] - s[a, j])
+        squared += f[3 + i] * f[3 + i]
+    f[6] = _FAR  # of a face without an area, which is never the nearest
+    if squared > 1e-30:
+        f[3:6] /= math.sqrt(squared)
+        f[6] = f[3] * s[a, 0] + f[4] * s[a, 1] + f[5] * s[a, 2]
+    return n + 1
+
+
+@_compiled
+def _epa(arm, k, rows, j, pose, s, points, faces, edges):
+    """Depth (m) of a body's hull in a shape's core, from a simplex of `_gjk` around the origin.
+
+    Writes the way out to s[28:31], and the body's deepest point to s[24:27]. `points`:
+    (`_EPA_VERTICES`, 6), `faces`: (`_EPA_FACES`, 7), `edges`: (3 * `_EPA_FACES`, 2).
+    """
+    for i in range(4):
+        for n in range(3):
+            points[i, n], points[i, 3 + n] = s[3 * i + n], s[12 + 3 * i + n]
+    num_points, num_faces = 4, 0
+    for face in range(4):
+        a, b, c = (face + 1) % 4, (face + 2) % 4, (face + 3) % 4
+        num_faces = _add_face(points, faces, num_faces, a, b, c)
+        if faces[num_faces - 1, 6] < 0.0:  # it looked inwards
+            num_faces = _add_face(points, faces, num_faces - 1, a, c, b)
+    while True:
+        nearest = 0
+        for f in range(1, num_faces):
+            if faces[f, 6] < faces[nearest, 6]:
+                nearest = f
+        face = faces[nearest]
+        x, y, z = face[3], face[4], face[5]
+        px, py, pz, ax, ay, az = _support(arm, k, rows, j, pose, x, y, z)
+        further = x * px + y * py + z * pz - face[6]
+        full = num_points == points.shape[0] or num_faces + num_points > faces.shape[0]
+        if further <= _EPA_TOLERANCE or full:
+            break
+        new = points[num_points]
+        new[0], new[1], new[2], new[3], new[4], new[5] = px, py, pz, ax, ay, az
+        # Faces that the new point sees make room for those between it and their outline.
+        num_edges, f = 0, 0
+        while f < num_faces:
+            seen = faces[f, 3] * px + faces[f, 4] * py + faces[f, 5] * pz - faces[f, 6]
+            if seen <= 1e-12:
+                f += 1
+                continue
+            for i in range(3):
+                a, b = int(faces[f, i]), int(faces[f, (i + 1) % 3])
+                for e in range(num_edges):
+                    if edges[e, 0] == b and edges[e, 1] == a:  # between two that are seen
+                        num_edges -= 1
+                        edges[e, 0], edges[e, 1] = edges[num_edges, 0], edges[num_edges, 1]
+                        break
+                else:
+                    edges[num_edges, 0], edges[num_edges, 1] = a, b
+                    num_edges += 1
+            num_faces -= 1
+            faces[f, :] = faces[num_faces, :]
+        for e in range(num_edges):
+            num_faces = _add_face(points, faces, num_faces, edges[e, 0], edges[e, 1], num_points)
+        num_points += 1
+    depth = face[6]
+    # The origin's shadow on that face, as a mean of its corners, and so of the body's vertices.
+    triangle = np.empty(9)
+    for i in range(3):
+        for n in range(3):
+            triangle[3 * i + n] = points[int(face[i]), n] - depth * face[3 + n]
+    _, u, v, w = _triangle(triangle, 0, 3, 6)
+    for n in range(3):
+        s[24 + n] = (
+            u * points[int(face[0]), 3 + n]
+            + v * points[int(face[1]), 3 + n]
+            + w * points[int(face[2]), 3 + n]
+        )
+        s[28 + n] = -face[3 + n]
+    return depth
+
+
+@_compiled
+def _signed_distance(arm, k, rows, j, frames, centres, pose, s, far, polytope):
+    """Distance (m) of a body's hull from a shape's core, minus the depth where they overlap.
+
+    `_FAR` if that is not less than `far`. Else s[28:31] is the way out and s[24:27] the hull's
+    nearest or deepest point, both in the body's axes and the latter from its centre.
+    """
+    bodies = arm[0]
+    squared = _sphere_gap(rows, j, centres, k)
+    reach = bodies[k, 4] + far
+    # From outside, no way out is longer than the radius less the distance.
+    if squared > 0.0 and (reach <= 0.0 or squared >= reach * reach):
+        return _FAR
+    _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
+    if _boxes_apart(bodies, k, rows, j, pose, far):
+        return _FAR
+    _begin(rows, j, pose, s)
+    distance, n = _gjk(arm, k, rows, j, pose, s, -1.0, far)
+    if distance >= far:
+        return _FAR
+    if distance == 0.0:
+        if n < 4:  # the origin is on a face or an edge of the simplex: move it off, by 0.1 um
+            pose[9] += 3e-8
+            pose[10] += 5e-8
+            pose[11] += 7e-8
+            n = _gjk(arm, k, rows, j, pose, s, -1.0, _FAR)[1]
+        if n == 4:
+            points, faces, edges = polytope
+            return -_epa(arm, k, rows, j, pose, s, points, faces, edges)
+    u, v, w = s[24], s[25] if n > 1 else 0.0, s[26] if n > 2 else 0.0
+    norm = math.sqrt(s[28] * s[28] + s[29] * s[29] + s[30] * s[30])
+    for i in range(3):
+        s[24 + i] = u * s[12 + i]
+        if n > 1:
+            s[24 + i] += v * s[15 + i]
+        if n > 2:
+            s[24 + i] += w * s[18 + i]
+        s[28 + i] /= norm
+    return distance
+
+
+@_compiled
+def _write(frames, f, centres, k, s, sign, back, direction, point):
+    """Direction and point of `_signed_distance`, in the base's frame; `back` (m) from the point."""
+    for i in range(3):
+        out = at = 0.0
+        for n in range(3):
+            out += frames[f, 3 * i + n] * s[28 + n]
+            at += frames[f, 3 * i + n] * s[24 + n]
+        direction[i], point[i] = sign * out, centres[k, i] + at - back * out
+
+
+@_compiled
+def _nearest_batch(states, self_collisions, arm, rows, distance, direction, point, which):
+    bodies, pairs, _, _, _ = arm
+    frames, centres, pose, s, other = _memory()
+    polytope = (
+        np.empty((_EPA_VERTICES, 6)),
+        np.empty((_EPA_FACES, 7)),
+        np.empty((3 * _EPA_FACES, 2), np.int64),
+    )
+    distance[:], direction[:], point[:] = np.inf, 0.0, 0.0
+    which[:] = rows.shape[0] + 1
+    for i in range(states.shape[0]):
+        _place(states[i], bodies, frames, centres)
+        for k in range(1, bodies.shape[0]):
+            f, link = int(bodies[k, 0]), k - 1
+            first, least = 0, _FAR  # what is probably nearest goes first: it rules out the others
+            for j in range(rows.shape[0]):
+                squared = _sphere_gap(rows, j, centres, k)
+                if squared < least:
+                    first, least = j, squared
+            for n in range(rows.shape[0]):
+                j = first if n == 0 else n - 1 if n <= first else n
+                rounding = rows[j, 16] + BULLET_MARGIN
+                far = min(distance[i, link] + rounding, _FAR)
+                core = _signed_distance(arm, k, rows, j, frames, centres, pose, s, far, polytope)
+                if core < far:
+                    distance[i, link], which[i, link] = core - rounding, j
+                    _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
+        rounding = 2 * BULLET_MARGIN
+        for j in range(pairs.shape[0] if self_collisions else 0):
+            a, b = pairs[j, 0], pairs[j, 1]
+            far = distance[i, b - 1] if a == 0 else max(distance[i, a - 1], distance[i, b - 1])
+            far = min(far + rounding, _FAR)
+            _as_row(bodies, b, frames, centres, other)
+            core = _signed_distance(arm, a, other, 0, frames, centres, pose, s, far, polytope)
+            for body, sign, back in ((a, 1.0, 0.0), (b, -1.0, core)):
+                link = body - 1
+                if link >= 0 and core < _FAR and core - rounding < distance[i, link]:
+                    distance[i, link], which[i, link] = core - rounding, rows.shape[0]
+                    f = int(bodies[a, 0])
+                    _write(frames, f, centres, a, s, sign, back, direction[i, link], point[i, link])
