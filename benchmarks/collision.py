@@ -1,4 +1,6 @@
-"""Compiled collision checks (`envs.collision`) against PyBullet's: do they agree, how fast are they?
+"""Compiled collision checks against PyBullet's: do they agree, and how fast are they?
+
+Ours are those of `envs.collision`.
 
     pip install -c constraints.txt -e .
     python benchmarks/collision.py                # 2 minutes
@@ -24,6 +26,7 @@ import json
 import os
 import platform
 import time
+from functools import partial
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -75,7 +78,7 @@ def compare(env, scenes, num, rng, progress):
     """(configurations, depths in m of the disagreements) in the scenes, `num` in all."""
     asked, depths = 0, []
     shares = np.diff(np.linspace(0, num, len(scenes) + 1).round().astype(int))
-    for scene, count in zip(scenes, shares, strict=True):
+    for scene, count in zip(scenes, shares.tolist(), strict=True):
         env.set_scene(scene)
         checker = CollisionChecker(scene)
         nudged = np.empty((0, 7))
@@ -88,9 +91,9 @@ def compare(env, scenes, num, rng, progress):
         for state, is_free in zip(states, free, strict=True):
             if env.in_collision(panda.denormalise(state)) == is_free:
                 ours = abs(checker.nearest(state).distance.min())
-                depths.append(np.nanmax([ours, abs(pybullet_distance(env))]))
+                depths.append(float(np.nanmax([ours, abs(pybullet_distance(env))])))
         asked += count
-        progress.update(int(count))
+        progress.update(count)
     return asked, depths
 
 
@@ -99,6 +102,11 @@ def pybullet_check(env, configuration):
     p.performCollisionDetection(physicsClientId=env.client)
     contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
     return any(contact[8] < 0.0 for contact in contacts)
+
+
+def ask(check, configurations):
+    for configuration in configurations:
+        check(configuration)
 
 
 def timed(function, *arguments):
@@ -123,11 +131,8 @@ def speed(rounds, rng):
             total["nearest"] += timed(checker.nearest, states[:500]) / 500
             env.set_scene(scene)
             configurations = panda.denormalise(states[:100]).tolist()
-            for name, check in (
-                ("pybullet", lambda c: pybullet_check(env, c)),
-                ("in_collision", env.in_collision),
-            ):
-                total[name] += timed(lambda check=check: [check(c) for c in configurations]) / 100
+            total["pybullet"] += timed(ask, partial(pybullet_check, env), configurations) / 100
+            total["in_collision"] += timed(ask, env.in_collision, configurations) / 100
         for name, value in total.items():
             seconds[name].append(value / len(scenes))
     env.close()

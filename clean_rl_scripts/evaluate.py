@@ -79,8 +79,6 @@ ENV_ARGUMENTS = ("action_mode", "max_step", "velocities", "encoder")
 LOOKING = ("via-points", "planner")  # policies that look for a motion before they move
 ROOT = Path(__file__).resolve().parent.parent
 NAMED = ("go-to-goal", "random", *LOOKING)
-# `via-points` keeps no margin, which would reject more than it saves: with 3 mm, clean success was
-# 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
 
@@ -216,6 +214,8 @@ def _via_points(env, seed, tries):
 
     checker = None
 
+    # No margin is kept, which would reject more than it saves: with 3 mm, clean success was 2 to 5
+    # points lower on `wall`, `double_walls` and `boxes`.
     def policy(index, query):
         nonlocal checker
         if checker is None or checker.scene is not env.scene:

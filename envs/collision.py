@@ -153,7 +153,7 @@ class CollisionChecker:
         rule = _motion_rule(margin, clearance, relaxed, resolution)
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
         flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
-        _motion_batch(*flat, rule, _arm(), self._rows, checks.reshape(-1))
+        _motion_batch(*flat, *rule, _arm(), self._rows, checks.reshape(-1))
         return checks
 
     def motion_checker(self, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION):
@@ -237,12 +237,12 @@ def _motion_rule(margin, clearance, relaxed, resolution):
 
 @functools.cache
 def _arm():
-    """The links' hulls as PyBullet makes them: `(bodies, pairs, vertices, cells, candidates)`.
+    """The links' hulls as PyBullet makes them: `(bodies, pairs, vertices, cells)`.
 
     `bodies`: float64 (11, 8), the base and `LINKS`: the frame in which it moves (0: the base's, or
     the number of a joint), the centre of its bounding box there 3, the radius of the sphere around
     that, half edges 3. `pairs`: int64 (n, 2), the bodies that may touch each other. `vertices`:
-    float64 (v, 3), m, from their body's centre. `cells`, `candidates`: see `_cells`.
+    float64 (v, 3), m, from their body's centre. `cells`: see `_cells`.
     """
     client = p.connect(p.DIRECT)
     try:
@@ -271,7 +271,7 @@ def _arm():
         bodies[body] = (min(body, panda.NUM_JOINTS), *centre, radius, *mesh.max(0))
     order = {link: body for body, link in enumerate((-1, *LINKS))}
     pairs = np.array([[order[a], order[b]] for a, b in panda.SELF_COLLISION_PAIRS])
-    return bodies, pairs, np.concatenate(meshes), *_cells(meshes)
+    return bodies, pairs, np.concatenate(meshes), _cells(meshes)
 
 
 def _cells(meshes):
@@ -281,8 +281,8 @@ def _cells(meshes):
     all four of them is never the farthest: some five vertices of 150 are left.
 
     Returns:
-        `cells`, int64 (bodies * 6 * `_CELLS`**2 + 1,): where a cell's candidates begin;
-        `candidates`, int64: indices of vertices.
+        An int64 array: for each cell (body by body, face by face) where in this array the indices
+        of its vertices begin; where the last ones end; and then these indices.
     """
     steps = np.linspace(-1.0, 1.0, _CELLS + 1)
     u, v = np.meshgrid(steps, steps, indexing="ij")
@@ -302,7 +302,7 @@ def _cells(meshes):
             ends.append(ends[-1] + np.bincount(cell, minlength=_CELLS**2).cumsum())
             ends = [*ends[:-1], *ends[-1].tolist()]
         first += len(mesh)
-    return np.array(ends), np.concatenate(candidates)
+    return np.concatenate([np.array(ends) + len(ends), *candidates])
 
 
 def _rows(obstacles):
@@ -444,9 +444,8 @@ def _begin(rows, j, pose, s):
 
 
 @_compiled
-def _farthest(arm, k, x, y, z):
+def _farthest(vertices, cells, k, x, y, z):
     """Index of the vertex of a body that is farthest along (x, y, z)."""
-    _, _, vertices, cells, candidates = arm
     u, v, w = abs(x), abs(y), abs(z)
     if u >= v and u >= w:
         face, size, u, v = 0 if x > 0.0 else 1, u, y, z
@@ -461,7 +460,7 @@ def _farthest(arm, k, x, y, z):
         cell = ((k * 6 + face) * _CELLS + i) * _CELLS + j
     best, found = -_FAR, 0
     for n in range(cells[cell], cells[cell + 1]):
-        i = candidates[n]
+        i = cells[n]
         value = vertices[i, 0] * x + vertices[i, 1] * y + vertices[i, 2] * z
         if value > best:
             best, found = value, i
@@ -469,16 +468,15 @@ def _farthest(arm, k, x, y, z):
 
 
 @_compiled
-def _support(arm, k, rows, j, pose, x, y, z):
+def _support(vertices, cells, k, rows, j, pose, x, y, z):
     """The point of body minus core that is farthest along (x, y, z), and the body's vertex."""
-    vertices = arm[2]
-    i = _farthest(arm, k, x, y, z)
+    i = _farthest(vertices, cells, k, x, y, z)
     # The core's point that is farthest the other way, in its own axes.
     u = -(pose[0] * x + pose[3] * y + pose[6] * z)
     v = -(pose[1] * x + pose[4] * y + pose[7] * z)
     w = -(pose[2] * x + pose[5] * y + pose[8] * z)
     if rows[j, 0] == _LINK:
-        n = _farthest(arm, int(rows[j, 17]), u, v, w)
+        n = _farthest(vertices, cells, int(rows[j, 17]), u, v, w)
         u, v, w = vertices[n, 0], vertices[n, 1], vertices[n, 2]
     elif rows[j, 0] == _CYLINDER:
         across = math.sqrt(u * u + v * v)
@@ -598,7 +596,7 @@ def _reduce(s, n):
 
 
 @_compiled
-def _gjk(arm, k, rows, j, pose, s, near, far):
+def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
     """Distance (m) of a body's hull from a shape's core; 0 where they overlap.
 
     It may stop early: at a lower bound of the distance that is at least `far`, or at an upper bound
@@ -611,7 +609,7 @@ def _gjk(arm, k, rows, j, pose, s, near, far):
     x, y, z = s[28], s[29], s[30]
     distance, bound, n = math.sqrt(x * x + y * y + z * z), _FAR, 0
     for _ in range(_MAX_ITERATIONS):
-        px, py, pz, ax, ay, az = _support(arm, k, rows, j, pose, -x, -y, -z)
+        px, py, pz, ax, ay, az = _support(vertices, cells, k, rows, j, pose, -x, -y, -z)
         lower = (px * x + py * y + pz * z) / distance
         if lower >= far:
             return lower, n
@@ -638,14 +636,13 @@ def _gjk(arm, k, rows, j, pose, s, near, far):
 
 
 @_compiled
-def _is_apart(arm, k, rows, j, frames, centres, pose, s, gap):
+def _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
     """Whether a body's hull is at least `gap` (m) away from a shape's core."""
-    bodies = arm[0]
     _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
     if _boxes_apart(bodies, k, rows, j, pose, gap):
         return True
     _begin(rows, j, pose, s)
-    return _gjk(arm, k, rows, j, pose, s, gap, gap)[0] >= gap
+    return _gjk(vertices, cells, k, rows, j, pose, s, gap, gap)[0] >= gap
 
 
 @_compiled
@@ -662,7 +659,7 @@ def _as_row(bodies, k, frames, centres, row):
 def _is_free(q, rule, arm, rows, memory):
     """`CollisionChecker.is_free` of one state."""
     margin, clearance, ends, growth = rule
-    bodies, pairs, _, _, _ = arm
+    bodies, pairs, vertices, cells = arm
     frames, centres, pose, s, other = memory
     for i in range(ends.shape[0]):
         squared = 0.0
@@ -676,7 +673,7 @@ def _is_free(q, rule, arm, rows, memory):
             reach = bodies[k, 4] + gap
             if reach > 0.0 and _sphere_gap(rows, j, centres, k) >= reach * reach:
                 continue
-            if not _is_apart(arm, k, rows, j, frames, centres, pose, s, gap):
+            if not _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
                 return False
     gap = margin + 2 * BULLET_MARGIN
     for i in range(pairs.shape[0]):
@@ -687,7 +684,7 @@ def _is_free(q, rule, arm, rows, memory):
         if reach > 0.0 and x * x + y * y + z * z >= reach * reach:
             continue
         _as_row(bodies, b, frames, centres, other)
-        if not _is_apart(arm, a, other, 0, frames, centres, pose, s, gap):
+        if not _is_apart(bodies, vertices, cells, a, other, 0, frames, centres, pose, s, gap):
             return False
     return True
 
@@ -760,7 +757,7 @@ def _add_face(s, faces, n, a, b, c):
 
 
 @_compiled
-def _epa(arm, k, rows, j, pose, s, points, faces, edges):
+def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
     """Depth (m) of a body's hull in a shape's core, from a simplex of `_gjk` around the origin.
 
     Writes the way out to s[28:31], and the body's deepest point to s[24:27]. `points`:
@@ -782,7 +779,7 @@ def _epa(arm, k, rows, j, pose, s, points, faces, edges):
                 nearest = f
         face = faces[nearest]
         x, y, z = face[3], face[4], face[5]
-        px, py, pz, ax, ay, az = _support(arm, k, rows, j, pose, x, y, z)
+        px, py, pz, ax, ay, az = _support(vertices, cells, k, rows, j, pose, x, y, z)
         further = x * px + y * py + z * pz - face[6]
         full = num_points == points.shape[0] or num_faces + num_points > faces.shape[0]
         if further <= _EPA_TOLERANCE or full:
@@ -829,13 +826,12 @@ def _epa(arm, k, rows, j, pose, s, points, faces, edges):
 
 
 @_compiled
-def _signed_distance(arm, k, rows, j, frames, centres, pose, s, far, polytope):
+def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope):
     """Distance (m) of a body's hull from a shape's core, minus the depth where they overlap.
 
     `_FAR` if that is not less than `far`. Else s[28:31] is the way out and s[24:27] the hull's
     nearest or deepest point, both in the body's axes and the latter from its centre.
     """
-    bodies = arm[0]
     squared = _sphere_gap(rows, j, centres, k)
     reach = bodies[k, 4] + far
     # From outside, no way out is longer than the radius less the distance.
@@ -845,7 +841,7 @@ def _signed_distance(arm, k, rows, j, frames, centres, pose, s, far, polytope):
     if _boxes_apart(bodies, k, rows, j, pose, far):
         return _FAR
     _begin(rows, j, pose, s)
-    distance, n = _gjk(arm, k, rows, j, pose, s, -1.0, far)
+    distance, n = _gjk(vertices, cells, k, rows, j, pose, s, -1.0, far)
     if distance >= far:
         return _FAR
     if distance == 0.0:
@@ -853,10 +849,10 @@ def _signed_distance(arm, k, rows, j, frames, centres, pose, s, far, polytope):
             pose[9] += 3e-8
             pose[10] += 5e-8
             pose[11] += 7e-8
-            n = _gjk(arm, k, rows, j, pose, s, -1.0, _FAR)[1]
+            n = _gjk(vertices, cells, k, rows, j, pose, s, -1.0, _FAR)[1]
         if n == 4:
             points, faces, edges = polytope
-            return -_epa(arm, k, rows, j, pose, s, points, faces, edges)
+            return -_epa(vertices, cells, k, rows, j, pose, s, points, faces, edges)
     u, v, w = s[24], s[25] if n > 1 else 0.0, s[26] if n > 2 else 0.0
     norm = math.sqrt(s[28] * s[28] + s[29] * s[29] + s[30] * s[30])
     for i in range(3):
@@ -882,7 +878,7 @@ def _write(frames, f, centres, k, s, sign, back, direction, point):
 
 @_compiled
 def _nearest_batch(states, self_collisions, arm, rows, distance, direction, point, which):
-    bodies, pairs, _, _, _ = arm
+    bodies, pairs, vertices, cells = arm
     frames, centres, pose, s, other = _memory()
     polytope = (
         np.empty((_EPA_VERTICES, 6)),
@@ -904,7 +900,9 @@ def _nearest_batch(states, self_collisions, arm, rows, distance, direction, poin
                 j = first if n == 0 else n - 1 if n <= first else n
                 rounding = rows[j, 16] + BULLET_MARGIN
                 far = min(distance[i, link] + rounding, _FAR)
-                core = _signed_distance(arm, k, rows, j, frames, centres, pose, s, far, polytope)
+                core = _signed_distance(
+                    bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope
+                )
                 if core < far:
                     distance[i, link], which[i, link] = core - rounding, j
                     _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
@@ -914,7 +912,9 @@ def _nearest_batch(states, self_collisions, arm, rows, distance, direction, poin
             far = distance[i, b - 1] if a == 0 else max(distance[i, a - 1], distance[i, b - 1])
             far = min(far + rounding, _FAR)
             _as_row(bodies, b, frames, centres, other)
-            core = _signed_distance(arm, a, other, 0, frames, centres, pose, s, far, polytope)
+            core = _signed_distance(
+                bodies, vertices, cells, a, other, 0, frames, centres, pose, s, far, polytope
+            )
             for body, sign, back in ((a, 1.0, 0.0), (b, -1.0, core)):
                 link = body - 1
                 if link >= 0 and core < _FAR and core - rounding < distance[i, link]:
