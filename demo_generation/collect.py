@@ -260,7 +260,7 @@ def _check(args):
             raise ValueError(f"--{name} must be at least {lowest}")
     with contextlib.closing(envs.make(args.task)) as env:
         # Refuses what a planner refuses, before any work is done.
-        make_planner(env, vars(args)).close()
+        make_planner(env, vars(args))
     check_writable(path)
     if query_path(args.task).exists():
         validate(query_path(args.task), args.task)  # demonstrations must not be of its queries

@@ -77,10 +77,14 @@ class Validity:
 
     def __call__(self, state):
         """Whether a configuration is free."""
+        state = tuple(map(float, state))
         return self.motion_free(state, state)
 
     def motion_free(self, start, end):
-        """Whether the straight motion from a configuration that is free to another is free."""
+        """Whether the straight motion from a configuration that is free to another is free.
+
+        Both are tuples of 7 floats.
+        """
         checks = self._check(start, end)
         self.checks += abs(checks)
         return checks > 0
@@ -109,7 +113,8 @@ class _States(ob.StateValidityChecker):
         self._is_valid = is_valid
 
     def isValid(self, state):  # noqa: N802 (OMPL's name)
-        return self._is_valid([state[i] for i in _JOINTS])
+        state = _values(state)
+        return self._is_valid.motion_free(state, state)
 
 
 class _Motions(ob.MotionValidator):
@@ -120,10 +125,11 @@ class _Motions(ob.MotionValidator):
         self._is_valid = is_valid
 
     def checkMotion(self, start, end):  # noqa: N802
-        return self._is_valid.motion_free([start[i] for i in _JOINTS], [end[i] for i in _JOINTS])
+        return self._is_valid.motion_free(_values(start), _values(end))
 
 
-_JOINTS = tuple(range(panda.NUM_JOINTS))
+def _values(state):
+    return state[0], state[1], state[2], state[3], state[4], state[5], state[6]
 
 
 class Planner:
@@ -208,7 +214,7 @@ class Planner:
         # For the random number generators that OMPL makes from here on. Spaces make some, for the
         # projections of KPIECE1 and its kin; how many must not matter to the planner.
         ou.RNG.setSeed(seed)
-        space = _space(is_valid)
+        space = self._space(is_valid)
         ou.RNG.setSeed(seed)
         if callable(self.planner):
             path = self.planner(is_valid, *states, np.random.default_rng(seed))
@@ -265,21 +271,26 @@ class Planner:
         }
         return Validity(self._checker, rule, self.time_limit, self.max_checks)
 
+    def _space(self, is_valid):
+        """OMPL's `SpaceInformation`, which asks `is_valid`."""
+        space = normalised_space()
+        information = ob.SpaceInformation(space)
+        information.setStateValidityChecker(_States(information, is_valid))
+        information.setMotionValidator(_Motions(information, is_valid))
+        # For the planners that count a motion's states themselves: a share of the longest motion.
+        information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
+        information.setup()
+        return information
 
-def _space(is_valid):
-    """OMPL's view of the normalised configuration space: a `SpaceInformation`."""
+
+def normalised_space():
+    """OMPL's view of the normalised configuration space."""
     space = ob.RealVectorStateSpace(panda.NUM_JOINTS)
     bounds = ob.RealVectorBounds(panda.NUM_JOINTS)
     bounds.setLow(-1.0)
     bounds.setHigh(1.0)
     space.setBounds(bounds)
-    information = ob.SpaceInformation(space)
-    information.setStateValidityChecker(_States(information, is_valid))
-    information.setMotionValidator(_Motions(information, is_valid))
-    # For the planners that count a motion's states themselves: a share of the longest motion.
-    information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
-    information.setup()
-    return information
+    return space
 
 
 def _state(space, values):

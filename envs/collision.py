@@ -127,7 +127,7 @@ class CollisionChecker:
         states = _states("states", states)
         free = np.empty(states.shape[:-1], dtype=np.bool_)
         rule = _rule(margin, clearance, relaxed)
-        _free_batch(states.reshape(-1, 7), rule, _arm(), self._rows, free.reshape(-1))
+        _free_batch(states.reshape(-1, 7), *rule, *_arm(), self._rows, free.reshape(-1))
         return free
 
     def is_motion_free(
@@ -150,24 +150,23 @@ class CollisionChecker:
     ):
         """How many configurations `is_motion_free` looks at, int64 (...); negative: not free."""
         starts, ends = np.broadcast_arrays(_states("starts", starts), _states("ends", ends))
-        rule = _motion_rule(margin, clearance, relaxed, resolution)
+        rule = _rule(margin, clearance, relaxed, resolution)
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
         flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
-        _motion_batch(*flat, *rule, _arm(), self._rows, checks.reshape(-1))
+        _motion_batch(*flat, *rule, *_arm(), self._rows, checks.reshape(-1))
         return checks
 
     def motion_checker(self, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION):
-        """For planners, which ask for one motion at a time: a function of two sequences of 7.
+        """For planners, which ask for one motion at a time: a function of two tuples of 7 floats.
 
         It is `motion_checks` for one motion from a start that is known to be free, which is not
-        looked at again, and looks at nothing about its arguments but their length.
+        looked at again; and it does not look at its arguments.
         """
-        rest = (*_motion_rule(margin, clearance, relaxed, resolution), _arm(), self._rows)
-        motion = np.empty((2, 7))
+        rule = _rule(margin, clearance, relaxed, resolution)
+        rest = (*rule, *_arm(), self._rows)
 
         def check(start, end):
-            motion[0], motion[1] = start, end
-            return _motion(motion, *rest)
+            return _motion(start, end, *rest)
 
         return check
 
@@ -185,7 +184,7 @@ class CollisionChecker:
         _nearest_batch(
             states.reshape(-1, 7),
             bool(self_collisions),
-            _arm(),
+            *_arm(),
             self._rows,
             distance.reshape(-1, len(LINKS)),
             direction.reshape(-1, len(LINKS), 3),
@@ -209,27 +208,26 @@ def _states(name, states):
     return states
 
 
-def _rule(margin, clearance, relaxed):
-    """What `is_free` is asked for, as the compiled functions take it. Raises ValueError."""
+def _rule(margin, clearance, relaxed, resolution=RESOLUTION):
+    """What is asked for, as the compiled functions take it. Raises ValueError.
+
+    Returns float64 (4,): margin, clearance, growth, resolution; and (k, 8): states and distances.
+    """
     for name, value in (("margin", margin), ("clearance", clearance)):
         if not 0 <= value < MAX_MARGIN:
             raise ValueError(f"{name} must be in [0, {MAX_MARGIN}) m, got {value!r}")
+    if not 0 < resolution < math.inf:
+        raise ValueError(f"resolution must be positive, got {resolution!r}")
     if relaxed is None:
-        return float(margin), float(clearance), np.empty((0, 8)), 0.0
+        return np.array([margin, clearance, 0.0, resolution]), np.empty((0, 8))
     states, distances, growth = relaxed
     states = _states("relaxed states", states)
     distances = np.asarray(distances, dtype=np.float64)
-    if distances.shape != states.shape[:-1] or states.ndim != 2 or np.isnan(distances).any():
+    if states.ndim != 2 or distances.shape != states.shape[:1] or np.isnan(distances).any():
         raise ValueError(f"relaxed: {states.shape} states and {distances.shape} distances")
     if not 0 <= growth < math.inf:
         raise ValueError(f"relaxed: growth must be finite and not negative, got {growth!r}")
-    return float(margin), float(clearance), np.c_[states, distances], float(growth)
-
-
-def _motion_rule(margin, clearance, relaxed, resolution):
-    if not 0 < resolution < math.inf:
-        raise ValueError(f"resolution must be positive, got {resolution!r}")
-    return float(resolution), _rule(margin, clearance, relaxed)
+    return np.array([margin, clearance, growth, resolution]), np.c_[states, distances]
 
 
 # --- The arm and the scene as arrays
@@ -656,16 +654,15 @@ def _as_row(bodies, k, frames, centres, row):
 
 
 @_compiled
-def _is_free(q, rule, arm, rows, memory):
+def _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
     """`CollisionChecker.is_free` of one state."""
-    margin, clearance, ends, growth = rule
-    bodies, pairs, vertices, cells = arm
     frames, centres, pose, s, other = memory
-    for i in range(ends.shape[0]):
+    margin, clearance, growth = rule[0], rule[1], rule[2]
+    for i in range(relaxed.shape[0]):
         squared = 0.0
         for j in range(7):
-            squared += (q[j] - ends[i, j]) ** 2
-        margin = min(margin, ends[i, 7] + growth * math.sqrt(squared))
+            squared += (q[j] - relaxed[i, j]) ** 2
+        margin = min(margin, relaxed[i, 7] + growth * math.sqrt(squared))
     _place(q, bodies, frames, centres)
     for k in range(bodies.shape[0] - 1, 0, -1):  # the hand first: it moves most
         for j in range(rows.shape[0]):
@@ -690,20 +687,20 @@ def _is_free(q, rule, arm, rows, memory):
 
 
 @_compiled
-def _free_batch(states, rule, arm, rows, free):
+def _free_batch(states, rule, relaxed, bodies, pairs, vertices, cells, rows, free):
     memory = _memory()
     for i in range(states.shape[0]):
-        free[i] = _is_free(states[i], rule, arm, rows, memory)
+        free[i] = _is_free(states[i], rule, relaxed, bodies, pairs, vertices, cells, rows, memory)
 
 
 @_compiled
-def _motion(motion, resolution, rule, arm, rows):
-    """How many states of a motion (2, 7) were looked at, but its start; negative: not free."""
+def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows):
+    """How many states of a motion were looked at, not counting its start; negative: not free."""
     memory, q = _memory(), np.empty(7)
     squared = 0.0
     for j in range(7):
-        squared += (motion[1, j] - motion[0, j]) ** 2
-    pieces = int(math.ceil(math.sqrt(squared) / resolution))
+        squared += (end[j] - start[j]) ** 2
+    pieces = int(math.ceil(math.sqrt(squared) / rule[3]))
     looked_at, parts, part = 0, 1, 1
     while True:
         i = part * pieces // parts  # of `pieces`: first the end, then the middle, ...
@@ -712,9 +709,9 @@ def _motion(motion, resolution, rule, arm, rows):
         if parts == 1 or (i != before and i != after):
             share = i / pieces if pieces > 0 else 1.0
             for j in range(7):
-                q[j] = motion[0, j] + (motion[1, j] - motion[0, j]) * share
+                q[j] = start[j] + (end[j] - start[j]) * share
             looked_at += 1
-            if not _is_free(q, rule, arm, rows, memory):
+            if not _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
                 return -looked_at
         part += 2
         if part > parts:
@@ -724,14 +721,13 @@ def _motion(motion, resolution, rule, arm, rows):
 
 
 @_compiled
-def _motion_batch(starts, stops, resolution, rule, arm, rows, checks):
-    motion, memory = np.empty((2, 7)), _memory()
+def _motion_batch(starts, stops, rule, relaxed, bodies, pairs, vertices, cells, rows, checks):
+    memory = _memory()
     for i in range(starts.shape[0]):
-        motion[0], motion[1] = starts[i], stops[i]
-        if not _is_free(starts[i], rule, arm, rows, memory):
+        if not _is_free(starts[i], rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
             checks[i] = -1
             continue
-        more = _motion(motion, resolution, rule, arm, rows)
+        more = _motion(starts[i], stops[i], rule, relaxed, bodies, pairs, vertices, cells, rows)
         checks[i] = more + 1 if more > 0 else more - 1
 
 
@@ -877,8 +873,9 @@ def _write(frames, f, centres, k, s, sign, back, direction, point):
 
 
 @_compiled
-def _nearest_batch(states, self_collisions, arm, rows, distance, direction, point, which):
-    bodies, pairs, vertices, cells = arm
+def _nearest_batch(
+    states, self_collisions, bodies, pairs, vertices, cells, rows, distance, direction, point, which
+):
     frames, centres, pose, s, other = _memory()
     polytope = (
         np.empty((_EPA_VERTICES, 6)),

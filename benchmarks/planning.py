@@ -1,0 +1,180 @@
+"""Planning with compiled collision checks: how fast, and how often is there a plan in time?
+
+    pip install -c constraints.txt -e .
+    python benchmarks/planning.py    # random_boxes_hard; some 3 minutes
+    python benchmarks/planning.py --task benchmaker_bookshelf_thin --split original
+
+Ours is `demo_generation.planning.Planner.plan_within`: RRT-Connect with one round of shortening, at
+most three attempts, each keeping less distance. Two others are the same but for their collision
+checks, one configuration at a time in PyBullet's world, asked from Python, as it was before
+`envs.collision`: one with today's options, and one with OMPL's own range and three rounds of
+shortening, as `evaluate.py --policy planner` had them then (`pybullet_checked`).
+
+The others plan the first `--peer` queries, in turns with ours. A mean is over all queries of a
+planner, those without a plan included; a ratio is over the queries that both have had. Times are
+wall-clock time of one process, so nothing else should run. The last line is JSON.
+"""
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import platform
+import time
+from dataclasses import replace
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import pybullet as p
+from ompl import base as ob
+from tqdm import tqdm
+
+import envs
+from demo_generation import planning
+from demo_generation.planning import MARGIN, MARGIN_GROWTH, Planner, PlanningError
+from envs import panda
+from envs.collision import RESOLUTION
+from envs.datasets import load_queries
+from envs.scenes import Box, Cylinder, Scene
+
+
+class PyBulletValidity:
+    """Whether a normalised configuration is free, by the contacts that PyBullet reports."""
+
+    def __init__(self, world, margin, ends, planner):
+        self.world, self.margin, self.checks = world, margin, 0
+        self.ends = [(panda.normalise(end), self.distance(end) - 1e-5) for end in ends]
+        self.deadline, self.max_checks = time.monotonic() + planner.time_limit, planner.max_checks
+
+    def distance(self, configuration):
+        client, robot = self.world.client, self.world.robot
+        panda.set_configuration(client, robot, configuration)
+        p.performCollisionDetection(physicsClientId=client)
+        contacts = p.getContactPoints(bodyA=robot, physicsClientId=client)
+        return min((contact[8] for contact in contacts), default=math.inf)
+
+    def __call__(self, state):
+        self.checks += 1
+        state = [state[i] for i in range(panda.NUM_JOINTS)]
+        nearest = self.distance(panda.denormalise_one(state))
+        return nearest >= self.margin or any(
+            nearest >= distance + MARGIN_GROWTH * math.dist(state, end)
+            for end, distance in self.ends
+        )
+
+    def exhausted(self):
+        return self.checks >= self.max_checks or time.monotonic() > self.deadline
+
+
+class PyBulletPlanner(Planner):
+    """`Planner` as it was: the clearance is kept by inflating the scene."""
+
+    def __init__(self, env, **options):
+        super().__init__(env, **options)
+        self.inflated = envs.RoboArmEnv(env.scene)
+
+    def _validity(self, start, goal, caution):
+        world = self.env
+        self.inflated.set_scene(inflate(self.env.scene, caution * self.clearance))
+        if not any(self.inflated.in_collision(end) for end in (start, goal)):
+            world = self.inflated
+        return PyBulletValidity(world, caution * MARGIN, (start, goal), self)
+
+    def _space(self, is_valid):
+        information = ob.SpaceInformation(planning.normalised_space())
+        information.setStateValidityChecker(is_valid)
+        longest = information.getStateSpace().getMaximumExtent()
+        information.setStateValidityCheckingResolution(RESOLUTION / longest)
+        information.setup()
+        return information
+
+
+def inflate(scene, clearance):
+    """The scene with everything larger by `clearance` (m) on all sides."""
+
+    def grow(body):
+        if isinstance(body, Box):
+            return replace(body, size=tuple(edge + 2 * clearance for edge in body.size))
+        if isinstance(body, Cylinder):
+            return replace(body, radius=body.radius + clearance, length=body.length + 2 * clearance)
+        return replace(body, radius=body.radius + clearance)
+
+    return Scene(
+        tuple(grow(obstacle) for obstacle in scene.obstacles),
+        table=None if scene.table is None else grow(scene.table),
+        floor=None if scene.floor is None else scene.floor + clearance,
+    )
+
+
+def plan(planner, query, seconds, seed):
+    """(milliseconds, the path or None)"""
+    began, path = time.perf_counter(), None
+    with contextlib.suppress(PlanningError):
+        path = planner.plan_within(seconds, *query, rng=np.random.default_rng(seed))
+    return 1e3 * (time.perf_counter() - began), path
+
+
+def length_of(path):
+    """L2 in the normalised space, of a path (n, 7), rad."""
+    return np.linalg.norm(np.diff(panda.normalise(path), axis=0), axis=1).sum()
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--task", default="random_boxes_hard", choices=list(envs.TASKS))
+    parser.add_argument("--split", default="test", choices=["test", "validation", "original"])
+    parser.add_argument("--num", type=int, default=1000, help="queries (1,000)")
+    parser.add_argument("--peer", type=int, default=300, help="of them also with the others (300)")
+    parser.add_argument("--limits", type=float, nargs="+", default=[5.0, 0.05], help="seconds")
+    args = parser.parse_args()
+    queries = load_queries(args.task, args.split)[: args.num]
+    if args.num < 1 or args.peer < 0 or min(args.limits) <= 0:
+        parser.error("--num must be at least 1, --peer at least 0, --limits positive")
+    env, other_env = envs.make(args.task), envs.make(args.task)
+    ways = {
+        "ours": Planner(env, max_checks=math.inf),
+        "pybullet_checked": PyBulletPlanner(
+            other_env, max_checks=math.inf, planner_range=0, simplify=3
+        ),
+        "pybullet_same_options": PyBulletPlanner(other_env, max_checks=math.inf),
+    }
+    plan(ways["ours"], queries[0], 60.0, 0)  # compiles
+    result = {"task": args.task, "split": args.split, "queries": len(queries)}
+    rows = []
+    for seconds in args.limits:
+        first = seconds == args.limits[0]
+        found = {way: [] for way in ways}
+        for i in tqdm(range(len(queries)), desc=f"{args.task}, {seconds:g} s", unit=" queries"):
+            for way, planner in ways.items():
+                if way == "ours" or (first and i < args.peer):
+                    found[way].append(plan(planner, queries[i], seconds, i))
+        times = {way: np.array([time for time, _ in plans]) for way, plans in found.items()}
+        for way, plans in found.items():
+            paths = [path for _, path in plans if path is not None]
+            if not paths:
+                continue
+            solved, length = len(paths) / len(plans), np.mean([length_of(path) for path in paths])
+            rows.append((seconds, way, len(plans), solved, times[way], length))
+            if way == "ours":
+                result[f"solved_in_{seconds:g}_s"] = solved
+            if first:
+                prefix = "" if way == "ours" else f"{way}_"
+                result |= {f"{prefix}mean_ms": times[way].mean(), f"{prefix}solved": solved}
+            if first and way != "ours":
+                ratio = times[way].mean() / times["ours"][: len(plans)].mean()
+                result[f"ratio_to_{way}"] = ratio
+    head = f"{'limit':>8}  {'planner':24}{'queries':>8}{'solved':>8}{'mean':>9}{'median':>9}"
+    print(f"\n{head}{'90 %':>9}{'length':>8}")
+    for seconds, way, count, solved, spent, length in rows:
+        line = f"{seconds:6g} s  {way:24}{count:8}{solved:8.3f}"
+        for value in (spent.mean(), *np.percentile(spent, [50, 90])):
+            line += f"{value:6.1f} ms"
+        print(f"{line}{length:8.2f}")
+    print()
+    print(json.dumps(result | {"python": platform.python_version()}))
+
+
+if __name__ == "__main__":
+    main()
