@@ -1,6 +1,6 @@
 """What to compare with, on every task: the floor, a little search, and the ceiling.
 
-    python benchmarks/baselines.py --workers 2                  # hours; what is done is skipped
+    python benchmarks/baselines.py --workers 2                  # 2 hours; what is done is skipped
     python benchmarks/baselines.py --only wall --workers 2
     python benchmarks/baselines.py --table                      # only writes the table
 
@@ -31,6 +31,7 @@ CELLS = {
     "go-to-goal": ["--policy", "go-to-goal"],
     "via-points, K = 16": ["--policy", "via-points", "--tries", "16"],
     "via-points, K = 64": ["--policy", "via-points", "--tries", "64"],
+    "RRT-Connect, 0.05 s": ["--policy", "planner", "--time-limit", "0.05"],
     "RRT-Connect, 0.5 s": ["--policy", "planner", "--time-limit", "0.5"],
     "RRT-Connect, 5 s": ["--policy", "planner", "--time-limit", "5"],
 }
