@@ -58,7 +58,7 @@ _ROW = 18
 _CELLS = 8
 # GJK stops at this precision (m), after 3 to 10 iterations in nearly all cases; EPA at its own.
 _TOLERANCE, _MAX_ITERATIONS = 1e-8, 64
-_EPA_TOLERANCE, _EPA_VERTICES, _EPA_FACES = 1e-7, 128, 256
+_EPA_TOLERANCE, _EPA_VERTICES, _EPA_FACES = 1e-7, 128, 768
 
 
 class Nearest(NamedTuple):
@@ -197,11 +197,14 @@ class CollisionChecker:
 def _states(name, states):
     """Normalised configurations as a contiguous float64 array. Raises ValueError."""
     try:
-        states = np.ascontiguousarray(states, dtype=np.float64)
+        states = np.asarray(states)
+        if states.dtype.kind not in "fiu":
+            raise TypeError(f"they are of type {states.dtype}")
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be numbers of shape (..., 7)") from error
-    if states.ndim == 0 or states.shape[-1] != panda.NUM_JOINTS:
+    if states.shape[-1:] != (panda.NUM_JOINTS,):
         raise ValueError(f"{name} must have shape (..., 7), got {states.shape}")
+    states = np.ascontiguousarray(states, dtype=np.float64)
     # float32 may round a limit to just beyond it. NaN is not at most anything.
     if states.size and not np.abs(states).max() <= 1.0 + 1e-6:
         raise ValueError(f"{name} must be normalised configurations: finite, in [-1, 1]")
@@ -757,7 +760,7 @@ def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
     """Depth (m) of a body's hull in a shape's core, from a simplex of `_gjk` around the origin.
 
     Writes the way out to s[28:31], and the body's deepest point to s[24:27]. `points`:
-    (`_EPA_VERTICES`, 6), `faces`: (`_EPA_FACES`, 7), `edges`: (3 * `_EPA_FACES`, 2).
+    (`_EPA_VERTICES`, 6), `faces`: (`_EPA_FACES`, 7), `edges`: (`_EPA_FACES`, 2).
     """
     for i in range(4):
         for n in range(3):
@@ -777,7 +780,8 @@ def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
         x, y, z = face[3], face[4], face[5]
         px, py, pz, ax, ay, az = _support(vertices, cells, k, rows, j, pose, x, y, z)
         further = x * px + y * py + z * pz - face[6]
-        full = num_points == points.shape[0] or num_faces + num_points > faces.shape[0]
+        # (At most three times as many faces come out of the next round.)
+        full = num_points == points.shape[0] or 3 * num_faces > faces.shape[0]
         if further <= _EPA_TOLERANCE or full:
             break
         new = points[num_points]
@@ -880,7 +884,7 @@ def _nearest_batch(
     polytope = (
         np.empty((_EPA_VERTICES, 6)),
         np.empty((_EPA_FACES, 7)),
-        np.empty((3 * _EPA_FACES, 2), np.int64),
+        np.empty((_EPA_FACES, 2), np.int64),
     )
     distance[:], direction[:], point[:] = np.inf, 0.0, 0.0
     which[:] = rows.shape[0] + 1
