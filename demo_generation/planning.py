@@ -23,6 +23,7 @@ from ompl import util as ou
 
 from envs import panda
 from envs.collision import RESOLUTION, CollisionChecker
+from envs.datasets import subgoals
 
 # OMPL writes to the console; what a user should know is raised here.
 ou.setLogLevel(ou.LogLevel.LOG_NONE)
@@ -48,6 +49,8 @@ MARGIN_GROWTH = 0.03
 # Attempts of `plan_within`: share of the remaining time, and caution. (Half of the time for the
 # first one solved 1 % less of `random_boxes_hard` in 0.05 s: validation queries.)
 ATTEMPTS = ((0.2, 1.0), (0.4, 0.5), (1.0, 0.25))
+# Steps by which the arm may come later than its last sub-goal.
+LAG = 10
 # Trials of cutting a corner in one round of simplification, and how many may fail in a row. Bounded
 # by iterations, unlike OMPL's simplifyMax, which is bounded by seconds, they are deterministic.
 SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS = 50, 25
@@ -238,21 +241,29 @@ class Planner:
     def plan_within(self, seconds, start, goal, scene=None, *, rng):
         """A path found in `seconds`, by attempts of less and less caution (`ATTEMPTS`).
 
-        `rng`, a NumPy Generator, gives the seeds; the rest is as for `plan`. Shortening a path that
-        was found in time may take a little longer.
+        A path that takes longer to follow than an episode lasts is only returned if later attempts
+        find no shorter one. `rng`, a NumPy Generator, gives the seeds; the rest is as for `plan`.
+        Shortening a path that was found in time may take a little longer.
         """
         deadline, limit = time.monotonic() + seconds, self.time_limit
+        longest, best = self.env.horizon - LAG, None
         try:
             for share, caution in ATTEMPTS:
                 self.time_limit = share * (deadline - time.monotonic())
                 seed = int(rng.integers(1, 2**32))
                 try:
-                    return self.plan(start, goal, scene, seed=seed, caution=caution)
+                    path = self.plan(start, goal, scene, seed=seed, caution=caution)
                 except PlanningError:
                     continue
+                if best is None or len(subgoals(path)) < len(subgoals(best)):
+                    best = path
+                if len(subgoals(best)) <= longest:
+                    break
         finally:
             self.time_limit = limit
-        raise PlanningError(f"no path in {seconds} s")
+        if best is None:
+            raise PlanningError(f"no path in {seconds} s")
+        return best
 
     def _validity(self, start, goal, caution):
         if self._checker is None or self._checker.scene is not self.env.scene:
