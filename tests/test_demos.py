@@ -36,7 +36,6 @@ def made():
     seeds = [3, 2**32 - 1, 5, 6, 7]
     plans = [planner.plan(*env.sample_query(rng), seed=seed) for seed in seeds]
     executions = [follow(env, plan) for plan in plans]
-    planner.close()
     env.close()
     return plans, executions, seeds
 

@@ -275,7 +275,6 @@ def test_the_planner_solves_double_walls_and_follows_its_plan():
         to_goal = panda.forward_kinematics(states) - panda.forward_kinematics(query.goal)
         steps = int(np.argmax(np.linalg.norm(to_goal, axis=1) <= env.ee_tolerance))
         rows.append((steps, evaluation.path_length(states[: steps + 1])))
-    planner.close()
     env.close()
     steps, lengths = np.mean(rows, axis=0)
     assert result["mean_steps"] == steps
