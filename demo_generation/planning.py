@@ -184,7 +184,11 @@ class Planner:
         self.time_limit, self.max_checks = time_limit, max_checks
         self.clearance = clearance
         self.planner_range, self.simplify = planner_range, simplify
-        self._checker = None
+        self._checker = CollisionChecker(env.scene)
+        # What is compiled at its first call is compiled now, not in a plan's time.
+        state = (0.0,) * panda.NUM_JOINTS
+        self._checker.nearest(state)
+        self._checker.motion_checker()(state, state)
         self.checks = 0
         """Configurations that the last plan has looked at."""
 
@@ -266,7 +270,7 @@ class Planner:
         return best
 
     def _validity(self, start, goal, caution):
-        if self._checker is None or self._checker.scene is not self.env.scene:
+        if self._checker.scene is not self.env.scene:
             self._checker = CollisionChecker(self.env.scene)
         ends = np.clip(np.stack([panda.normalise(start), panda.normalise(goal)]), -1.0, 1.0)
         near = self._checker.nearest(ends).distance.min(-1)
