@@ -15,7 +15,6 @@ import numpy as np
 from tqdm import tqdm
 
 from envs import panda
-from envs.arm_env import HOLD_STEPS, RoboArmEnv
 from envs.dataset_format import (
     ORIGINAL,
     QUERY_ARRAYS,
@@ -34,6 +33,7 @@ from envs.dataset_format import (
 )
 from envs.scenes import Scene
 from envs.tasks import get_task
+from envs.world import HOLD_STEPS, World
 
 # Positions may differ by a rounding error between machines.
 _POSITION_TOLERANCE = 1e-6  # m
@@ -211,16 +211,16 @@ def _simulate(path, queries, hold_steps, progress):
         if off.any():
             row = int(np.argmax(off))
             raise DatasetError(f"{path}: {split}/goal_position[{row}] is not where the goal is")
-    env = RoboArmEnv(queries["test"].scenes.base)
+    world = World(queries["test"].scenes.base)
     total = sum(len(queries[split]) for split in queries)
     with (
-        contextlib.closing(env),
+        contextlib.closing(world),
         tqdm(total=total, unit=" queries", desc=Path(path).name, disable=not progress) as bar,
     ):
         for split in queries:
             for row, (start, goal, scene) in enumerate(queries[split]):
-                env.set_scene(scene)
+                world.set_scene(scene)
                 for name, configuration in (("start", start), ("goal", goal)):
-                    if not env.is_feasible(configuration, hold_steps):
+                    if not world.is_feasible(configuration, hold_steps):
                         raise DatasetError(f"{path}: {split}/{name}[{row}] is not feasible")
                 bar.update()

@@ -137,7 +137,7 @@ def test_replay_is_exact_among_other_scenes(env):
 def test_the_world_is_made_anew_now_and_then_and_nothing_changes(env, monkeypatch):
     env.reset(seed=2)
     before = env.reset(seed=3)[0]
-    monkeypatch.setattr("envs.arm_env.MAX_BODIES_MADE", 10)
+    monkeypatch.setattr("envs.world.MAX_BODIES_MADE", 10)
     for seed in range(10):
         env.reset(seed=seed)
     after = env.reset(seed=3)[0]
@@ -178,7 +178,7 @@ def test_spheres_collide():
 def test_friction_is_that_of_the_scene():
     for friction in (0.5, 1.0, 1.5):
         env = RoboArmEnv(Scene((Box((0.5, 0.0, 0.3), (0.1, 0.1, 0.6)),), friction=friction))
-        found = p.getDynamicsInfo(env._bodies[-1], -1, physicsClientId=env.client)[1]
+        found = p.getDynamicsInfo(env.world._bodies[-1], -1, physicsClientId=env.client)[1]
         assert found == pytest.approx(friction)
         env.close()
 

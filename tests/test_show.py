@@ -335,7 +335,7 @@ def test_errors(tmp_path, capsys, monkeypatch):
     (tmp_path / "full.yaml").write_text("obstacles: [sphere: {position: [0, 0, 0.3], radius: 0.3}]")
     (tmp_path / "empty").mkdir()
     before = sorted(os.listdir(tmp_path))
-    monkeypatch.setattr(envs.arm_env, "MAX_SAMPLING_TRIES", 5)
+    monkeypatch.setattr("envs.world.MAX_SAMPLING_TRIES", 5)
     png, gif = ["--output", tmp_path / "out.png"], ["--output", tmp_path / "out.gif"]
     many = len(load_queries("wall"))
     cases = [
