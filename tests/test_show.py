@@ -213,6 +213,24 @@ def test_random_actions_depend_on_the_seed(tmp_path, monkeypatch):
     assert first == same != other
 
 
+@pytest.mark.parametrize(
+    ("policy", "touched"),
+    [
+        ("go-to-goal", "something"),
+        ("via-points", "nothing"),
+        ("planner", "nothing"),
+        ("bc-config-double_walls-s1", "something"),
+    ],
+)
+def test_policies_by_name(policy, touched, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+    # Straight to this goal the arm slides along a wall; there is a way around.
+    arguments = ["--policy", policy, "--query", 11, "--split", "validation", *SIZE]
+    assert run("double_walls", "--output", tmp_path / "a.gif", *arguments) == 0
+    text = capsys.readouterr().out
+    assert f"{policy}: reached the goal in " in text and f"touching {touched}" in text
+
+
 def test_a_demonstration(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 3)
     demo = load_demos("wall")[7]
