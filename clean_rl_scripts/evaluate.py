@@ -45,13 +45,10 @@ From Python: `evaluate(policy, task, ...)` returns the same numbers as a dict.
 import io
 import json
 import math
-import multiprocessing
 import platform
-import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -64,7 +61,7 @@ from PIL import Image
 from tqdm import tqdm
 
 import envs
-from envs import panda
+from envs import panda, workers
 from envs.datasets import Query, QueryScenes, load_queries, validate
 from envs.files import check_writable, write_atomically
 from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy
@@ -225,57 +222,42 @@ def _run_queries(job, env, policy, indices):
     return outcomes
 
 
-_worker = None  # (job, env, policy) of this process
+class _Worker:
+    """Runs the queries of a job, chunk by chunk."""
+
+    def __init__(self, job):
+        torch.set_num_threads(1)
+        self.job = job
+        self.env, self.policy = job.make()
+
+    def __call__(self, indices):
+        """`indices`, a range, and their outcomes."""
+        return indices, _run_queries(self.job, self.env, self.policy, indices)
 
 
-def _start_worker(job):
-    global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's business
-    torch.set_num_threads(1)
-    _worker = (job, *job.make())
-
-
-def _work(indices):
-    return indices, _run_queries(*_worker, indices)
+def _results(job, chunks, warn):
+    """The chunks and their outcomes, in any order."""
+    if job.workers == 1:
+        return map(_Worker(job), chunks)
+    return workers.run(_Worker, (job,), chunks, min(job.workers, len(chunks)), warn)
 
 
 def _run(job, progress):
     """The outcomes of all queries, in their order."""
     count = len(job.start)
     chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
-    outcomes = [None] * count
+    outcomes, successes = [None] * count, 0
     bar = tqdm(total=count, unit="query", disable=None if progress else True)
-    successes = 0
-
-    def store(indices, results):
-        nonlocal successes
-        outcomes[indices.start : indices.stop] = results
-        successes += sum(result.success for result in results)
-        bar.update(len(results))
-        bar.set_postfix(success=f"{successes / bar.n:.3f}" if bar.n else "-")
-
-    with bar:
-        if job.workers == 1:
-            threads = torch.get_num_threads()
-            torch.set_num_threads(1)
-            try:
-                env, policy = job.make()
-                for chunk in chunks:
-                    store(chunk, _run_queries(job, env, policy, chunk))
-            finally:
-                torch.set_num_threads(threads)
-            return outcomes
-        pool = ProcessPoolExecutor(
-            min(job.workers, len(chunks)),
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_start_worker,
-            initargs=(job,),
-        )
-        try:
-            for future in as_completed([pool.submit(_work, chunk) for chunk in chunks]):
-                store(*future.result())
-        finally:
-            pool.shutdown(cancel_futures=True)
+    threads = torch.get_num_threads()
+    try:
+        with bar:
+            for indices, found in _results(job, chunks, bar.write):
+                outcomes[indices.start : indices.stop] = found
+                successes += sum(outcome.success for outcome in found)
+                bar.update(len(found))
+                bar.set_postfix(success=f"{successes / bar.n:.3f}")
+    finally:
+        torch.set_num_threads(threads)
     return outcomes
 
 

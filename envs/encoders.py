@@ -10,6 +10,7 @@ Paper: sections 5.1 and 5.3. `SceneEncodingWrapper` is in `envs.wrappers`.
 
 import functools
 import hashlib
+import importlib.resources
 import io
 import sys
 import zipfile
@@ -26,7 +27,8 @@ from envs.scenes import ROW, to_array
 from envs.sensors import PointCloud, SensorWorld
 
 ORACLE = "oracle"
-PACKAGED = Path(__file__).resolve().parent.parent / "scene_embedding_train" / "encoders"
+# Only data are found there: `envs` imports no trainer.
+PACKAGED = Path(importlib.resources.files("scene_embedding_train") / "encoders")
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
 # Of the arm when an encoder looks, rad: always the same, so that z_E depends on the scene alone.
@@ -49,7 +51,7 @@ def oracle(scene):
     return rows.ravel()
 
 
-def _read_codes(path, key):
+def _read_latents(path, key):
     """What `SceneEncoder.encode_demos` kept; None if it is not there, damaged or out of date."""
     try:
         with np.load(path) as file:
@@ -114,21 +116,21 @@ class SceneEncoder:
         A trained encoder looks at them once, with a progress bar: z_E is kept in a file beside it,
         `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others.
         """
-        scenes = [demos.scenes[i] for i in range(len(demos))]
+        seen = [demos.scenes[i] for i in range(len(demos))]
         if self.path is None:
-            return np.stack([self(scene) for scene in scenes])
+            return np.stack([self(scene) for scene in seen])
         path = self.path.with_suffix(f".{demos.task}.npz")
-        key = hashlib.sha256(self.path.read_bytes() + repr(scenes).encode()).hexdigest()
-        codes = _read_codes(path, key)
-        if codes is None:
+        key = hashlib.sha256(self.path.read_bytes() + repr(seen).encode()).hexdigest()
+        latents = _read_latents(path, key)
+        if latents is None:
             quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
-            bar = tqdm(scenes, desc=f"encoding {demos.task}", unit="scene", mininterval=quiet)
-            codes = np.stack([self(scene) for scene in bar])
+            bar = tqdm(seen, desc=f"encoding {demos.task}", unit="scene", mininterval=quiet)
+            latents = np.stack([self(scene) for scene in bar])
             file = io.BytesIO()
-            np.savez(file, key=key, codes=codes)
+            np.savez(file, key=key, codes=latents)
             write_atomically(path, file.getvalue())
-        self._of_demos |= zip(scenes, codes, strict=True)
-        return codes
+        self._of_demos |= zip(seen, latents, strict=True)
+        return latents
 
     def look(self, scene):
         """Its program's inputs, a batch of 1: what the sensors see of a `Scene`."""
