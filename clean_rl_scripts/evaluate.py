@@ -3,9 +3,13 @@
     python clean_rl_scripts/evaluate.py --policy go-to-goal --task double_walls --workers 2
     python clean_rl_scripts/evaluate.py --policy runs/my_run --task wall --json result.json
 
-An episode is one query, in the query's scene, under the task's standard rules (goal tolerances and
-horizon of `RoboArmEnv`'s defaults). The same arguments give the same numbers, times excepted,
-whatever the number of workers.
+An episode is one query, in the query's scene, under the task's standard rules: goal tolerances,
+horizon and longest step of `RoboArmEnv`'s defaults, contacts allowed. The same arguments give the
+same numbers, times excepted, whatever the number of workers.
+
+A policy that was trained with another longest step (`max_step`) acts with that one, and
+`--stop-on-collision` is no standard rule either. Such numbers are not comparable with others: the
+table says so, and the JSON (`deviations`, empty under the standard rules).
 
 Policies to compare a trained one with:
 
@@ -62,12 +66,14 @@ from tqdm import tqdm
 
 import envs
 from envs import panda, workers
-from envs.datasets import Query, QueryScenes, load_queries, validate
+from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
 from envs.files import check_writable, write_atomically
 from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy
 from envs.scenes import Scene
 from envs.tasks import get_task, task_name
 
+# Rules that an evaluation may deviate from, and then says so.
+STANDARD_RULES = {"max_step": MAX_STEP, "stop_on_collision": False}
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
 
@@ -255,7 +261,8 @@ def _run(job, progress):
                 outcomes[indices.start : indices.stop] = found
                 successes += sum(outcome.success for outcome in found)
                 bar.update(len(found))
-                bar.set_postfix(success=f"{successes / bar.n:.3f}")
+                if bar.n:  # 0 as long as no bar is shown
+                    bar.set_postfix(success=f"{successes / bar.n:.3f}")
     finally:
         torch.set_num_threads(threads)
     return outcomes
@@ -441,6 +448,11 @@ def _summary(job, outcomes):
         "ms_per_action": 1e3 * float(columns.policy_seconds.sum()) / actions if actions else None,
         **planning,
         "env": job.env,
+        "deviations": {
+            name: job.env[name]
+            for name, standard in STANDARD_RULES.items()
+            if job.env.get(name, standard) != standard
+        },
         "seed": job.seed if job.policy in ("random", *PLANNING) else None,
         "tries": job.tries if job.policy == "via-points" else None,
         "time_limit": job.time_limit if job.policy == "planner" else None,
@@ -480,6 +492,10 @@ def _table(result):
         [
             f"{result['policy']} on {result['task']}: {result['num_queries']} {result['split']} "
             f"queries, goal type {result['goal_type']}",
+            *(
+                f"  not comparable: {name} is {value}, not {STANDARD_RULES[name]}"
+                for name, value in result["deviations"].items()
+            ),
             *shares,
             row("mean steps", result["mean_steps"], "on the way to the goal"),
             row("path length", result["path_length"], "rad"),

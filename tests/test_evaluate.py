@@ -300,6 +300,26 @@ def test_the_planner_without_ompl(monkeypatch):
     assert evaluate("via-points", "wall", queries=queries)["success_rate"] == 1
 
 
+def test_a_policy_with_longer_steps_is_not_comparable(query_file, tmp_path, capsys):
+    def run(policy, *flags):
+        arguments = ["--task", "no_obstacles", "--queries", query_file, "--num-queries", "3"]
+        arguments += ["--policy", policy, "--json", tmp_path / "out.json", *flags]
+        assert evaluation.main([str(argument) for argument in arguments]) == 0
+        return json.loads((tmp_path / "out.json").read_text()), capsys.readouterr().out
+
+    usual = _save(tmp_path / "usual.pt", env={"goal_type": "config", "max_step": 0.03})
+    longer = _save(tmp_path / "longer.pt", env={"goal_type": "config", "max_step": 0.06})
+    standard, table = run(usual)
+    assert standard["deviations"] == {} and "not comparable" not in table
+    faster, table = run(longer)
+    assert faster["mean_steps"] < 0.7 * standard["mean_steps"]
+    assert faster["deviations"] == {"max_step": 0.06}
+    assert "not comparable: max_step is 0.06, not 0.03" in table
+    stopped, table = run("go-to-goal", "--stop-on-collision")
+    assert stopped["deviations"] == {"stop_on_collision": True}
+    assert "not comparable: stop_on_collision is True, not False" in table
+
+
 # --- Scenes
 
 BLOCKED = Scene((Box((0.6, 0.0, 0.3875), (0.7, 0.04, 0.775)),))
