@@ -81,7 +81,7 @@ FRAMES = 8  # of a picture
 @dataclass
 class Args:
     policy: str
-    """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy program, a run's folder
+    """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy network, a run's folder
     with a `policy.pt` in it, or the name of a policy of docs/results.md"""
     task: str
     """the task, one of `envs.TASKS`, or a scene file (.yaml)"""
@@ -290,7 +290,7 @@ def evaluate(
     """Run a policy on a task's queries.
 
     Args:
-        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy program or of
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy network or of
             a folder with a `policy.pt`, the name of a policy in a `policies` folder, or a function
             from an observation (dict of `RoboArmEnv`) to an action (7,); with several workers, one
             that can be pickled.
@@ -309,7 +309,7 @@ def evaluate(
         workers: processes. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
         env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
-            defaults. A policy program brings its own.
+            defaults. A policy network brings its own.
         progress: show a progress bar, with the success rate so far.
 
     Returns:

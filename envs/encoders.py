@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from envs.exported_networks import NetworkError, load_network
 from envs.files import write_atomically
 from envs.observations import sensors_from_json
-from envs.programs import ProgramError, load_program
 from envs.scenes import ROW, to_array
 from envs.sensors import PointCloud, SensorWorld
 
@@ -70,15 +70,15 @@ class SceneEncoder:
     """Encodes scenes; an equal scene is encoded once.
 
     Args:
-        name: `oracle`, the name of an encoder in `PACKAGED`, or the path of a program (encoder.pt).
+        name: `oracle`, the name of an encoder in `PACKAGED`, or the path of a network (encoder.pt).
 
     Attributes:
         name: as given, a string.
-        path: of the program; None for the oracle.
+        path: of the network; None for the oracle.
         size: of z_E.
 
     Raises:
-        ProgramError: the file cannot be used.
+        NetworkError: the file cannot be used.
     """
 
     def __init__(self, name):
@@ -90,13 +90,13 @@ class SceneEncoder:
         else:
             packaged = PACKAGED / f"{name}.pt"
             self.path = packaged if packaged.exists() else Path(name)
-            self._program = load_program(self.path)
-            if self._program.metadata.get("kind") != "encoder":
-                raise ProgramError(f"{name}: not an encoder, but {self._program.metadata!r}")
+            self._network = load_network(self.path)
+            if self._network.metadata.get("kind") != "encoder":
+                raise NetworkError(f"{name}: not an encoder, but {self._network.metadata!r}")
             try:
-                self.sensors = sensors_from_json(self._program.metadata["sensors"])
+                self.sensors = sensors_from_json(self._network.metadata["sensors"])
             except (KeyError, TypeError, ValueError) as error:
-                raise ProgramError(f"{name}: its sensors make no sense: {error!r}") from error
+                raise NetworkError(f"{name}: its sensors make no sense: {error!r}") from error
             self._world = SensorWorld()
             self._encode = lambda scene: self.encode(self.look(scene))
             self.size = len(self(self._world.scene))
@@ -133,7 +133,7 @@ class SceneEncoder:
         return latents
 
     def look(self, scene):
-        """Its program's inputs, a batch of 1: what the sensors see of a `Scene`."""
+        """Its network's inputs, a batch of 1: what the sensors see of a `Scene`."""
         self._world.show(scene, POSE)
         inputs = {}
         for name, sensor in self.sensors.items():
@@ -142,11 +142,11 @@ class SceneEncoder:
                 inputs |= {f"{name}_{output}": array for output, array in seen.items()}
             else:
                 inputs[name] = seen["rgb"]
-        return {name: torch.from_numpy(inputs[name])[None] for name in self._program.inputs}
+        return {name: torch.from_numpy(inputs[name])[None] for name in self._network.inputs}
 
     def encode(self, seen):
         """z_E, float32 (size,), of what `look` returned."""
-        return self._program(**seen)[0].numpy()
+        return self._network(**seen)[0].numpy()
 
     def close(self):
         """Close the world it looks into."""

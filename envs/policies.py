@@ -73,7 +73,7 @@ def policy_file(name):
     shipped = shipped_policies()
     if str(name) not in shipped:
         raise PolicyError(
-            f"no such policy: {path} (expected {', '.join(UNTRAINED)}, a policy program, a folder "
+            f"no such policy: {path} (expected {', '.join(UNTRAINED)}, a policy network, a folder "
             f"with a policy.pt in it, or a name: {', '.join(shipped) or 'there are none'})"
         )
     return shipped[str(name)]
@@ -103,7 +103,7 @@ def make_policy(policy, env, seed=0, tries=TRIES, time_limit=TIME_LIMIT):
     the arm.
 
     Args:
-        policy: one of `UNTRAINED`, the path of a policy program, or a function from an observation
+        policy: one of `UNTRAINED`, the path of a policy network, or a function from an observation
             to an action (7,).
         env: the `RoboArmEnv` it will act in.
         seed: of `random`, `via-points` and `planner`; each query has its own generator.
@@ -111,7 +111,7 @@ def make_policy(policy, env, seed=0, tries=TRIES, time_limit=TIME_LIMIT):
         time_limit: seconds that `planner` may search per query.
 
     Raises:
-        PolicyError: the program cannot act in this environment.
+        PolicyError: the network cannot act in this environment.
     """
     if policy == "go-to-goal":
         return lambda number, query: EpisodePolicy(_go_to_goal(query.goal))
@@ -197,42 +197,42 @@ def _follow(path):
 
 
 def _load(path):
-    """A policy program, and the arguments of the environment it was trained in."""
-    from envs.programs import ProgramError, load_program
+    """A policy network, and the arguments of the environment it was trained in."""
+    from envs.exported_networks import NetworkError, load_network
 
     try:
-        program = load_program(path)
-    except ProgramError as error:
+        network = load_network(path)
+    except NetworkError as error:
         raise PolicyError(str(error)) from error
-    trained = program.metadata.get("env")
-    if program.metadata.get("kind") != "policy" or not isinstance(trained, dict):
-        raise PolicyError(f"{path}: a program, but not a policy")
+    trained = network.metadata.get("env")
+    if network.metadata.get("kind") != "policy" or not isinstance(trained, dict):
+        raise PolicyError(f"{path}: a network, but not a policy")
     if "goal_type" not in trained:
         raise PolicyError(f"{path}: does not say which goal type it was trained with")
-    return program, {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
+    return network, {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
 
 
 def _trained(path, env):
-    """A policy program as a function from an observation to an action."""
+    """A policy network as a function from an observation to an action."""
     import torch
 
-    from envs.programs import ProgramError
+    from envs.exported_networks import NetworkError
 
-    program, _ = _load(path)
+    network, _ = _load(path)
 
     # One observation at a time: in a batch its last bits would depend on the batch's size, for a
     # gain of a tenth of the time at most.
     def act(observation):
-        inputs = {name: torch.from_numpy(observation[name])[None] for name in program.inputs}
-        return program(**inputs)[0].numpy()
+        inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
+        return network(**inputs)[0].numpy()
 
     space = env.observation_space
-    unknown = set(program.inputs) - set(space)
+    unknown = set(network.inputs) - set(space)
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
     try:
-        action = program(**{name: torch.zeros(1, *space[name].shape) for name in program.inputs})
-    except ProgramError as error:
+        action = network(**{name: torch.zeros(1, *space[name].shape) for name in network.inputs})
+    except NetworkError as error:
         raise PolicyError(str(error)) from error
     if not isinstance(action, torch.Tensor) or action.shape != (1, panda.NUM_JOINTS):
         raise PolicyError(f"{path}: its output is not an action for each observation")

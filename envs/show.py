@@ -70,7 +70,7 @@ class Args:
     policy: str = "go-to-goal"
     """Who moves the arm, in the window and in an animation: `go-to-goal` (straight to the goal
     configuration), `random`, `via-points`, `planner` (as in clean_rl_scripts/evaluate.py), a policy
-    program, a run's folder with a `policy.pt` in it, or the name of a policy of docs/results.md.
+    network, a run's folder with a `policy.pt` in it, or the name of a policy of docs/results.md.
     `demo` replays the task's demonstrations; --query is the number of one of these then."""
     query: int = 0
     """Number of the (first) query to show, from 0."""

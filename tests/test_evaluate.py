@@ -20,8 +20,8 @@ from demo_generation.following import follow
 from demo_generation.planning import Planner, PlanningError
 from envs import panda
 from envs.datasets import load_queries, write_queries
+from envs.exported_networks import save_network
 from envs.policies import make_policy
-from envs.programs import save_program
 from envs.scene_files import save_scene
 from envs.scenes import Box, Scene
 from envs.tasks import Task
@@ -67,7 +67,7 @@ def _save(path, module=None, goal_size=7, observation_size=10, **metadata):
         "desired_goal": torch.zeros(1, goal_size),
     }
     metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
-    save_program(path, module or Straight(), inputs, metadata)
+    save_network(path, module or Straight(), inputs, metadata)
     return path
 
 
@@ -171,7 +171,7 @@ def test_random_actions_depend_on_seed_and_query_only():
     assert np.abs(actions(1, 4)).max() <= 1
 
 
-def test_a_program_a_function_and_the_baseline_agree(queries, tmp_path):
+def test_a_network_a_function_and_the_baseline_agree(queries, tmp_path):
     def straight(observation):
         return observation["desired_goal"] - observation["observation"][:7]
 
@@ -179,18 +179,18 @@ def test_a_program_a_function_and_the_baseline_agree(queries, tmp_path):
     threads = torch.get_num_threads()
     baseline = evaluate("go-to-goal", "no_obstacles", "config", **few)
     function = evaluate(straight, "no_obstacles", "config", **few)
-    program = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
+    network = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
     folder = evaluate(str(tmp_path), "no_obstacles", **few, workers=2)
     assert torch.get_num_threads() == threads
-    assert _numbers(program) == _numbers(folder)
+    assert _numbers(network) == _numbers(folder)
     assert function["policy"] == "straight"
-    assert program["goal_type"] == "config" and program["policy"] == str(tmp_path / "policy.pt")
-    for result in (function, program):
+    assert network["goal_type"] == "config" and network["policy"] == str(tmp_path / "policy.pt")
+    for result in (function, network):
         assert result["success_rate"] == baseline["success_rate"] > 0.8
         assert result["path_length"] == pytest.approx(baseline["path_length"], rel=1e-3)
 
 
-def test_a_program_brings_its_environment_but_not_the_rules(queries, tmp_path):
+def test_a_network_brings_its_environment_but_not_the_rules(queries, tmp_path):
     class Still(Straight):
         def forward(self, observation, achieved_goal, desired_goal):
             return observation[:, :7] + 0 * observation[:, 14:].sum(1, keepdim=True)
@@ -421,8 +421,8 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
     cases = [
         ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol"),
         ({"policy": str(tmp_path / "empty")}, "no such policy"),
-        ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a program file"),
-        ({"policy": encoder}, "encoder.pt: a program, but not a policy"),
+        ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
+        ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
