@@ -25,10 +25,11 @@ from tqdm import tqdm
 import envs
 from envs.datasets import load_queries
 from envs.encoders import ORACLE, SceneEncoder
+from envs.policies import ENV_ARGUMENTS, policy_file
 from envs.programs import load_program
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "clean_rl_scripts"))
-from evaluate import ENV_ARGUMENTS, evaluate, policy_file
+from evaluate import evaluate
 
 TASK = "random_boxes_hard"
 
@@ -37,7 +38,7 @@ def policy_times(policy, queries):
     """Means (s) of `rendering`, `encoding`, `action`, `total`; and `success_rate`."""
     program = load_program(policy_file(policy))
     trained = program.metadata["env"]
-    arguments = {name: trained[name] for name in ("goal_type", *ENV_ARGUMENTS) if name in trained}
+    arguments = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
     env = envs.make(TASK, **arguments)
     sees = arguments.get("encoder") not in (None, ORACLE)
     encoder = SceneEncoder(arguments["encoder"]) if sees else None

@@ -14,8 +14,8 @@ import psutil
 from tqdm import trange
 
 import envs
-from envs.arm_env import MAX_BODIES_MADE
 from envs.scenes import Scene
+from envs.world import MAX_BODIES_MADE
 
 
 def main():

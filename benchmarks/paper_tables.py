@@ -276,6 +276,9 @@ def page(cells, results):
         "95 % interval, or mean ± standard deviation over seeds.",
         "`python benchmarks/paper_tables.py` runs cells and writes this page;",
         "`clean_rl_scripts/evaluate.py --policy NAME` runs any of the policies below.",
+        "`not run`: no policy of that cell was kept. Two earlier runs, whose policies were not:",
+        "[experiments.md](experiments.md#the-first-long-runs).",
+        "The words: [glossary.md](glossary.md).",
     ]
     for goal_type, text in GOALS.items():
         chosen = [cell for cell in goals if cell.goal_type == goal_type]

@@ -3,9 +3,13 @@
     python clean_rl_scripts/evaluate.py --policy go-to-goal --task double_walls --workers 2
     python clean_rl_scripts/evaluate.py --policy runs/my_run --task wall --json result.json
 
-An episode is one query, in the query's scene, under the task's standard rules (goal tolerances and
-horizon of `RoboArmEnv`'s defaults). The same arguments give the same numbers, times excepted,
-whatever the number of workers.
+An episode is one query, in the query's scene, under the task's standard rules: goal tolerances,
+horizon and longest step of `RoboArmEnv`'s defaults, contacts allowed. The same arguments give the
+same numbers, times excepted, whatever the number of workers.
+
+A policy that was trained with another longest step (`max_step`) acts with that one, and
+`--stop-on-collision` is no standard rule either. Such numbers are not comparable with others: the
+table says so, and the JSON (`deviations`, empty under the standard rules).
 
 Policies to compare a trained one with:
 
@@ -43,17 +47,12 @@ From Python: `evaluate(policy, task, ...)` returns the same numbers as a dict.
 """
 
 import io
-import itertools
 import json
 import math
-import multiprocessing
 import platform
-import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -66,19 +65,15 @@ from PIL import Image
 from tqdm import tqdm
 
 import envs
-from envs import panda
-from envs.datasets import Query, Scenes, load_queries, subgoals, validate
-from envs.files import write_atomically
-from envs.programs import ProgramError, load_program
+from envs import panda, workers
+from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
+from envs.files import check_writable, write_atomically
+from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy
 from envs.scenes import Scene
 from envs.tasks import get_task, task_name
 
-# What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
-# they decide what a success is.
-ENV_ARGUMENTS = ("action_mode", "max_step", "velocities", "encoder")
-LOOKING = ("via-points", "planner")  # policies that look for a motion before they move
-ROOT = Path(__file__).resolve().parent.parent
-NAMED = ("go-to-goal", "random", *LOOKING)
+# Rules that an evaluation may deviate from, and then says so.
+STANDARD_RULES = {"max_step": MAX_STEP, "stop_on_collision": False}
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
 
@@ -86,7 +81,7 @@ FRAMES = 8  # of a picture
 @dataclass
 class Args:
     policy: str
-    """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy program, a run's folder
+    """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy network, a run's folder
     with a `policy.pt` in it, or the name of a policy of docs/results.md"""
     task: str
     """the task, one of `envs.TASKS`, or a scene file (.yaml)"""
@@ -104,9 +99,9 @@ class Args:
     """end an episode at the first touch"""
     seed: int = 0
     """of `random`, `via-points` and `planner`"""
-    tries: int = 16
+    tries: int = TRIES
     """random configurations that `via-points` tries per query"""
-    time_limit: float = 5.0
+    time_limit: float = TIME_LIMIT
     """seconds that `planner` may search per query"""
     json: Path | None = None
     """write the results to this file too"""
@@ -162,108 +157,6 @@ def smoothness(configurations):
     return float(np.linalg.norm(np.diff(configurations, n=2, axis=0), axis=1).mean())
 
 
-# --- Policies: at the start of an episode, (query's number, `Query`) -> `_Decision`
-
-
-class _Decision(NamedTuple):
-    """What a policy will do in an episode.
-
-    act: act(observation) -> action (7,); None: it gives up.
-    found: whether it found a motion; None if it did not look for one. Planning moves the arm.
-    """
-
-    act: Callable | None
-    found: bool | None = None
-
-
-def _make_policy(job, env):
-    if job.policy == "go-to-goal":
-        return lambda index, query: _Decision(_go_to_goal(query.goal))
-    if job.policy == "random":
-        return lambda index, query: _Decision(_random(np.random.default_rng([job.seed, index])))
-    if job.policy == "via-points":
-        return _via_points(env, job.seed, job.tries)
-    if job.policy == "planner":
-        return _planner(env, job.seed, job.time_limit)
-    act = _run_program(load_program(job.policy)) if isinstance(job.policy, Path) else job.policy
-    return lambda index, query: _Decision(act)
-
-
-def _go_to_goal(goal):
-    target = panda.normalise(goal)
-    return lambda observation: target - observation["observation"][:7]
-
-
-def _random(rng):
-    return lambda observation: rng.uniform(-1.0, 1.0, 7)
-
-
-def _run_program(program):
-    # One observation at a time: in a batch its last bits would depend on the batch's size, for a
-    # gain of a tenth of the time at most.
-    def act(observation):
-        inputs = {name: torch.from_numpy(observation[name])[None] for name in program.inputs}
-        return program(**inputs)[0].numpy()
-
-    return act
-
-
-def _via_points(env, seed, tries):
-    """`via-points`, as described at the top of this file."""
-    from envs.collision import CollisionChecker  # here, because Numba takes a while to import
-
-    checker = None
-
-    # No margin is kept, which would reject more than it saves: with 3 mm, clean success was 2 to 5
-    # points lower on `wall`, `double_walls` and `boxes`.
-    def policy(index, query):
-        nonlocal checker
-        if checker is None or checker.scene is not env.scene:
-            checker = CollisionChecker(env.scene)
-        # float32 may round a limit to just beyond it.
-        start, goal = np.clip(panda.normalise(np.stack([query.start, query.goal])), -1.0, 1.0)
-        if checker.is_motion_free(start, goal):
-            return _Decision(_go_to_goal(query.goal), found=True)
-        for via in np.random.default_rng([seed, index]).uniform(-1.0, 1.0, (tries, 7)):
-            if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
-                path = panda.denormalise(np.stack([start, via, goal]))
-                return _Decision(_follow(path), found=True)
-        return _Decision(_go_to_goal(query.goal), found=False)
-
-    return policy
-
-
-def _planner(env, seed, time_limit):
-    """`planner`, as described at the top of this file."""
-    planning = _import_planning()
-    planner = planning.Planner(env, max_checks=math.inf)
-
-    def policy(index, query):
-        rng = np.random.default_rng([seed, index])
-        try:
-            path = planner.plan_within(time_limit, *query, rng=rng)
-        except planning.PlanningError:
-            return _Decision(None, found=False)
-        return _Decision(_follow(path), found=True)
-
-    return policy
-
-
-def _import_planning():
-    try:  # only here, so that nothing else needs OMPL
-        from demo_generation import planning
-    except ImportError as error:
-        raise EvaluationError(f"the policy planner needs OMPL, and {error}") from error
-    return planning
-
-
-def _follow(path):
-    """One sub-goal per step along a path (n, 7), rad, and then the goal again and again."""
-    targets = subgoals(path)[1:]
-    left = itertools.chain(targets, itertools.repeat(targets[-1]))
-    return lambda observation: next(left) - observation["observation"][:7]
-
-
 # --- Episodes
 
 
@@ -285,7 +178,7 @@ class _Job:
 
     def make(self, **kwargs):
         env = envs.make(self.task, **self.env, **kwargs)
-        return env, _make_policy(self, env)
+        return env, make_policy(self.policy, env, self.seed, self.tries, self.time_limit)
 
     def query(self, index):
         return Query(self.start[index], self.goal[index], self.scenes[index])
@@ -297,7 +190,7 @@ def _run_episode(env, policy, index, query, on_step=None):
     began = time.perf_counter()
     act, found = policy(index, query)
     planning_seconds = time.perf_counter() - began
-    if found is not None:  # the policy has moved the arm
+    if found is not None:  # it may have moved the arm
         observation, info = env.reset_specific(*query)
     states = [observation["observation"][:7]]
     seconds, ended = 0.0, info["is_success"] or act is None
@@ -335,57 +228,43 @@ def _run_queries(job, env, policy, indices):
     return outcomes
 
 
-_worker = None  # (job, env, policy) of this process
+class _Worker:
+    """Runs the queries of a job, chunk by chunk."""
+
+    def __init__(self, job):
+        torch.set_num_threads(1)
+        self.job = job
+        self.env, self.policy = job.make()
+
+    def __call__(self, indices):
+        """`indices`, a range, and their outcomes."""
+        return indices, _run_queries(self.job, self.env, self.policy, indices)
 
 
-def _start_worker(job):
-    global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's business
-    torch.set_num_threads(1)
-    _worker = (job, *job.make())
-
-
-def _work(indices):
-    return indices, _run_queries(*_worker, indices)
+def _results(job, chunks, warn):
+    """The chunks and their outcomes, in any order."""
+    if job.workers == 1:
+        return map(_Worker(job), chunks)
+    return workers.run(_Worker, (job,), chunks, min(job.workers, len(chunks)), warn)
 
 
 def _run(job, progress):
     """The outcomes of all queries, in their order."""
     count = len(job.start)
     chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
-    outcomes = [None] * count
+    outcomes, successes = [None] * count, 0
     bar = tqdm(total=count, unit="query", disable=None if progress else True)
-    successes = 0
-
-    def store(indices, results):
-        nonlocal successes
-        outcomes[indices.start : indices.stop] = results
-        successes += sum(result.success for result in results)
-        bar.update(len(results))
-        bar.set_postfix(success=f"{successes / bar.n:.3f}" if bar.n else "-")
-
-    with bar:
-        if job.workers == 1:
-            threads = torch.get_num_threads()
-            torch.set_num_threads(1)
-            try:
-                env, policy = job.make()
-                for chunk in chunks:
-                    store(chunk, _run_queries(job, env, policy, chunk))
-            finally:
-                torch.set_num_threads(threads)
-            return outcomes
-        pool = ProcessPoolExecutor(
-            min(job.workers, len(chunks)),
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_start_worker,
-            initargs=(job,),
-        )
-        try:
-            for future in as_completed([pool.submit(_work, chunk) for chunk in chunks]):
-                store(*future.result())
-        finally:
-            pool.shutdown(cancel_futures=True)
+    threads = torch.get_num_threads()
+    try:
+        with bar:
+            for indices, found in _results(job, chunks, bar.write):
+                outcomes[indices.start : indices.stop] = found
+                successes += sum(outcome.success for outcome in found)
+                bar.update(len(found))
+                if bar.n:  # 0 as long as no bar is shown
+                    bar.set_postfix(success=f"{successes / bar.n:.3f}")
+    finally:
+        torch.set_num_threads(threads)
     return outcomes
 
 
@@ -402,8 +281,8 @@ def evaluate(
     num_queries=None,
     stop_on_collision=False,
     seed=0,
-    tries=16,
-    time_limit=5.0,
+    tries=TRIES,
+    time_limit=TIME_LIMIT,
     workers=1,
     env=None,
     progress=False,
@@ -411,7 +290,7 @@ def evaluate(
     """Run a policy on a task's queries.
 
     Args:
-        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy program or of
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy network or of
             a folder with a `policy.pt`, the name of a policy in a `policies` folder, or a function
             from an observation (dict of `RoboArmEnv`) to an action (7,); with several workers, one
             that can be pickled.
@@ -430,7 +309,7 @@ def evaluate(
         workers: processes. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
         env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
-            defaults. A policy program brings its own.
+            defaults. A policy network brings its own.
         progress: show a progress bar, with the success rate so far.
 
     Returns:
@@ -455,22 +334,6 @@ def evaluate(
         env,
     )
     return _summary(job, _run(job, progress))
-
-
-def policy_file(policy):
-    """The program that is meant: of a file, a run's folder, or a name in `policies/`."""
-    path = Path(policy)
-    if path.is_dir():
-        path = path / "policy.pt"
-    if path.exists():
-        return path
-    named = {found.stem: found for found in sorted(ROOT.glob("*/policies/*.pt"))}
-    if str(policy) not in named:
-        raise EvaluationError(
-            f"no such policy: {path} (expected {', '.join(NAMED)}, a policy program, a folder with "
-            f"a policy.pt in it, or a name: {', '.join(named) or 'there are none'})"
-        )
-    return named[str(policy)]
 
 
 def _prepare(
@@ -498,31 +361,26 @@ def _prepare(
         raise EvaluationError(f"tries must be at least 1, got {tries}")
     if not 0 < time_limit < math.inf:
         raise EvaluationError(f"time_limit must be a positive number of seconds, got {time_limit}")
-    env, program = dict(env or {}), None
-    if policy == "planner":
-        _import_planning()
-    if not callable(policy) and policy not in NAMED:
-        policy = policy_file(policy)
-        program, trained = _load_policy(policy)
-        env = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
-        if goal_type not in (None, trained["goal_type"]):
-            raise EvaluationError(
-                f"{policy} was trained with the goal type {trained['goal_type']!r}, it cannot be "
-                f"evaluated with {goal_type!r}"
-            )
-        goal_type = trained["goal_type"]
-    env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
-
+    env = dict(env or {})
     try:
+        if not callable(policy):
+            policy, trained = find_policy(policy)
+            if trained:
+                if goal_type not in (None, trained["goal_type"]):
+                    raise EvaluationError(
+                        f"{policy} was trained with the goal type {trained['goal_type']!r}, it "
+                        f"cannot be evaluated with {goal_type!r}"
+                    )
+                env, goal_type = trained, trained["goal_type"]
+        env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
         if queries is None:
             queries = load_queries(task, split)
         elif isinstance(queries, (str, Path)):
             validate(queries, task)  # they are for this task, with the scene it has now
             queries = load_queries(queries, split)
         arm = envs.make(task, **env)
+        make_policy(policy, arm)  # or it raises
         arm.close()
-        if program is not None:
-            _try(program, policy, arm.observation_space)
     except (TypeError, ValueError) as error:
         raise EvaluationError(str(error)) from error
     name = task_name(task)
@@ -532,7 +390,7 @@ def _prepare(
     if scenes is None:
         if not isinstance(scene, Scene):
             raise EvaluationError(f"{name} has random scenes: these queries need `scenes` as well")
-        scenes = Scenes(scene)
+        scenes = QueryScenes(scene)
     available = len(queries.start)
     count = available if num_queries is None else num_queries
     if not 1 <= count <= available:
@@ -552,31 +410,6 @@ def _prepare(
     )
 
 
-def _load_policy(path):
-    """A policy program, and the arguments of the environment it was trained in."""
-    try:
-        program = load_program(path)
-    except ProgramError as error:
-        raise EvaluationError(str(error)) from error
-    trained = program.metadata.get("env")
-    if program.metadata.get("kind") != "policy" or not isinstance(trained, dict):
-        raise EvaluationError(f"{path}: a program, but not a policy")
-    if "goal_type" not in trained:
-        raise EvaluationError(f"{path}: does not say which goal type it was trained with")
-    return program, trained
-
-
-def _try(program, path, space):
-    """Raise EvaluationError unless a policy program makes an action out of an observation."""
-    unknown = set(program.inputs) - set(space)
-    if unknown:
-        raise EvaluationError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
-    zeros = {name: torch.zeros(1, *space[name].shape) for name in program.inputs}
-    action = program(**zeros)
-    if not isinstance(action, torch.Tensor) or action.shape != (1, panda.NUM_JOINTS):
-        raise EvaluationError(f"{path}: its output is not an action for each observation")
-
-
 def _summary(job, outcomes):
     count = len(outcomes)
     columns = Outcome(*(np.array(column) for column in zip(*outcomes, strict=True)))
@@ -592,7 +425,7 @@ def _summary(job, outcomes):
         return float(values[which].mean()) if which.any() else None
 
     planning = {"planning_seconds": None, "planning_seconds_solved": None, "free_motion_rate": None}
-    if job.policy in LOOKING:
+    if job.policy in PLANNING:
         found = columns.found.astype(bool)
         planning["planning_seconds"] = float(columns.planning_seconds.mean())
         planning["planning_seconds_solved"] = mean(columns.planning_seconds, found)
@@ -615,7 +448,12 @@ def _summary(job, outcomes):
         "ms_per_action": 1e3 * float(columns.policy_seconds.sum()) / actions if actions else None,
         **planning,
         "env": job.env,
-        "seed": job.seed if job.policy in ("random", *LOOKING) else None,
+        "deviations": {
+            name: job.env[name]
+            for name, standard in STANDARD_RULES.items()
+            if job.env.get(name, standard) != standard
+        },
+        "seed": job.seed if job.policy in ("random", *PLANNING) else None,
         "tries": job.tries if job.policy == "via-points" else None,
         "time_limit": job.time_limit if job.policy == "planner" else None,
         "versions": {
@@ -654,6 +492,10 @@ def _table(result):
         [
             f"{result['policy']} on {result['task']}: {result['num_queries']} {result['split']} "
             f"queries, goal type {result['goal_type']}",
+            *(
+                f"  not comparable: {name} is {value}, not {STANDARD_RULES[name]}"
+                for name, value in result["deviations"].items()
+            ),
             *shares,
             row("mean steps", result["mean_steps"], "on the way to the goal"),
             row("path length", result["path_length"], "rad"),
@@ -683,23 +525,13 @@ def _draw(job):
     return png.getvalue()
 
 
-def _check_writable(path):
-    try:
-        if path.is_dir():
-            raise IsADirectoryError(None, "it is a folder")
-        with tempfile.NamedTemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise EvaluationError(f"cannot write {path}: {error.strerror or error}") from error
-
-
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 for arguments that make no sense."""
     args = tyro.cli(Args, args=arguments, description=__doc__)
     try:
         for path in (args.json, args.picture):
             if path is not None:
-                _check_writable(path)
+                check_writable(path)
         job = _prepare(
             args.policy,
             args.task,
@@ -715,7 +547,7 @@ def main(arguments=None):
             env=None,
         )
         result = _summary(job, _run(job, progress=True))
-    except EvaluationError as error:
+    except ValueError as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
     print(_table(result))

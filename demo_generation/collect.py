@@ -23,10 +23,9 @@ import tyro
 from tqdm import tqdm
 
 import envs
-from demo_generation import workers
 from demo_generation.following import follow
-from demo_generation.journal import Journal, journal_of
 from demo_generation.planning import Planner, PlanningError
+from envs import workers
 from envs.datasets import (
     check_writable,
     demo_path,
@@ -34,6 +33,7 @@ from envs.datasets import (
     validate,
     write_demos,
 )
+from envs.journal import Journal, journal_of
 from envs.scenes import Scene, from_array, to_array
 
 # Streams 1 and 2 of random numbers are those of the test and validation queries.

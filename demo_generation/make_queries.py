@@ -25,14 +25,14 @@ import tyro
 from tqdm import tqdm
 
 import envs
-from demo_generation import workers
 from demo_generation.collect import MAX_QUERIES, demonstrate
-from demo_generation.journal import Journal, journal_of
 from demo_generation.motionbenchmaker import read_problems
 from demo_generation.planning import Planner
-from envs.arm_env import HOLD_DRIFT, SUBSTEPS, TIME_STEP
+from envs import workers
 from envs.datasets import ORIGINAL, check_writable, query_path, write_queries
+from envs.journal import Journal, journal_of
 from envs.scenes import Scene, from_array, to_array
+from envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
 HOLD_STEPS = 24

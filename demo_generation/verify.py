@@ -16,10 +16,10 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from demo_generation import workers
 from demo_generation.collect import make_planner
 from demo_generation.following import follow
 from demo_generation.planning import PlanningError
+from envs import workers
 from envs.arm_env import RoboArmEnv
 from envs.datasets import DatasetError, demo_path, load_demos, write_demos
 from envs.tasks import is_task

@@ -13,7 +13,7 @@ def make(task, encoder=None, **kwargs):
 
     Args:
         task: name of a task (`TASKS`), or path of a scene file (docs/your_own_scene.md).
-        encoder: what is appended to `observation` about the scene: path of an encoder's program, or
+        encoder: what is appended to `observation` about the scene: path of an encoder's network, or
             `oracle` (`envs.encoders`); None for nothing.
         kwargs: arguments of `RoboArmEnv`.
 

@@ -3,7 +3,6 @@
 Paper: sections 2 and 4, appendix "Extended NMP goal-conditioned MDP description".
 """
 
-import contextlib
 import math
 import os
 import sys
@@ -14,30 +13,18 @@ import numpy as np
 import pybullet as p
 
 from envs import panda
-from envs.scenes import FRICTION, Box, Cylinder, Scene, floor_box
+from envs.world import (  # some of them only for those who import them from here
+    HOLD_DRIFT,  # noqa: F401
+    HOLD_STEPS,
+    MAX_BODIES_MADE,  # noqa: F401
+    POSITION_GAINS,  # noqa: F401
+    SUBSTEPS,
+    TIME_STEP,
+    World,
+)
 
 GOAL_TYPES = ("ee", "config", "combined")
 ACTION_MODES = ("relative", "subgoal")
-
-# One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
-# controller; docs/environment.md has the measured tracking error.
-TIME_STEP = 1.0 / 120.0
-SUBSTEPS = 4
-POSITION_GAINS = [0.6] * panda.NUM_JOINTS
-# A configuration is "held" if the controller keeps it, untouched, this many environment steps
-# without drifting further than this (normalised).
-HOLD_STEPS = 5
-HOLD_DRIFT = 1e-3
-# Colour and friction.
-FLOOR_LOOK, TABLE_LOOK = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
-OBSTACLE_COLOUR = (0.36, 0.50, 0.65, 1)
-MAX_SAMPLING_TRIES = 10_000
-# PyBullet keeps some 4 kB of each body that is removed, so after this many the world is made anew,
-# which takes as long as 100 changes of scene.
-MAX_BODIES_MADE = 5_000
-# Where and how the arm touches nothing (m, rad). PyBullet places a body by its centre of mass.
-FAR_AWAY, IN_PLACE, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0)
-CONTACT_FREE = ((panda.LOWER + panda.UPPER) / 2).tolist()
 
 
 class RoboArmEnv(gym.Env):
@@ -104,7 +91,6 @@ class RoboArmEnv(gym.Env):
         render_mode=None,
         render_size=(480, 360),
     ):
-        self.client = None
         _one_of("goal_type", goal_type, GOAL_TYPES)
         _one_of("action_mode", action_mode, ACTION_MODES)
         _one_of("reward", reward, ("sparse", "dense"))
@@ -118,14 +104,12 @@ class RoboArmEnv(gym.Env):
         ]:
             if not (np.isscalar(value) and np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be a positive number, got {value!r}")
-        self.scenes = scene if hasattr(scene, "sample") else None
+        self.scene_distribution = scene if hasattr(scene, "sample") else None
         """The distribution that scenes are drawn from; None if the scene is fixed."""
         self.episodes_per_scene = int(episodes_per_scene)
         self._episodes_in_scene = self.episodes_per_scene
-        if self.scenes is not None:
-            scene = self.scenes.base
-        scene = Scene() if scene is None else scene
-        _check_scene(scene)
+        if self.scene_distribution is not None:
+            scene = self.scene_distribution.base
         self.goal_type = goal_type
         self._tolerance = config_tolerance if goal_type == "config" else ee_tolerance
         self.ee_tolerance = ee_tolerance
@@ -157,129 +141,46 @@ class RoboArmEnv(gym.Env):
             # PyBullet would end the whole process.
             gym.logger.warn("render_mode='human' needs a display (DISPLAY is not set): no window")
             self._window = False
-        self.client = p.connect(p.GUI if self._window else p.DIRECT)
-        self.scene = None
-        self._make_world()
-        self.set_scene(scene)
-
+        self.world = World(scene, self._window)
+        """The simulated `World`. Change its scene by `set_scene` of the environment."""
         self.start_configuration = None
         """Start of this episode, float32 (7,), rad; None before the first reset."""
         self.goal_configuration = None
         """Goal of this episode, float32 (7,), rad; None if it was given as a position."""
 
-    # --- The scene
+    # --- The world
 
-    def _make_world(self):
-        """The physics engine's settings and the robot, without a scene."""
-        p.resetSimulation(physicsClientId=self.client)
-        # Without deterministicOverlappingPairs the same episode differs from run to run.
-        p.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self.client
-        )
-        p.setGravity(0, 0, -9.81, physicsClientId=self.client)
-        self.robot = self._load_robot()
-        self._parts, self._bodies, self._bodies_made = [], [], 0
-        self._goal_marker = None
+    @property
+    def client(self):
+        """PyBullet's number of the physics engine; None once it is closed."""
+        return self.world.client
 
-    def _load_robot(self):
-        return panda.load(self.client)
+    @property
+    def robot(self):
+        """PyBullet's number of the arm's body."""
+        return self.world.robot
+
+    @property
+    def scene(self):
+        """The `Scene` that the arm is in."""
+        return self.world.scene
 
     def set_scene(self, scene):
         """Put the arm into another `Scene`. That ends the episode; an equal one changes nothing."""
-        _check_scene(scene)
-        if scene is self.scene or scene == self.scene:
-            return
-        self.start_configuration = None
-        if self._bodies_made > MAX_BODIES_MADE:
-            self._make_world()
-        before, self.scene = self._parts, scene
-        self._parts = []
-        if scene.floor is not None:
-            self._parts.append((floor_box(scene.floor), *FLOOR_LOOK))
-        if scene.table is not None:
-            self._parts.append((scene.table, *TABLE_LOOK))
-        look = (OBSTACLE_COLOUR, scene.friction)
-        self._parts += [(obstacle, *look) for obstacle in scene.obstacles]
-        # What comes first and is the same, floor and table mostly, stays.
-        same = 0
-        while same < min(len(before), len(self._parts)) and before[same] == self._parts[same]:
-            same += 1
-        for body in self._bodies[same:]:
-            p.removeBody(body, physicsClientId=self.client)
-        self._bodies = self._bodies[:same]
-        for part in self._parts[same:]:
-            self._add(*part)
-
-    def _add(self, obstacle, colour, friction):
-        orientation = NO_TURN
-        if isinstance(obstacle, Box):
-            kind, collision = p.GEOM_BOX, {"halfExtents": [edge / 2 for edge in obstacle.size]}
-            visual, orientation = collision, obstacle.orientation
-        elif isinstance(obstacle, Cylinder):
-            kind, orientation = p.GEOM_CYLINDER, obstacle.orientation
-            collision = {"radius": obstacle.radius, "height": obstacle.length}
-            visual = {"radius": obstacle.radius, "length": obstacle.length}
-        else:
-            kind, collision = p.GEOM_SPHERE, {"radius": obstacle.radius}
-            visual = collision
-        client = self.client
-        body = p.createMultiBody(
-            0.0,  # kg: it never moves
-            p.createCollisionShape(kind, **collision, physicsClientId=client),
-            p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client),
-            basePosition=obstacle.position,
-            baseOrientation=orientation,
-            physicsClientId=client,
-        )
-        if friction != FRICTION:
-            p.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
-        if obstacle is self.scene.table:  # the base is bolted to it
-            p.setCollisionFilterPair(self.robot, body, -1, -1, 0, physicsClientId=client)
-        self._bodies.append(body)
-        self._bodies_made += 1
-
-    # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
+        if self.world.set_scene(scene):
+            self.start_configuration = None
 
     def in_collision(self, configuration):
-        """Whether the arm at joint angles (7, rad, inside the limits) overlaps the scene or itself.
-
-        Moves the arm: call it between episodes, or go on with a reset.
-        """
-        self._place(configuration)
-        p.performCollisionDetection(physicsClientId=self.client)
-        return any(
-            contact[8] < 0.0
-            for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
-        )
+        """As `World.in_collision`. Go on with a reset."""
+        return self.world.in_collision(configuration)
 
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
-        """Whether joint angles (7, rad) are inside the limits, collision free and held.
-
-        Held: the position controller keeps the arm there for `hold_steps` environment steps. Moves
-        the arm: call it between episodes, or go on with a reset.
-        """
-        if np.any(configuration < panda.LOWER) or np.any(configuration > panda.UPPER):
-            return False
-        if self.in_collision(configuration):
-            return False
-        panda.command(self.client, self.robot, list(configuration), POSITION_GAINS)
-        for _ in range(hold_steps):
-            if self._simulate():
-                return False
-        self._read_arm()
-        drift = self._state - panda.normalise(configuration)
-        return math.sqrt(drift @ drift) <= HOLD_DRIFT
+        """As `World.is_feasible`. Go on with a reset."""
+        return self.world.is_feasible(configuration, hold_steps)
 
     def sample_feasible(self, rng):
-        """A feasible configuration, uniform in the limits: float32 (7,), rad.
-
-        `rng` is a NumPy Generator.
-        """
-        for _ in range(MAX_SAMPLING_TRIES):
-            configuration = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
-            if self.is_feasible(configuration):
-                return configuration
-        raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
+        """As `World.sample_feasible`. Go on with a reset."""
+        return self.world.sample_feasible(rng)
 
     def sample_query(self, rng):
         """A start and a goal the start does not already reach: two float32 (7,), rad."""
@@ -298,8 +199,8 @@ class RoboArmEnv(gym.Env):
 
     def sample_scene(self, rng):
         """Change to a scene drawn from the task's distribution; nothing, if the scene is fixed."""
-        if self.scenes is not None:
-            self.set_scene(self.scenes.sample(rng))
+        if self.scene_distribution is not None:
+            self.set_scene(self.scene_distribution.sample(rng))
 
     def reset(self, *, seed=None, options=None):
         """Start an episode from a random feasible start to a random feasible goal.
@@ -340,37 +241,13 @@ class RoboArmEnv(gym.Env):
                     )
         if scene is not None:
             self.set_scene(scene)
-        before = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
-        for name, configuration in (("goal", goal), ("start", start)):
-            if configuration.size == 7 and self.in_collision(configuration):
-                touched = self._touched_names()
-                p.resetJointStatesMultiDof(
-                    self.robot,
-                    panda.RESET_JOINTS,
-                    [[joint[0]] for joint in before],
-                    [[joint[1]] for joint in before],
-                    physicsClientId=self.client,
-                )
-                raise ValueError(f"{name} is in collision: {touched}")
+        ends = {"goal": goal, "start": start}
+        self.world.check_free(**{name: end for name, end in ends.items() if end.size == 7})
         return self._begin(start, goal)
 
-    def _place(self, configuration):
-        """Teleport the arm, at rest, leaving no contact points from before.
-
-        Bullet keeps the contact points of two bodies while these move little against each other.
-        So a configuration could inherit points from an earlier one that brought the same two links
-        nearly as close. Out in the open, in a pose without contacts, all of them are dropped.
-        """
-        client, robot = self.client, self.robot
-        p.resetBasePositionAndOrientation(robot, FAR_AWAY, NO_TURN, physicsClientId=client)
-        panda.set_configuration(client, robot, CONTACT_FREE)
-        p.performCollisionDetection(physicsClientId=client)
-        p.resetBasePositionAndOrientation(robot, IN_PLACE, NO_TURN, physicsClientId=client)
-        panda.set_configuration(client, robot, configuration)
-
     def _begin(self, start, goal):
-        self._place(start)
-        panda.command(self.client, self.robot, start.tolist(), POSITION_GAINS)
+        self.world.place(start)
+        self.world.command(start.tolist())
         self.start_configuration = start
         if goal.size == 7:
             self.goal_configuration = goal
@@ -384,9 +261,9 @@ class RoboArmEnv(gym.Env):
         self._steps = 0
         self._collision_so_far = False
         self._in_sink = False
-        self._read_arm()
+        self._state, self._velocity, self._position = self.world.read_arm(self.velocities)
         if self.render_mode is not None:
-            self._mark_goal()
+            self.world.mark_goal(self._goal_position, self.ee_tolerance)
         observation = self._observation()
         distance = self._distance(observation["achieved_goal"], self._desired_goal)
         self._is_success = bool(distance <= self._tolerance)
@@ -415,12 +292,12 @@ class RoboArmEnv(gym.Env):
         if length > self.max_step:
             delta = delta * (self.max_step / length)
         target = panda.denormalise(np.clip(self._state + delta, -1.0, 1.0))
-        panda.command(self.client, self.robot, target.tolist(), POSITION_GAINS)
-        collision = self._simulate()
+        self.world.command(target.tolist())
+        collision = self.world.simulate()
         if self._window:
             time.sleep(TIME_STEP * SUBSTEPS)  # as long as the simulated time
         self._collision_so_far = self._collision_so_far or collision
-        self._read_arm()
+        self._state, self._velocity, self._position = self.world.read_arm(self.velocities)
 
         observation = self._observation()
         distance = self._distance(observation["achieved_goal"], self._desired_goal)
@@ -431,44 +308,6 @@ class RoboArmEnv(gym.Env):
         self._in_sink = self.sink_state and ended
         terminated = ended and not self.sink_state
         return observation, reward, terminated, self._steps >= self.horizon and not terminated, info
-
-    def _simulate(self):
-        """Run the physics of one environment step; whether the arm touched anything in it."""
-        touched = False
-        for _ in range(SUBSTEPS):
-            p.stepSimulation(physicsClientId=self.client)
-            if not touched:
-                # A contact also counts at distance zero, when the surfaces push on each other.
-                contacts = p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
-                touched = any(contact[8] < 0.0 or contact[9] > 0.0 for contact in contacts)
-        return touched
-
-    def _touched_names(self):
-        """What the arm overlaps, in words; after `in_collision`."""
-        names = set()
-        for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client):
-            if contact[8] < 0.0:
-                body = contact[2]
-                if body == self.robot:
-                    names.add("the arm with itself")
-                else:
-                    index = self._bodies.index(body)
-                    kinds = ["the floor"] * (self.scene.floor is not None)
-                    kinds += ["the table"] * (self.scene.table is not None)
-                    kinds += [f"obstacle {i}" for i in range(len(self.scene.obstacles))]
-                    names.add(f"the arm with {kinds[index]}")
-        return ", ".join(sorted(names))
-
-    def _read_arm(self):
-        joints = p.getJointStates(self.robot, panda.ARM_JOINTS, physicsClientId=self.client)
-        self._state = panda.normalise([joint[0] for joint in joints])
-        if self.velocities:
-            speeds = np.array([joint[1] for joint in joints])
-            self._velocity = 2.0 * speeds / (panda.UPPER - panda.LOWER)
-        link = p.getLinkState(
-            self.robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=self.client
-        )
-        self._position = np.array(link[4])
 
     def _goal_vector(self, state, position):
         if self.goal_type == "ee":
@@ -542,22 +381,6 @@ class RoboArmEnv(gym.Env):
 
     # --- Pictures
 
-    def _mark_goal(self):
-        """A green ball, visual only, at the goal position."""
-        if self._goal_marker is None:
-            ball = p.createVisualShape(
-                p.GEOM_SPHERE,
-                radius=self.ee_tolerance,
-                rgbaColor=(0.1, 0.75, 0.2, 1),
-                physicsClientId=self.client,
-            )
-            self._goal_marker = p.createMultiBody(
-                baseVisualShapeIndex=ball, physicsClientId=self.client
-            )
-        p.resetBasePositionAndOrientation(
-            self._goal_marker, self._goal_position, (0, 0, 0, 1), physicsClientId=self.client
-        )
-
     def render(self):
         """With `rgb_array`: a uint8 picture (height, width, 3) of the arm, scene and goal."""
         if self.render_mode != "rgb_array":
@@ -578,26 +401,12 @@ class RoboArmEnv(gym.Env):
 
     def close(self):
         """Disconnect from PyBullet. Closing twice is allowed."""
-        if self.client is not None:
-            p.disconnect(physicsClientId=self.client)
-            self.client = None
-
-    def __del__(self):
-        # An env that nobody closed must not keep one of PyBullet's connections.
-        if getattr(self, "client", None) is not None:
-            with contextlib.suppress(TypeError):  # PyBullet is gone already, as the process ends
-                if p.isConnected(self.client):
-                    p.disconnect(physicsClientId=self.client)
+        self.world.close()
 
 
 def _one_of(name, value, allowed):
     if value not in allowed:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
-
-
-def _check_scene(scene):
-    if not isinstance(scene, Scene):
-        raise TypeError(f"a scene must be an envs.scenes.Scene, got {scene!r}")
 
 
 def _vector(name, value, sizes):

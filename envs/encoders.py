@@ -10,6 +10,7 @@ Paper: sections 5.1 and 5.3. `SceneEncodingWrapper` is in `envs.wrappers`.
 
 import functools
 import hashlib
+import importlib.resources
 import io
 import sys
 import zipfile
@@ -19,14 +20,15 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from envs.exported_networks import NetworkError, load_network
 from envs.files import write_atomically
 from envs.observations import sensors_from_json
-from envs.programs import ProgramError, load_program
 from envs.scenes import ROW, to_array
 from envs.sensors import PointCloud, SensorWorld
 
 ORACLE = "oracle"
-PACKAGED = Path(__file__).resolve().parent.parent / "scene_embedding_train" / "encoders"
+# Only data are found there: `envs` imports no trainer.
+PACKAGED = Path(importlib.resources.files("scene_embedding_train") / "encoders")
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
 # Of the arm when an encoder looks, rad: always the same, so that z_E depends on the scene alone.
@@ -49,7 +51,7 @@ def oracle(scene):
     return rows.ravel()
 
 
-def _read_codes(path, key):
+def _read_latents(path, key):
     """What `SceneEncoder.encode_demos` kept; None if it is not there, damaged or out of date."""
     try:
         with np.load(path) as file:
@@ -68,15 +70,15 @@ class SceneEncoder:
     """Encodes scenes; an equal scene is encoded once.
 
     Args:
-        name: `oracle`, the name of an encoder in `PACKAGED`, or the path of a program (encoder.pt).
+        name: `oracle`, the name of an encoder in `PACKAGED`, or the path of a network (encoder.pt).
 
     Attributes:
         name: as given, a string.
-        path: of the program; None for the oracle.
+        path: of the network; None for the oracle.
         size: of z_E.
 
     Raises:
-        ProgramError: the file cannot be used.
+        NetworkError: the file cannot be used.
     """
 
     def __init__(self, name):
@@ -88,13 +90,13 @@ class SceneEncoder:
         else:
             packaged = PACKAGED / f"{name}.pt"
             self.path = packaged if packaged.exists() else Path(name)
-            self._program = load_program(self.path)
-            if self._program.metadata.get("kind") != "encoder":
-                raise ProgramError(f"{name}: not an encoder, but {self._program.metadata!r}")
+            self._network = load_network(self.path)
+            if self._network.metadata.get("kind") != "encoder":
+                raise NetworkError(f"{name}: not an encoder, but {self._network.metadata!r}")
             try:
-                self.sensors = sensors_from_json(self._program.metadata["sensors"])
+                self.sensors = sensors_from_json(self._network.metadata["sensors"])
             except (KeyError, TypeError, ValueError) as error:
-                raise ProgramError(f"{name}: its sensors make no sense: {error!r}") from error
+                raise NetworkError(f"{name}: its sensors make no sense: {error!r}") from error
             self._world = SensorWorld()
             self._encode = lambda scene: self.encode(self.look(scene))
             self.size = len(self(self._world.scene))
@@ -114,24 +116,24 @@ class SceneEncoder:
         A trained encoder looks at them once, with a progress bar: z_E is kept in a file beside it,
         `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others.
         """
-        scenes = [demos.scenes[i] for i in range(len(demos))]
+        seen = [demos.scenes[i] for i in range(len(demos))]
         if self.path is None:
-            return np.stack([self(scene) for scene in scenes])
+            return np.stack([self(scene) for scene in seen])
         path = self.path.with_suffix(f".{demos.task}.npz")
-        key = hashlib.sha256(self.path.read_bytes() + repr(scenes).encode()).hexdigest()
-        codes = _read_codes(path, key)
-        if codes is None:
+        key = hashlib.sha256(self.path.read_bytes() + repr(seen).encode()).hexdigest()
+        latents = _read_latents(path, key)
+        if latents is None:
             quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
-            bar = tqdm(scenes, desc=f"encoding {demos.task}", unit="scene", mininterval=quiet)
-            codes = np.stack([self(scene) for scene in bar])
+            bar = tqdm(seen, desc=f"encoding {demos.task}", unit="scene", mininterval=quiet)
+            latents = np.stack([self(scene) for scene in bar])
             file = io.BytesIO()
-            np.savez(file, key=key, codes=codes)
+            np.savez(file, key=key, codes=latents)
             write_atomically(path, file.getvalue())
-        self._of_demos |= zip(scenes, codes, strict=True)
-        return codes
+        self._of_demos |= zip(seen, latents, strict=True)
+        return latents
 
     def look(self, scene):
-        """Its program's inputs, a batch of 1: what the sensors see of a `Scene`."""
+        """Its network's inputs, a batch of 1: what the sensors see of a `Scene`."""
         self._world.show(scene, POSE)
         inputs = {}
         for name, sensor in self.sensors.items():
@@ -140,11 +142,11 @@ class SceneEncoder:
                 inputs |= {f"{name}_{output}": array for output, array in seen.items()}
             else:
                 inputs[name] = seen["rgb"]
-        return {name: torch.from_numpy(inputs[name])[None] for name in self._program.inputs}
+        return {name: torch.from_numpy(inputs[name])[None] for name in self._network.inputs}
 
     def encode(self, seen):
         """z_E, float32 (size,), of what `look` returned."""
-        return self._program(**seen)[0].numpy()
+        return self._network(**seen)[0].numpy()
 
     def close(self):
         """Close the world it looks into."""

@@ -1,6 +1,7 @@
 """Writing files whole."""
 
 import os
+import tempfile
 from pathlib import Path
 
 
@@ -20,3 +21,14 @@ def write_atomically(path, contents):
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def check_writable(path):
+    """Raise ValueError if no file can be written at `path`. To be called before long work."""
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory, not a file")
+    try:
+        tempfile.TemporaryFile(dir=path.absolute().parent).close()
+    except OSError as error:
+        raise ValueError(f"cannot write {path}: {error.strerror}") from error

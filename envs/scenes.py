@@ -3,6 +3,7 @@
 All lengths in metres, in the frame of the robot's base (x forward, y left, z up).
 """
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,3 +111,24 @@ def from_array(rows):
         else:
             raise ValueError(f"unknown kind of obstacle {kind}: 0 box, 1 cylinder, 2 sphere")
     return tuple(obstacles)
+
+
+def scene_to_json(scene):
+    """A `Scene` as text; equal scenes give equal texts."""
+    fields = {
+        "obstacles": to_array(scene.obstacles).tolist(),
+        "table": None if scene.table is None else to_array([scene.table])[0].tolist(),
+        "floor": scene.floor,
+    }
+    if scene.friction != FRICTION:
+        fields["friction"] = scene.friction
+    return json.dumps(fields, sort_keys=True)
+
+
+def scene_from_json(text):
+    """The inverse of `scene_to_json`."""
+    fields = json.loads(text)
+    table = fields["table"] and from_array([fields["table"]])[0]
+    rows = np.array(fields["obstacles"]).reshape(-1, ROW)
+    friction = fields.get("friction", FRICTION)
+    return Scene(from_array(rows), table, fields["floor"], friction)

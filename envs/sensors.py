@@ -13,7 +13,7 @@ import numpy as np
 import pybullet as p
 
 from envs import panda
-from envs.arm_env import RoboArmEnv
+from envs.world import World
 
 # Classes (paper, appendix "Training and verifying the encoders").
 ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
@@ -192,7 +192,7 @@ def _check_view(sensor):
         raise ValueError(f"near and far must be 0 < near < far, got {sensor.near}, {sensor.far}")
 
 
-class SensorWorld(RoboArmEnv):
+class SensorWorld(World):
     """A scene with the arm in it, to be looked at.
 
     The arm looks like its collision meshes. Spheres and cylinders are drawn as polyhedra, up to a

@@ -4,6 +4,7 @@
     python -m envs.show double_walls --output picture.png
     python -m envs.show my_scene.yaml --output pictures.png --draws 9
     python -m envs.show wall --output episode.gif --policy runs/my_run
+    python -m envs.show double_walls --output episode.gif --policy planner
 
 The arm is white where it is, transparent green where it has to go; the green ball is the goal
 position of its end-effector. A picture shows the start. The window shows the policy's episodes one
@@ -39,6 +40,7 @@ from envs.datasets import (
     query_path,
 )
 from envs.files import write_atomically
+from envs.policies import find_policy, make_policy
 
 SIZE = (640, 480)
 LARGEST_SIZE = 4096  # PyBullet gets slow long before
@@ -58,9 +60,6 @@ GHOST_COLOUR, GHOST_OPACITY = (0.25, 1.0, 0.4), 0.6
 MAX_FRAMES, COLOURS = 60, 128
 PAUSE = 1.5  # s, at the end of an episode
 
-# What a policy's metadata may say about its environment, as in clean_rl_scripts/evaluate.py.
-ENV_ARGUMENTS = ("goal_type", "action_mode", "max_step", "velocities", "encoder")
-
 
 @dataclass
 class Args:
@@ -70,8 +69,9 @@ class Args:
     """Write this file instead of opening a window: a picture (.png) or an animation (.gif)."""
     policy: str = "go-to-goal"
     """Who moves the arm, in the window and in an animation: `go-to-goal` (straight to the goal
-    configuration), `random`, a policy program, or a run's folder with a `policy.pt` in it. `demo`
-    replays the task's demonstrations; --query is the number of one of these then."""
+    configuration), `random`, `via-points`, `planner` (as in clean_rl_scripts/evaluate.py), a policy
+    network, a run's folder with a `policy.pt` in it, or the name of a policy of docs/results.md.
+    `demo` replays the task's demonstrations; --query is the number of one of these then."""
     query: int = 0
     """Number of the (first) query to show, from 0."""
     split: Literal["test", "validation", "original"] = "test"
@@ -82,7 +82,7 @@ class Args:
     size: tuple[int, int] = SIZE
     """Width and height of one picture in pixels."""
     seed: int = 0
-    """Of random queries, and of the `random` policy."""
+    """Of random queries, and of `random`, `via-points` and `planner`."""
 
 
 class ShowError(ValueError):
@@ -249,7 +249,7 @@ def rollout(env, query, act):
     Args:
         env: a `RoboArmEnv`.
         query: an `envs.datasets.Query`.
-        act: a function from an observation to an action (7,).
+        act: a function from an observation to an action (7,); None: nothing is done.
 
     Returns:
         The configurations (n, 7), rad, from the start on, and the last step's info.
@@ -258,61 +258,12 @@ def rollout(env, query, act):
         ValueError: the environment refuses the query or an action.
     """
     observation, info = env.reset_specific(*query)
-    states, ended = [observation["observation"][:7]], info["is_success"]
+    states, ended = [observation["observation"][:7]], info["is_success"] or act is None
     while not ended:
         observation, _, terminated, truncated, info = env.step(act(observation))
         states.append(observation["observation"][:7])
         ended = terminated or truncated
     return panda.denormalise(states), info
-
-
-def _make_policy(policy, seed):
-    """(arguments of the environment, function from a query and its number to an `act`)."""
-    if policy == "go-to-goal":
-        return {}, lambda query, number: _straight_to(panda.normalise(query.goal))
-    if policy == "random":
-        return {}, lambda query, number: _random(np.random.default_rng([seed, number]))
-    arguments, act = _load_policy(Path(policy))
-    return arguments, lambda query, number: act
-
-
-def _straight_to(target):
-    return lambda observation: target - observation["observation"][:7]
-
-
-def _random(rng):
-    return lambda observation: rng.uniform(-1.0, 1.0, panda.NUM_JOINTS)
-
-
-def _load_policy(path):
-    if path.is_dir():
-        path = path / "policy.pt"
-    if not path.exists():
-        raise ShowError(
-            f"no such policy: {path} (expected go-to-goal, random, demo, a policy program or a "
-            f"folder with a policy.pt in it)"
-        )
-    import torch  # takes seconds, and only this needs it
-
-    from envs.programs import load_program
-
-    program = load_program(path)
-    trained = program.metadata.get("env")
-    if program.metadata.get("kind") != "policy" or not isinstance(trained, dict):
-        raise ShowError(f"{path}: a program, but not a policy")
-    arguments = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
-
-    def act(observation):
-        unknown = set(program.inputs) - set(observation)
-        if unknown:
-            raise ShowError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
-        inputs = {name: torch.from_numpy(observation[name])[None] for name in program.inputs}
-        action = program(**inputs)
-        if not isinstance(action, torch.Tensor) or action.shape != (1, panda.NUM_JOINTS):
-            raise ShowError(f"{path}: its output is not an action")
-        return action[0].numpy()
-
-    return arguments, act
 
 
 # --- The command
@@ -389,9 +340,9 @@ def _check(args):
 def _show(args):
     _check(args)
     suffix = None if args.output is None else args.output.suffix.lower()
-    arguments, policy = {}, None
+    arguments, policy, begin = {}, None, None
     if suffix != ".png" and args.policy != "demo":
-        arguments, policy = _make_policy(args.policy, args.seed)
+        policy, arguments = find_policy(args.policy)
     queries = _find_queries(args)
     last = args.query + args.draws - 1
     if queries.count is not None and last >= queries.count:
@@ -402,13 +353,15 @@ def _show(args):
     except (TypeError, ValueError) as error:
         raise ShowError(f"{args.policy}: its environment cannot be made: {error}") from error
     try:
-        {None: _window, ".png": _draw, ".gif": _animate}[suffix](args, env, queries, policy)
+        if policy is not None:
+            begin = make_policy(policy, env, args.seed)
+        {None: _window, ".png": _draw, ".gif": _animate}[suffix](args, env, queries, begin)
     finally:
         if p.isConnected(env.client):  # not after Escape
             env.close()
 
 
-def _draw(args, env, queries, policy):
+def _draw(args, env, queries, begin):
     bar = tqdm(range(args.query, args.query + args.draws), "drawing", disable=None)
     pictures = [picture(env, queries.get(number), args.size) for number in bar]
     columns = math.ceil(math.sqrt(args.draws))
@@ -422,10 +375,10 @@ def _draw(args, env, queries, policy):
     print(f"{args.output}: written, {args.task}, {queries.name} {args.query}{until}")
 
 
-def _animate(args, env, queries, policy):
+def _animate(args, env, queries, begin):
     query = queries.get(args.query)
     if queries.demos is None:
-        configurations, info = rollout(env, query, policy(query, args.query))
+        configurations, info = rollout(env, query, begin(args.query, query).act)
     else:
         configurations, info = panda.denormalise(queries.demos[args.query].states), None
     last = len(configurations) - 1
@@ -450,7 +403,7 @@ def _animate(args, env, queries, policy):
     print(f"{args.output}: written, {args.task}, {text}")
 
 
-def _window(args, env, queries, policy):
+def _window(args, env, queries, begin):
     print("Ctrl-C ends, and so does Escape in the window", flush=True)
     client = env.client
     p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0, physicsClientId=client)  # no side panels
@@ -466,7 +419,7 @@ def _window(args, env, queries, policy):
                 camera.distance, camera.yaw, PITCH, camera.target, physicsClientId=client
             )
             if queries.demos is None:
-                configurations, info = rollout(env, query, policy(query, number))
+                configurations, info = rollout(env, query, begin(number, query).act)
             else:
                 configurations = panda.denormalise(queries.demos[number].states)
                 for configuration in configurations:

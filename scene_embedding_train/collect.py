@@ -22,7 +22,7 @@ import tyro
 from tqdm import tqdm
 
 import envs
-from demo_generation import workers
+from envs import workers
 from envs.datasets import attribute
 from envs.files import write_atomically
 from envs.observations import (

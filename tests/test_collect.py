@@ -19,13 +19,13 @@ import psutil
 import pytest
 
 import envs
-from demo_generation import collect, workers
+from demo_generation import collect
 from demo_generation.following import follow
-from demo_generation.journal import VERSION
 from demo_generation.planning import Planner
 from demo_generation.verify import VERDICTS, Verifier, verify
-from envs import panda
+from envs import panda, workers
 from envs.datasets import DatasetError, load_demos, scene_to_json, write_demos
+from envs.journal import VERSION
 
 ROOT = Path(__file__).parents[1]
 TASK, NUM = "double_walls", 16

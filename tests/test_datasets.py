@@ -17,7 +17,7 @@ import pytest
 
 import envs
 from demo_generation import make_queries
-from envs import datasets, panda
+from envs import dataset_format, datasets, panda
 from envs.datasets import DatasetError, load_queries, query_path, validate, write_queries
 from envs.scenes import Box, Scene
 
@@ -308,7 +308,7 @@ def test_flipped_bytes_anywhere_change_nothing_or_are_refused(path):
 def test_a_file_for_another_task_is_refused(path, monkeypatch):
     with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'"):
         validate(path, "no_obstacles")
-    monkeypatch.setattr(datasets, "query_path", lambda task: path)
+    monkeypatch.setattr("envs.queries.query_path", lambda task: path)
     assert load_queries("wall").task == "wall"
     with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'"):
         load_queries("no_obstacles")
@@ -349,10 +349,10 @@ def test_simulating_finds_infeasible_queries(made, tmp_path):
 def test_simulating_finds_wrong_positions(path):
     with h5py.File(path, "r+") as file:
         file["test/goal_position"][4, 0] += np.float32(0.001)
-        attributes = {name: datasets.attribute(file, name) for name in datasets._ATTRIBUTES}
-        names = datasets._arrays_of(datasets.QUERY_SCHEMA, file)
+        attributes = {name: datasets.attribute(file, name) for name in dataset_format._ATTRIBUTES}
+        names = dataset_format.array_formats(dataset_format.QUERY_SCHEMA, file)
         arrays = {name: file[name][()] for name in names}
-        file.attrs["checksum"] = np.bytes_(datasets._checksum(attributes, arrays))
+        file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
     validate(path)
     with pytest.raises(DatasetError, match=r"test/goal_position\[4\]"):
         validate(path, simulate=True)

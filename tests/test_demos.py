@@ -11,7 +11,7 @@ import pytest
 import envs
 from demo_generation.following import follow
 from demo_generation.planning import Planner
-from envs import datasets, panda
+from envs import dataset_format, datasets, demonstrations, panda
 from envs.datasets import (
     MAX_STEP,
     QUANTUM,
@@ -441,9 +441,9 @@ def wrong_shape(path):
 def sign_again(path):
     """Give a changed file the checksum it should have."""
     with h5py.File(path, "r+") as file:
-        attributes = {name: datasets.attribute(file, name) for name in datasets._ATTRIBUTES}
-        arrays = {name: file[name][()] for name in datasets._DEMO_ARRAYS}
-        file.attrs["checksum"] = np.bytes_(datasets._checksum(attributes, arrays))
+        attributes = {name: datasets.attribute(file, name) for name in dataset_format._ATTRIBUTES}
+        arrays = {name: file[name][()] for name in dataset_format.DEMO_ARRAYS}
+        file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
 
 
 def a_row_too_many(path):
@@ -506,7 +506,7 @@ def test_a_demonstration_file_is_no_query_file(path):
 
 
 def test_a_file_for_another_task_is_refused(path, monkeypatch):
-    monkeypatch.setattr(datasets, "demo_path", lambda task: path)
+    monkeypatch.setattr(demonstrations, "demo_path", lambda task: path)
     assert load_demos("wall").task == "wall"
     with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'") as caught:
         load_demos("no_obstacles")

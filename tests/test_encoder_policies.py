@@ -119,7 +119,7 @@ def test_what_is_no_encoder_is_refused(trainer, tmp_path):
     given = command(trainer, tmp_path / "runs", "--encoder", str(tmp_path / "encoder.pt"))
     done = subprocess.run(given, capture_output=True, text=True)
     assert done.returncode == 1 and "Traceback" not in done.stderr
-    assert "--encoder: " in done.stderr and "not a program file" in done.stderr
+    assert "--encoder: " in done.stderr and "not a network file" in done.stderr
 
 
 def test_one_encoder_serves_all_environments_of_a_process(env):

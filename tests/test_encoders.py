@@ -20,8 +20,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import envs
 from envs.datasets import load_demos, load_queries
 from envs.encoders import MAX_OBSTACLES, PACKAGED, SceneEncoder, oracle
+from envs.exported_networks import NetworkError, load_network, save_network
 from envs.observations import Observations
-from envs.programs import ProgramError, load_program, save_program
 from envs.scenes import Scene, Sphere, from_array
 from envs.sensors import PointCloud
 from envs.wrappers import SceneEncodingWrapper
@@ -353,7 +353,7 @@ def test_a_run_is_kept_with_its_figures_and_picture(run, tmp_path):
 
 def test_the_saved_encoder_needs_no_script(run, observations):
     name, folder = run
-    encoder = load_program(folder / "encoder.pt")
+    encoder = load_network(folder / "encoder.pt")
     assert encoder.metadata["kind"] == "encoder"
     read = Observations(observations)
     if name == "pointnet2":
@@ -466,11 +466,11 @@ def test_a_trained_encoder_in_an_environment(run, observations):
 
 
 def test_packaged_encoders_are_found_by_name():
-    programs = sorted(PACKAGED.glob("*.pt"))
-    assert [path.stem for path in programs] == sorted(SCRIPTS)
+    networks = sorted(PACKAGED.glob("*.pt"))
+    assert [path.stem for path in networks] == sorted(SCRIPTS)
     assert sum(path.stat().st_size for path in PACKAGED.glob("*.[pj]*")) < 6e6
     queries = load_queries("random_boxes_hard")
-    for path in programs:
+    for path in networks:
         encoder = SceneEncoder(path.stem)
         codes = np.stack([encoder(queries.scenes[i]) for i in (0, 9_999)])
         assert codes.shape == (2, 64) and np.isfinite(codes).all()
@@ -517,14 +517,14 @@ def test_demonstrations_are_encoded_once(run, tmp_path, monkeypatch):
 
 
 def test_what_is_no_encoder_is_refused(tmp_path):
-    with pytest.raises(ProgramError, match="cannot be read"):
+    with pytest.raises(NetworkError, match="cannot be read"):
         SceneEncoder(tmp_path / "encoder.pt")
     inputs = {"x": torch.zeros(2, 3)}
-    save_program(tmp_path / "policy.pt", Double(), inputs, {"kind": "policy"})
-    with pytest.raises(ProgramError, match="not an encoder"):
+    save_network(tmp_path / "policy.pt", Double(), inputs, {"kind": "policy"})
+    with pytest.raises(NetworkError, match="not an encoder"):
         SceneEncoder(tmp_path / "policy.pt")
-    save_program(tmp_path / "e.pt", Double(), inputs, {"kind": "encoder", "sensors": "[1"})
-    with pytest.raises(ProgramError, match="sensors make no sense"):
+    save_network(tmp_path / "e.pt", Double(), inputs, {"kind": "encoder", "sensors": "[1"})
+    with pytest.raises(NetworkError, match="sensors make no sense"):
         SceneEncoder(tmp_path / "e.pt")
 
 

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import math
 import os
 import subprocess
 import sys
@@ -19,7 +20,8 @@ from demo_generation.following import follow
 from demo_generation.planning import Planner, PlanningError
 from envs import panda
 from envs.datasets import load_queries, write_queries
-from envs.programs import save_program
+from envs.exported_networks import save_network
+from envs.policies import make_policy
 from envs.scene_files import save_scene
 from envs.scenes import Box, Scene
 from envs.tasks import Task
@@ -65,7 +67,7 @@ def _save(path, module=None, goal_size=7, observation_size=10, **metadata):
         "desired_goal": torch.zeros(1, goal_size),
     }
     metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
-    save_program(path, module or Straight(), inputs, metadata)
+    save_network(path, module or Straight(), inputs, metadata)
     return path
 
 
@@ -160,8 +162,7 @@ def test_workers_do_not_change_the_result(queries):
 
 def test_random_actions_depend_on_seed_and_query_only():
     def actions(seed, index):
-        job = SimpleNamespace(policy="random", seed=seed)
-        act, _ = evaluation._make_policy(job, None)(index, None)
+        act, _ = make_policy("random", None, seed)(index, None)
         return np.array([act({}) for _ in range(5)])
 
     assert np.array_equal(actions(1, 4), actions(1, 4))
@@ -170,7 +171,7 @@ def test_random_actions_depend_on_seed_and_query_only():
     assert np.abs(actions(1, 4)).max() <= 1
 
 
-def test_a_program_a_function_and_the_baseline_agree(queries, tmp_path):
+def test_a_network_a_function_and_the_baseline_agree(queries, tmp_path):
     def straight(observation):
         return observation["desired_goal"] - observation["observation"][:7]
 
@@ -178,18 +179,18 @@ def test_a_program_a_function_and_the_baseline_agree(queries, tmp_path):
     threads = torch.get_num_threads()
     baseline = evaluate("go-to-goal", "no_obstacles", "config", **few)
     function = evaluate(straight, "no_obstacles", "config", **few)
-    program = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
+    network = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
     folder = evaluate(str(tmp_path), "no_obstacles", **few, workers=2)
     assert torch.get_num_threads() == threads
-    assert _numbers(program) == _numbers(folder)
+    assert _numbers(network) == _numbers(folder)
     assert function["policy"] == "straight"
-    assert program["goal_type"] == "config" and program["policy"] == str(tmp_path / "policy.pt")
-    for result in (function, program):
+    assert network["goal_type"] == "config" and network["policy"] == str(tmp_path / "policy.pt")
+    for result in (function, network):
         assert result["success_rate"] == baseline["success_rate"] > 0.8
         assert result["path_length"] == pytest.approx(baseline["path_length"], rel=1e-3)
 
 
-def test_a_program_brings_its_environment_but_not_the_rules(queries, tmp_path):
+def test_a_network_brings_its_environment_but_not_the_rules(queries, tmp_path):
     class Still(Straight):
         def forward(self, observation, achieved_goal, desired_goal):
             return observation[:, :7] + 0 * observation[:, 14:].sum(1, keepdim=True)
@@ -240,22 +241,6 @@ def test_via_points_go_straight_where_that_is_free_or_nothing_is_found():
     assert 0 < result["planning_seconds_solved"] != result["planning_seconds"]
 
 
-def test_a_motion_is_checked_everywhere_and_its_waypoints_first(monkeypatch):
-    asked = []
-    monkeypatch.setattr(evaluation, "_touches", lambda env, c: asked.append(panda.normalise(c)))
-    corners = np.array([[0.0] * 7, [0.4] + [0.0] * 6, [0.4, -0.3] + [0.0] * 5])
-    assert evaluation._is_free(None, corners)
-    assert asked[0] == pytest.approx(corners[1])
-    # The first leg is 0.4 long, so in 20 steps of 0.02; next comes the largest power of two.
-    assert asked[1] == pytest.approx([16 * 0.02] + [0.0] * 6)
-    first = sorted(point[0] for point in asked if point[1] == pytest.approx(0.0))
-    assert first == pytest.approx(np.arange(1, 21) * 0.02)
-    second = sorted(point[1] for point in asked if point[1] < -1e-6)
-    assert len(first) + len(second) == len(asked)
-    assert np.diff([-0.3, *second, 0.0]).max() <= 0.021
-    assert evaluation._is_free(None, corners[:1].repeat(2, axis=0))  # nowhere to go
-
-
 def test_the_planner_solves_double_walls_and_follows_its_plan():
     queries = load_queries("double_walls", "validation")[:4]
     straight = evaluate("go-to-goal", "double_walls", queries=queries)
@@ -268,10 +253,10 @@ def test_the_planner_solves_double_walls_and_follows_its_plan():
     assert "ompl" in result["versions"] and "ompl" not in straight["versions"]
 
     env, rows = envs.make("double_walls"), []
-    planner = Planner(env, **evaluation.PLANNER_OPTIONS)
+    planner = Planner(env, max_checks=math.inf)
     for index, query in enumerate(queries):
-        seed = int(np.random.default_rng([2, index]).integers(1, 2**32))
-        states = panda.denormalise(follow(env, planner.plan(*query, seed=seed)).states)
+        path = planner.plan_within(60.0, *query, rng=np.random.default_rng([2, index]))
+        states = panda.denormalise(follow(env, path).states)
         to_goal = panda.forward_kinematics(states) - panda.forward_kinematics(query.goal)
         steps = int(np.argmax(np.linalg.norm(to_goal, axis=1) <= env.ee_tolerance))
         rows.append((steps, evaluation.path_length(states[: steps + 1])))
@@ -313,6 +298,26 @@ def test_the_planner_without_ompl(monkeypatch):
     with pytest.raises(evaluation.EvaluationError, match="the policy planner needs OMPL"):
         evaluate("planner", "wall", queries=queries)
     assert evaluate("via-points", "wall", queries=queries)["success_rate"] == 1
+
+
+def test_a_policy_with_longer_steps_is_not_comparable(query_file, tmp_path, capsys):
+    def run(policy, *flags):
+        arguments = ["--task", "no_obstacles", "--queries", query_file, "--num-queries", "3"]
+        arguments += ["--policy", policy, "--json", tmp_path / "out.json", *flags]
+        assert evaluation.main([str(argument) for argument in arguments]) == 0
+        return json.loads((tmp_path / "out.json").read_text()), capsys.readouterr().out
+
+    usual = _save(tmp_path / "usual.pt", env={"goal_type": "config", "max_step": 0.03})
+    longer = _save(tmp_path / "longer.pt", env={"goal_type": "config", "max_step": 0.06})
+    standard, table = run(usual)
+    assert standard["deviations"] == {} and "not comparable" not in table
+    faster, table = run(longer)
+    assert faster["mean_steps"] < 0.7 * standard["mean_steps"]
+    assert faster["deviations"] == {"max_step": 0.06}
+    assert "not comparable: max_step is 0.06, not 0.03" in table
+    stopped, table = run("go-to-goal", "--stop-on-collision")
+    assert stopped["deviations"] == {"stop_on_collision": True}
+    assert "not comparable: stop_on_collision is True, not False" in table
 
 
 # --- Scenes
@@ -416,8 +421,8 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
     cases = [
         ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol"),
         ({"policy": str(tmp_path / "empty")}, "no such policy"),
-        ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a program file"),
-        ({"policy": encoder}, "encoder.pt: a program, but not a policy"),
+        ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
+        ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
@@ -432,7 +437,7 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"tries": "0"}, "tries must be at least 1, got 0"),
         ({"time-limit": "0"}, "time_limit must be a positive number of seconds, got 0.0"),
         ({"time-limit": "nan"}, "time_limit must be a positive number of seconds"),
-        ({"json": str(tmp_path)}, "cannot write"),
+        ({"json": str(tmp_path)}, "is a directory, not a file"),
         ({"json": str(tmp_path / "no such folder" / "a.json")}, "cannot write"),
         ({"picture": str(tmp_path / "no such folder" / "a.png")}, "cannot write"),
     ]

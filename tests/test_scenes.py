@@ -10,7 +10,7 @@ import pytest
 import envs
 from demo_generation import collect, make_queries, verify
 from demo_generation.planning import Planner, PlanningError
-from envs import datasets, panda
+from envs import dataset_format, panda
 from envs.arm_env import RoboArmEnv
 from envs.datasets import DatasetError, load_demos, load_queries, write_queries
 from envs.random_boxes import GRID, KEEP_CLEAR, SHOULDER
@@ -137,7 +137,7 @@ def test_replay_is_exact_among_other_scenes(env):
 def test_the_world_is_made_anew_now_and_then_and_nothing_changes(env, monkeypatch):
     env.reset(seed=2)
     before = env.reset(seed=3)[0]
-    monkeypatch.setattr("envs.arm_env.MAX_BODIES_MADE", 10)
+    monkeypatch.setattr("envs.world.MAX_BODIES_MADE", 10)
     for seed in range(10):
         env.reset(seed=seed)
     after = env.reset(seed=3)[0]
@@ -178,7 +178,7 @@ def test_spheres_collide():
 def test_friction_is_that_of_the_scene():
     for friction in (0.5, 1.0, 1.5):
         env = RoboArmEnv(Scene((Box((0.5, 0.0, 0.3), (0.1, 0.1, 0.6)),), friction=friction))
-        found = p.getDynamicsInfo(env._bodies[-1], -1, physicsClientId=env.client)[1]
+        found = p.getDynamicsInfo(env.world._bodies[-1], -1, physicsClientId=env.client)[1]
         assert found == pytest.approx(friction)
         env.close()
 
@@ -239,7 +239,7 @@ def test_a_split_that_is_not_there(tmp_path, scenes):
 def test_scenes_that_make_no_sense_are_refused(tmp_path, scenes):
     write(tmp_path / "queries.h5", scenes)
     path = tmp_path / "queries.h5"
-    attributes, arrays = datasets._read(path, datasets.QUERY_SCHEMA, HARD)
+    attributes, arrays = dataset_format.read_file(path, dataset_format.QUERY_SCHEMA, HARD)
     for name, change, complaint in [
         ("test/scene", lambda a: a + 1, "does not fit"),
         ("test/obstacle_count", lambda a: a + 1, "does not fit"),
@@ -248,7 +248,7 @@ def test_scenes_that_make_no_sense_are_refused(tmp_path, scenes):
     ]:
         damaged = arrays | {name: change(arrays[name]).astype(arrays[name].dtype)}
         with pytest.raises(DatasetError, match=complaint):
-            datasets._scenes_from(path, attributes, damaged, "test/")
+            dataset_format.read_scenes(path, attributes, damaged, "test/")
 
 
 def test_obstacle_arrays_round_trip():

@@ -15,7 +15,7 @@ from torch import nn
 import envs
 from envs import panda, show
 from envs.datasets import Query, load_demos, load_queries, write_queries
-from envs.programs import save_program
+from envs.exported_networks import save_network
 from envs.scenes import Box, Scene, Sphere
 from envs.tasks import TASKS, Task
 
@@ -162,7 +162,7 @@ def save(path, module=None, **metadata):
     sizes = {"observation": 10, "achieved_goal": 7, "desired_goal": 7}
     inputs = {name: torch.zeros(1, size) for name, size in sizes.items()}
     metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
-    save_program(path, module or Straight(), inputs, metadata)
+    save_network(path, module or Straight(), inputs, metadata)
     return path
 
 
@@ -177,7 +177,7 @@ def test_a_rollout_is_an_episode(env):
     assert np.linalg.norm(ends[-1] - target) <= 0.021 < np.linalg.norm(ends[-2] - target)
 
 
-def test_an_animation_of_a_program_and_of_the_same_policy(tmp_path, capsys, monkeypatch):
+def test_an_animation_of_a_network_and_of_the_same_policy(tmp_path, capsys, monkeypatch):
     save(tmp_path / "policy.pt")
     arguments = ["--query", 2, *SIZE]
     assert run("wall", "--output", tmp_path / "a.gif", "--policy", tmp_path, *arguments) == 0
@@ -211,6 +211,24 @@ def test_random_actions_depend_on_the_seed(tmp_path, monkeypatch):
         assert run("no_obstacles", "--output", files[-1], *policy, *SIZE) == 0
     first, same, other = (file.read_bytes() for file in files)
     assert first == same != other
+
+
+@pytest.mark.parametrize(
+    ("policy", "touched"),
+    [
+        ("go-to-goal", "something"),
+        ("via-points", "nothing"),
+        ("planner", "nothing"),
+        ("bc-config-double_walls-s1", "something"),
+    ],
+)
+def test_policies_by_name(policy, touched, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+    # Straight to this goal the arm slides along a wall; there is a way around.
+    arguments = ["--policy", policy, "--query", 11, "--split", "validation", *SIZE]
+    assert run("double_walls", "--output", tmp_path / "a.gif", *arguments) == 0
+    text = capsys.readouterr().out
+    assert f"{policy}: reached the goal in " in text and f"touching {touched}" in text
 
 
 def test_a_demonstration(tmp_path, capsys, monkeypatch):
@@ -335,7 +353,7 @@ def test_errors(tmp_path, capsys, monkeypatch):
     (tmp_path / "full.yaml").write_text("obstacles: [sphere: {position: [0, 0, 0.3], radius: 0.3}]")
     (tmp_path / "empty").mkdir()
     before = sorted(os.listdir(tmp_path))
-    monkeypatch.setattr(envs.arm_env, "MAX_SAMPLING_TRIES", 5)
+    monkeypatch.setattr("envs.world.MAX_SAMPLING_TRIES", 5)
     png, gif = ["--output", tmp_path / "out.png"], ["--output", tmp_path / "out.gif"]
     many = len(load_queries("wall"))
     cases = [
@@ -356,8 +374,8 @@ def test_errors(tmp_path, capsys, monkeypatch):
         (["wall", *png, "--split", "original"], "has no original queries"),
         (["wall", *gif, "--policy", "go-to-gaol"], "no such policy: go-to-gaol"),
         (["wall", *gif, "--policy", tmp_path / "empty"], "no such policy"),
-        (["wall", *gif, "--policy", tmp_path / "broken.pt"], "broken.pt: not a program file"),
-        (["wall", *gif, "--policy", encoder], "encoder.pt: a program, but not a policy"),
+        (["wall", *gif, "--policy", tmp_path / "broken.pt"], "broken.pt: not a network file"),
+        (["wall", *gif, "--policy", encoder], "encoder.pt: a network, but not a policy"),
         (["wall", *gif, "--policy", unfit], "unfit.pt: aten.sub.Tensor failed"),
         (["wall", *gif, "--policy", no_action], "no_action.pt: its output is not an action"),
         (["wall", *gif, "--policy", strange], "goal_type must be one of"),

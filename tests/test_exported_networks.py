@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from envs.programs import ProgramError, halve_program, load_program, save_program
+from envs.exported_networks import NetworkError, halve_network, load_network, save_network
 
 
 class Actor(nn.Module):
@@ -122,19 +122,19 @@ def _leaves(value):
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
-def test_a_loaded_program_computes_what_the_module_does_for_any_batch(name, tmp_path):
+def test_a_loaded_network_computes_what_the_module_does_for_any_batch(name, tmp_path):
     torch.manual_seed(0)
     make, inputs = ARCHITECTURES[name]
     module = make().eval()
-    save_program(tmp_path / "net.pt", module, inputs(1), {"kind": name})
-    program = load_program(tmp_path / "net.pt")
-    assert program.metadata == {"kind": name}
-    assert program.inputs == list(inputs(1))
+    save_network(tmp_path / "net.pt", module, inputs(1), {"kind": name})
+    network = load_network(tmp_path / "net.pt")
+    assert network.metadata == {"kind": name}
+    assert network.inputs == list(inputs(1))
     for rows in (1, 2, 7):
         batch = inputs(rows)
         with torch.no_grad():
             expected = _leaves(module(**batch))
-        got = _leaves(program(**batch))
+        got = _leaves(network(**batch))
         assert len(got) == len(expected)
         for one, other in zip(got, expected, strict=True):
             assert one.dtype == other.dtype and one.shape == other.shape
@@ -143,10 +143,10 @@ def test_a_loaded_program_computes_what_the_module_does_for_any_batch(name, tmp_
 
 
 def test_structure_of_the_outputs_is_kept(tmp_path):
-    save_program(
+    save_network(
         tmp_path / "net.pt", ConvNet(), {"image": torch.zeros(2, 3, 32, 32).byte()}, metadata={}
     )
-    outputs = load_program(tmp_path / "net.pt")(torch.zeros(4, 3, 32, 32).byte())
+    outputs = load_network(tmp_path / "net.pt")(torch.zeros(4, 3, 32, 32).byte())
     assert set(outputs) == {"code", "pictures"}
     assert [len(picture) for picture in outputs["pictures"]] == [4, 4]
 
@@ -157,7 +157,7 @@ def test_saving_does_not_touch_the_module_or_the_random_numbers(tmp_path):
     torch.manual_seed(3)
     expected = torch.rand(3)
     torch.manual_seed(3)
-    save_program(tmp_path / "net.pt", module, _inputs(2, torch.Generator()), {})
+    save_network(tmp_path / "net.pt", module, _inputs(2, torch.Generator()), {})
     assert torch.equal(torch.rand(3), expected)
     assert module.training and all(parameter.requires_grad for parameter in module.parameters())
     assert all(torch.equal(before[name], tensor) for name, tensor in module.state_dict().items())
@@ -167,35 +167,35 @@ def test_saving_does_not_touch_the_module_or_the_random_numbers(tmp_path):
 def test_a_file_holds_its_own_tensors_only(tmp_path):
     module = nn.Linear(4, 4)
     module.weight = nn.Parameter(torch.zeros(1_000_000)[:16].view(4, 4))
-    save_program(tmp_path / "net.pt", module, {"input": torch.zeros(1, 4)}, {})
+    save_network(tmp_path / "net.pt", module, {"input": torch.zeros(1, 4)}, {})
     assert (tmp_path / "net.pt").stat().st_size < 20_000
 
 
-def test_a_halved_program_computes_in_float32_from_rounded_numbers(tmp_path):
+def test_a_halved_network_computes_in_float32_from_rounded_numbers(tmp_path):
     torch.manual_seed(0)
     module, batch = Actor().eval(), _inputs(5)
-    save_program(tmp_path / "net.pt", module, batch, {"kind": "policy"})
+    save_network(tmp_path / "net.pt", module, batch, {"kind": "policy"})
     for _ in range(2):  # the second time there is nothing left to do
-        halve_program(tmp_path / "net.pt", tmp_path / "half.pt")
+        halve_network(tmp_path / "net.pt", tmp_path / "half.pt")
         (tmp_path / "half.pt").rename(tmp_path / "net.pt")
     for name, tensor in module.state_dict().items():
         module.state_dict()[name].copy_(tensor.half().float())
-    program = load_program(tmp_path / "net.pt")
+    network = load_network(tmp_path / "net.pt")
     with torch.no_grad():
-        assert torch.allclose(program(**batch), module(**batch), rtol=0, atol=1e-6)
-    assert program.metadata == {"kind": "policy"}
+        assert torch.allclose(network(**batch), module(**batch), rtol=0, atol=1e-6)
+    assert network.metadata == {"kind": "policy"}
 
 
-def test_a_halved_program_has_half_the_size_or_is_an_error(tmp_path):
+def test_a_halved_network_has_half_the_size_or_is_an_error(tmp_path):
     module, batch = nn.Linear(100, 1000), {"input": torch.zeros(1, 100)}
-    save_program(tmp_path / "net.pt", module, batch, {})
-    halve_program(tmp_path / "net.pt", tmp_path / "half.pt")
+    save_network(tmp_path / "net.pt", module, batch, {})
+    halve_network(tmp_path / "net.pt", tmp_path / "half.pt")
     sizes = [(tmp_path / name).stat().st_size for name in ("half.pt", "net.pt")]
     assert sizes[0] < 0.51 * sizes[1]
     nn.init.constant_(module.bias, 1e5)
-    save_program(tmp_path / "large.pt", module, batch, {})
-    with pytest.raises(ProgramError, match=r"large.pt: cannot be halved"):
-        halve_program(tmp_path / "large.pt", tmp_path / "half2.pt")
+    save_network(tmp_path / "large.pt", module, batch, {})
+    with pytest.raises(NetworkError, match=r"large.pt: cannot be halved"):
+        halve_network(tmp_path / "large.pt", tmp_path / "half2.pt")
     assert not (tmp_path / "half2.pt").exists()
 
 
@@ -223,41 +223,41 @@ class _LooksAtTheBatch(nn.Module):
 def test_what_cannot_be_saved_is_an_error_and_leaves_the_old_file(make, tmp_path):
     path = tmp_path / "net.pt"
     path.write_text("old")
-    with pytest.raises(ProgramError, match="net.pt"):
-        save_program(path, make(), {"x": torch.ones(2, 3)}, {})
+    with pytest.raises(NetworkError, match="net.pt"):
+        save_network(path, make(), {"x": torch.ones(2, 3)}, {})
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["net.pt"]
 
 
 def test_metadata_must_be_json(tmp_path):
-    with pytest.raises(ProgramError, match="JSON"):
-        save_program(tmp_path / "net.pt", nn.ReLU(), {"input": torch.ones(1, 3)}, {"a": object()})
+    with pytest.raises(NetworkError, match="JSON"):
+        save_network(tmp_path / "net.pt", nn.ReLU(), {"input": torch.ones(1, 3)}, {"a": object()})
 
 
 @pytest.fixture(scope="module")
 def actor_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("program") / "actor.pt"
-    save_program(path, Actor(), _inputs(2), {"kind": "policy"})
+    path = tmp_path_factory.mktemp("network") / "actor.pt"
+    save_network(path, Actor(), _inputs(2), {"kind": "policy"})
     return path
 
 
 @pytest.fixture
 def saved(actor_file, tmp_path):
-    """A good program file, to be damaged."""
+    """A good network file, to be damaged."""
     return Path(shutil.copy(actor_file, tmp_path))
 
 
 def test_inputs_are_checked_when_it_is_called(saved):
-    program = load_program(saved)
+    network = load_network(saved)
     inputs = _inputs(2)
-    assert torch.equal(program(*inputs.values()), program(**inputs))
-    with pytest.raises(ProgramError, match=r"actor.pt: its inputs are observation, achieved_goal"):
-        program(observation=inputs["observation"])
-    with pytest.raises(ProgramError, match="picture"):
-        program(**inputs, picture=torch.zeros(2))
-    with pytest.raises(ProgramError, match="by name"):
-        program(*inputs.values(), observation=inputs["observation"])
-    with pytest.raises(ProgramError, match=r"actor.pt: aten.cat.default failed"):
-        program(**(inputs | {"observation": torch.zeros(3, 10)}))
+    assert torch.equal(network(*inputs.values()), network(**inputs))
+    with pytest.raises(NetworkError, match=r"actor.pt: its inputs are observation, achieved_goal"):
+        network(observation=inputs["observation"])
+    with pytest.raises(NetworkError, match="picture"):
+        network(**inputs, picture=torch.zeros(2))
+    with pytest.raises(NetworkError, match="by name"):
+        network(*inputs.values(), observation=inputs["observation"])
+    with pytest.raises(NetworkError, match=r"actor.pt: aten.cat.default failed"):
+        network(**(inputs | {"observation": torch.zeros(3, 10)}))
 
 
 class _Malicious:
@@ -275,8 +275,8 @@ def test_a_file_with_code_in_it_is_refused_and_does_nothing(zipped, saved, tmp_p
     target = tmp_path / "made by the file"
     content = torch.load(saved, weights_only=True) | {"metadata": _Malicious(target)}
     torch.save(content, tmp_path / "bad.pt", _use_new_zipfile_serialization=zipped)
-    with pytest.raises(ProgramError, match=r"bad.pt: not a program file"):
-        load_program(tmp_path / "bad.pt")
+    with pytest.raises(NetworkError, match=r"bad.pt: not a network file"):
+        load_network(tmp_path / "bad.pt")
     assert not target.exists()
     torch.load(tmp_path / "bad.pt", weights_only=False)  # the file would have worked
     assert target.exists()
@@ -285,8 +285,8 @@ def test_a_file_with_code_in_it_is_refused_and_does_nothing(zipped, saved, tmp_p
 def test_a_torch_export_archive_is_refused(tmp_path):
     exported = torch.export.export(nn.ReLU(), (torch.ones(2),))
     torch.export.save(exported, tmp_path / "net.pt2")
-    with pytest.raises(ProgramError, match="not a program file"):
-        load_program(tmp_path / "net.pt2")
+    with pytest.raises(NetworkError, match="not a network file"):
+        load_network(tmp_path / "net.pt2")
 
 
 def _edit(path, change):
@@ -321,8 +321,8 @@ def test_other_operations_are_refused(operation, saved):
         content["nodes"][0][1] = operation
 
     _edit(saved, change)
-    with pytest.raises(ProgramError, match=r"actor.pt: the operation .* is not allowed"):
-        load_program(saved)
+    with pytest.raises(NetworkError, match=r"actor.pt: the operation .* is not allowed"):
+        load_network(saved)
 
 
 def _constant(name):
@@ -335,24 +335,24 @@ def _constant(name):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda content: content.update(format="another"), "not a program file"),
-        (lambda content: content.update(version=2), "program version 2, this code reads 1"),
-        (lambda content: content.pop("nodes"), "damaged program"),
-        (lambda content: content.pop("metadata"), "damaged program"),
-        (lambda content: content["nodes"].pop(0), "damaged program"),
-        (lambda content: content["nodes"][0].pop(), "damaged program"),
-        (lambda content: content["tensors"].clear(), "damaged program"),
-        (lambda content: content.update(outputs={"node": "nowhere"}), "damaged program"),
+        (lambda content: content.update(format="another"), "not a network file"),
+        (lambda content: content.update(version=2), "network version 2, this code reads 1"),
+        (lambda content: content.pop("nodes"), "damaged network"),
+        (lambda content: content.pop("metadata"), "damaged network"),
+        (lambda content: content["nodes"].pop(0), "damaged network"),
+        (lambda content: content["nodes"][0].pop(), "damaged network"),
+        (lambda content: content["tensors"].clear(), "damaged network"),
+        (lambda content: content.update(outputs={"node": "nowhere"}), "damaged network"),
         (lambda content: content["tensors"].update(a=nn.Parameter(torch.ones(1))), "not plain"),
         (lambda content: content.update(metadata=torch.Size([1])), "not plain"),
         (_constant("load"), "torch.load is not allowed"),
-        (_constant("no_such_thing"), "damaged program"),
+        (_constant("no_such_thing"), "damaged network"),
     ],
 )
 def test_damaged_and_foreign_contents_are_refused(change, message, saved):
     _edit(saved, change)
-    with pytest.raises(ProgramError, match=message) as error:
-        load_program(saved)
+    with pytest.raises(NetworkError, match=message) as error:
+        load_network(saved)
     assert str(saved) in str(error.value)
 
 
@@ -372,11 +372,18 @@ def test_damaged_and_foreign_files_are_refused(saved, tmp_path):
     for name, content in cases.items():
         path = tmp_path / name
         path.write_bytes(content)
-        with pytest.raises(ProgramError, match=name):
-            load_program(path)
+        with pytest.raises(NetworkError, match=name):
+            load_network(path)
     torch.save([1, 2], tmp_path / "list")
     with zipfile.ZipFile(tmp_path / "zip", "w") as archive:
         archive.writestr("a", "b")
     for name in ("list", "zip", "missing", "."):
-        with pytest.raises(ProgramError):
-            load_program(tmp_path / name)
+        with pytest.raises(NetworkError):
+            load_network(tmp_path / name)
+
+
+def test_the_earlier_names_still_work():
+    from envs import programs
+
+    assert programs.save_program is save_network and programs.load_program is load_network
+    assert programs.halve_program is halve_network and programs.ProgramError is NetworkError

@@ -4,8 +4,8 @@ import fcntl
 import json
 import os
 
-import envs
-from envs.datasets import scene_to_json
+from envs.scenes import scene_to_json
+from envs.tasks import get_task
 
 VERSION = 2
 
@@ -35,7 +35,7 @@ class Journal:
         self.path = path
         self.entries = {}
         """Index -> entry."""
-        scene = scene_to_json(envs.get_task(options["task"]).base_scene)
+        scene = scene_to_json(get_task(options["task"]).base_scene)
         header = {"journal": VERSION, **options, "scene": scene}
         self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
         try:

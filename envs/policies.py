@@ -1,0 +1,239 @@
+"""Policies by name: those that learn nothing, and trained ones from their files.
+
+    policy, arguments = find_policy("via-points")        # or a file, a run's folder, a shipped name
+    env = envs.make("wall", **arguments)
+    begin = make_policy(policy, env)
+    act, found = begin(0, load_queries("wall")[0])       # at the start of an episode, once
+    action = act(observation)                            # at every step
+
+- go-to-goal: straight to the goal configuration, whatever is in the way (paper, section 5.1);
+- random: a random action at every step;
+- via-points: straight to the goal configuration if that motion is free of collisions, or else by
+  way of the first of some random configurations for which the motion is free; if there is none,
+  straight all the same;
+- planner: OMPL's RRT-Connect plans, within a time limit, and the plan is followed.
+"""
+
+import importlib.resources
+import itertools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from envs import panda
+from envs.subgoals import subgoals
+
+PLANNING = ("via-points", "planner")
+"""The policies that look for a motion before they move; they know the true obstacles."""
+UNTRAINED = ("go-to-goal", "random", *PLANNING)
+# What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
+# they decide what a success is.
+ENV_ARGUMENTS = ("goal_type", "action_mode", "max_step", "velocities", "encoder")
+# Packages with a folder `policies`. Only data are found there: `envs` imports no trainer.
+PACKAGES = ("bc_script", "clean_rl_scripts")
+TRIES = 16  # of `via-points`, by default
+TIME_LIMIT = 5.0  # s, of `planner`, by default
+
+
+class PolicyError(ValueError):
+    """A policy that cannot be had or used; the message says why."""
+
+
+class EpisodePolicy(NamedTuple):
+    """What a policy does in one episode.
+
+    act: act(observation) -> action (7,); None: it gives up.
+    found: whether it found a motion; None if it did not look for one.
+    """
+
+    act: Callable | None
+    found: bool | None = None
+
+
+def shipped_policies():
+    """The trained policies that come with the project: dict of name -> path."""
+    folders = [importlib.resources.files(package) / "policies" for package in PACKAGES]
+    paths = [Path(file) for folder in folders if folder.is_dir() for file in folder.iterdir()]
+    return {path.stem: path for path in sorted(paths) if path.suffix == ".pt"}
+
+
+def policy_file(name):
+    """The path of a trained policy: of a file, a run's folder, or a name of `shipped_policies`.
+
+    Raises PolicyError if it is none of these.
+    """
+    path = Path(name)
+    if path.is_dir():
+        path = path / "policy.pt"
+    if path.exists():
+        return path
+    shipped = shipped_policies()
+    if str(name) not in shipped:
+        raise PolicyError(
+            f"no such policy: {path} (expected {', '.join(UNTRAINED)}, a policy network, a folder "
+            f"with a policy.pt in it, or a name: {', '.join(shipped) or 'there are none'})"
+        )
+    return shipped[str(name)]
+
+
+def find_policy(name):
+    """What `make_policy` takes, and the arguments of `envs.make` that it was trained with.
+
+    Args:
+        name: one of `UNTRAINED`, which have no arguments, or what `policy_file` takes.
+
+    Raises:
+        PolicyError: there is no such policy, its file is not one, or `planner` lacks OMPL.
+    """
+    if name == "planner":
+        _import_planning()
+    if name in UNTRAINED:
+        return name, {}
+    path = policy_file(name)
+    return path, _load(path)[1]
+
+
+def make_policy(policy, env, seed=0, tries=TRIES, time_limit=TIME_LIMIT):
+    """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
+
+    It is called once per episode, before the environment is put to the start: `planner` moves
+    the arm.
+
+    Args:
+        policy: one of `UNTRAINED`, the path of a policy network, or a function from an observation
+            to an action (7,).
+        env: the `RoboArmEnv` it will act in.
+        seed: of `random`, `via-points` and `planner`; each query has its own generator.
+        tries: random configurations that `via-points` tries per query.
+        time_limit: seconds that `planner` may search per query.
+
+    Raises:
+        PolicyError: the network cannot act in this environment.
+    """
+    if policy == "go-to-goal":
+        return lambda number, query: EpisodePolicy(_go_to_goal(query.goal))
+    if policy == "random":
+        return lambda number, query: EpisodePolicy(_random(np.random.default_rng([seed, number])))
+    if policy == "via-points":
+        return _via_points(seed, tries)
+    if policy == "planner":
+        return _planner(env, seed, time_limit)
+    act = policy if callable(policy) else _trained(policy, env)
+    return lambda number, query: EpisodePolicy(act)
+
+
+# --- Those that learn nothing
+
+
+def _go_to_goal(goal):
+    target = panda.normalise(goal)
+    return lambda observation: target - observation["observation"][:7]
+
+
+def _random(rng):
+    return lambda observation: rng.uniform(-1.0, 1.0, panda.NUM_JOINTS)
+
+
+def _via_points(seed, tries):
+    from envs.collision import CollisionChecker  # here, because Numba takes a while to import
+
+    checker = None
+
+    # No margin is kept, which would reject more than it saves: with 3 mm, clean success was 2 to 5
+    # points lower on `wall`, `double_walls` and `boxes`.
+    def begin(number, query):
+        nonlocal checker
+        if checker is None or checker.scene != query.scene:
+            checker = CollisionChecker(query.scene)
+        # float32 may round a limit to just beyond it.
+        start, goal = np.clip(panda.normalise(np.stack([query.start, query.goal])), -1.0, 1.0)
+        if checker.is_motion_free(start, goal):
+            return EpisodePolicy(_go_to_goal(query.goal), found=True)
+        for via in np.random.default_rng([seed, number]).uniform(-1.0, 1.0, (tries, 7)):
+            if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
+                path = panda.denormalise(np.stack([start, via, goal]))
+                return EpisodePolicy(_follow(path), found=True)
+        return EpisodePolicy(_go_to_goal(query.goal), found=False)
+
+    return begin
+
+
+def _planner(env, seed, time_limit):
+    planning = _import_planning()
+    planner = planning.Planner(env, max_checks=math.inf)
+
+    def begin(number, query):
+        rng = np.random.default_rng([seed, number])
+        try:
+            path = planner.plan_within(time_limit, *query, rng=rng)
+        except planning.PlanningError:
+            return EpisodePolicy(None, found=False)
+        return EpisodePolicy(_follow(path), found=True)
+
+    return begin
+
+
+def _import_planning():
+    # The one place where `envs` uses `demo_generation`, which is built on it: only when somebody
+    # asks for this policy by name, so that neither it nor OMPL is needed by anything else.
+    try:
+        from demo_generation import planning
+    except ImportError as error:
+        raise PolicyError(f"the policy planner needs OMPL, and {error}") from error
+    return planning
+
+
+def _follow(path):
+    """One sub-goal per step along a path (n, 7), rad, and then the goal again and again."""
+    targets = subgoals(path)[1:]
+    left = itertools.chain(targets, itertools.repeat(targets[-1]))
+    return lambda observation: next(left) - observation["observation"][:7]
+
+
+# --- Trained ones. PyTorch is imported only here: it takes seconds.
+
+
+def _load(path):
+    """A policy network, and the arguments of the environment it was trained in."""
+    from envs.exported_networks import NetworkError, load_network
+
+    try:
+        network = load_network(path)
+    except NetworkError as error:
+        raise PolicyError(str(error)) from error
+    trained = network.metadata.get("env")
+    if network.metadata.get("kind") != "policy" or not isinstance(trained, dict):
+        raise PolicyError(f"{path}: a network, but not a policy")
+    if "goal_type" not in trained:
+        raise PolicyError(f"{path}: does not say which goal type it was trained with")
+    return network, {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
+
+
+def _trained(path, env):
+    """A policy network as a function from an observation to an action."""
+    import torch
+
+    from envs.exported_networks import NetworkError
+
+    network, _ = _load(path)
+
+    # One observation at a time: in a batch its last bits would depend on the batch's size, for a
+    # gain of a tenth of the time at most.
+    def act(observation):
+        inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
+        return network(**inputs)[0].numpy()
+
+    space = env.observation_space
+    unknown = set(network.inputs) - set(space)
+    if unknown:
+        raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
+    try:
+        action = network(**{name: torch.zeros(1, *space[name].shape) for name in network.inputs})
+    except NetworkError as error:
+        raise PolicyError(str(error)) from error
+    if not isinstance(action, torch.Tensor) or action.shape != (1, panda.NUM_JOINTS):
+        raise PolicyError(f"{path}: its output is not an action for each observation")
+    return act

@@ -1,0 +1,49 @@
+"""Sub-goals: the points of a plan that the arm is sent to, one per environment step."""
+
+import numpy as np
+
+from envs import panda
+
+# A plan is followed by commanding one sub-goal per step. This far apart, the controller's lag
+# seldom makes a step longer than the paper's 0.03, to which it is clipped.
+MAX_STEP = 0.03
+SUBGOAL_SPACING = 0.95 * MAX_STEP
+
+
+def subgoals(path):
+    """Points along a path at most `SUBGOAL_SPACING` apart, every waypoint among them.
+
+    Args:
+        path: (n, 7), rad.
+
+    Returns:
+        float64 (m, 7), normalised; the first is the path's start, the last its goal.
+    """
+    return all_subgoals(np.asarray(path), np.array([0, len(path)]))[0]
+
+
+def all_subgoals(plan, plan_offsets):
+    """The sub-goals of all plans (k, 7), and the offsets (n + 1,) of each plan's first one."""
+    waypoints = panda.normalise(plan.astype(np.float64))
+    moves = np.diff(waypoints, axis=0)
+    steps = np.ceil(np.sqrt(np.square(moves).sum(1)) / SUBGOAL_SPACING)
+    steps = np.maximum(steps, 1).astype(np.int64)
+    steps[plan_offsets[1:-1] - 1] = 1  # from the end of a plan to the start of the next
+    move = np.repeat(np.arange(len(moves)), steps)
+    first = np.concatenate([[0], np.cumsum(steps)])  # sub-goals before each waypoint
+    share = (np.arange(len(move)) - first[move] + 1) / steps[move]
+    points = np.concatenate([waypoints[:1], waypoints[move] + moves[move] * share[:, None]])
+    return points, np.concatenate([first[plan_offsets[:-1]], [len(points)]])
+
+
+def schedule(plan, plan_offsets, offsets):
+    """The sub-goal (m, 7) due at each executed configuration, the one before and the one after.
+
+    The last one is repeated as long as the execution went on; so is the first, as `before`.
+    """
+    points, first = all_subgoals(plan, plan_offsets)
+    demo = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    step = np.arange(offsets[-1]) - offsets[demo]
+    here = first[demo] + step
+    low, high = first[demo], first[demo + 1] - 1
+    return (points[np.clip(here + shift, low, high)] for shift in (-1, 0, 1))

@@ -1,0 +1,287 @@
+"""The simulated world: the physics engine, the arm, the scene's bodies, contacts, feasibility.
+
+Everything that moves an arm or looks at one stands on this; `envs.arm_env.RoboArmEnv` makes a
+goal-conditioned MDP of it, `envs.sensors.SensorWorld` something to be looked at.
+"""
+
+import contextlib
+import math
+
+import numpy as np
+import pybullet as p
+
+from envs import panda
+from envs.scenes import FRICTION, Box, Cylinder, Scene, floor_box
+
+# One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
+# controller; docs/environment.md has the measured tracking error.
+TIME_STEP = 1.0 / 120.0
+SUBSTEPS = 4
+POSITION_GAINS = [0.6] * panda.NUM_JOINTS
+# A configuration is "held" if the controller keeps it, untouched, this many environment steps
+# without drifting further than this (normalised).
+HOLD_STEPS = 5
+HOLD_DRIFT = 1e-3
+# Colour and friction.
+FLOOR_LOOK, TABLE_LOOK = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
+OBSTACLE_COLOUR = (0.36, 0.50, 0.65, 1)
+MAX_SAMPLING_TRIES = 10_000
+# PyBullet keeps some 4 kB of each body that is removed, so after this many the world is made anew,
+# which takes as long as 100 changes of scene.
+MAX_BODIES_MADE = 5_000
+# Where and how the arm touches nothing (m, rad). PyBullet places a body by its centre of mass.
+FAR_AWAY, IN_PLACE, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0)
+CONTACT_FREE = ((panda.LOWER + panda.UPPER) / 2).tolist()
+
+
+class World:
+    """A scene with the arm in it, in a physics engine of its own.
+
+    Args:
+        scene: a `Scene`; by default an empty one.
+        window: open PyBullet's window.
+
+    Attributes:
+        client: PyBullet's number of the engine; None once it is closed.
+        robot: PyBullet's number of the arm's body.
+        scene: the `Scene`; `set_scene` changes it.
+
+    Raises:
+        TypeError: `scene` is not a `Scene`.
+    """
+
+    def __init__(self, scene=None, window=False):
+        self.client = None
+        scene = Scene() if scene is None else scene
+        _check_scene(scene)
+        self.client = p.connect(p.GUI if window else p.DIRECT)
+        self.scene = None
+        self._make()
+        self.set_scene(scene)
+
+    def _make(self):
+        """The physics engine's settings and the robot, without a scene."""
+        p.resetSimulation(physicsClientId=self.client)
+        # Without deterministicOverlappingPairs the same episode differs from run to run.
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self.client
+        )
+        p.setGravity(0, 0, -9.81, physicsClientId=self.client)
+        self.robot = self._load_robot()
+        self._parts, self._bodies, self._bodies_made = [], [], 0
+        self._goal_marker = None
+
+    def _load_robot(self):
+        return panda.load(self.client)
+
+    def set_scene(self, scene):
+        """Put the arm into another `Scene`; whether it is another: an equal one changes nothing."""
+        _check_scene(scene)
+        if scene is self.scene or scene == self.scene:
+            return False
+        if self._bodies_made > MAX_BODIES_MADE:
+            self._make()
+        before, self.scene = self._parts, scene
+        self._parts = []
+        if scene.floor is not None:
+            self._parts.append((floor_box(scene.floor), *FLOOR_LOOK))
+        if scene.table is not None:
+            self._parts.append((scene.table, *TABLE_LOOK))
+        look = (OBSTACLE_COLOUR, scene.friction)
+        self._parts += [(obstacle, *look) for obstacle in scene.obstacles]
+        # What comes first and is the same, floor and table mostly, stays.
+        same = 0
+        while same < min(len(before), len(self._parts)) and before[same] == self._parts[same]:
+            same += 1
+        for body in self._bodies[same:]:
+            p.removeBody(body, physicsClientId=self.client)
+        self._bodies = self._bodies[:same]
+        for part in self._parts[same:]:
+            self._add(*part)
+        return True
+
+    def _add(self, obstacle, colour, friction):
+        orientation = NO_TURN
+        if isinstance(obstacle, Box):
+            kind, collision = p.GEOM_BOX, {"halfExtents": [edge / 2 for edge in obstacle.size]}
+            visual, orientation = collision, obstacle.orientation
+        elif isinstance(obstacle, Cylinder):
+            kind, orientation = p.GEOM_CYLINDER, obstacle.orientation
+            collision = {"radius": obstacle.radius, "height": obstacle.length}
+            visual = {"radius": obstacle.radius, "length": obstacle.length}
+        else:
+            kind, collision = p.GEOM_SPHERE, {"radius": obstacle.radius}
+            visual = collision
+        client = self.client
+        body = p.createMultiBody(
+            0.0,  # kg: it never moves
+            p.createCollisionShape(kind, **collision, physicsClientId=client),
+            p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client),
+            basePosition=obstacle.position,
+            baseOrientation=orientation,
+            physicsClientId=client,
+        )
+        if friction != FRICTION:
+            p.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
+        if obstacle is self.scene.table:  # the base is bolted to it
+            p.setCollisionFilterPair(self.robot, body, -1, -1, 0, physicsClientId=client)
+        self._bodies.append(body)
+        self._bodies_made += 1
+
+    # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
+
+    def in_collision(self, configuration):
+        """Whether the arm at joint angles (7, rad, inside the limits) overlaps the scene or itself.
+
+        Moves the arm: call it between episodes, or go on with a reset.
+        """
+        self.place(configuration)
+        p.performCollisionDetection(physicsClientId=self.client)
+        return any(
+            contact[8] < 0.0
+            for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
+        )
+
+    def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
+        """Whether joint angles (7, rad) are inside the limits, collision free and held.
+
+        Held: the position controller keeps the arm there for `hold_steps` environment steps. Moves
+        the arm: call it between episodes, or go on with a reset.
+        """
+        if np.any(configuration < panda.LOWER) or np.any(configuration > panda.UPPER):
+            return False
+        if self.in_collision(configuration):
+            return False
+        self.command(list(configuration))
+        for _ in range(hold_steps):
+            if self.simulate():
+                return False
+        drift = self.read_arm()[0] - panda.normalise(configuration)
+        return math.sqrt(drift @ drift) <= HOLD_DRIFT
+
+    def sample_feasible(self, rng):
+        """A feasible configuration, uniform in the limits: float32 (7,), rad.
+
+        `rng` is a NumPy Generator.
+        """
+        for _ in range(MAX_SAMPLING_TRIES):
+            configuration = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
+            if self.is_feasible(configuration):
+                return configuration
+        raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
+
+    def check_free(self, **configurations):
+        """Raise ValueError, saying what is touched, if one of some joint angles is in collision.
+
+        The arm is then left as it was; otherwise it has moved. E.g. `check_free(start=start)`.
+        """
+        before = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
+        for name, configuration in configurations.items():
+            if self.in_collision(configuration):
+                touched = self._touched_names()
+                p.resetJointStatesMultiDof(
+                    self.robot,
+                    panda.RESET_JOINTS,
+                    [[joint[0]] for joint in before],
+                    [[joint[1]] for joint in before],
+                    physicsClientId=self.client,
+                )
+                raise ValueError(f"{name} is in collision: {touched}")
+
+    def _touched_names(self):
+        """What the arm overlaps, in words; after `in_collision`."""
+        names = set()
+        for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client):
+            if contact[8] < 0.0:
+                body = contact[2]
+                if body == self.robot:
+                    names.add("the arm with itself")
+                else:
+                    index = self._bodies.index(body)
+                    kinds = ["the floor"] * (self.scene.floor is not None)
+                    kinds += ["the table"] * (self.scene.table is not None)
+                    kinds += [f"obstacle {i}" for i in range(len(self.scene.obstacles))]
+                    names.add(f"the arm with {kinds[index]}")
+        return ", ".join(sorted(names))
+
+    # --- The arm
+
+    def place(self, configuration):
+        """Teleport the arm to joint angles (7, rad), at rest, leaving no old contact points.
+
+        Bullet keeps the contact points of two bodies while these move little against each other.
+        So a configuration could inherit points from an earlier one that brought the same two links
+        nearly as close. Out in the open, in a pose without contacts, all of them are dropped.
+        """
+        client, robot = self.client, self.robot
+        p.resetBasePositionAndOrientation(robot, FAR_AWAY, NO_TURN, physicsClientId=client)
+        panda.set_configuration(client, robot, CONTACT_FREE)
+        p.performCollisionDetection(physicsClientId=client)
+        p.resetBasePositionAndOrientation(robot, IN_PLACE, NO_TURN, physicsClientId=client)
+        panda.set_configuration(client, robot, configuration)
+
+    def command(self, configuration):
+        """Point the arm's position controllers at joint angles (list of 7, rad)."""
+        panda.command(self.client, self.robot, configuration, POSITION_GAINS)
+
+    def simulate(self):
+        """Run the physics of one environment step; whether the arm touched anything in it."""
+        touched = False
+        for _ in range(SUBSTEPS):
+            p.stepSimulation(physicsClientId=self.client)
+            if not touched:
+                # A contact also counts at distance zero, when the surfaces push on each other.
+                contacts = p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
+                touched = any(contact[8] < 0.0 or contact[9] > 0.0 for contact in contacts)
+        return touched
+
+    def read_arm(self, velocities=False):
+        """Where the arm is.
+
+        Returns:
+            Its normalised configuration (7,), its joint velocities (7,) in normalised units per
+            second (None without `velocities`), and its end-effector position (3,), m; all float64.
+        """
+        joints = p.getJointStates(self.robot, panda.ARM_JOINTS, physicsClientId=self.client)
+        state, velocity = panda.normalise([joint[0] for joint in joints]), None
+        if velocities:
+            speeds = np.array([joint[1] for joint in joints])
+            velocity = 2.0 * speeds / (panda.UPPER - panda.LOWER)
+        link = p.getLinkState(
+            self.robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=self.client
+        )
+        return state, velocity, np.array(link[4])
+
+    def mark_goal(self, position, radius):
+        """Show a green ball, visual only, at a position (3,), m. Only one, and always as large."""
+        if self._goal_marker is None:
+            ball = p.createVisualShape(
+                p.GEOM_SPHERE,
+                radius=radius,
+                rgbaColor=(0.1, 0.75, 0.2, 1),
+                physicsClientId=self.client,
+            )
+            self._goal_marker = p.createMultiBody(
+                baseVisualShapeIndex=ball, physicsClientId=self.client
+            )
+        p.resetBasePositionAndOrientation(
+            self._goal_marker, position, (0, 0, 0, 1), physicsClientId=self.client
+        )
+
+    def close(self):
+        """Disconnect from PyBullet. Closing twice is allowed."""
+        if self.client is not None:
+            p.disconnect(physicsClientId=self.client)
+            self.client = None
+
+    def __del__(self):
+        # A world that nobody closed must not keep one of PyBullet's connections.
+        if getattr(self, "client", None) is not None:
+            with contextlib.suppress(TypeError):  # PyBullet is gone already, as the process ends
+                if p.isConnected(self.client):
+                    p.disconnect(physicsClientId=self.client)
+
+
+def _check_scene(scene):
+    if not isinstance(scene, Scene):
+        raise TypeError(f"a scene must be an envs.scenes.Scene, got {scene!r}")
