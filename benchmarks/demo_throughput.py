@@ -6,7 +6,7 @@
 
 Ours is `demo_generation.collect.Collector`. On `random_boxes_hard` it is only timed as a whole, new
 scenes and queries included (`--random`), because the plain way has one scene. Both ways get the
-first queries that it draws, its planner seeds, its limits on a plan and its three attempts on a query,
+first queries that it draws, its planner seeds, its limits on a plan, its three attempts on a query,
 and the same scene and arm; a demonstration counts if it reaches its goal (0.02 m and 0.05
 normalised) and touched nothing in any physics step. Drawing the queries is not timed: it is the
 same for both (and is in the column "end to end").
