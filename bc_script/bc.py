@@ -9,12 +9,9 @@ your own, copy this file and change the parts under `# ALGO LOGIC`. Parts betwee
 `# END SHARED` are those of `clean_rl_scripts/sac_her_mp.py`.
 """
 
-import json
 import math
-import os
 import sys
-import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -22,14 +19,23 @@ import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-import tyro
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 import envs as roboarm
 from envs import panda
 from envs.datasets import MAX_STEP, DatasetError, load_demos, load_queries
 from envs.programs import load_program, save_program
+from envs.runs import (
+    elapsed,
+    load_checkpoint,
+    parse_args,
+    progress_bar,
+    rate,
+    run_folder,
+    save_checkpoint,
+    seed_torch,
+    summary_writer,
+    write_json,
+)
 from envs.tasks import task_name
 
 
@@ -97,13 +103,6 @@ class Args:
     """validation queries per evaluation"""
     test_queries: int = 1_000
     """test queries for the best policy at the end"""
-
-
-def configuration_of(args):
-    """The fields that define what is computed: a run can only be resumed with the same."""
-    free = {"resume", "runs_dir", "threads", "test_queries"}
-    values = {k: v for k, v in asdict(args).items() if k not in free}
-    return values | {"demos": [str(path) for path in args.demos]}
 
 
 # ALGO LOGIC: the policy
@@ -224,7 +223,7 @@ def transitions(demos, goal_type, num_demos=None):
     return *(a.astype(np.float32) for a in arrays), actions, which[commanded]
 
 
-# SHARED: averaging, evaluation, files and resuming
+# SHARED: averaging and evaluation
 def polyak_update(target_parameters, parameters, tau):
     """target <- (1 - tau) target + tau parameter, all tensors at once."""
     with torch.no_grad():
@@ -287,44 +286,11 @@ def picture_of_rollout(policy, env, queries, device, frames=8):
     return np.concatenate([pictures[i] for i in chosen], axis=1)
 
 
-def write_atomically(path, write):
-    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
-    temporary = path.with_name(path.name + ".part")
-    write(temporary)
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def parse_args():
-    """Flags, or with --resume those of the run, which must not be contradicted."""
-    args = tyro.cli(Args)
-    if args.resume is None:
-        return args
-    saved_file = args.resume / "args.json"
-    if not saved_file.exists():
-        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
-    saved = json.loads(saved_file.read_text())
-    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
-    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
-    args = tyro.cli(Args, default=defaults)
-    contradicted = [
-        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
-        for name, value in configuration_of(args).items()
-        if value != saved.get(name)
-    ]
-    if contradicted:
-        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
-    return args
-
-
 # END SHARED
 
 
 if __name__ == "__main__":
-    args = parse_args()
-    if args.device == "cuda" and not torch.cuda.is_available():
-        sys.exit("--device cuda: PyTorch sees no CUDA device here")
+    args = parse_args(Args, may_change={"test_queries"})
     try:
         if not roboarm.get_task(args.task).trainable:
             sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
@@ -341,21 +307,8 @@ if __name__ == "__main__":
         files = [load_demos(file, args.task) for file in args.demos or (args.task,)]
     except DatasetError as error:
         sys.exit(f"--demos: {error}")
-    if args.resume is not None:
-        run = args.resume
-    else:
-        name = f"{task_name(args.task)}__{args.exp_name}__{args.seed}__{int(time.time())}"
-        run = args.runs_dir / name
-        run.mkdir(parents=True)
-        text = json.dumps(asdict(args), indent=2, default=str)
-        write_atomically(run / "args.json", lambda path: path.write_text(text))
-
-    # TRY NOT TO MODIFY: seeding
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
-    torch.use_deterministic_algorithms(True)
-    device = torch.device(args.device)
+    run = run_folder(args, task_name(args.task))
+    device = seed_torch(args)
 
     # data and env setup
     parts = [transitions(demos, args.goal_type, args.num_demos) for demos in files]
@@ -389,43 +342,14 @@ if __name__ == "__main__":
     actor_average.load_state_dict(actor.state_dict())
     parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
-    saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
     progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_update": 0}
+    saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
+    saved_parts |= {"progress": progress}
+    load_checkpoint(args, saved_parts)
 
-    def save_checkpoint():
-        state = {name: part.state_dict() for name, part in saved_parts.items()}
-        state |= {"progress": progress, "torch_rng": torch.get_rng_state()}
-        if device.type == "cuda":
-            state["cuda_rng"] = torch.cuda.get_rng_state()
-        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
-
-    if args.resume is not None and (run / "checkpoint.pt").exists():
-        try:
-            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
-        except Exception as error:  # whatever a damaged file leads to
-            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
-        for name, part in saved_parts.items():
-            part.load_state_dict(state[name])
-        progress.update(state["progress"])
-        torch.set_rng_state(state["torch_rng"].cpu())
-        if device.type == "cuda":
-            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
-        del state
-
-    writer = SummaryWriter(run, purge_step=progress["updates"] + 1)
-    writer.add_text(
-        "hyperparameters",
-        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
-    )
-    started, seconds_before = time.time(), progress["seconds"]
-    updates_before = progress["updates"]
-    bar = tqdm(
-        total=args.total_updates,
-        initial=updates_before,
-        unit="update",
-        smoothing=0.05,
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
-    )
+    writer = summary_writer(run, args, progress["updates"])
+    seconds_before = progress["seconds"]
+    bar = progress_bar(args.total_updates, progress["updates"], "update")
 
     while progress["updates"] < args.total_updates:
         # ALGO LOGIC: learn
@@ -448,8 +372,7 @@ if __name__ == "__main__":
         if step % 1000 == 0:
             writer.add_scalar("losses/negative_log_likelihood", loss.item(), step)
             writer.add_scalar("charts/learning_rate", optimizer.param_groups[0]["lr"], step)
-            ups = (step - updates_before) / (time.time() - started)
-            writer.add_scalar("charts/SPS", int(ups), step)
+            writer.add_scalar("charts/SPS", int(rate(bar)), step)
 
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every == 0 or step == args.total_updates:
@@ -466,8 +389,8 @@ if __name__ == "__main__":
             bar.set_postfix(
                 eval=f"{result['success_rate']:.3f}", best=f"{progress['best_success']:.3f}"
             )
-            progress["seconds"] = seconds_before + time.time() - started
-            save_checkpoint()
+            progress["seconds"] = seconds_before + elapsed(bar)
+            save_checkpoint(run, saved_parts)
     bar.close()
 
     # The best policy (by validation) on test queries
@@ -477,8 +400,7 @@ if __name__ == "__main__":
     result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_update"]}
     result |= {"validation_success_rate": progress["best_success"]}
     result |= {"steps": progress["updates"], "seconds": round(progress["seconds"])}
-    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
-    write_atomically(run / "result.json", lambda path: path.write_text(text))
+    write_json(run / "result.json", result | {"args": asdict(args)})
     print(
         f"{args.task}, goal {args.goal_type}, {len(test)} test queries: "
         f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "

@@ -11,10 +11,8 @@ under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are those of `
 
 import json
 import math
-import os
 import sys
-import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -22,14 +20,23 @@ import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-import tyro
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 import envs as roboarm
 from envs import panda
 from envs.datasets import MAX_STEP, DatasetError, load_demos, load_queries
 from envs.programs import load_program, save_program
+from envs.runs import (
+    elapsed,
+    load_checkpoint,
+    parse_args,
+    progress_bar,
+    rate,
+    run_folder,
+    save_checkpoint,
+    seed_torch,
+    summary_writer,
+    write_json,
+)
 from envs.tasks import task_name
 
 
@@ -146,13 +153,6 @@ class Args:
 
 
 # SHARED: arguments
-def configuration_of(args):
-    """The fields that define what is computed: a run can only be resumed with the same."""
-    free = {"resume", "runs_dir", "threads", "total_timesteps", "test_queries", "stop_at_success"}
-    values = {k: v for k, v in asdict(args).items() if k not in free}
-    return values | {"demos": args.demos and str(args.demos)}
-
-
 def env_arguments(args):
     names = ("goal_type", "action_mode", "max_step", "horizon", "stop_on_collision", "velocities")
     return {name: getattr(args, name) for name in (*names, "encoder")}
@@ -408,7 +408,7 @@ def td_target(reward, terminated, next_q1, next_q2, gamma):
     return reward + gamma * (1.0 - terminated) * torch.minimum(next_q1, next_q2)
 
 
-# SHARED: averaging, evaluation, files and resuming
+# SHARED: averaging and evaluation
 def polyak_update(target_parameters, parameters, tau):
     """target <- (1 - tau) target + tau parameter, all tensors at once."""
     with torch.no_grad():
@@ -471,45 +471,12 @@ def picture_of_rollout(policy, env, queries, device, frames=8):
     return np.concatenate([pictures[i] for i in chosen], axis=1)
 
 
-def write_atomically(path, write):
-    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
-    temporary = path.with_name(path.name + ".part")
-    write(temporary)
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def parse_args():
-    """Flags, or with --resume those of the run, which must not be contradicted."""
-    args = tyro.cli(Args)
-    if args.resume is None:
-        return args
-    saved_file = args.resume / "args.json"
-    if not saved_file.exists():
-        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
-    saved = json.loads(saved_file.read_text())
-    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
-    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
-    args = tyro.cli(Args, default=defaults)
-    contradicted = [
-        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
-        for name, value in configuration_of(args).items()
-        if value != saved.get(name)
-    ]
-    if contradicted:
-        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
-    return args
-
-
 # END SHARED
 
 
 if __name__ == "__main__":
     # SHARED: checks, folder, seeds and environments
-    args = parse_args()
-    if args.device == "cuda" and not torch.cuda.is_available():
-        sys.exit("--device cuda: PyTorch sees no CUDA device here")
+    args = parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     try:
         if not roboarm.get_task(args.task).trainable:
             sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
@@ -533,21 +500,8 @@ if __name__ == "__main__":
             sys.exit(f"--demo-prob: {error}")
         if args.stop_on_collision and demos.collided.any():
             sys.exit("--stop-on-collision: some of these demonstrations touch something")
-    if args.resume is not None:
-        run = args.resume
-    else:
-        name = f"{task_name(args.task)}__{args.exp_name}__{args.seed}__{int(time.time())}"
-        run = args.runs_dir / name
-        run.mkdir(parents=True)
-        text = json.dumps(asdict(args), indent=2, default=str)
-        write_atomically(run / "args.json", lambda path: path.write_text(text))
-
-    # TRY NOT TO MODIFY: seeding
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
-    torch.use_deterministic_algorithms(True)
-    device = torch.device(args.device)
+    run = run_folder(args, task_name(args.task))
+    device = seed_torch(args)
 
     if args.bf16 is None:
         args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
@@ -591,6 +545,8 @@ if __name__ == "__main__":
     buffer = HerReplayBuffer(
         eval_envs[0], args.buffer_size, args.her_probability, np.random.default_rng(args.seed)
     )
+    progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
+    progress |= {"best_success": -1.0, "best_step": 0, "demos_injected": 0}
     saved_parts = {
         "actor": actor,
         "actor_target": actor_target,
@@ -602,36 +558,12 @@ if __name__ == "__main__":
         "q_optimizer": q_optimizer,
         "actor_optimizer": actor_optimizer,
         "buffer": buffer,
+        "progress": progress,
     }
-    progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
-    progress |= {"best_success": -1.0, "best_step": 0, "demos_injected": 0}
-
-    def save_checkpoint():
-        state = {name: part.state_dict() for name, part in saved_parts.items()}
-        state |= {"progress": progress, "torch_rng": torch.get_rng_state()}
-        if device.type == "cuda":
-            state["cuda_rng"] = torch.cuda.get_rng_state()
-        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
-
-    if args.resume is not None and (run / "checkpoint.pt").exists():
-        try:
-            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
-        except Exception as error:  # whatever a damaged file leads to
-            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
-        for name, part in saved_parts.items():
-            part.load_state_dict(state[name])
-        progress.update(state["progress"])
-        torch.set_rng_state(state["torch_rng"].cpu())
-        if device.type == "cuda":
-            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
-        del state
+    load_checkpoint(args, saved_parts)
 
     # SHARED: episodes
-    writer = SummaryWriter(run, purge_step=progress["global_step"] + 1)
-    writer.add_text(
-        "hyperparameters",
-        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
-    )
+    writer = summary_writer(run, args, progress["global_step"])
 
     query = [None] * args.num_envs  # number of the demonstration whose query each env is on
 
@@ -658,15 +590,8 @@ if __name__ == "__main__":
     staged = [[] for _ in envs]  # transitions of the running episodes
     returns = [0.0] * args.num_envs
     recent_success = []
-    started, seconds_before = time.time(), progress["seconds"]
-    steps_before = progress["global_step"]
-    bar = tqdm(
-        total=args.total_timesteps,
-        initial=steps_before,
-        unit="step",
-        smoothing=0.05,
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
-    )
+    seconds_before = progress["seconds"]
+    bar = progress_bar(args.total_timesteps, progress["global_step"], "step")
 
     # END SHARED
 
@@ -777,8 +702,7 @@ if __name__ == "__main__":
                 writer.add_scalar("losses/qf_loss", (qf1_loss + qf2_loss).item() / 2, step)
                 writer.add_scalar("losses/actor_loss", actor_loss.item(), step)
                 writer.add_scalar("losses/preactivation", preactivation.abs().mean().item(), step)
-                sps = (step - steps_before) / (time.time() - started)
-                writer.add_scalar("charts/SPS", int(sps), step)
+                writer.add_scalar("charts/SPS", int(rate(bar)), step)
 
         # SHARED: evaluate, keep the best policy, checkpoint
         step = progress["global_step"]
@@ -801,8 +725,8 @@ if __name__ == "__main__":
             for episode in filter(None, staged):
                 buffer.add_episode(episode)
             staged, returns = [[] for _ in envs], [0.0] * args.num_envs
-            progress["seconds"] = seconds_before + time.time() - started
-            save_checkpoint()
+            progress["seconds"] = seconds_before + elapsed(bar)
+            save_checkpoint(run, saved_parts)
             observations = begin_episodes()
             stop = result["success_rate"] >= args.stop_at_success
     bar.close()
@@ -814,8 +738,7 @@ if __name__ == "__main__":
     result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
     result |= {"validation_success_rate": progress["best_success"]}
     result |= {"steps": progress["global_step"], "seconds": round(progress["seconds"])}
-    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
-    write_atomically(run / "result.json", lambda path: path.write_text(text))
+    write_json(run / "result.json", result | {"args": asdict(args)})
     print(
         f"{args.task}, goal {args.goal_type}, {len(test)} test queries: "
         f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
