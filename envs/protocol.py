@@ -1,0 +1,181 @@
+"""The benchmark's protocol, as every trainer of a policy follows it.
+
+Validation queries say which policy of a run is the best; that one is saved, `policy.pt`, and at the
+end it is tested on test queries, with the result in `result.json`. (The evaluation on all queries,
+with more numbers, is `clean_rl_scripts/evaluate.py`.)
+
+The functions that take flags of the command line are for scripts: where the user is wrong, they end
+the program with a message.
+"""
+
+import sys
+from dataclasses import asdict
+
+import numpy as np
+import torch
+
+import envs
+from envs.datasets import load_queries
+from envs.programs import load_program, save_program
+from envs.runs import write_json
+
+NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
+PICTURE_SIZE = (240, 180)
+
+
+def load_task(args):
+    """The first validation queries and test queries, as many as the flags say, of `args.task`.
+
+    Raises:
+        SystemExit: unknown task, a task for testing only, or its query file cannot be used.
+    """
+    try:
+        if not envs.get_task(args.task).trainable:
+            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
+        validation = load_queries(args.task, "validation")[: args.eval_queries]
+        return validation, load_queries(args.task, "test")[: args.test_queries]
+    except ValueError as error:
+        sys.exit(f"--task: {error}")
+
+
+def make_envs(task, number, **kwargs):
+    """A list of environments of a task; `kwargs` as for `envs.make`.
+
+    Raises:
+        SystemExit: an argument is refused.
+    """
+    try:
+        return [envs.make(task, **kwargs) for _ in range(number)]
+    except ValueError as error:
+        sys.exit(f"--encoder: {error}" if kwargs.get("encoder") is not None else str(error))
+
+
+def make_eval_envs(task, **kwargs):
+    """The environments of `validate` and `final_test`, as `make_envs`."""
+    pictured = make_envs(task, 1, render_mode="rgb_array", render_size=PICTURE_SIZE, **kwargs)
+    return pictured + make_envs(task, NUM_ENVS - 1, **kwargs)
+
+
+def stack(observations, device):
+    """List of observation dicts -> dict of float32 tensors (N, ...)."""
+    return {
+        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
+        for name in observations[0]
+    }
+
+
+@torch.no_grad()
+def evaluate(policy, envs, queries, device):
+    """Run a deterministic policy on every query, each env one at a time; mean results.
+
+    Args:
+        policy: from `observation`, `achieved_goal`, `desired_goal`, tensors (N, ...), to actions
+            (N, 7); a module or a program.
+        envs: the environments to do it in.
+        queries: `envs.datasets.Queries`.
+        device: of the policy.
+
+    Returns:
+        A dict of floats: `success_rate`, `clean_success_rate` (without a touch), `collision_rate`
+        and `episode_length` in steps.
+    """
+    waiting = iter(range(len(queries)))
+    running, results = {}, []
+
+    def start(env):
+        i = next(waiting, None)
+        running.pop(env, None)
+        if i is not None:
+            running[env] = env.reset_specific(*queries[i])[0]
+
+    for env in envs:
+        start(env)
+    while running:
+        actions = policy(**stack(list(running.values()), device)).cpu().numpy()
+        for env, action in zip(list(running), actions, strict=True):
+            running[env], _, terminated, truncated, info = env.step(action)
+            if terminated or truncated:
+                results.append(
+                    (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
+                )
+                start(env)
+    success, touched, steps = np.array(results, dtype=np.float64).T
+    return {
+        "success_rate": float(success.mean()),
+        "clean_success_rate": float((success * (1 - touched)).mean()),
+        "collision_rate": float(touched.mean()),
+        "episode_length": float(steps.mean()),
+    }
+
+
+@torch.no_grad()
+def picture_of_rollout(policy, env, query, device, frames=8):
+    """An image strip (height, frames * width, 3), uint8, of the policy on one query.
+
+    `env`: one that renders.
+    """
+    observation, _ = env.reset_specific(*query)
+    pictures, done = [env.render()], False
+    while not done:
+        action = policy(**stack([observation], device))[0].cpu().numpy()
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        if info["elapsed_steps"] % 10 == 0 or done:
+            pictures.append(env.render())
+    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
+    return np.concatenate([pictures[i] for i in chosen], axis=1)
+
+
+def validate(policy, envs, queries, device, writer, step):
+    """`evaluate` on validation queries, with results and a picture of the first in TensorBoard.
+
+    `envs`: of `make_eval_envs`.
+    """
+    result = evaluate(policy, envs, queries, device)
+    for name, value in result.items():
+        writer.add_scalar(f"eval/{name}", value, step)
+    picture = picture_of_rollout(policy, envs[0], queries[0], device)
+    writer.add_image("eval/rollout", picture, step, dataformats="HWC")
+    return result
+
+
+def save_policy(run, policy, envs, device, args, env_arguments, step):
+    """Write `policy.pt` for `evaluate.py` and others.
+
+    Args:
+        run: the run's folder.
+        policy: the module, `forward(observation, achieved_goal, desired_goal)`.
+        envs: some of its environments, for examples of observations.
+        device: of the policy.
+        args: the flags; `task`, `exp_name` and `seed` are noted in the file.
+        env_arguments: of `envs.make`, noted too: the policy is evaluated with them.
+        step: of the training.
+    """
+    metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
+    metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
+    example = stack([env.reset(seed=0)[0] for env in envs[:2]], device)
+    save_program(run / "policy.pt", policy, example, metadata)
+
+
+def final_test(run, args, env_arguments, queries, device, about):
+    """Test `policy.pt` on test queries: `result.json`, and a line on the console.
+
+    Args:
+        run: the run's folder.
+        args: the flags, written into the file.
+        env_arguments: of `envs.make`.
+        queries: the test queries.
+        device: where to run the policy.
+        about: dict with what else the file should say; `steps` and `seconds` are printed too.
+    """
+    policy = load_program(run / "policy.pt").to(device)
+    test_envs = make_eval_envs(args.task, **env_arguments)
+    result = evaluate(policy, test_envs, queries, device)
+    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
+    result |= {"policy": str(run / "policy.pt"), **about}
+    write_json(run / "result.json", result | {"args": asdict(args)})
+    print(
+        f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
+        f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
+        f"{about['steps']} steps in {about['seconds']:.0f} s. {run / 'result.json'}"
+    )
