@@ -129,8 +129,8 @@ class Args:
     """validation queries per evaluation"""
     test_queries: int = 1_000
     """test queries for the best policy at the end"""
-    stop_at_success: float = 1.0
-    """stop as soon as a validation success rate is this high, e.g. 0.9"""
+    stop_at_success: float | None = None
+    """stop as soon as a validation success rate is this high, e.g. 0.9; by default never"""
     # END SHARED
 
 
@@ -590,7 +590,7 @@ if __name__ == "__main__":
             progress["seconds"] = seconds_before + runs.elapsed(bar)
             runs.save_checkpoint(run, saved_parts)
             observations = begin_episodes()
-            stop = success >= args.stop_at_success
+            stop = args.stop_at_success is not None and success >= args.stop_at_success
     bar.close()
     about = {"policy_step": progress["best_step"]}
     about |= {"validation_success_rate": progress["best_success"]}

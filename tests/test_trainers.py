@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import PATHS, command, load, run_script
+from trainers import PATHS, command, load, run_here, run_script
 
 import envs
 from envs.datasets import demo_path
@@ -155,6 +155,18 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer)
     same(*(torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed)))
     results = [json.loads((run / "result.json").read_text()) for run in (whole, killed)]
     assert results[0]["success_rate"] == results[1]["success_rate"]
+
+
+@pytest.mark.parametrize("stop, steps", [(None, 1800), (1.0, 600)])
+def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps):
+    success = {"success_rate": 1.0, "clean_success_rate": 1.0}
+    monkeypatch.setattr("envs.protocol.evaluate", lambda *_: success)
+    flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
+    if stop is not None:
+        flags += ["--stop-at-success", stop]
+    run_here("sac_her_mp", monkeypatch, *flags)
+    (result,) = tmp_path.glob("*/result.json")
+    assert json.loads(result.read_text())["steps"] == steps
 
 
 # --- Bad input
