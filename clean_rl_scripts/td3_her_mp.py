@@ -359,15 +359,31 @@ def polyak_update(target_parameters, parameters, tau):
 
 
 # SHARED: batches
+def updates_due(step, buffer, args):
+    """Number of updates that fall due in the environment steps that led to `step`.
+
+    None before `learning_starts`, and none for steps in which nothing was there to learn from:
+    episodes enter the buffer when they end.
+    """
+    if buffer.size == 0:
+        return 0
+    before, now = (max(0, s - args.learning_starts) for s in (step - args.num_envs, step))
+    return int(now * args.updates_per_step) - int(before * args.updates_per_step)
+
+
+DRAWN_TOGETHER = 64  # batches
+
+
 def batches(buffer, number, batch_size, device):
-    """Draw `number` batches, dicts of tensors, from the replay buffer: at once, which is faster."""
-    if number > 0:
-        together = {
+    """Draw `number` batches, dicts of tensors, from the buffer: some at once, which is faster."""
+    for first in range(0, number, DRAWN_TOGETHER):
+        count = min(DRAWN_TOGETHER, number - first)
+        drawn = {
             name: torch.as_tensor(array, device=device).split(batch_size)
-            for name, array in buffer.sample(number * batch_size).items()
+            for name, array in buffer.sample(count * batch_size).items()
         }
-        for i in range(number):
-            yield {name: tensors[i] for name, tensors in together.items()}
+        for i in range(count):
+            yield {name: tensors[i] for name, tensors in drawn.items()}
 
 
 # END SHARED
@@ -565,9 +581,8 @@ if __name__ == "__main__":
         bar.update(args.num_envs)
         step = progress["global_step"]
 
-        due = (step - args.learning_starts) * args.updates_per_step
-        updates = max(0, int(due) - progress["updates"]) if buffer.size > 0 else 0
-        for batch in batches(buffer, updates, args.batch_size, device):
+        number = updates_due(step, buffer, args)
+        for batch in batches(buffer, number, args.batch_size, device):
             losses |= agent.update(batch, progress["updates"])
             progress["updates"] += 1
             if progress["updates"] % 1000 == 0:

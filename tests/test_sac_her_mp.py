@@ -173,6 +173,31 @@ def test_bfloat16_products_stay_close_to_float32():
     assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
 
 
+def test_updates_fall_due_from_the_first_stored_episode_on():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 1000, 0.8, np.random.default_rng(0))
+    args = sac.Args(learning_starts=200, updates_per_step=0.3, num_envs=7)
+    assert all(sac.updates_due(step, buffer, args) == 0 for step in range(0, 7000, 7))
+    buffer.add_episode(episode(4, 0, env))
+    due = {step: sac.updates_due(step, buffer, args) for step in range(7, 7001, 7)}
+    assert all(number == 0 for step, number in due.items() if step <= 200)
+    assert sum(due.values()) == int((7000 - 200) * 0.3)
+    assert set(list(due.values())[30:]) == {2, 3}  # 2.1 per seven steps; nothing is made up for
+
+
+def test_batches_are_drawn_some_at_a_time(monkeypatch):
+    env, drawn = envs.make("no_obstacles"), []
+    buffer = sac.HerReplayBuffer(env, 1000, 0.8, np.random.default_rng(0))
+    buffer.add_episode(episode(4, 0, env))
+    sample = buffer.sample
+    monkeypatch.setattr(buffer, "sample", lambda size: drawn.append(size) or sample(size))
+    found = list(sac.batches(buffer, 150, 8, "cpu"))
+    assert len(found) == 150 and sum(drawn) == 150 * 8 and max(drawn) <= 64 * 8
+    assert all(len(tensor) == 8 for batch in found for tensor in batch.values())
+    assert len({batch["observation"].numpy().tobytes() for batch in found}) > 140
+    assert list(sac.batches(buffer, 0, 8, "cpu")) == []
+
+
 # --- Demonstrations
 
 
