@@ -21,6 +21,7 @@ from envs.runs import write_json
 
 NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
 PICTURE_SIZE = (240, 180)
+RULES = ("horizon", "stop_on_collision")  # which decide what a success is
 
 
 def load_task(args):
@@ -160,22 +161,36 @@ def save_policy(run, policy, envs, device, args, env_arguments, step):
 def final_test(run, args, env_arguments, queries, device, about):
     """Test `policy.pt` on test queries: `result.json`, and a line on the console.
 
+    Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed, also
+    where the policy was trained under others: results are to be compared. File and line say so.
+
     Args:
         run: the run's folder.
         args: the flags, written into the file.
-        env_arguments: of `envs.make`.
+        env_arguments: of `envs.make`, in training.
         queries: the test queries.
         device: where to run the policy.
         about: dict with what else the file should say; `steps` and `seconds` are printed too.
     """
     policy = load_program(run / "policy.pt").to(device)
-    test_envs = make_eval_envs(args.task, **env_arguments)
+    own = {name: value for name, value in env_arguments.items() if name not in RULES}
+    test_envs = make_eval_envs(args.task, **own)
     result = evaluate(policy, test_envs, queries, device)
+    rules = {name: getattr(test_envs[0], name) for name in RULES}
+    trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}
+    result |= {"rules": rules, "rules_in_training": trained}
     result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
     result |= {"policy": str(run / "policy.pt"), **about}
     write_json(run / "result.json", result | {"args": asdict(args)})
+    if rules != trained:
+        print(f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:")
     print(
         f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
         f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
         f"{about['steps']} steps in {about['seconds']:.0f} s. {run / 'result.json'}"
     )
+
+
+def _words(rules):
+    contacts = "ended by a touch" if rules["stop_on_collision"] else "contacts allowed"
+    return f"{rules['horizon']} steps, {contacts}"
