@@ -135,14 +135,13 @@ class MLP(nn.Module):
         bf16 = self.bf16 and self.training
         for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
             # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
-            if not bf16:
-                x = layer(x)
-            elif i == 0:
-                x = layer(x).bfloat16()
+            # No kernel gets two types: CUDA's refuse that.
+            if bf16 and i > 0:
+                x = F.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
             else:
-                x = F.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16())
+                x = layer(x)
             x = F.relu(norm(x))
-        return self.head(x.float())
+        return self.head(x)
 
 
 # END SHARED
