@@ -259,10 +259,12 @@ if __name__ == "__main__":
     actor_average.load_state_dict(actor.state_dict())
     parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
-    progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_update": 0}
+    progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
     saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
     saved_parts |= {"progress": progress}
     runs.load_checkpoint(args, saved_parts)
+    if "best_update" in progress:  # its name in older runs
+        progress["best_step"] = progress.pop("best_update")
     writer = runs.summary_writer(run, args, progress["updates"])
     seconds_before = progress["seconds"]
     bar = runs.progress_bar(args.total_updates, progress["updates"], "update")
@@ -289,10 +291,10 @@ if __name__ == "__main__":
 
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every == 0 or step == args.total_updates:
-            result = protocol.validate(actor_average, eval_envs, validation, device, writer, step)
-            success = result["success_rate"]
-            if success > progress["best_success"]:
-                progress |= {"best_success": success, "best_update": step}
+            success, best = protocol.validate(
+                actor_average, eval_envs, validation, device, writer, step, progress
+            )
+            if best:
                 protocol.save_policy(
                     run, actor_average, eval_envs, device, args, env_arguments, step
                 )
@@ -300,8 +302,5 @@ if __name__ == "__main__":
             progress["seconds"] = seconds_before + runs.elapsed(bar)
             runs.save_checkpoint(run, saved_parts)
     bar.close()
-    about = {"policy_step": progress["best_update"]}
-    about |= {"validation_success_rate": progress["best_success"]}
-    about |= {"steps": progress["updates"], "seconds": round(progress["seconds"])}
-    protocol.final_test(run, args, env_arguments, test, device, about)
+    protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
     writer.close()

@@ -521,18 +521,7 @@ if __name__ == "__main__":
     saved_parts = agent.saved_parts() | {"buffer": buffer, "progress": progress}
     runs.load_checkpoint(args, saved_parts)
     writer = runs.summary_writer(run, args, progress["global_step"])
-
-    def begin_episodes():
-        """Fresh episodes in all envs, from seeds that depend on the step count alone.
-
-        Every checkpoint cuts the running episodes off and begins new ones here, so a resumed run
-        needs no simulator state to go on exactly like an uninterrupted one.
-        """
-        seeds = np.random.SeedSequence([args.seed, progress["global_step"]])
-        seeds = seeds.generate_state(args.num_envs).tolist()
-        return [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
-
-    observations = begin_episodes()
+    observations = protocol.begin_episodes(envs, args.seed, progress["global_step"])
     staged = [[] for _ in envs]  # transitions of the running episodes
     returns = [0.0] * args.num_envs
     recent_success, losses, stop = [], {}, False
@@ -592,10 +581,10 @@ if __name__ == "__main__":
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
             policy = agent.actor_average
-            result = protocol.validate(policy, eval_envs, validation, device, writer, step)
-            success = result["success_rate"]
-            if success > progress["best_success"]:
-                progress |= {"best_success": success, "best_step": step}
+            success, best = protocol.validate(
+                policy, eval_envs, validation, device, writer, step, progress
+            )
+            if best:
                 protocol.save_policy(run, policy, eval_envs, device, args, env_arguments, step)
             bar.set_postfix(eval=success, best=progress["best_success"])
             for episode in filter(None, staged):
@@ -603,12 +592,10 @@ if __name__ == "__main__":
             staged, returns = [[] for _ in envs], [0.0] * args.num_envs
             progress["seconds"] = seconds_before + runs.elapsed(bar)
             runs.save_checkpoint(run, saved_parts)
-            observations = begin_episodes()
+            # A resumed run goes on exactly as this one does: with new episodes.
+            observations = protocol.begin_episodes(envs, args.seed, step)
             stop = args.stop_at_success is not None and success >= args.stop_at_success
     bar.close()
-    about = {"policy_step": progress["best_step"]}
-    about |= {"validation_success_rate": progress["best_success"]}
-    about |= {"steps": progress["global_step"], "seconds": round(progress["seconds"])}
-    protocol.final_test(run, args, env_arguments, test, device, about)
+    protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
     writer.close()
     # END SHARED

@@ -57,6 +57,16 @@ def make_eval_envs(task, **kwargs):
     return pictured + make_envs(task, NUM_ENVS - 1, **kwargs)
 
 
+def begin_episodes(envs, seed, step):
+    """First observations of fresh episodes, from random numbers that depend on seed and step alone.
+
+    Whoever begins new ones at every checkpoint needs no simulator state to go on exactly like an
+    uninterrupted run.
+    """
+    seeds = np.random.SeedSequence([seed, step]).generate_state(len(envs)).tolist()
+    return [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+
+
 def stack(observations, device):
     """List of observation dicts -> dict of float32 tensors (N, ...)."""
     return {
@@ -127,17 +137,29 @@ def picture_of_rollout(policy, env, query, device, frames=8):
     return np.concatenate([pictures[i] for i in chosen], axis=1)
 
 
-def validate(policy, envs, queries, device, writer, step):
+def validate(policy, envs, queries, device, writer, step, progress):
     """`evaluate` on validation queries, with results and a picture of the first in TensorBoard.
 
-    `envs`: of `make_eval_envs`.
+    Args:
+        policy, queries, device: as for `evaluate`.
+        envs: of `make_eval_envs`.
+        writer: TensorBoard's.
+        step: of the training.
+        progress: dict with `best_success` and `best_step`, which are set if this is the best.
+
+    Returns:
+        The success rate, and whether it is the best so far.
     """
     result = evaluate(policy, envs, queries, device)
     for name, value in result.items():
         writer.add_scalar(f"eval/{name}", value, step)
     picture = picture_of_rollout(policy, envs[0], queries[0], device)
     writer.add_image("eval/rollout", picture, step, dataformats="HWC")
-    return result
+    success = result["success_rate"]
+    best = success > progress["best_success"]
+    if best:
+        progress |= {"best_success": success, "best_step": step}
+    return success, best
 
 
 def save_policy(run, policy, envs, device, args, env_arguments, step):
@@ -158,7 +180,7 @@ def save_policy(run, policy, envs, device, args, env_arguments, step):
     save_program(run / "policy.pt", policy, example, metadata)
 
 
-def final_test(run, args, env_arguments, queries, device, about):
+def final_test(run, args, env_arguments, queries, device, progress, steps):
     """Test `policy.pt` on test queries: `result.json`, and a line on the console.
 
     Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed, also
@@ -170,7 +192,9 @@ def final_test(run, args, env_arguments, queries, device, about):
         env_arguments: of `envs.make`, in training.
         queries: the test queries.
         device: where to run the policy.
-        about: dict with what else the file should say; `steps` and `seconds` are printed too.
+        progress: dict with the run's `seconds`, `best_success` on validation queries, and
+            `best_step`, at which the policy was saved.
+        steps: of the run.
     """
     policy = load_program(run / "policy.pt").to(device)
     own = {name: value for name, value in env_arguments.items() if name not in RULES}
@@ -180,14 +204,16 @@ def final_test(run, args, env_arguments, queries, device, about):
     trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}
     result |= {"rules": rules, "rules_in_training": trained}
     result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
-    result |= {"policy": str(run / "policy.pt"), **about}
+    result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
+    result |= {"validation_success_rate": progress["best_success"]}
+    result |= {"steps": steps, "seconds": round(progress["seconds"])}
     write_json(run / "result.json", result | {"args": asdict(args)})
     if rules != trained:
         print(f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:")
     print(
         f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
         f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
-        f"{about['steps']} steps in {about['seconds']:.0f} s. {run / 'result.json'}"
+        f"{steps} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
     )
 
 

@@ -58,8 +58,8 @@ def result_of(run, capsys, **env_arguments):
     made = protocol.make_eval_envs(args.task, **env_arguments)
     protocol.save_policy(run, Toward(0.01), made, "cpu", args, env_arguments, 7)
     queries = load_queries("no_obstacles", "test")[:3]
-    about = {"steps": 10, "seconds": 2}
-    protocol.final_test(run, args, env_arguments, queries, "cpu", about)
+    progress = {"seconds": 2.0, "best_success": 0.5, "best_step": 7}
+    protocol.final_test(run, args, env_arguments, queries, "cpu", progress, 10)
     return json.loads((run / "result.json").read_text()), capsys.readouterr().out
 
 
@@ -68,6 +68,8 @@ def test_the_test_is_run_under_the_standard_rules(tmp_path, capsys, monkeypatch)
     standard, line = result_of(tmp_path, capsys)
     assert standard["success_rate"] > 0.5 and standard["episode_length"] > 50
     assert standard["rules"] == standard["rules_in_training"]
+    assert (standard["policy_step"], standard["steps"], standard["seconds"]) == (7, 10, 2)
+    assert standard["validation_success_rate"] == 0.5
     assert "trained with" not in line and "3 test queries: success" in line
     for other in ({"horizon": 50}, {"stop_on_collision": True}):
         result, lines = result_of(tmp_path, capsys, **other)

@@ -121,7 +121,8 @@ def test_alpha_follows_the_target_entropy(target_entropy, direction):
 
 
 def test_an_update_of_td3():
-    agent = make(td3, "TD3", gamma=0.9, tau=0.1, policy_average=0.2, preactivation_penalty=0.4)
+    flags = {"tau": 0.1, "policy_average": 0.2, "preactivation_penalty": 0.4, "policy_noise": 0.6}
+    agent = make(td3, "TD3", gamma=0.9, **flags)
     names = ("actor_target", "qf1_target", "qf2_target")
     with torch.no_grad():
         for parameter in (p for name in names for p in getattr(agent, name).parameters()):
@@ -130,7 +131,7 @@ def test_an_update_of_td3():
     torch.manual_seed(5)
     losses = agent.update(data, 0)
     torch.manual_seed(5)
-    noise = np.clip(0.2 * torch.randn(N, 7).numpy(), -0.5, 0.5)
+    noise = np.clip(0.6 * torch.randn(N, 7).numpy(), -0.5, 0.5)
     new, goal = state(agent), data["desired_goal"]
 
     following = old["actor_target"](data["next_observation"], None, goal).detach().numpy()
