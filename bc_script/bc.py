@@ -9,12 +9,9 @@ your own, copy this file and change the parts under `# ALGO LOGIC`. Parts betwee
 `# END SHARED` are those of `clean_rl_scripts/sac_her_mp.py`.
 """
 
-import json
 import math
-import os
 import sys
-import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -22,14 +19,10 @@ import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-import tyro
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
-import envs as roboarm
-from envs import panda
-from envs.datasets import MAX_STEP, DatasetError, load_demos, load_queries
-from envs.programs import load_program, save_program
+from envs import panda, protocol, runs
+from envs.datasets import MAX_STEP, DatasetError, load_demos
+from envs.demo_episodes import observed
 from envs.tasks import task_name
 
 
@@ -88,7 +81,6 @@ class Args:
     `vqvae`, `pointnet2`, or the path of your own `encoder.pt`, docs/sensors.md), or `oracle`, the
     obstacles themselves; by default nothing"""
     velocities: ClassVar[bool] = False  # demonstrations have none
-    scene_size: ClassVar[int] = 0  # numbers of the encoded scene; set when the encoder is there
 
     # Evaluation and bookkeeping
     eval_every: int = 50_000
@@ -99,19 +91,13 @@ class Args:
     """test queries for the best policy at the end"""
 
 
-def configuration_of(args):
-    """The fields that define what is computed: a run can only be resumed with the same."""
-    free = {"resume", "runs_dir", "threads", "test_queries"}
-    values = {k: v for k, v in asdict(args).items() if k not in free}
-    return values | {"demos": [str(path) for path in args.demos]}
-
-
 # ALGO LOGIC: the policy
 # SHARED: features and layers
 class Features(nn.Module):
     """Network inputs: observation, desired goal, and functions of them that speed up learning."""
 
-    def __init__(self, args):
+    def __init__(self, args, scene_size=0):
+        """`scene_size`: numbers of the encoded scene at the end of observations."""
         super().__init__()
         self.goal_type, self.relative_goal = args.goal_type, args.relative_goal
         self.trigonometric = args.trigonometric
@@ -120,7 +106,7 @@ class Features(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
         self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
-        self.size = self.ee.stop + args.scene_size + goal_size
+        self.size = self.ee.stop + scene_size + goal_size
         self.size += 14 * args.trigonometric
         self.size += 3 * (args.relative_goal and args.goal_type != "config")
 
@@ -149,14 +135,13 @@ class MLP(nn.Module):
         bf16 = self.bf16 and self.training
         for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
             # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
-            if not bf16:
-                x = layer(x)
-            elif i == 0:
-                x = layer(x).bfloat16()
+            # No kernel gets two types: CUDA's refuse that.
+            if bf16 and i > 0:
+                x = F.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
             else:
-                x = F.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16())
+                x = layer(x)
             x = F.relu(norm(x))
-        return self.head(x.float())
+        return self.head(x)
 
 
 # END SHARED
@@ -169,9 +154,9 @@ LOG_STD_MIN = -5
 class Actor(nn.Module):
     """A mixture of Gaussians with diagonal covariances over the action, in units of `MAX_STEP`."""
 
-    def __init__(self, args):
+    def __init__(self, args, scene_size=0):
         super().__init__()
-        self.features = Features(args)
+        self.features = Features(args, scene_size)
         self.num_modes = args.num_modes
         self.mlp = MLP(self.features.size, 15 * args.num_modes, args, layer_norm=False)
 
@@ -207,131 +192,38 @@ def transitions(demos, goal_type, num_demos=None):
     Actions are in units of `MAX_STEP`.
     """
     number = len(demos) if num_demos is None else min(num_demos, len(demos))
-    rows = slice(demos.offsets[number])
     which = np.repeat(np.arange(number), np.diff(demos.offsets[: number + 1]))
-    goal_position = panda.forward_kinematics(demos.goal[:number])
-    goal = {
-        "ee": goal_position,
-        "config": panda.normalise(demos.goal[:number]),
-        "combined": np.hstack([panda.normalise(demos.goal[:number]), goal_position]),
-    }[goal_type]
     commanded = np.ones(len(which), bool)
     commanded[demos.offsets[1 : number + 1] - 1] = False  # from the last, nothing was
-    states = demos.states[rows][commanded]
-    positions = panda.forward_kinematics(panda.denormalise(states))
-    arrays = np.hstack([states, positions]), goal[which[commanded]]
-    actions = demos.actions[rows][commanded] / MAX_STEP
-    return *(a.astype(np.float32) for a in arrays), actions, which[commanded]
+    rows, which = np.flatnonzero(commanded), which[commanded]
+    observation, _, goal = observed(demos.states[rows], demos.goal[:number], goal_type)
+    return observation, goal[which], demos.actions[rows] / MAX_STEP, which
 
 
-# SHARED: averaging, evaluation, files and resuming
+# SHARED: averaging
 def polyak_update(target_parameters, parameters, tau):
     """target <- (1 - tau) target + tau parameter, all tensors at once."""
     with torch.no_grad():
         torch._foreach_lerp_(target_parameters, parameters, tau)
 
 
-# Evaluation
-def stack(observations, device):
-    """List of observation dicts -> dict of float32 tensors (N, ...)."""
-    return {
-        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
-        for name in observations[0]
-    }
-
-
-@torch.no_grad()
-def evaluate(policy, envs, queries, device):
-    """Run a deterministic policy on every query, each env one at a time; mean results."""
-    waiting = iter(range(len(queries)))
-    running, results = {}, []
-
-    def start(env):
-        i = next(waiting, None)
-        running.pop(env, None)
-        if i is not None:
-            running[env] = env.reset_specific(*queries[i])[0]
-
-    for env in envs:
-        start(env)
-    while running:
-        actions = policy(**stack(list(running.values()), device)).cpu().numpy()
-        for env, action in zip(list(running), actions, strict=True):
-            running[env], _, terminated, truncated, info = env.step(action)
-            if terminated or truncated:
-                results.append(
-                    (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
-                )
-                start(env)
-    success, touched, steps = np.array(results, dtype=np.float64).T
-    return {
-        "success_rate": float(success.mean()),
-        "clean_success_rate": float((success * (1 - touched)).mean()),
-        "collision_rate": float(touched.mean()),
-        "episode_length": float(steps.mean()),
-    }
-
-
-@torch.no_grad()
-def picture_of_rollout(policy, env, queries, device, frames=8):
-    """An image strip (height, frames * width, 3), uint8, of the policy on the first query."""
-    observation, _ = env.reset_specific(*queries[0])
-    pictures, done = [env.render()], False
-    while not done:
-        action = policy(**stack([observation], device))[0].cpu().numpy()
-        observation, _, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        if info["elapsed_steps"] % 10 == 0 or done:
-            pictures.append(env.render())
-    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
-    return np.concatenate([pictures[i] for i in chosen], axis=1)
-
-
-def write_atomically(path, write):
-    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
-    temporary = path.with_name(path.name + ".part")
-    write(temporary)
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def parse_args():
-    """Flags, or with --resume those of the run, which must not be contradicted."""
-    args = tyro.cli(Args)
-    if args.resume is None:
-        return args
-    saved_file = args.resume / "args.json"
-    if not saved_file.exists():
-        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
-    saved = json.loads(saved_file.read_text())
-    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
-    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
-    args = tyro.cli(Args, default=defaults)
-    contradicted = [
-        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
-        for name, value in configuration_of(args).items()
-        if value != saved.get(name)
-    ]
-    if contradicted:
-        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
-    return args
-
-
 # END SHARED
 
 
+# ALGO LOGIC: one update
+def update(actor, optimizer, observation, goal, action):
+    """One step on a batch, (N, o), (N, g), (N, 7); the loss before it."""
+    loss = -actor.log_likelihood(observation, goal, action).mean()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return loss
+
+
 if __name__ == "__main__":
-    args = parse_args()
-    if args.device == "cuda" and not torch.cuda.is_available():
-        sys.exit("--device cuda: PyTorch sees no CUDA device here")
-    try:
-        if not roboarm.get_task(args.task).trainable:
-            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
-        validation = load_queries(args.task, "validation")[: args.eval_queries]
-        test = load_queries(args.task, "test")[: args.test_queries]
-    except ValueError as error:
-        sys.exit(f"--task: {error}")
+    args = runs.parse_args(Args, may_change={"test_queries"})
+    device = runs.seed_torch(args)
+    validation, test = protocol.load_task(args)
     for name in ("num_modes", "batch_size", "total_updates", "eval_every"):
         if getattr(args, name) < 1:
             sys.exit(f"--{name.replace('_', '-')} must be at least 1")
@@ -341,91 +233,41 @@ if __name__ == "__main__":
         files = [load_demos(file, args.task) for file in args.demos or (args.task,)]
     except DatasetError as error:
         sys.exit(f"--demos: {error}")
-    if args.resume is not None:
-        run = args.resume
-    else:
-        name = f"{task_name(args.task)}__{args.exp_name}__{args.seed}__{int(time.time())}"
-        run = args.runs_dir / name
-        run.mkdir(parents=True)
-        text = json.dumps(asdict(args), indent=2, default=str)
-        write_atomically(run / "args.json", lambda path: path.write_text(text))
+    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
+    eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
+    run = runs.run_folder(args, task_name(args.task))
 
-    # TRY NOT TO MODIFY: seeding
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
-    torch.use_deterministic_algorithms(True)
-    device = torch.device(args.device)
-
-    # data and env setup
+    # ALGO LOGIC: data
     parts = [transitions(demos, args.goal_type, args.num_demos) for demos in files]
     data = [
         torch.as_tensor(np.concatenate(arrays), device=device)
         for arrays in zip(*parts, strict=True)
     ]
-    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
-    try:
-        roboarm.make(args.task, **env_arguments).close()
-    except ValueError as error:
-        sys.exit(f"--encoder: {error}" if args.encoder is not None else str(error))
-    eval_envs = [roboarm.make(args.task, **env_arguments) for _ in range(8)]
-    picture_env = roboarm.make(
-        args.task, **env_arguments, render_mode="rgb_array", render_size=(240, 180)
-    )
-    example = stack([env.reset(seed=0)[0] for env in eval_envs[:2]], device)
-    args.scene_size = eval_envs[0].observation_space["observation"].shape[0] - 10
-    codes = None  # the encoded scene of each demonstration
+    latents, scene_size = None, 0  # the encoded scene of each demonstration
     if args.encoder is not None:
-        shown = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
-        firsts = np.cumsum([0, *map(len, shown)])
+        encoded = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
+        firsts = np.cumsum([0, *map(len, encoded)])
         numbers = [first + part[3] for first, part in zip(firsts, parts, strict=False)]
-        codes = torch.as_tensor(np.concatenate(shown), device=device)
+        latents = torch.as_tensor(np.concatenate(encoded), device=device)
         data[3] = torch.as_tensor(np.concatenate(numbers), device=device)
+        scene_size = latents.shape[1]
     del files, parts
 
     # ALGO LOGIC: network and optimiser
-    actor = Actor(args).to(device)
-    actor_average = Actor(args).to(device).eval()  # evaluated and saved
+    actor = Actor(args, scene_size).to(device)
+    actor_average = Actor(args, scene_size).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
     parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
+    progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
     saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
-    progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_update": 0}
-
-    def save_checkpoint():
-        state = {name: part.state_dict() for name, part in saved_parts.items()}
-        state |= {"progress": progress, "torch_rng": torch.get_rng_state()}
-        if device.type == "cuda":
-            state["cuda_rng"] = torch.cuda.get_rng_state()
-        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
-
-    if args.resume is not None and (run / "checkpoint.pt").exists():
-        try:
-            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
-        except Exception as error:  # whatever a damaged file leads to
-            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
-        for name, part in saved_parts.items():
-            part.load_state_dict(state[name])
-        progress.update(state["progress"])
-        torch.set_rng_state(state["torch_rng"].cpu())
-        if device.type == "cuda":
-            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
-        del state
-
-    writer = SummaryWriter(run, purge_step=progress["updates"] + 1)
-    writer.add_text(
-        "hyperparameters",
-        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
-    )
-    started, seconds_before = time.time(), progress["seconds"]
-    updates_before = progress["updates"]
-    bar = tqdm(
-        total=args.total_updates,
-        initial=updates_before,
-        unit="update",
-        smoothing=0.05,
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
-    )
+    saved_parts |= {"progress": progress}
+    runs.load_checkpoint(args, saved_parts)
+    if "best_update" in progress:  # its name in older runs
+        progress["best_step"] = progress.pop("best_update")
+    writer = runs.summary_writer(run, args, progress["updates"])
+    seconds_before = progress["seconds"]
+    bar = runs.progress_bar(args.total_updates, progress["updates"], "update")
 
     while progress["updates"] < args.total_updates:
         # ALGO LOGIC: learn
@@ -434,12 +276,9 @@ if __name__ == "__main__":
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         rows = torch.randint(len(data[0]), (args.batch_size,), device=device)
         observation, goal, action, number = (tensor[rows] for tensor in data)
-        if codes is not None:
-            observation = torch.cat([observation, codes[number]], dim=1)
-        loss = -actor.log_likelihood(observation, goal, action).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        if latents is not None:
+            observation = torch.cat([observation, latents[number]], dim=1)
+        loss = update(actor, optimizer, observation, goal, action)
         polyak_update(average_parameters, parameters, args.policy_average)
         progress["updates"] += 1
         bar.update()
@@ -448,40 +287,20 @@ if __name__ == "__main__":
         if step % 1000 == 0:
             writer.add_scalar("losses/negative_log_likelihood", loss.item(), step)
             writer.add_scalar("charts/learning_rate", optimizer.param_groups[0]["lr"], step)
-            ups = (step - updates_before) / (time.time() - started)
-            writer.add_scalar("charts/SPS", int(ups), step)
+            writer.add_scalar("charts/SPS", int(runs.rate(bar)), step)
 
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every == 0 or step == args.total_updates:
-            result = evaluate(actor_average, eval_envs, validation, device)
-            for name, value in result.items():
-                writer.add_scalar(f"eval/{name}", value, step)
-            picture = picture_of_rollout(actor_average, picture_env, validation, device)
-            writer.add_image("eval/rollout", picture, step, dataformats="HWC")
-            if result["success_rate"] > progress["best_success"]:
-                progress["best_success"], progress["best_update"] = result["success_rate"], step
-                metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
-                metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
-                save_program(run / "policy.pt", actor_average, example, metadata)
-            bar.set_postfix(
-                eval=f"{result['success_rate']:.3f}", best=f"{progress['best_success']:.3f}"
+            success, best = protocol.validate(
+                actor_average, eval_envs, validation, device, writer, step, progress
             )
-            progress["seconds"] = seconds_before + time.time() - started
-            save_checkpoint()
+            if best:
+                protocol.save_policy(
+                    run, actor_average, eval_envs, device, args, env_arguments, step
+                )
+            bar.set_postfix(eval=success, best=progress["best_success"])
+            progress["seconds"] = seconds_before + runs.elapsed(bar)
+            runs.save_checkpoint(run, saved_parts)
     bar.close()
-
-    # The best policy (by validation) on test queries
-    best = load_program(run / "policy.pt").to(device)
-    result = evaluate(best, eval_envs, test, device)
-    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(test)}
-    result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_update"]}
-    result |= {"validation_success_rate": progress["best_success"]}
-    result |= {"steps": progress["updates"], "seconds": round(progress["seconds"])}
-    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
-    write_atomically(run / "result.json", lambda path: path.write_text(text))
-    print(
-        f"{args.task}, goal {args.goal_type}, {len(test)} test queries: "
-        f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
-        f"{progress['updates']} updates in {progress['seconds']:.0f} s. {run / 'result.json'}"
-    )
+    protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
     writer.close()

@@ -19,11 +19,11 @@ Policies to compare a trained one with:
   free of collisions, or else by way of the first of `--tries` random configurations for which the
   motion is free; if there is none it goes straight all the same;
 - planner: plans before it moves, with OMPL's RRT-Connect, and follows the plan. It may search for
-  `--time-limit` seconds per query: a short search for a plan that keeps away from obstacles, one for
-  a plan that keeps half as far away, one for a quarter as far, then the same three for twice as
-  long, and so on. (Shortening a plan may take some milliseconds more.) Without a plan it gives up: a
-  failure of 0 steps. As the limit is wall-clock time, the numbers may depend on the machine, and on
-  what else it is doing.
+  `--time-limit` seconds per query: a short search for a plan that keeps away from obstacles, one
+  for a plan that keeps half as far away, one for a quarter as far, then the same three for twice
+  as long, and so on. (Shortening a plan may take some milliseconds more.) Without a plan it gives
+  up: a failure of 0 steps. As the limit is wall-clock time, the numbers may depend on the machine,
+  and on what else it is doing.
 
 The last two check collisions with the true obstacles (`envs.collision`), which a trained policy
 does not see.

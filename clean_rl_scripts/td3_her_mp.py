@@ -6,30 +6,24 @@
 Twin Delayed DDPG (Fujimoto et al., 2018) in CleanRL's form, goals relabelled with the `future`
 strategy (Andrychowicz et al., 2017), demonstrations injected upon failure (TD3-MP), as in the
 paper's sections 2 and 5. To make an algorithm of your own, copy this file and change the parts
-under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are those of `sac_her_mp.py`.
+under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are those of `sac_her_mp.py`; what
+is imported from `envs` is the benchmark, not the algorithm.
 """
 
 import json
 import math
-import os
 import sys
-import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-import tyro
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
-import envs as roboarm
-from envs import panda
-from envs.datasets import MAX_STEP, DatasetError, load_demos, load_queries
-from envs.programs import load_program, save_program
+from envs import panda, protocol, runs
+from envs.demo_episodes import DemoQueriesWrapper, demo_transitions, load_demos_for
 from envs.tasks import task_name
 
 
@@ -71,7 +65,6 @@ class Args:
     obstacles themselves; by default nothing"""
     num_envs: int = 4
     """environments stepped together; every one of their steps counts"""
-    scene_size: ClassVar[int] = 0  # numbers of the encoded scene; set when the encoder is there
     # END SHARED
 
     # The algorithm
@@ -140,25 +133,9 @@ class Args:
     """validation queries per evaluation"""
     test_queries: int = 1_000
     """test queries for the best policy at the end"""
-    stop_at_success: float = 1.0
-    """stop as soon as a validation success rate is this high, e.g. 0.9"""
+    stop_at_success: float | None = None
+    """stop as soon as a validation success rate is this high, e.g. 0.9; by default never"""
     # END SHARED
-
-
-# SHARED: arguments
-def configuration_of(args):
-    """The fields that define what is computed: a run can only be resumed with the same."""
-    free = {"resume", "runs_dir", "threads", "total_timesteps", "test_queries", "stop_at_success"}
-    values = {k: v for k, v in asdict(args).items() if k not in free}
-    return values | {"demos": args.demos and str(args.demos)}
-
-
-def env_arguments(args):
-    names = ("goal_type", "action_mode", "max_step", "horizon", "stop_on_collision", "velocities")
-    return {name: getattr(args, name) for name in (*names, "encoder")}
-
-
-# END SHARED
 
 
 # ALGO LOGIC: networks
@@ -166,7 +143,8 @@ def env_arguments(args):
 class Features(nn.Module):
     """Network inputs: observation, desired goal, and functions of them that speed up learning."""
 
-    def __init__(self, args):
+    def __init__(self, args, scene_size=0):
+        """`scene_size`: numbers of the encoded scene at the end of observations."""
         super().__init__()
         self.goal_type, self.relative_goal = args.goal_type, args.relative_goal
         self.trigonometric = args.trigonometric
@@ -175,7 +153,7 @@ class Features(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
         self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
-        self.size = self.ee.stop + args.scene_size + goal_size
+        self.size = self.ee.stop + scene_size + goal_size
         self.size += 14 * args.trigonometric
         self.size += 3 * (args.relative_goal and args.goal_type != "config")
 
@@ -204,14 +182,13 @@ class MLP(nn.Module):
         bf16 = self.bf16 and self.training
         for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
             # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
-            if not bf16:
-                x = layer(x)
-            elif i == 0:
-                x = layer(x).bfloat16()
+            # No kernel gets two types: CUDA's refuse that.
+            if bf16 and i > 0:
+                x = F.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
             else:
-                x = F.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16())
+                x = layer(x)
             x = F.relu(norm(x))
-        return self.head(x.float())
+        return self.head(x)
 
 
 # END SHARED
@@ -219,9 +196,9 @@ class MLP(nn.Module):
 
 # SHARED: critic
 class QNetwork(nn.Module):
-    def __init__(self, args):
+    def __init__(self, args, scene_size=0):
         super().__init__()
-        self.features = Features(args)
+        self.features = Features(args, scene_size)
         self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
         self.mlp = MLP(self.features.size + 7, 1, args, args.layer_norm)
 
@@ -235,9 +212,9 @@ class QNetwork(nn.Module):
 
 
 class Actor(nn.Module):
-    def __init__(self, args):
+    def __init__(self, args, scene_size=0):
         super().__init__()
-        self.features = Features(args)
+        self.features = Features(args, scene_size)
         self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
         self.mlp = MLP(self.features.size, 7, args, layer_norm=False)
 
@@ -261,28 +238,24 @@ class HerReplayBuffer:
     One float32 row per transition. `remaining` counts the transitions that follow in the same
     episode, so a goal reached later in it is found without storing episodes. New episodes
     overwrite the oldest rows from an episode's start on, so what a row points to outlives it. The
-    encoded scene at the end of observations is stored once per scene, in `codes`.
+    encoded scene at the end of observations (its latent) is stored once per scene, in `latents`.
     """
 
     def __init__(self, env, capacity, her_probability, rng):
         spaces = env.unwrapped.observation_space
-        scene_size = env.observation_space["observation"].shape[0] - spaces["observation"].shape[0]
-        sizes = {
-            "observation": spaces["observation"].shape[0],
-            "action": 7,
-            "next_observation": spaces["observation"].shape[0],
-            "next_achieved_goal": spaces["achieved_goal"].shape[0],
-            "desired_goal": spaces["desired_goal"].shape[0],
-            "collision": 1,
-        }
-        ends = np.cumsum(list(sizes.values()))
-        self.columns = {
-            name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)
-        }
+        observation_size = spaces["observation"].shape[0]  # without the encoded scene
+        goal_size = spaces["desired_goal"].shape[0]
+        sizes = {"observation": observation_size, "action": 7}
+        sizes |= {"next_observation": observation_size, "next_achieved_goal": goal_size}
+        sizes |= {"desired_goal": goal_size, "collision": 1}
+        ends = np.cumsum(list(sizes.values())).tolist()
+        self.columns = {n: slice(end - sizes[n], end) for n, end in zip(sizes, ends, strict=True)}
         self.rows = np.zeros((capacity, ends[-1]), np.float32)
         self.remaining = np.zeros(capacity, np.int32)
-        self.codes, self.numbers = np.zeros((1, scene_size), np.float32), {}
-        self.scene = np.zeros(capacity, np.int32)  # row of `codes`
+        self.scene_size = env.observation_space["observation"].shape[0] - observation_size
+        self.latents = np.zeros((1, self.scene_size), np.float32)
+        self.row_of_latent = {}  # the latent's bytes -> its row in `latents`
+        self.latent_row = np.zeros(capacity, np.int32)  # of each transition
         self.env, self.rng = env, rng
         self.capacity, self.her_probability = capacity, her_probability
         self.position, self.size = 0, 0
@@ -292,22 +265,21 @@ class HerReplayBuffer:
         index = (self.position + np.arange(len(transitions))) % self.capacity
         for name, columns in self.columns.items():
             width = columns.stop - columns.start  # without the encoded scene
-            self.rows[index, columns] = np.stack(
-                [np.atleast_1d(t[name])[:width] for t in transitions]
-            )
-        self.scene[index] = self.number_of(transitions[0]["observation"])
+            values = [np.atleast_1d(transition[name])[:width] for transition in transitions]
+            self.rows[index, columns] = np.stack(values)
+        self.latent_row[index] = self.store_latent(transitions[0]["observation"])
         self.remaining[index] = np.arange(len(transitions))[::-1]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
 
-    def number_of(self, observation):
-        """The row of `codes` that has the encoded scene of an observation."""
-        code = np.float32(observation[len(observation) - self.codes.shape[1] :])
-        number = self.numbers.setdefault(code.tobytes(), len(self.numbers))
-        if number == len(self.codes):
-            self.codes = np.concatenate([self.codes, np.zeros_like(self.codes)])
-        self.codes[number] = code
-        return number
+    def store_latent(self, observation):
+        """Store the encoded scene at the end of an observation; its row in `latents`."""
+        latent = np.float32(observation[len(observation) - self.latents.shape[1] :])
+        row = self.row_of_latent.setdefault(latent.tobytes(), len(self.row_of_latent))
+        if row == len(self.latents):
+            self.latents = np.concatenate([self.latents, np.zeros_like(self.latents)])
+        self.latents[row] = latent
+        return row
 
     def sample(self, batch_size):
         """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
@@ -323,18 +295,18 @@ class HerReplayBuffer:
         info = {"collision": batch["collision"][:, 0] > 0}
         batch["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
         batch["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
-        if self.codes.shape[1] > 0:
-            code = self.codes[self.scene[index]]
+        if self.latents.shape[1] > 0:
+            latent = self.latents[self.latent_row[index]]
             for name in ("observation", "next_observation"):
-                batch[name] = np.hstack([batch[name], code])
+                batch[name] = np.hstack([batch[name], latent])
         return batch
 
     def state_dict(self):
         return {
             "rows": torch.from_numpy(self.rows[: self.size]),
             "remaining": torch.from_numpy(self.remaining[: self.size]),
-            "scene": torch.from_numpy(self.scene[: self.size]),
-            "codes": torch.from_numpy(self.codes[: len(self.numbers)]),
+            "scene": torch.from_numpy(self.latent_row[: self.size]),
+            "codes": torch.from_numpy(self.latents[: len(self.row_of_latent)]),
             "position": self.position,
             "rng": json.dumps(self.rng.bit_generator.state),
         }
@@ -343,52 +315,19 @@ class HerReplayBuffer:
         self.size, self.position = len(state["rows"]), state["position"]
         self.rows[: self.size] = state["rows"].numpy()
         self.remaining[: self.size] = state["remaining"].numpy()
-        self.scene[: self.size] = state["scene"].numpy()
-        for code in state["codes"].numpy():
-            self.number_of(code)
+        self.latent_row[: self.size] = state["scene"].numpy()
+        for latent in state["codes"].numpy():
+            self.store_latent(latent)
         self.rng.bit_generator.state = json.loads(state["rng"])
 
 
 # ALGO LOGIC: demonstrations
-def demonstration_to_inject(demos, query, is_success, demo_prob, rng):
-    """After an episode on `demos`' query number `query`: its demonstration, or None.
+def inject_demonstration(is_success, demo_prob, rng):
+    """Whether the demonstration of its query enters the buffer after an episode.
 
     Only failures are shown how to do it, and only with probability `demo_prob`.
     """
-    if is_success or rng.random() >= demo_prob:
-        return None
-    return demos[query]
-
-
-def demonstration_episode(demo, env, args):
-    """A demonstration as transitions for `HerReplayBuffer.add_episode`, up to reaching its goal."""
-    positions = panda.forward_kinematics(panda.denormalise(demo.states))
-    goal_position, goal_state = panda.forward_kinematics(demo.goal), panda.normalise(demo.goal)
-    achieved_goals, desired_goal = {
-        "ee": (positions, goal_position),
-        "config": (demo.states, goal_state),
-        "combined": (np.hstack([demo.states, positions]), np.hstack([goal_state, goal_position])),
-    }[args.goal_type]
-    observations = np.hstack([demo.states, positions])
-    if args.encoder is not None:
-        code = env.encoder(demo.scene)
-        observations = np.hstack([observations, np.tile(code, (len(observations), 1))])
-    actions = demo.actions
-    if args.action_mode == "subgoal":
-        actions = demo.states[:-1] + demo.actions
-    ended = env.compute_terminated(achieved_goals[1:], desired_goal, {})
-    length = int(np.argmax(ended)) + 1 if ended.any() else len(ended)
-    return [
-        {
-            "observation": observations[t],
-            "action": actions[t],
-            "next_observation": observations[t + 1],
-            "next_achieved_goal": achieved_goals[t + 1],
-            "desired_goal": desired_goal,
-            "collision": False,
-        }
-        for t in range(length)
-    ]
+    return not is_success and rng.random() < demo_prob
 
 
 # END SHARED
@@ -408,280 +347,194 @@ def td_target(reward, terminated, next_q1, next_q2, gamma):
     return reward + gamma * (1.0 - terminated) * torch.minimum(next_q1, next_q2)
 
 
-# SHARED: averaging, evaluation, files and resuming
+# SHARED: averaging
 def polyak_update(target_parameters, parameters, tau):
     """target <- (1 - tau) target + tau parameter, all tensors at once."""
     with torch.no_grad():
         torch._foreach_lerp_(target_parameters, parameters, tau)
 
 
-# Evaluation
-def stack(observations, device):
-    """List of observation dicts -> dict of float32 tensors (N, ...)."""
-    return {
-        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
-        for name in observations[0]
-    }
+# END SHARED
 
 
-@torch.no_grad()
-def evaluate(policy, envs, queries, device):
-    """Run a deterministic policy on every query, each env one at a time; mean results."""
-    waiting = iter(range(len(queries)))
-    running, results = {}, []
+# SHARED: batches
+def updates_due(step, buffer, args):
+    """Number of updates that fall due in the environment steps that led to `step`.
 
-    def start(env):
-        i = next(waiting, None)
-        running.pop(env, None)
-        if i is not None:
-            running[env] = env.reset_specific(*queries[i])[0]
-
-    for env in envs:
-        start(env)
-    while running:
-        actions = policy(**stack(list(running.values()), device)).cpu().numpy()
-        for env, action in zip(list(running), actions, strict=True):
-            running[env], _, terminated, truncated, info = env.step(action)
-            if terminated or truncated:
-                results.append(
-                    (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
-                )
-                start(env)
-    success, touched, steps = np.array(results, dtype=np.float64).T
-    return {
-        "success_rate": float(success.mean()),
-        "clean_success_rate": float((success * (1 - touched)).mean()),
-        "collision_rate": float(touched.mean()),
-        "episode_length": float(steps.mean()),
-    }
+    None before `learning_starts`, and none for steps in which nothing was there to learn from:
+    episodes enter the buffer when they end.
+    """
+    if buffer.size == 0:
+        return 0
+    before, now = (max(0, s - args.learning_starts) for s in (step - args.num_envs, step))
+    return int(now * args.updates_per_step) - int(before * args.updates_per_step)
 
 
-@torch.no_grad()
-def picture_of_rollout(policy, env, queries, device, frames=8):
-    """An image strip (height, frames * width, 3), uint8, of the policy on the first query."""
-    observation, _ = env.reset_specific(*queries[0])
-    pictures, done = [env.render()], False
-    while not done:
-        action = policy(**stack([observation], device))[0].cpu().numpy()
-        observation, _, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        if info["elapsed_steps"] % 10 == 0 or done:
-            pictures.append(env.render())
-    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
-    return np.concatenate([pictures[i] for i in chosen], axis=1)
+DRAWN_TOGETHER = 64  # batches
 
 
-def write_atomically(path, write):
-    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
-    temporary = path.with_name(path.name + ".part")
-    write(temporary)
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def parse_args():
-    """Flags, or with --resume those of the run, which must not be contradicted."""
-    args = tyro.cli(Args)
-    if args.resume is None:
-        return args
-    saved_file = args.resume / "args.json"
-    if not saved_file.exists():
-        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
-    saved = json.loads(saved_file.read_text())
-    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
-    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
-    args = tyro.cli(Args, default=defaults)
-    contradicted = [
-        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
-        for name, value in configuration_of(args).items()
-        if value != saved.get(name)
-    ]
-    if contradicted:
-        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
-    return args
+def batches(buffer, number, batch_size, device):
+    """Draw `number` batches, dicts of tensors, from the buffer: some at once, which is faster."""
+    for first in range(0, number, DRAWN_TOGETHER):
+        count = min(DRAWN_TOGETHER, number - first)
+        drawn = {
+            name: torch.as_tensor(array, device=device).split(batch_size)
+            for name, array in buffer.sample(count * batch_size).items()
+        }
+        for i in range(count):
+            yield {name: tensors[i] for name, tensors in drawn.items()}
 
 
 # END SHARED
 
 
+# ALGO LOGIC: networks, optimisers and one update
+class TD3:
+    def __init__(self, args, scene_size, device):
+        self.args = args
+        self.actor, self.actor_target = (Actor(args, scene_size).to(device) for _ in range(2))
+        self.actor_target.load_state_dict(self.actor.state_dict())
+        self.actor_average = Actor(args, scene_size).to(device).eval()  # evaluated and saved
+        self.actor_average.load_state_dict(self.actor.state_dict())
+        self.qf1, self.qf2, self.qf1_target, self.qf2_target = (
+            QNetwork(args, scene_size).to(device) for _ in range(4)
+        )
+        self.qf1_target.load_state_dict(self.qf1.state_dict())
+        self.qf2_target.load_state_dict(self.qf2.state_dict())
+
+        self.actor_parameters = list(self.actor.parameters())
+        self.average_parameters = list(self.actor_average.parameters())
+        self.q_parameters = [*self.qf1.parameters(), *self.qf2.parameters()]
+        self.parameters = [*self.actor_parameters, *self.q_parameters]
+        targets = (self.actor_target, self.qf1_target, self.qf2_target)
+        self.target_parameters = [one for network in targets for one in network.parameters()]
+        self.q_optimizer = torch.optim.Adam(self.q_parameters, lr=args.q_lr, fused=True)
+        self.actor_optimizer = torch.optim.Adam(
+            self.actor_parameters, lr=args.policy_lr, fused=True
+        )
+
+    def saved_parts(self):
+        """What a checkpoint has of it."""
+        names = "actor actor_target actor_average qf1 qf2 qf1_target qf2_target q_optimizer"
+        return {name: getattr(self, name) for name in [*names.split(), "actor_optimizer"]}
+
+    @torch.no_grad()
+    def explore(self, observation):
+        """Random actions (N, 7), a NumPy array, for training."""
+        self.actor.eval()
+        action = self.actor(**observation)
+        self.actor.train()
+        noise = self.args.exploration_noise * torch.randn_like(action)
+        return smoothed(action, noise, math.inf, self.actor.action_scale).cpu().numpy()
+
+    def update_critics(self, batch):
+        """One step on a batch of the replay buffer; tensors for TensorBoard, by tag."""
+        goal = batch["desired_goal"]
+        with torch.no_grad():
+            next_action = self.actor_target(batch["next_observation"], None, goal)
+            noise = self.args.policy_noise * torch.randn_like(next_action)
+            scale = self.actor.action_scale
+            next_action = smoothed(next_action, noise, self.args.noise_clip, scale)
+            target = td_target(
+                batch["reward"],
+                batch["terminated"],
+                self.qf1_target(batch["next_observation"], goal, next_action),
+                self.qf2_target(batch["next_observation"], goal, next_action),
+                self.args.gamma,
+            )
+        q1 = self.qf1(batch["observation"], goal, batch["action"])
+        q2 = self.qf2(batch["observation"], goal, batch["action"])
+        qf1_loss, qf2_loss = F.mse_loss(q1, target), F.mse_loss(q2, target)
+        self.q_optimizer.zero_grad()
+        (qf1_loss + qf2_loss).backward()
+        self.q_optimizer.step()
+        return {
+            "qf1_values": q1.mean(),
+            "qf2_values": q2.mean(),
+            "qf1_loss": qf1_loss,
+            "qf2_loss": qf2_loss,
+            "qf_loss": (qf1_loss + qf2_loss) / 2,
+        }
+
+    def update_policy(self, batch):
+        """One step of the policy, and of all targets; as `update_critics`."""
+        for parameter in self.q_parameters:  # the policy's gradient needs none into the critics
+            parameter.requires_grad_(False)
+        preactivation = self.actor.preactivation(batch["observation"], batch["desired_goal"])
+        action = self.actor.squashed(preactivation)
+        q = self.qf1(batch["observation"], batch["desired_goal"], action)
+        penalty = self.args.preactivation_penalty * preactivation.square().mean()
+        actor_loss = penalty - q.mean()
+        self.actor_optimizer.zero_grad()
+        actor_loss.backward()
+        self.actor_optimizer.step()
+        for parameter in self.q_parameters:
+            parameter.requires_grad_(True)
+        polyak_update(self.average_parameters, self.actor_parameters, self.args.policy_average)
+        polyak_update(self.target_parameters, self.parameters, self.args.tau)
+        return {"actor_loss": actor_loss, "preactivation": preactivation.abs().mean()}
+
+    def update(self, batch, count):
+        """Update number `count` of the run."""
+        losses = self.update_critics(batch)
+        if count % self.args.policy_frequency == 0:
+            losses |= self.update_policy(batch)
+        return losses
+
+
 if __name__ == "__main__":
-    # SHARED: checks, folder, seeds and environments
-    args = parse_args()
-    if args.device == "cuda" and not torch.cuda.is_available():
-        sys.exit("--device cuda: PyTorch sees no CUDA device here")
-    try:
-        if not roboarm.get_task(args.task).trainable:
-            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
-        validation = load_queries(args.task, "validation")[: args.eval_queries]
-        test = load_queries(args.task, "test")[: args.test_queries]
-    except ValueError as error:
-        sys.exit(f"--task: {error}")
+    # SHARED: checks, environments, folder
+    args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
+    device = runs.seed_torch(args)
+    validation, test = protocol.load_task(args)
     if args.buffer_size < args.horizon:
         sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
-    demos = None
+    if args.demo_prob is not None and not 0 <= args.demo_prob <= 1:
+        sys.exit(f"--demo-prob {args.demo_prob}: a probability is in [0, 1]")
     if args.demos is not None and args.demo_prob is None:
         sys.exit("--demos goes with --demo-prob")
+    names = "goal_type action_mode max_step horizon stop_on_collision velocities encoder"
+    env_arguments = {name: getattr(args, name) for name in names.split()}
+    envs = protocol.make_envs(args.task, args.num_envs, **env_arguments)
+    eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
     if args.demo_prob is not None:
-        if not 0 <= args.demo_prob <= 1:
-            sys.exit(f"--demo-prob {args.demo_prob}: a probability is in [0, 1]")
-        if args.velocities or args.max_step < MAX_STEP:
-            sys.exit(f"--demo-prob: demonstrations have no velocities, and steps up to {MAX_STEP}")
         try:
-            demos = load_demos(args.demos or args.task, args.task)
-        except DatasetError as error:
+            demos = load_demos_for(eval_envs[0], args.demos or args.task, args.task)
+        except ValueError as error:
             sys.exit(f"--demo-prob: {error}")
-        if args.stop_on_collision and demos.collided.any():
-            sys.exit("--stop-on-collision: some of these demonstrations touch something")
-    if args.resume is not None:
-        run = args.resume
-    else:
-        name = f"{task_name(args.task)}__{args.exp_name}__{args.seed}__{int(time.time())}"
-        run = args.runs_dir / name
-        run.mkdir(parents=True)
-        text = json.dumps(asdict(args), indent=2, default=str)
-        write_atomically(run / "args.json", lambda path: path.write_text(text))
-
-    # TRY NOT TO MODIFY: seeding
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
-    torch.use_deterministic_algorithms(True)
-    device = torch.device(args.device)
-
+        envs = [DemoQueriesWrapper(env, demos) for env in envs]
+        if args.encoder is not None:
+            eval_envs[0].encoder.encode_demos(demos)  # once, not in the loop
+    run = runs.run_folder(args, task_name(args.task))
     if args.bf16 is None:
         args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
-
-    # env setup
-    kwargs = env_arguments(args)
-    try:
-        roboarm.make(args.task, **kwargs).close()
-    except ValueError as error:
-        sys.exit(f"--encoder: {error}" if args.encoder is not None else str(error))
-    envs = [roboarm.make(args.task, **kwargs) for _ in range(args.num_envs)]
-    eval_envs = [roboarm.make(args.task, **kwargs) for _ in range(8)]
-    picture_env = roboarm.make(args.task, **kwargs, render_mode="rgb_array", render_size=(240, 180))
-    observation_size = eval_envs[0].observation_space["observation"].shape[0]
-    args.scene_size = observation_size - 10 - 7 * args.velocities
-    if args.encoder is not None and demos is not None:
-        eval_envs[0].encoder.encode_demos(demos)  # once, not in the loop
-
-    # END SHARED
-
-    # ALGO LOGIC: networks and optimisers
-    actor, actor_target = Actor(args).to(device), Actor(args).to(device)
-    actor_target.load_state_dict(actor.state_dict())
-    actor_average = Actor(args).to(device).eval()  # evaluated and saved
-    actor_average.load_state_dict(actor.state_dict())
-    qf1, qf2 = QNetwork(args).to(device), QNetwork(args).to(device)
-    qf1_target, qf2_target = QNetwork(args).to(device), QNetwork(args).to(device)
-    qf1_target.load_state_dict(qf1.state_dict())
-    qf2_target.load_state_dict(qf2.state_dict())
-    actor_parameters = list(actor.parameters())
-    average_parameters = list(actor_average.parameters())
-    q_parameters = [*qf1.parameters(), *qf2.parameters()]
-    parameters = [*actor_parameters, *q_parameters]
-    target_parameters = [
-        *actor_target.parameters(),
-        *qf1_target.parameters(),
-        *qf2_target.parameters(),
-    ]
-    q_optimizer = torch.optim.Adam(q_parameters, lr=args.q_lr, fused=True)
-    actor_optimizer = torch.optim.Adam(actor_parameters, lr=args.policy_lr, fused=True)
     buffer = HerReplayBuffer(
         eval_envs[0], args.buffer_size, args.her_probability, np.random.default_rng(args.seed)
     )
-    saved_parts = {
-        "actor": actor,
-        "actor_target": actor_target,
-        "actor_average": actor_average,
-        "qf1": qf1,
-        "qf2": qf2,
-        "qf1_target": qf1_target,
-        "qf2_target": qf2_target,
-        "q_optimizer": q_optimizer,
-        "actor_optimizer": actor_optimizer,
-        "buffer": buffer,
-    }
     progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
     progress |= {"best_success": -1.0, "best_step": 0, "demos_injected": 0}
-
-    def save_checkpoint():
-        state = {name: part.state_dict() for name, part in saved_parts.items()}
-        state |= {"progress": progress, "torch_rng": torch.get_rng_state()}
-        if device.type == "cuda":
-            state["cuda_rng"] = torch.cuda.get_rng_state()
-        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
-
-    if args.resume is not None and (run / "checkpoint.pt").exists():
-        try:
-            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
-        except Exception as error:  # whatever a damaged file leads to
-            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
-        for name, part in saved_parts.items():
-            part.load_state_dict(state[name])
-        progress.update(state["progress"])
-        torch.set_rng_state(state["torch_rng"].cpu())
-        if device.type == "cuda":
-            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
-        del state
-
-    # SHARED: episodes
-    writer = SummaryWriter(run, purge_step=progress["global_step"] + 1)
-    writer.add_text(
-        "hyperparameters",
-        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
-    )
-
-    query = [None] * args.num_envs  # number of the demonstration whose query each env is on
-
-    def begin_episode(i):
-        """A query of the demonstrations, or a random one."""
-        if demos is None:
-            return envs[i].reset()[0]
-        query[i] = int(envs[i].np_random.integers(len(demos)))
-        demo = demos[query[i]]
-        return envs[i].reset_specific(demo.start, demo.goal, demo.scene)[0]
-
-    def begin_episodes():
-        """Fresh episodes in all envs, from seeds that depend on the step count alone.
-
-        Every checkpoint cuts the running episodes off and begins new ones here, so a resumed run
-        needs no simulator state to go on exactly like an uninterrupted one.
-        """
-        seeds = np.random.SeedSequence([args.seed, progress["global_step"]])
-        seeds = seeds.generate_state(args.num_envs).tolist()
-        first = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
-        return first if demos is None else [begin_episode(i) for i in range(args.num_envs)]
-
-    observations = begin_episodes()
-    staged = [[] for _ in envs]  # transitions of the running episodes
-    returns = [0.0] * args.num_envs
-    recent_success = []
-    started, seconds_before = time.time(), progress["seconds"]
-    steps_before = progress["global_step"]
-    bar = tqdm(
-        total=args.total_timesteps,
-        initial=steps_before,
-        unit="step",
-        smoothing=0.05,
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
-    )
-
     # END SHARED
 
-    stop = False
+    agent = TD3(args, buffer.scene_size, device)
+
+    # SHARED: resuming and episodes
+    saved_parts = agent.saved_parts() | {"buffer": buffer, "progress": progress}
+    runs.load_checkpoint(args, saved_parts)
+    writer = runs.summary_writer(run, args, progress["global_step"])
+    observations = protocol.begin_episodes(envs, args.seed, progress["global_step"])
+    staged = [[] for _ in envs]  # transitions of the running episodes
+    returns = [0.0] * args.num_envs
+    recent_success, losses, stop = [], {}, False
+    seconds_before = progress["seconds"]
+    bar = runs.progress_bar(args.total_timesteps, progress["global_step"], "step")
+    # END SHARED
+
     while progress["global_step"] < args.total_timesteps and not stop:
         # ALGO LOGIC: act
         if progress["global_step"] < args.learning_starts:
-            actions = (2 * torch.rand(args.num_envs, 7) - 1).numpy() * actor.action_scale
+            actions = (2 * torch.rand(args.num_envs, 7) - 1).numpy() * agent.actor.action_scale
         else:
-            with torch.no_grad():
-                actor.eval()
-                actions = actor(**stack(observations, device))
-                actor.train()
-                noise = args.exploration_noise * torch.randn_like(actions)
-                actions = smoothed(actions, noise, math.inf, actor.action_scale).cpu().numpy()
+            actions = agent.explore(protocol.stack(observations, device))
 
         # SHARED: a step in every environment
         for i, env in enumerate(envs):
@@ -705,121 +558,44 @@ if __name__ == "__main__":
                 writer.add_scalar("charts/episodic_return", returns[i], step)
                 writer.add_scalar("charts/episodic_length", info["elapsed_steps"], step)
                 writer.add_scalar("charts/success", np.mean(recent_success), step)
-                if demos is not None:
-                    demo = demonstration_to_inject(
-                        demos, query[i], info["is_success"], args.demo_prob, env.np_random
-                    )
-                    if demo is not None:
-                        buffer.add_episode(demonstration_episode(demo, env, args))
+                if args.demo_prob is not None:
+                    if inject_demonstration(info["is_success"], args.demo_prob, env.np_random):
+                        buffer.add_episode(demo_transitions(env.demo, env.env))
                         progress["demos_injected"] += 1
                     writer.add_scalar("charts/demos_injected", progress["demos_injected"], step)
                 staged[i], returns[i] = [], 0.0
-                observations[i] = begin_episode(i)
+                observations[i] = env.reset()[0]
         progress["global_step"] += args.num_envs
         bar.update(args.num_envs)
-        # END SHARED
-
-        # ALGO LOGIC: learn
-        # SHARED: batches
-        due = (progress["global_step"] - args.learning_starts) * args.updates_per_step
-        updates = max(0, int(due) - progress["updates"]) if buffer.size > 0 else 0
-        if updates > 0:
-            batches = {  # sampled together, because that is faster
-                name: torch.as_tensor(array, device=device).split(args.batch_size)
-                for name, array in buffer.sample(updates * args.batch_size).items()
-            }
-        for update in range(updates):
-            batch = {name: tensors[update] for name, tensors in batches.items()}
-            goal = batch["desired_goal"]
-            # END SHARED
-
-            with torch.no_grad():
-                next_action = actor_target(batch["next_observation"], None, goal)
-                noise = args.policy_noise * torch.randn_like(next_action)
-                next_action = smoothed(next_action, noise, args.noise_clip, actor.action_scale)
-                target = td_target(
-                    batch["reward"],
-                    batch["terminated"],
-                    qf1_target(batch["next_observation"], goal, next_action),
-                    qf2_target(batch["next_observation"], goal, next_action),
-                    args.gamma,
-                )
-            q1 = qf1(batch["observation"], goal, batch["action"])
-            q2 = qf2(batch["observation"], goal, batch["action"])
-            qf1_loss, qf2_loss = F.mse_loss(q1, target), F.mse_loss(q2, target)
-            q_optimizer.zero_grad()
-            (qf1_loss + qf2_loss).backward()
-            q_optimizer.step()
-
-            if progress["updates"] % args.policy_frequency == 0:
-                for parameter in q_parameters:  # the policy's gradient needs none into the critics
-                    parameter.requires_grad_(False)
-                preactivation = actor.preactivation(batch["observation"], goal)
-                q = qf1(batch["observation"], goal, actor.squashed(preactivation))
-                penalty = args.preactivation_penalty * preactivation.square().mean()
-                actor_loss = penalty - q.mean()
-                actor_optimizer.zero_grad()
-                actor_loss.backward()
-                actor_optimizer.step()
-                for parameter in q_parameters:
-                    parameter.requires_grad_(True)
-                polyak_update(average_parameters, actor_parameters, args.policy_average)
-                polyak_update(target_parameters, parameters, args.tau)
-
-            progress["updates"] += 1
-
-            if progress["updates"] % 1000 == 0:
-                step = progress["global_step"]
-                writer.add_scalar("losses/qf1_values", q1.mean().item(), step)
-                writer.add_scalar("losses/qf2_values", q2.mean().item(), step)
-                writer.add_scalar("losses/qf1_loss", qf1_loss.item(), step)
-                writer.add_scalar("losses/qf2_loss", qf2_loss.item(), step)
-                writer.add_scalar("losses/qf_loss", (qf1_loss + qf2_loss).item() / 2, step)
-                writer.add_scalar("losses/actor_loss", actor_loss.item(), step)
-                writer.add_scalar("losses/preactivation", preactivation.abs().mean().item(), step)
-                sps = (step - steps_before) / (time.time() - started)
-                writer.add_scalar("charts/SPS", int(sps), step)
-
-        # SHARED: evaluate, keep the best policy, checkpoint
         step = progress["global_step"]
+
+        number = updates_due(step, buffer, args)
+        for batch in batches(buffer, number, args.batch_size, device):
+            losses |= agent.update(batch, progress["updates"])
+            progress["updates"] += 1
+            if progress["updates"] % 1000 == 0:
+                for name, value in losses.items():
+                    writer.add_scalar(f"losses/{name}", value.item(), step)
+                writer.add_scalar("charts/SPS", int(runs.rate(bar)), step)
+
+        # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
-            result = evaluate(actor_average, eval_envs, validation, device)
-            for name, value in result.items():
-                writer.add_scalar(f"eval/{name}", value, step)
-            picture = picture_of_rollout(actor_average, picture_env, validation, device)
-            writer.add_image("eval/rollout", picture, step, dataformats="HWC")
-            if result["success_rate"] > progress["best_success"]:
-                progress["best_success"], progress["best_step"] = result["success_rate"], step
-                metadata = {"kind": "policy", "task": args.task, "env": env_arguments(args)}
-                metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
-                save_program(
-                    run / "policy.pt", actor_average, stack(observations, device), metadata
-                )
-            bar.set_postfix(
-                eval=f"{result['success_rate']:.3f}", best=f"{progress['best_success']:.3f}"
+            policy = agent.actor_average
+            success, best = protocol.validate(
+                policy, eval_envs, validation, device, writer, step, progress
             )
+            if best:
+                protocol.save_policy(run, policy, eval_envs, device, args, env_arguments, step)
+            bar.set_postfix(eval=success, best=progress["best_success"])
             for episode in filter(None, staged):
                 buffer.add_episode(episode)
             staged, returns = [[] for _ in envs], [0.0] * args.num_envs
-            progress["seconds"] = seconds_before + time.time() - started
-            save_checkpoint()
-            observations = begin_episodes()
-            stop = result["success_rate"] >= args.stop_at_success
+            progress["seconds"] = seconds_before + runs.elapsed(bar)
+            runs.save_checkpoint(run, saved_parts)
+            # A resumed run goes on exactly as this one does: with new episodes.
+            observations = protocol.begin_episodes(envs, args.seed, step)
+            stop = args.stop_at_success is not None and success >= args.stop_at_success
     bar.close()
-
-    # The best policy (by validation) on test queries
-    best = load_program(run / "policy.pt").to(device)
-    result = evaluate(best, eval_envs, test, device)
-    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(test)}
-    result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
-    result |= {"validation_success_rate": progress["best_success"]}
-    result |= {"steps": progress["global_step"], "seconds": round(progress["seconds"])}
-    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
-    write_atomically(run / "result.json", lambda path: path.write_text(text))
-    print(
-        f"{args.task}, goal {args.goal_type}, {len(test)} test queries: "
-        f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
-        f"{progress['global_step']} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
-    )
+    protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
     writer.close()
     # END SHARED

@@ -30,8 +30,8 @@ from tqdm import tqdm
 
 import envs
 from demo_generation.following import follow
-from envs import panda
 from envs.datasets import MAX_STEP, demo_path, load_demos, subgoals
+from envs.demo_episodes import demo_episode
 
 
 @dataclass
@@ -80,27 +80,16 @@ def episode(demo, env):
         `terminations` and `truncations`, bool (T,), `infos`, a dict with `is_success`, bool
         (T + 1,).
     """
-    positions = panda.forward_kinematics(panda.denormalise(demo.states))
-    goal_state, goal_position = panda.normalise(demo.goal), panda.forward_kinematics(demo.goal)
-    achieved, desired = {
-        "ee": (positions, goal_position),
-        "config": (demo.states, goal_state),
-        "combined": (np.hstack([demo.states, positions]), np.hstack([goal_state, goal_position])),
-    }[env.goal_type]
-    achieved, desired = achieved.astype(np.float32), desired.astype(np.float32)
-    success = env.compute_terminated(achieved, desired, {})
-    reached = np.flatnonzero(success[1:])
-    length = reached[0] + 1 if len(reached) else len(demo.actions)
-    achieved, success = achieved[: length + 1], success[: length + 1]
-    truncations = np.zeros(length, bool)
+    observation, achieved, desired, action, success = demo_episode(demo, env)
+    truncations = np.zeros(len(action), bool)
     truncations[-1] = not success[-1]  # the recording ends, not the task
     return {
         "observations": {
-            "observation": np.hstack([demo.states, positions])[: length + 1].astype(np.float32),
+            "observation": observation,
             "achieved_goal": achieved,
-            "desired_goal": np.tile(desired, (length + 1, 1)),
+            "desired_goal": np.tile(desired, (len(observation), 1)),
         },
-        "actions": demo.actions[:length],
+        "actions": action,
         "rewards": env.compute_reward(achieved[1:], desired, {}),
         "terminations": success[1:],
         "truncations": truncations,

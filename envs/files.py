@@ -15,9 +15,7 @@ def write_atomically(path, contents):
     try:
         with open(temporary, "wb") as file:
             file.write(contents)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        replace_atomically(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -32,3 +30,13 @@ def check_writable(path):
         tempfile.TemporaryFile(dir=path.absolute().parent).close()
     except OSError as error:
         raise ValueError(f"cannot write {path}: {error.strerror}") from error
+
+
+def replace_atomically(temporary, path):
+    """Rename a file that is whole, in `path`'s folder, to `path`, which it replaces.
+
+    What was written is brought to the disk first: after a power cut too, `path` is whole.
+    """
+    with open(temporary, "rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(temporary, path)

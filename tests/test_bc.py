@@ -15,6 +15,7 @@ import envs
 from envs import panda
 from envs.datasets import demo_path, load_demos
 from envs.programs import load_program
+from envs.protocol import stack
 
 bc = load("bc")
 
@@ -77,7 +78,7 @@ def test_it_overfits_five_demonstrations_and_follows_them(tmp_path):
         observation, _ = env.reset_specific(demos.start[i], demos.goal[i])
         over = False
         while not over:
-            action = policy(**bc.stack([observation], "cpu"))[0].numpy()
+            action = policy(**stack([observation], "cpu"))[0].numpy()
             observation, _, terminated, truncated, info = env.step(action)
             over = terminated or truncated
         assert info["is_success"]

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from trainers import PATHS, ROOT, TINY, load
 
+import envs
+
 PAGE = (ROOT / "docs" / "your_own_algorithm.md").read_text()
 
 
@@ -45,7 +47,7 @@ def test_the_example_relabels_with_the_ends_of_episodes(tmp_path, monkeypatch):
     script.write_text(PATHS["sac_her_mp"].read_text().replace(before, after))
     monkeypatch.setitem(PATHS, "sac_final_mp", script)
     module = load("sac_final_mp")
-    env = module.roboarm.make("no_obstacles")
+    env = envs.make("no_obstacles")
     buffer = module.HerReplayBuffer(env, 100, 1.0, np.random.default_rng(0))
     for length in (3, 7):
         buffer.add_episode(

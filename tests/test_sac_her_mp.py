@@ -12,6 +12,8 @@ import envs
 from demo_generation import collect
 from envs import panda
 from envs.datasets import Demos, Scenes, load_demos
+from envs.demo_episodes import demo_transitions
+from envs.protocol import stack
 
 sac = load("sac_her_mp")
 
@@ -76,7 +78,7 @@ def test_network_inputs():
 def test_networks_fit_every_observation(goal_type, velocities):
     args = sac.Args(goal_type=goal_type, velocities=velocities, num_hidden_layers=4)
     env = envs.make("wall", goal_type=goal_type, velocities=velocities)
-    batch = sac.stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
+    batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
     action = sac.Actor(args)(**batch)
     assert action.shape == (2, 7)
     value = sac.QNetwork(args)(batch["observation"], batch["desired_goal"], action)
@@ -171,6 +173,31 @@ def test_bfloat16_products_stay_close_to_float32():
     assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
 
 
+def test_updates_fall_due_from_the_first_stored_episode_on():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 1000, 0.8, np.random.default_rng(0))
+    args = sac.Args(learning_starts=200, updates_per_step=0.3, num_envs=7)
+    assert all(sac.updates_due(step, buffer, args) == 0 for step in range(0, 7000, 7))
+    buffer.add_episode(episode(4, 0, env))
+    due = {step: sac.updates_due(step, buffer, args) for step in range(7, 7001, 7)}
+    assert all(number == 0 for step, number in due.items() if step <= 200)
+    assert sum(due.values()) == int((7000 - 200) * 0.3)
+    assert set(list(due.values())[30:]) == {2, 3}  # 2.1 per seven steps; nothing is made up for
+
+
+def test_batches_are_drawn_some_at_a_time(monkeypatch):
+    env, drawn = envs.make("no_obstacles"), []
+    buffer = sac.HerReplayBuffer(env, 1000, 0.8, np.random.default_rng(0))
+    buffer.add_episode(episode(4, 0, env))
+    sample = buffer.sample
+    monkeypatch.setattr(buffer, "sample", lambda size: drawn.append(size) or sample(size))
+    found = list(sac.batches(buffer, 150, 8, "cpu"))
+    assert len(found) == 150 and sum(drawn) == 150 * 8 and max(drawn) <= 64 * 8
+    assert all(len(tensor) == 8 for batch in found for tensor in batch.values())
+    assert len({batch["observation"].numpy().tobytes() for batch in found}) > 140
+    assert list(sac.batches(buffer, 0, 8, "cpu")) == []
+
+
 # --- Demonstrations
 
 
@@ -203,17 +230,12 @@ def hand_made_demos(number=3, steps=12, task="no_obstacles"):
     )
 
 
-def test_demonstrations_follow_failures_of_their_query_only_and_as_often_as_p():
-    demos, rng = hand_made_demos(), np.random.default_rng(0)
-    for query in range(len(demos)):
-        demo = sac.demonstration_to_inject(demos, query, False, 1.0, rng)
-        np.testing.assert_array_equal(demo.start, demos.start[query])
-        np.testing.assert_array_equal(demo.goal, demos.goal[query])
-        assert sac.demonstration_to_inject(demos, query, True, 1.0, rng) is None
-        assert sac.demonstration_to_inject(demos, query, False, 0.0, rng) is None
-    injected = [
-        sac.demonstration_to_inject(demos, 0, False, 0.3, rng) is not None for _ in range(10_000)
-    ]
+def test_demonstrations_follow_failures_only_and_as_often_as_p():
+    rng = np.random.default_rng(0)
+    assert sac.inject_demonstration(False, 1.0, rng)
+    assert not sac.inject_demonstration(True, 1.0, rng)
+    assert not sac.inject_demonstration(False, 0.0, rng)
+    injected = [sac.inject_demonstration(False, 0.3, rng) for _ in range(10_000)]
     assert abs(np.mean(injected) - 0.3) < 0.02
 
 
@@ -221,7 +243,7 @@ def test_demonstrations_follow_failures_of_their_query_only_and_as_often_as_p():
 def test_a_demonstration_as_transitions_by_hand(goal_type):
     demo = hand_made_demos()[1]
     env = envs.make("no_obstacles", goal_type=goal_type)
-    episode = sac.demonstration_episode(demo, env, sac.Args(goal_type=goal_type))
+    episode = demo_transitions(demo, env)
     angles = panda.denormalise(demo.states.astype(np.float64))
     positions = panda.forward_kinematics(angles)
     goal_position = panda.forward_kinematics(demo.goal)
@@ -243,16 +265,15 @@ def test_a_demonstration_as_transitions_by_hand(goal_type):
             "combined": np.concatenate([panda.normalise(demo.goal), goal_position]),
         }[goal_type]
         np.testing.assert_allclose(transition["desired_goal"], goal, atol=1e-6)
-    sub_goals = sac.demonstration_episode(
-        demo, env, sac.Args(goal_type=goal_type, action_mode="subgoal")
-    )
+    env.action_mode = "subgoal"
+    sub_goals = demo_transitions(demo, env)
     np.testing.assert_allclose(sub_goals[3]["action"], demo.states[4], atol=1e-6)
     env.close()
 
 
 def test_rewards_and_hindsight_of_injected_demonstrations():
     demo, env = hand_made_demos()[2], envs.make("no_obstacles")
-    episode = sac.demonstration_episode(demo, env, sac.Args())
+    episode = demo_transitions(demo, env)
     for her_probability in (0.0, 1.0):
         buffer = sac.HerReplayBuffer(env, 1000, her_probability, np.random.default_rng(0))
         buffer.add_episode(episode)

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import PATHS, command, load, run_script
+from trainers import PATHS, command, load, run_here, run_script
 
 import envs
 from envs.datasets import demo_path
 from envs.programs import load_program
+from envs.protocol import stack
 
 
 @pytest.fixture(params=PATHS)
@@ -59,15 +60,15 @@ def shared_blocks(trainer):
 
 
 def test_shared_blocks_have_not_drifted_apart():
-    blocks = {name: shared_blocks(name) for name in PATHS}
-    assert blocks["sac_her_mp"].keys() == blocks["td3_her_mp"].keys()
-    assert blocks["bc"].keys() == {
-        "features and layers",
-        "averaging, evaluation, files and resuming",
-    }
-    for trainer in ("td3_her_mp", "bc"):
-        for name, lines in blocks[trainer].items():
-            assert lines == blocks["sac_her_mp"][name], f"{name} of {trainer}"
+    trainers = {}  # block -> trainer -> lines
+    for trainer in PATHS:
+        for name, lines in shared_blocks(trainer).items():
+            trainers.setdefault(name, {})[trainer] = lines
+    assert trainers
+    for name, versions in trainers.items():
+        assert len(versions) > 1, f"{name} is only in {list(versions)}"
+        first, *others = versions.values()
+        assert all(lines == first for lines in others), f"{name} of {list(versions)}"
 
 
 # --- Real runs
@@ -96,7 +97,7 @@ def test_the_saved_policy_acts_without_the_script(finished_run, trainer):
     assert policy.metadata["kind"] == "policy" and policy.metadata["task"] == "no_obstacles"
     env = envs.make(policy.metadata["task"], **policy.metadata["env"])
     observation, _ = env.reset(seed=0)
-    action = policy(**load(trainer).stack([observation], "cpu"))[0].numpy()
+    action = policy(**stack([observation], "cpu"))[0].numpy()
     assert action.shape == (7,) and np.abs(action).max() <= 0.06
     env.step(action)
 
@@ -154,6 +155,18 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer)
     same(*(torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed)))
     results = [json.loads((run / "result.json").read_text()) for run in (whole, killed)]
     assert results[0]["success_rate"] == results[1]["success_rate"]
+
+
+@pytest.mark.parametrize("stop, steps", [(None, 1800), (1.0, 600)])
+def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps):
+    success = {"success_rate": 1.0, "clean_success_rate": 1.0}
+    monkeypatch.setattr("envs.protocol.evaluate", lambda *_: success)
+    flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
+    if stop is not None:
+        flags += ["--stop-at-success", stop]
+    run_here("sac_her_mp", monkeypatch, *flags)
+    (result,) = tmp_path.glob("*/result.json")
+    assert json.loads(result.read_text())["steps"] == steps
 
 
 # --- Bad input

@@ -1,6 +1,7 @@
 """Trainers as modules and as commands, for the tests."""
 
 import importlib.util
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -37,3 +38,9 @@ def run_script(trainer, folder, *flags):
     done = subprocess.run(command(trainer, folder, *flags), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return next(folder.iterdir())
+
+
+def run_here(trainer, monkeypatch, *flags):
+    """The same in this process, so that what the script imports can be changed first."""
+    monkeypatch.setattr(sys, "argv", list(map(str, flags)))
+    runpy.run_path(str(PATHS[trainer]), run_name="__main__")

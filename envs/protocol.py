@@ -1,0 +1,222 @@
+"""The benchmark's protocol, as every trainer of a policy follows it.
+
+Validation queries say which policy of a run is the best; that one is saved, `policy.pt`, and at the
+end it is tested on test queries, with the result in `result.json`. (The evaluation on all queries,
+with more numbers, is `clean_rl_scripts/evaluate.py`.)
+
+The functions that take flags of the command line are for scripts: where the user is wrong, they end
+the program with a message.
+"""
+
+import sys
+from dataclasses import asdict
+
+import numpy as np
+import torch
+
+import envs
+from envs.datasets import load_queries
+from envs.programs import load_program, save_program
+from envs.runs import write_json
+
+NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
+PICTURE_SIZE = (240, 180)
+RULES = ("horizon", "stop_on_collision")  # which decide what a success is
+
+
+def load_task(args):
+    """The first validation queries and test queries, as many as the flags say, of `args.task`.
+
+    Raises:
+        SystemExit: unknown task, a task for testing only, or its query file cannot be used.
+    """
+    try:
+        if not envs.get_task(args.task).trainable:
+            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
+        validation = load_queries(args.task, "validation")[: args.eval_queries]
+        return validation, load_queries(args.task, "test")[: args.test_queries]
+    except ValueError as error:
+        sys.exit(f"--task: {error}")
+
+
+def make_envs(task, number, **kwargs):
+    """A list of environments of a task; `kwargs` as for `envs.make`.
+
+    Raises:
+        SystemExit: an argument is refused.
+    """
+    try:
+        return [envs.make(task, **kwargs) for _ in range(number)]
+    except ValueError as error:
+        sys.exit(f"--encoder: {error}" if kwargs.get("encoder") is not None else str(error))
+
+
+def make_eval_envs(task, **kwargs):
+    """The environments of `validate` and `final_test`, as `make_envs`."""
+    pictured = make_envs(task, 1, render_mode="rgb_array", render_size=PICTURE_SIZE, **kwargs)
+    return pictured + make_envs(task, NUM_ENVS - 1, **kwargs)
+
+
+def begin_episodes(envs, seed, step):
+    """First observations of fresh episodes, from random numbers that depend on seed and step alone.
+
+    Whoever begins new ones at every checkpoint needs no simulator state to go on exactly like an
+    uninterrupted run.
+    """
+    seeds = np.random.SeedSequence([seed, step]).generate_state(len(envs)).tolist()
+    return [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+
+
+def stack(observations, device):
+    """List of observation dicts -> dict of float32 tensors (N, ...)."""
+    return {
+        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
+        for name in observations[0]
+    }
+
+
+@torch.no_grad()
+def evaluate(policy, envs, queries, device):
+    """Run a deterministic policy on every query, each env one at a time; mean results.
+
+    Args:
+        policy: from `observation`, `achieved_goal`, `desired_goal`, tensors (N, ...), to actions
+            (N, 7); a module or a program.
+        envs: the environments to do it in.
+        queries: `envs.datasets.Queries`.
+        device: of the policy.
+
+    Returns:
+        A dict of floats: `success_rate`, `clean_success_rate` (without a touch), `collision_rate`
+        and `episode_length` in steps.
+    """
+    waiting = iter(range(len(queries)))
+    running, results = {}, []
+
+    def start(env):
+        i = next(waiting, None)
+        running.pop(env, None)
+        if i is not None:
+            running[env] = env.reset_specific(*queries[i])[0]
+
+    for env in envs:
+        start(env)
+    while running:
+        actions = policy(**stack(list(running.values()), device)).cpu().numpy()
+        for env, action in zip(list(running), actions, strict=True):
+            running[env], _, terminated, truncated, info = env.step(action)
+            if terminated or truncated:
+                results.append(
+                    (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
+                )
+                start(env)
+    success, touched, steps = np.array(results, dtype=np.float64).T
+    return {
+        "success_rate": float(success.mean()),
+        "clean_success_rate": float((success * (1 - touched)).mean()),
+        "collision_rate": float(touched.mean()),
+        "episode_length": float(steps.mean()),
+    }
+
+
+@torch.no_grad()
+def picture_of_rollout(policy, env, query, device, frames=8):
+    """An image strip (height, frames * width, 3), uint8, of the policy on one query.
+
+    `env`: one that renders.
+    """
+    observation, _ = env.reset_specific(*query)
+    pictures, done = [env.render()], False
+    while not done:
+        action = policy(**stack([observation], device))[0].cpu().numpy()
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        if info["elapsed_steps"] % 10 == 0 or done:
+            pictures.append(env.render())
+    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
+    return np.concatenate([pictures[i] for i in chosen], axis=1)
+
+
+def validate(policy, envs, queries, device, writer, step, progress):
+    """`evaluate` on validation queries, with results and a picture of the first in TensorBoard.
+
+    Args:
+        policy, queries, device: as for `evaluate`.
+        envs: of `make_eval_envs`.
+        writer: TensorBoard's.
+        step: of the training.
+        progress: dict with `best_success` and `best_step`, which are set if this is the best.
+
+    Returns:
+        The success rate, and whether it is the best so far.
+    """
+    result = evaluate(policy, envs, queries, device)
+    for name, value in result.items():
+        writer.add_scalar(f"eval/{name}", value, step)
+    picture = picture_of_rollout(policy, envs[0], queries[0], device)
+    writer.add_image("eval/rollout", picture, step, dataformats="HWC")
+    success = result["success_rate"]
+    best = success > progress["best_success"]
+    if best:
+        progress |= {"best_success": success, "best_step": step}
+    return success, best
+
+
+def save_policy(run, policy, envs, device, args, env_arguments, step):
+    """Write `policy.pt` for `evaluate.py` and others.
+
+    Args:
+        run: the run's folder.
+        policy: the module, `forward(observation, achieved_goal, desired_goal)`.
+        envs: some of its environments, for examples of observations.
+        device: of the policy.
+        args: the flags; `task`, `exp_name` and `seed` are noted in the file.
+        env_arguments: of `envs.make`, noted too: the policy is evaluated with them.
+        step: of the training.
+    """
+    metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
+    metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
+    example = stack([env.reset(seed=0)[0] for env in envs[:2]], device)
+    save_program(run / "policy.pt", policy, example, metadata)
+
+
+def final_test(run, args, env_arguments, queries, device, progress, steps):
+    """Test `policy.pt` on test queries: `result.json`, and a line on the console.
+
+    Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed, also
+    where the policy was trained under others: results are to be compared. File and line say so.
+
+    Args:
+        run: the run's folder.
+        args: the flags, written into the file.
+        env_arguments: of `envs.make`, in training.
+        queries: the test queries.
+        device: where to run the policy.
+        progress: dict with the run's `seconds`, `best_success` on validation queries, and
+            `best_step`, at which the policy was saved.
+        steps: of the run.
+    """
+    policy = load_program(run / "policy.pt").to(device)
+    own = {name: value for name, value in env_arguments.items() if name not in RULES}
+    test_envs = make_eval_envs(args.task, **own)
+    result = evaluate(policy, test_envs, queries, device)
+    rules = {name: getattr(test_envs[0], name) for name in RULES}
+    trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}
+    result |= {"rules": rules, "rules_in_training": trained}
+    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
+    result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
+    result |= {"validation_success_rate": progress["best_success"]}
+    result |= {"steps": steps, "seconds": round(progress["seconds"])}
+    write_json(run / "result.json", result | {"args": asdict(args)})
+    if rules != trained:
+        print(f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:")
+    print(
+        f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
+        f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
+        f"{steps} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
+    )
+
+
+def _words(rules):
+    contacts = "ended by a touch" if rules["stop_on_collision"] else "contacts allowed"
+    return f"{rules['horizon']} steps, {contacts}"

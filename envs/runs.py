@@ -1,0 +1,206 @@
+"""Run folders: what a training run leaves, and how it goes on after it was stopped.
+
+    args = parse_args(Args, may_change={"total_updates"})   # with --resume, those of the run
+    run, device = run_folder(args, "wall"), seed_torch(args)
+    progress = {"updates": 0, "seconds": 0.0}
+    saved_parts = {"model": model, "optimizer": optimizer, "progress": progress}
+    load_checkpoint(args, saved_parts)
+    writer = summary_writer(run, args, progress["updates"])
+    bar = progress_bar(args.total_updates, progress["updates"], "update")
+    ...
+    save_checkpoint(run, saved_parts)
+
+Every trainer uses these. Its `Args`, a dataclass, has at least the fields `exp_name`, `seed`,
+`runs_dir`, `resume`, `device` and `threads`. These functions are for scripts: where the user is
+wrong, they end the program with a message.
+"""
+
+import json
+import os
+import sys
+import time
+import typing
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from envs.files import replace_atomically, write_atomically
+
+MAY_CHANGE = {"resume", "runs_dir", "threads"}  # they do not change what is computed
+
+
+def parse_args(Args, may_change=()):
+    """The flags of the command line; with --resume those of the run, which it must not contradict.
+
+    Args:
+        Args: the dataclass of the flags.
+        may_change: names of further flags with which a run may be resumed at another value.
+
+    Raises:
+        SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device.
+    """
+    args = tyro.cli(Args)
+    if args.resume is not None:
+        args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
+    if args.device == "cuda" and not torch.cuda.is_available():
+        sys.exit("--device cuda: PyTorch sees no CUDA device here")
+    return args
+
+
+def _args_of_run(Args, run, may_change):
+    if not (run / "args.json").exists():
+        sys.exit(f"--resume: {run} is no run's folder (it has no args.json)")
+    saved = json.loads((run / "args.json").read_text())
+    kinds = typing.get_type_hints(Args)
+    known = [field.name for field in fields(Args) if field.name in saved]
+    defaults = Args(**{name: _from_json(saved[name], kinds[name]) for name in known})
+    defaults.resume = run
+    args = tyro.cli(Args, default=defaults)
+    had, given = (json.loads(_to_json(asdict(one))) for one in (defaults, args))
+    contradicted = [
+        f"--{name.replace('_', '-')} is {given[name]!r} now, the run had {had[name]!r}"
+        for name in given
+        if name not in may_change and given[name] != had[name]
+    ]
+    if contradicted:
+        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
+    return args
+
+
+def _from_json(value, kind):
+    """A flag's value as the dataclass has it: JSON knows neither tuples nor paths."""
+    if isinstance(value, list):
+        return tuple(_from_json(one, kind) for one in value)
+    if isinstance(value, str) and Path in (kind, *typing.get_args(kind)):
+        return Path(value)
+    return value
+
+
+def _to_json(content):
+    return json.dumps(content, indent=2, default=str)
+
+
+def write_json(path, content):
+    """Write a file with a dict, atomically; paths in it become strings."""
+    write_atomically(path, _to_json(content).encode())
+
+
+def run_folder(args, task):
+    """The run's folder: that of --resume, or else a new one, with the flags in its `args.json`.
+
+    Args:
+        args: the flags.
+        task: the name of what is learned, the first part of the folder's name.
+    """
+    if args.resume is not None:
+        return args.resume
+    run = args.runs_dir / f"{task}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    run.mkdir(parents=True)
+    write_json(run / "args.json", asdict(args))
+    return run
+
+
+def seed_torch(args):
+    """Make torch repeat itself: seed, threads, deterministic kernels. Returns the device."""
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
+    torch.use_deterministic_algorithms(True)
+    return torch.device(args.device)
+
+
+def save_checkpoint(run, parts):
+    """Write `checkpoint.pt`: the states of the run's parts, and of torch's random numbers.
+
+    Args:
+        run: the run's folder.
+        parts: dict from a name to what changes in the run: anything with `state_dict` and
+            `load_state_dict` (modules, optimisers), a tensor, a dict of plain values, or a NumPy
+            generator.
+    """
+    state = {name: _state_of(part) for name, part in parts.items()}
+    state["torch_rng"] = torch.get_rng_state()
+    if torch.cuda.is_initialized():
+        state["cuda_rng"] = torch.cuda.get_rng_state()
+    # Always the same temporary name: a run that is killed often leaves one half checkpoint at most.
+    temporary = run / "checkpoint.pt.part"
+    torch.save(state, temporary)
+    replace_atomically(temporary, run / "checkpoint.pt")
+
+
+def load_checkpoint(args, parts):
+    """Give the parts the states they had in the checkpoint of --resume, if there is one.
+
+    Args:
+        args: the flags.
+        parts: as given to `save_checkpoint`, with the same names. They stay on their devices.
+
+    Raises:
+        SystemExit: the checkpoint is damaged, or of other parts.
+    """
+    if args.resume is None or not (args.resume / "checkpoint.pt").exists():
+        return
+    path = args.resume / "checkpoint.pt"
+    try:  # on the CPU first: what is not a network belongs there
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever a damaged file leads to
+        sys.exit(f"--resume: {path} is damaged: {error}")
+    missing = parts.keys() - state.keys()
+    if missing:
+        sys.exit(f"--resume: {path} is of another version: it has no {', '.join(sorted(missing))}")
+    for name, part in parts.items():
+        _restore(part, state[name])
+    torch.set_rng_state(state["torch_rng"])
+    if "cuda_rng" in state:
+        torch.cuda.set_rng_state(state["cuda_rng"])
+
+
+def _state_of(part):
+    if isinstance(part, np.random.Generator):
+        return json.dumps(part.bit_generator.state)  # its integers are too large for torch.save
+    if isinstance(part, torch.Tensor):
+        return part.detach()
+    return part if isinstance(part, dict) else part.state_dict()
+
+
+def _restore(part, state):
+    if isinstance(part, np.random.Generator):
+        part.bit_generator.state = json.loads(state)
+    elif isinstance(part, torch.Tensor):
+        part.data.copy_(state)
+    elif isinstance(part, dict):
+        part.update(state)
+    else:
+        part.load_state_dict(state)
+
+
+def summary_writer(run, args, step):
+    """TensorBoard's writer for a run that is at `step`, with a table of the flags.
+
+    What an earlier process wrote after its last checkpoint is hidden.
+    """
+    writer = SummaryWriter(run, purge_step=step + 1)
+    rows = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
+    writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+    return writer
+
+
+def progress_bar(total, done, unit):
+    """A bar of `total` steps, of which `done` were done by earlier processes."""
+    quiet = 0.2 if sys.stderr.isatty() else 30  # seconds; a log file needs fewer lines
+    return tqdm(total=total, initial=done, unit=unit, smoothing=0.05, mininterval=quiet)
+
+
+def elapsed(bar):
+    """Seconds since the bar began."""
+    return bar.format_dict["elapsed"]
+
+
+def rate(bar):
+    """Mean steps per second since the bar began."""
+    return (bar.n - bar.initial) / elapsed(bar)

@@ -1,0 +1,87 @@
+"""Every trainer of a policy with the `meta` device in CUDA's place: another one, without numbers.
+
+On it, as on CUDA, tensors of two devices do not mix and `.numpy()` is refused. It takes part in no
+kernel, so tensors of two types in one are looked for separately.
+"""
+
+import json
+
+import pytest
+import torch
+from trainers import PATHS, command, run_here
+
+import envs.protocol
+
+ONCE = "--total-timesteps 60 --horizon 30 --eval-every 30 --learning-starts 15 --num-envs 3"
+ONCE_BC = "--total-updates 4 --eval-every 2"
+SEEING = ["--task", "random_boxes_hard", "--encoder", "oracle", "--goal-type", "combined"]
+
+
+@pytest.fixture
+def meta(monkeypatch):
+    """What CUDA can do and `meta` cannot: bring numbers to the CPU, fused Adam."""
+    cpu, adam = torch.Tensor.cpu, torch.optim.Adam
+
+    def to_cpu(tensor):
+        return torch.zeros(tensor.shape, dtype=tensor.dtype) if tensor.is_meta else cpu(tensor)
+
+    monkeypatch.setattr(torch.Tensor, "cpu", to_cpu)
+    monkeypatch.setattr(torch.Tensor, "item", lambda tensor: to_cpu(tensor).tolist())
+    monkeypatch.setattr(torch.optim, "Adam", lambda *args, fused, **kw: adam(*args, **kw))
+
+
+def flags(trainer):
+    few = (ONCE_BC if trainer == "bc" else ONCE).split()
+    return [*few, "--eval-queries", "1", "--test-queries", "1", "--device", "meta"]
+
+
+@pytest.mark.parametrize("seeing", [False, True])
+@pytest.mark.parametrize("trainer", PATHS)
+def test_update_evaluation_and_resume_on_another_device(
+    trainer, seeing, tmp_path, meta, monkeypatch
+):
+    more = SEEING if seeing else ["--goal-type", "ee"]
+    if seeing and trainer != "bc":
+        more = [*more, "--demo-prob", "1"]
+    run_here(trainer, monkeypatch, *command(trainer, tmp_path, *flags(trainer), *more)[1:])
+    (run,) = tmp_path.iterdir()
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    assert state["progress"]["updates"] > 0
+    assert all(tensor.is_meta for tensor in state["actor"].values())
+    (run / "result.json").unlink()
+    longer = [] if trainer == "bc" else ["--total-timesteps", "120"]
+    run_here(trainer, monkeypatch, PATHS[trainer], "--resume", run, *longer)
+    assert json.loads((run / "result.json").read_text())["steps"] == (4 if trainer == "bc" else 120)
+
+
+def test_a_tensor_left_on_the_cpu_is_noticed(tmp_path, meta, monkeypatch):
+    stack = envs.protocol.stack
+    monkeypatch.setattr(envs.protocol, "stack", lambda observations, _: stack(observations, "cpu"))
+    with pytest.raises(RuntimeError, match="device"):
+        run_here("bc", monkeypatch, *command("bc", tmp_path, *flags("bc"))[1:])
+
+
+class OneType(torch.overrides.TorchFunctionMode):
+    """Refuses floating-point tensors of two types in one call, as many of CUDA's kernels do."""
+
+    ALLOWED = ("copy_", "type_as", "to", "set_data", "__set__")
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        leaves = torch.utils._pytree.tree_leaves((args, kwargs))
+        kinds = {
+            one.dtype
+            for one in leaves
+            if isinstance(one, torch.Tensor) and one.is_floating_point() and one.dim() > 0
+        }
+        name = getattr(function, "__name__", str(function))
+        assert len(kinds) < 2 or name in self.ALLOWED, f"{name} of {kinds}"
+        return function(*args, **kwargs)
+
+
+@pytest.mark.parametrize("trainer", PATHS)
+def test_no_kernel_gets_two_types(trainer, tmp_path, monkeypatch):
+    few = [flag for flag in flags(trainer) if flag not in ("--device", "meta")]
+    given = command(trainer, tmp_path, *few, "--bf16", *(["True"] if trainer != "bc" else []))[1:]
+    with OneType():
+        run_here(trainer, monkeypatch, *given)

@@ -1,0 +1,80 @@
+"""envs/protocol.py: what trainers count, and under which rules. (Whole runs: test_trainers.py.)"""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import envs
+from envs import protocol
+from envs.datasets import load_queries
+
+
+class Toward(torch.nn.Module):
+    """Straight to the goal configuration, in steps of `size` (L2)."""
+
+    def __init__(self, size):
+        super().__init__()
+        self.size = size
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        apart = desired_goal - observation[:, :7]
+        return self.size * apart / torch.linalg.vector_norm(apart, dim=1, keepdim=True)
+
+
+@pytest.mark.parametrize("number", [1, 3, 8])
+def test_what_is_counted_is_what_happens_query_by_query(number):
+    queries = load_queries("wall", "validation")[:6]
+    policy = Toward(0.03)
+    found = protocol.evaluate(
+        policy, protocol.make_envs("wall", number, goal_type="config"), queries, "cpu"
+    )
+    env, outcomes = envs.make("wall", goal_type="config"), []
+    for query in queries:
+        observation, _ = env.reset_specific(*query)
+        over = False
+        while not over:
+            batch = {name: torch.tensor(value[None]) for name, value in observation.items()}
+            observation, _, terminated, truncated, info = env.step(policy(**batch)[0].numpy())
+            over = terminated or truncated
+        outcomes.append((info["is_success"], info["collision_so_far"], info["elapsed_steps"]))
+    assert len({outcome[:2] for outcome in outcomes}) > 1  # some touch or fail, and some do not
+    assert found == pytest.approx(
+        {
+            "success_rate": np.mean([success for success, _, _ in outcomes]),
+            "clean_success_rate": np.mean([s and not touched for s, touched, _ in outcomes]),
+            "collision_rate": np.mean([touched for _, touched, _ in outcomes]),
+            "episode_length": np.mean([steps for _, _, steps in outcomes]),
+        }
+    )
+
+
+def result_of(run, capsys, **env_arguments):
+    """`result.json` and the printed lines for a policy that needs more than 50 steps."""
+    args = SimpleNamespace(task="no_obstacles", goal_type="config", exp_name="x", seed=1)
+    env_arguments |= {"goal_type": "config"}
+    made = protocol.make_eval_envs(args.task, **env_arguments)
+    protocol.save_policy(run, Toward(0.01), made, "cpu", args, env_arguments, 7)
+    queries = load_queries("no_obstacles", "test")[:3]
+    progress = {"seconds": 2.0, "best_success": 0.5, "best_step": 7}
+    protocol.final_test(run, args, env_arguments, queries, "cpu", progress, 10)
+    return json.loads((run / "result.json").read_text()), capsys.readouterr().out
+
+
+def test_the_test_is_run_under_the_standard_rules(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(protocol, "asdict", vars)
+    standard, line = result_of(tmp_path, capsys)
+    assert standard["success_rate"] > 0.5 and standard["episode_length"] > 50
+    assert standard["rules"] == standard["rules_in_training"]
+    assert (standard["policy_step"], standard["steps"], standard["seconds"]) == (7, 10, 2)
+    assert standard["validation_success_rate"] == 0.5
+    assert "trained with" not in line and "3 test queries: success" in line
+    for other in ({"horizon": 50}, {"stop_on_collision": True}):
+        result, lines = result_of(tmp_path, capsys, **other)
+        assert result["rules"] == {"horizon": 400, "stop_on_collision": False}
+        assert result["rules_in_training"] == result["rules"] | other
+        assert result["success_rate"] == standard["success_rate"]
+        assert result["episode_length"] == standard["episode_length"]
+        assert "tested under the standard rules, 400 steps, contacts allowed:" in lines

@@ -1,0 +1,156 @@
+"""envs/runs.py: flags of a run, what a checkpoint brings back. (Whole runs: test_trainers.py.)"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from envs import runs
+
+
+@dataclass
+class Args:
+    exp_name: str = "test"
+    seed: int = 1
+    runs_dir: Path = Path("runs")
+    resume: Path | None = None
+    device: str = "cpu"
+    threads: int = 1
+    data: Path | None = None
+    files: tuple[Path, ...] = ()
+    radii: tuple[float, float] = (0.1, 0.2)
+    name: str | None = None
+    steps: int = 10
+    size: ClassVar[int] = 0
+
+
+@pytest.fixture
+def parse(monkeypatch):
+    def parse(*flags):
+        monkeypatch.setattr("sys.argv", ["trainer.py", *map(str, flags)])
+        return runs.parse_args(Args, may_change={"steps", "data"})
+
+    return parse
+
+
+def test_flags_come_back_as_they_were(parse, tmp_path):
+    flags = ["--runs-dir", tmp_path, "--data", "a.h5", "--files", "b.h5", "c.h5", "--name", "x"]
+    args = parse(*flags, "--radii", "0.3", "0.5", "--threads", "2")
+    run = runs.run_folder(args, "wall")
+    assert run.parent == tmp_path and run.name.startswith("wall__test__1__")
+    again = parse("--resume", run)
+    assert again.resume == run == runs.run_folder(again, "wall")
+    args.resume = run
+    assert again == args
+    assert isinstance(again.data, Path) and all(isinstance(file, Path) for file in again.files)
+    changed = parse("--resume", run, "--steps", "20", "--data", "d.h5", "--threads", "3")
+    assert (changed.steps, changed.data, changed.threads) == (20, Path("d.h5"), 3)
+
+
+@pytest.mark.parametrize(
+    "flags, message",
+    [
+        (["--radii", "0.3", "0.4"], r"--radii is \[0.3, 0.4\] now, the run had \[0.1, 0.2\]"),
+        (["--files", "e.h5"], r"--files is \['e.h5'\] now, the run had \[\]"),
+        (["--name", "y"], "--name is 'y' now, the run had None"),
+        (["--seed", "2", "--exp-name", "z"], "--exp-name is 'z' .*; --seed is 2 now"),
+    ],
+)
+def test_a_run_is_not_resumed_as_another(parse, tmp_path, flags, message):
+    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    with pytest.raises(SystemExit, match=message):
+        parse("--resume", run, *flags)
+
+
+def test_a_run_older_than_a_flag_has_its_default(parse, tmp_path):
+    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    saved = json.loads((run / "args.json").read_text())
+    del saved["radii"]
+    (run / "args.json").write_text(json.dumps(saved | {"a_flag_that_was": 3}))
+    assert parse("--resume", run).radii == (0.1, 0.2)
+    with pytest.raises(SystemExit, match="--radii"):
+        parse("--resume", run, "--radii", "0.3", "0.4")
+
+
+def test_no_run_and_no_gpu(parse, tmp_path, monkeypatch):
+    with pytest.raises(SystemExit, match="is no run's folder"):
+        parse("--resume", tmp_path)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(SystemExit, match="PyTorch sees no CUDA device"):
+        parse("--device", "cuda")
+
+
+def parts():
+    model = torch.nn.Linear(3, 2)
+    return {
+        "model": model,
+        "optimizer": torch.optim.Adam(model.parameters(), lr=0.1, fused=True),
+        "alpha": torch.zeros(1, requires_grad=True),
+        "rng": np.random.default_rng(0),
+        "progress": {"updates": 0, "best": {}},
+    }
+
+
+def learn(parts):
+    """Steps that use every part; what came out."""
+    inputs = torch.randn(4, 3) * float(parts["rng"].random()) + parts["alpha"]
+    loss = parts["model"](inputs).square().sum()
+    parts["optimizer"].zero_grad()
+    loss.backward()
+    parts["optimizer"].step()
+    with torch.no_grad():
+        parts["alpha"] += 1
+    parts["progress"]["updates"] += 1
+    parts["progress"]["best"] = {"loss": loss.item()}
+    return loss.item()
+
+
+def test_a_checkpoint_brings_every_part_back(parse, tmp_path):
+    args = parse("--runs-dir", tmp_path)
+    run = runs.run_folder(args, "wall")
+    runs.seed_torch(args)
+    before = parts()
+    runs.load_checkpoint(args, before)  # a new run: nothing happens
+    learn(before)
+    runs.save_checkpoint(run, before)
+    assert {path.name for path in run.iterdir()} == {"args.json", "checkpoint.pt"}
+    expected = [learn(before) for _ in range(3)]
+
+    args = parse("--resume", run)
+    after = parts()
+    runs.load_checkpoint(args, after)
+    assert after["progress"]["updates"] == 1 and after["alpha"].requires_grad
+    assert [learn(after) for _ in range(3)] == expected
+    with pytest.raises(SystemExit, match="of another version: it has no critic"):
+        runs.load_checkpoint(args, after | {"critic": torch.nn.Linear(1, 1)})
+
+
+def test_a_checkpoint_of_a_damaged_file_says_which(parse, tmp_path):
+    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    args = parse("--resume", run)
+    runs.load_checkpoint(args, parts())  # stopped before the first checkpoint
+    runs.save_checkpoint(run, parts())
+    content = (run / "checkpoint.pt").read_bytes()
+    (run / "checkpoint.pt").write_bytes(content[: len(content) // 2])
+    with pytest.raises(SystemExit, match="checkpoint.pt is damaged"):
+        runs.load_checkpoint(args, parts())
+
+
+def test_events_of_steps_that_are_done_again_are_hidden(parse, tmp_path):
+    args = parse("--runs-dir", tmp_path)
+    run = runs.run_folder(args, "wall")
+    for begin, end in ((0, 4), (2, 5)):  # stopped after step 4, its checkpoint was of step 2
+        with runs.summary_writer(run, args, begin) as writer:
+            for step in range(begin + 1, end + 1):
+                writer.add_scalar("loss", 10 * begin + step, step)
+    events = EventAccumulator(str(run))
+    events.Reload()
+    found = [(event.step, event.value) for event in events.Scalars("loss")]
+    assert found == [(1, 1), (2, 2), (3, 23), (4, 24), (5, 25)]
+    table = events.Tensors("hyperparameters/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "|radii|(0.1, 0.2)|" in table

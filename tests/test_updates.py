@@ -1,0 +1,238 @@
+"""One update of SAC and TD3 against independent formulas, and that each learns something tiny."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.distributions import Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
+from trainers import load
+
+sac, td3, bc = load("sac_her_mp"), load("td3_her_mp"), load("bc")
+N = 64
+
+
+def batch(seed=0):
+    rng = torch.Generator().manual_seed(seed)
+
+    def normal(*size):
+        return torch.randn(*size, generator=rng)
+
+    return {
+        "observation": 0.5 * normal(N, 10),
+        "next_observation": 0.5 * normal(N, 10),
+        "desired_goal": 0.3 * normal(N, 3),
+        "action": 0.03 * normal(N, 7),
+        "reward": -(torch.rand(N, generator=rng) < 0.8).float(),
+        "terminated": (torch.rand(N, generator=rng) < 0.2).float(),
+    }
+
+
+def make(module, kind, **flags):
+    torch.manual_seed(1)
+    args = module.Args(hidden_size=16, bf16=False, batch_size=N, **flags)
+    return getattr(module, kind)(args, 0, torch.device("cpu"))
+
+
+def state(agent):
+    """All that an update may change, copied."""
+    return copy.deepcopy({k: v for k, v in agent.saved_parts().items() if "optimizer" not in k})
+
+
+def values(critics, *inputs):
+    """Of both critics, (2, N)."""
+    return torch.stack([critic(*inputs) for critic in critics])
+
+
+def assert_adam_step(before, after, loss, rate):
+    """`after` is `before` minus the first step of Adam on the gradient of `loss` at `before`."""
+    gradients = torch.autograd.grad(loss, before, retain_graph=True)
+    assert any(gradient.abs().max() > 1e-6 for gradient in gradients)
+    for old, new, gradient in zip(before, after, gradients, strict=True):
+        step = -rate * gradient / (gradient.abs() + 1e-8)
+        clear = gradient.abs() > 1e-6  # of smaller ones, rounding decides the sign
+        torch.testing.assert_close((new - old)[clear], step[clear], rtol=2e-2, atol=1e-6)
+
+
+def assert_moved(old, new, toward, share):
+    for a, b, c in zip(*(list(m.parameters()) for m in (old, new, toward)), strict=True):
+        torch.testing.assert_close(b, (1 - share) * a + share * c, rtol=1e-4, atol=1e-7)
+
+
+def squashed_gaussian(actor, observation, goal, noise):
+    """The policy's action for given normal numbers, and its log-density, by torch.distributions."""
+    mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
+    std = torch.exp(-5 + 3.5 * (torch.tanh(log_std) + 1))
+    unsquashed = mean + std * noise
+    density = TransformedDistribution(Normal(mean, std), TanhTransform(cache_size=1))
+    action = density.transforms[0](unsquashed)
+    return 0.06 * action, density.log_prob(action).sum(1)
+
+
+@pytest.mark.parametrize("autotune", [True, False])
+def test_an_update_of_sac(autotune):
+    agent = make(sac, "SAC", gamma=0.9, alpha=0.3, tau=0.1, policy_average=0.2, autotune=autotune)
+    with torch.no_grad():  # targets that are not the critics
+        for parameter in (*agent.qf1_target.parameters(), *agent.qf2_target.parameters()):
+            parameter.mul_(1.3)
+    old, data = state(agent), batch()
+    torch.manual_seed(5)
+    losses = agent.update(data, 0)
+    torch.manual_seed(5)
+    noises = torch.randn(N, 7), torch.randn(N, 7)
+    new, goal = state(agent), data["desired_goal"]
+
+    critics, targets = ((old["qf1" + end], old["qf2" + end]) for end in ("", "_target"))
+    following, density = squashed_gaussian(old["actor"], data["next_observation"], goal, noises[0])
+    future = values(targets, data["next_observation"], goal, following).amin(0) - 0.3 * density
+    target = (data["reward"] + 0.9 * (1 - data["terminated"]) * future).detach()
+    errors = (values(critics, data["observation"], goal, data["action"]) - target).square().mean(1)
+    torch.testing.assert_close(
+        torch.stack([losses["qf1_loss"], losses["qf2_loss"]]), errors, rtol=1e-3, atol=1e-5
+    )
+    for name, error in zip(("qf1", "qf2"), errors, strict=True):
+        before, after = (list(one[name].parameters()) for one in (old, new))
+        assert_adam_step(before, after, error, agent.args.q_lr)
+        assert_moved(old[f"{name}_target"], new[f"{name}_target"], new[name], 0.1)
+
+    # The policy's step is against the critics that were just updated.
+    action, density = squashed_gaussian(old["actor"], data["observation"], goal, noises[1])
+    q = values((new["qf1"], new["qf2"]), data["observation"], goal, action)
+    loss = (0.3 * density - q.amin(0)).mean()
+    torch.testing.assert_close(losses["actor_loss"], loss, rtol=1e-3, atol=1e-4)
+    before, after = (list(one["actor"].parameters()) for one in (old, new))
+    assert_adam_step(before, after, loss, agent.args.policy_lr)
+    assert_moved(old["actor_average"], new["actor_average"], new["actor"], 0.2)
+
+    # Entropy below its target (-mean of log pi < target) raises alpha, above it lowers it.
+    moved = (new["log_alpha"] - old["log_alpha"]).item()
+    below = -density.mean().item() < agent.args.target_entropy
+    expected = (agent.args.q_lr if below else -agent.args.q_lr) if autotune else 0.0
+    assert moved == pytest.approx(expected, rel=1e-3, abs=1e-8)
+
+
+@pytest.mark.parametrize("target_entropy, direction", [(50.0, 1), (-50.0, -1)])
+def test_alpha_follows_the_target_entropy(target_entropy, direction):
+    agent = make(sac, "SAC", target_entropy=target_entropy)
+    agent.update(batch(), 0)
+    assert (agent.log_alpha.item() - math.log(0.2)) * direction > 0
+
+
+def test_an_update_of_td3():
+    flags = {"tau": 0.1, "policy_average": 0.2, "preactivation_penalty": 0.4, "policy_noise": 0.6}
+    agent = make(td3, "TD3", gamma=0.9, **flags)
+    names = ("actor_target", "qf1_target", "qf2_target")
+    with torch.no_grad():
+        for parameter in (p for name in names for p in getattr(agent, name).parameters()):
+            parameter.mul_(1.3)
+    old, data = state(agent), batch()
+    torch.manual_seed(5)
+    losses = agent.update(data, 0)
+    torch.manual_seed(5)
+    noise = np.clip(0.6 * torch.randn(N, 7).numpy(), -0.5, 0.5)
+    new, goal = state(agent), data["desired_goal"]
+
+    following = old["actor_target"](data["next_observation"], None, goal).detach().numpy()
+    following = torch.from_numpy(np.clip(following + 0.06 * noise, -0.06, 0.06))
+    targets = (old["qf1_target"], old["qf2_target"])
+    future = values(targets, data["next_observation"], goal, following).amin(0)
+    target = (data["reward"] + 0.9 * (1 - data["terminated"]) * future).detach()
+    critics = (old["qf1"], old["qf2"])
+    errors = (values(critics, data["observation"], goal, data["action"]) - target).square().mean(1)
+    torch.testing.assert_close(
+        torch.stack([losses["qf1_loss"], losses["qf2_loss"]]), errors, rtol=1e-3, atol=1e-5
+    )
+    for name, error in zip(("qf1", "qf2"), errors, strict=True):
+        before, after = (list(one[name].parameters()) for one in (old, new))
+        assert_adam_step(before, after, error, agent.args.q_lr)
+        assert_moved(old[f"{name}_target"], new[f"{name}_target"], new[name], 0.1)
+
+    features = old["actor"].features(data["observation"], goal)
+    preactivation = old["actor"].mlp(features)
+    q = new["qf1"](data["observation"], goal, 0.06 * torch.tanh(preactivation))
+    loss = 0.4 * preactivation.square().mean() - q.mean()
+    torch.testing.assert_close(losses["actor_loss"], loss, rtol=1e-3, atol=1e-4)
+    before, after = (list(one["actor"].parameters()) for one in (old, new))
+    assert_adam_step(before, after, loss, agent.args.policy_lr)
+    assert_moved(old["actor_average"], new["actor_average"], new["actor"], 0.2)
+    assert_moved(old["actor_target"], new["actor_target"], new["actor"], 0.1)
+
+
+@pytest.mark.parametrize("module, kind", [(sac, "SAC"), (td3, "TD3")])
+def test_the_policy_is_updated_every_so_often(module, kind):
+    agent = make(module, kind, policy_frequency=3)
+    for count in range(7):
+        old = state(agent)
+        losses, new = agent.update(batch(count), count), state(agent)
+        moved = {
+            name: any(
+                not torch.equal(a, b)
+                for a, b in zip(part.parameters(), new[name].parameters(), strict=True)
+            )
+            for name, part in old.items()
+            if name != "log_alpha"
+        }
+        due = count % 3 == 0
+        assert moved["qf1"] and moved["qf2"]
+        assert moved["actor"] == moved["actor_average"] == ("actor_loss" in losses) == due
+        assert moved["qf1_target"] == moved["qf2_target"] == (kind == "SAC" or due)
+        assert all(parameter.requires_grad for parameter in agent.qf1.parameters())
+
+
+@pytest.mark.parametrize("module, kind", [(sac, "SAC"), (td3, "TD3")])
+def test_it_learns_which_action_is_best(module, kind):
+    """One step, and the reward is minus the squared distance from an action that the goal says."""
+    flags = {"policy_lr": 3e-3, "q_lr": 3e-3, "policy_frequency": 1, "policy_average": 0.05}
+    flags |= {"autotune": False, "alpha": 0.002} if kind == "SAC" else {}
+    agent = make(module, kind, relative_goal=False, trigonometric=False, **flags)
+    rng = torch.Generator().manual_seed(2)
+
+    def best(goal):  # within [-0.03, 0.03]
+        return 0.03 * torch.cat([goal, -goal, goal[:, :1]], dim=1)
+
+    def error(goal):
+        nothing = torch.zeros(len(goal), 10)
+        with torch.no_grad():
+            action = agent.actor_average(nothing, goal, goal)
+        return ((action - best(goal)) / 0.03).square().mean().item()
+
+    asked = 2 * torch.rand(500, 3, generator=rng) - 1
+    before = error(asked)
+    for count in range(1500):
+        goal = 2 * torch.rand(N, 3, generator=rng) - 1
+        action = 0.06 * (2 * torch.rand(N, 7, generator=rng) - 1)
+        reward = -((action - best(goal)) / 0.03).square().mean(1)
+        nothing = torch.zeros(N, 10)
+        agent.update(
+            {
+                "observation": nothing,
+                "next_observation": nothing,
+                "desired_goal": goal,
+                "action": action,
+                "reward": reward,
+                "terminated": torch.ones(N),
+            },
+            count,
+        )
+    assert before > 0.2 and error(asked) < 0.25 * before
+
+
+def test_an_update_of_behavioural_cloning():
+    torch.manual_seed(1)
+    actor = bc.Actor(bc.Args(goal_type="ee", hidden_size=16, num_modes=1))
+    optimizer = torch.optim.Adam(actor.parameters(), lr=0.01, fused=True)
+    data, old = batch(), copy.deepcopy(actor)
+    inputs = data["observation"], data["desired_goal"], data["action"] / 0.03
+    outputs = old.mlp(old.features(*inputs[:2]))
+    std = torch.exp(-5 + 3.5 * (torch.tanh(outputs[:, 7:14]) + 1))
+    expected = -Normal(outputs[:, :7], std).log_prob(inputs[2]).sum(1).mean()
+    loss = bc.update(actor, optimizer, *inputs)
+    torch.testing.assert_close(loss, expected, rtol=1e-4, atol=1e-4)
+    weights = [p for name, p in old.named_parameters()]
+    after = [p for name, p in actor.named_parameters()]
+    assert_adam_step(weights, after, expected, 0.01)
+    for _ in range(20):
+        last = bc.update(actor, optimizer, *inputs)
+    assert last < loss - 1
