@@ -16,26 +16,35 @@ of your own, copy this file and change the parts under `# MODEL`. Parts between 
 `# END SHARED` are those of `vae.py`.
 """
 
-import json
 import math
 import os
 import sys
-import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-import tyro
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from envs.datasets import DatasetError
-from envs.observations import Observations, sensors_to_json
+from envs.observations import sensors_to_json
 from envs.programs import save_program
+from envs.runs import (
+    elapsed,
+    load_checkpoint,
+    parse_args,
+    progress_bar,
+    rate,
+    run_folder,
+    save_checkpoint,
+    seed_torch,
+    summary_writer,
+    write_json,
+)
 from envs.sensors import NOTHING, OBSTACLE, PointCloud
+from scene_embedding_train.clouds import comparison, whole_clouds
+from scene_embedding_train.training_data import open_observations, split
 
 TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
 APART = 0.05  # m between a cloud and what counts as not being in it
@@ -98,16 +107,6 @@ class Args:
     # END SHARED
 
 
-# SHARED: arguments
-def configuration_of(args):
-    """The fields that define what is computed: a run can only be resumed with the same."""
-    free = {"resume", "runs_dir", "threads", "observations"}
-    return {k: v for k, v in asdict(args).items() if k not in free}
-
-
-# END SHARED
-
-
 def load_clouds(observations, num_points):
     """Points of what the point cloud sensors saw, and the sensors' names.
 
@@ -138,24 +137,6 @@ def load_clouds(observations, num_points):
             array.flush()
             os.replace(old, new)
     return *(np.load(path, mmap_mode="r") for path in paths), names
-
-
-def whole_clouds(observations, shard, name):
-    """All that a sensor saw in the scenes of a shard, as `envs.sensors.PointCloud.points` has it.
-
-    Points, float32 (n, samples, 3), and labels, uint8 (n, samples).
-    """
-    sensor = observations.sensors[name]
-    pictures = (
-        observations.read(shard, f"{name}/{output}") for output in ("depth", "segmentation")
-    )
-    seen = [
-        sensor.points(depth * (sensor.far / 65_535), segmentation)
-        for depth, segmentation in zip(*pictures, strict=True)
-    ]
-    return tuple(
-        torch.from_numpy(np.stack([one[key] for one in seen])) for key in ("points", "labels")
-    )
 
 
 def batch_of(clouds, rows, device):
@@ -359,40 +340,16 @@ class SceneEncoder(nn.Module):
         return torch.cat(latents, dim=1)
 
 
-# SHARED: files and resuming
-def write_atomically(path, write):
-    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
-    temporary = path.with_name(path.name + ".part")
-    write(temporary)
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def parse_args():
-    """Flags, or with --resume those of the run, which must not be contradicted."""
-    args = tyro.cli(Args)
-    if args.resume is None:
-        return args
-    saved_file = args.resume / "args.json"
-    if not saved_file.exists():
-        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
-    saved = json.loads(saved_file.read_text())
-    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
-    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
-    defaults.observations = Path(defaults.observations)
-    args = tyro.cli(Args, default=defaults)
-    contradicted = [
-        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
-        for name, value in configuration_of(args).items()
-        if value != saved.get(name)
-    ]
-    if contradicted:
-        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
-    return args
-
-
-# END SHARED
+def update(model, optimizer, batch, args):
+    """One step on a batch of `batch_of`; its loss, a scalar."""
+    logits, truth = model(batch, args.num_queries)
+    loss = F.cross_entropy(
+        torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=IGNORED
+    )
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return loss
 
 
 @torch.no_grad()
@@ -427,59 +384,14 @@ def evaluate(model, clouds, rows, batch_size, device):
     return result | dict(zip(names, iou.tolist(), strict=True))
 
 
-COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [150, 150, 150]], np.uint8)
-
-
-def comparison(points, truth, predicted, size=160):
-    """A picture, uint8: a sensor's points (p, 3) seen from above; true classes left, ours right.
-
-    Robot red, table and floor orange, obstacles yellow, as in the paper's figure; nothing grey.
-    """
-    pictures = []
-    for labels in (truth, predicted):
-        picture = np.full((size, size, 3), 255, np.uint8)
-        order = np.argsort(points[:, 2])  # the highest is drawn last
-        pixels = ((1.2 - points[order, :2]) / 2.4 * size).astype(int)
-        inside = ((pixels >= 0) & (pixels < size - 1)).all(1)
-        for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            picture[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
-        pictures.append(picture)
-    return np.concatenate(pictures, axis=1)
-
-
 if __name__ == "__main__":
-    # SHARED: checks
-    args = parse_args()
-    if args.device == "cuda" and not torch.cuda.is_available():
-        sys.exit("--device cuda: PyTorch sees no CUDA device here")
-    try:
-        observations = Observations(args.observations)
-    except DatasetError as error:
-        sys.exit(f"--observations: {error}")
-    # END SHARED
+    args = parse_args(Args, may_change={"observations"})
+    observations = open_observations(args.observations)
     clouds = load_clouds(observations, args.num_points)
     sensors = {name: observations.sensors[name] for name in clouds[2]}
-
-    # SHARED: folder and seeds
-    num_training = len(observations) - max(1, round(args.validation_share * len(observations)))
-    validation = np.arange(num_training, len(observations))[: args.eval_scenes]
-    if num_training < 1:
-        sys.exit(f"--observations: {len(observations)} scenes are too few")
-    if args.resume is not None:
-        run = args.resume
-    else:
-        name = f"{observations.task}__{args.exp_name}__{args.seed}__{int(time.time())}"
-        run = args.runs_dir / name
-        run.mkdir(parents=True)
-        text = json.dumps(asdict(args), indent=2, default=str)
-        write_atomically(run / "args.json", lambda path: path.write_text(text))
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
-    torch.use_deterministic_algorithms(True)
-    device = torch.device(args.device)
+    num_training, validation = split(observations, args)
+    run, device = run_folder(args, observations.task), seed_torch(args)
     rng = np.random.default_rng(args.seed)
-    # END SHARED
 
     # MODEL: network and optimiser
     model = PointNet2(len(sensors), args).to(device)
@@ -491,69 +403,26 @@ if __name__ == "__main__":
     hit = cloud[1][row] != NOTHING
     pictured, classes = (one[row][hit].unsqueeze(0).to(device) for one in cloud)
 
-    # SHARED: checkpoints
-    saved_parts = {"model": model, "optimizer": optimizer}
-    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0}
-    progress["best"] = {}
-
-    def save_checkpoint():
-        state = {name: part.state_dict() for name, part in saved_parts.items()}
-        state |= {"progress": progress, "torch_rng": torch.get_rng_state()}
-        state["rng"] = json.dumps(rng.bit_generator.state)
-        if device.type == "cuda":
-            state["cuda_rng"] = torch.cuda.get_rng_state()
-        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
-
-    if args.resume is not None and (run / "checkpoint.pt").exists():
-        try:
-            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
-        except Exception as error:  # whatever a damaged file leads to
-            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
-        for name, part in saved_parts.items():
-            part.load_state_dict(state[name])
-        progress.update(state["progress"])
-        rng.bit_generator.state = json.loads(state["rng"])
-        torch.set_rng_state(state["torch_rng"].cpu())
-        if device.type == "cuda":
-            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
-        del state
-
-    writer = SummaryWriter(run, purge_step=progress["updates"] + 1)
-    writer.add_text(
-        "hyperparameters",
-        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
-    )
-    started, seconds_before = time.time(), progress["seconds"]
-    updates_before = progress["updates"]
-    bar = tqdm(
-        total=args.total_updates,
-        initial=updates_before,
-        unit="update",
-        smoothing=0.05,
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
-    )
+    # SHARED: checkpoint and log
+    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
+    saved_parts = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
+    load_checkpoint(args, saved_parts)
+    seconds_before = progress["seconds"]
+    writer = summary_writer(run, args, progress["updates"])
+    bar = progress_bar(args.total_updates, progress["updates"], "update")
     # END SHARED
 
     while progress["updates"] < args.total_updates:
         # MODEL: learn
         remaining = 1.0 - progress["updates"] / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
-        rows = rng.integers(num_training, size=args.batch_size)
-        logits, truth = model(batch_of(clouds, rows, device), args.num_queries)
-        loss = F.cross_entropy(
-            torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=IGNORED
-        )
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        progress["updates"] += 1
+        batch = batch_of(clouds, rng.integers(num_training, size=args.batch_size), device)
+        loss = update(model, optimizer, batch, args)
+        progress["updates"] = step = progress["updates"] + 1
         bar.update()
-
-        step = progress["updates"]
         if step % 100 == 0:
             writer.add_scalar("losses/loss", loss.item(), step)
-            ups = (step - updates_before) / (time.time() - started)
-            writer.add_scalar("charts/updates_per_second", ups, step)
+            writer.add_scalar("charts/updates_per_second", rate(bar), step)
 
         # Evaluate, keep the best encoder
         if step % args.eval_every == 0 or step == args.total_updates:
@@ -568,27 +437,25 @@ if __name__ == "__main__":
             error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
             if error < progress["best_error"]:
                 progress["best_error"], progress["best_update"] = error, step
+                progress["best"] = result
                 example = {}
                 for name in sensors:
                     points, labels = (one[:2] for one in whole_clouds(observations, 0, name))
-                    example[f"{name}_points"] = points.to(device)
-                    example[f"{name}_labels"] = labels.to(device)
+                    example |= {f"{name}_points": points, f"{name}_labels": labels}
                 metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
-                metadata |= {"sensors": sensors_to_json(sensors)}
-                metadata |= {"seed": args.seed, "step": step, **result}
-                save_program(run / "encoder.pt", SceneEncoder(model, clouds[2]), example, metadata)
-                progress["best"] = result
+                metadata |= {"sensors": sensors_to_json(sensors), "seed": args.seed, "step": step}
+                encoder = SceneEncoder(model, clouds[2])
+                save_program(run / "encoder.pt", encoder, example, metadata | result)
             bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
-            # SHARED: checkpoint
-            progress["seconds"] = seconds_before + time.time() - started
-            save_checkpoint()
+            # SHARED: checkpoint and result
+            progress["seconds"] = seconds_before + elapsed(bar)
+            save_checkpoint(run, saved_parts)
     bar.close()
 
     result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}
-    result |= {"updates": progress["updates"], "best_update": progress["best_update"]}
-    result |= {"seconds": round(progress["seconds"])}
-    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
-    write_atomically(run / "result.json", lambda path: path.write_text(text))
+    result |= {name: progress[name] for name in ("updates", "best_update")}
+    result["seconds"] = round(progress["seconds"])
+    write_json(run / "result.json", result | {"args": asdict(args)})
     # END SHARED
     shown = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor {iou_static:.3f}, "
     shown += "obstacles {iou_obstacle:.3f}; of other scenes' obstacles {absent:.3f} told"

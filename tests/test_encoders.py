@@ -25,7 +25,7 @@ from envs.programs import ProgramError, load_program, save_program
 from envs.scenes import Scene, Sphere, from_array
 from envs.sensors import PointCloud
 from envs.wrappers import SceneEncodingWrapper
-from scene_embedding_train import collect
+from scene_embedding_train import clouds, collect, pictures
 
 FOLDER = Path(__file__).parents[1] / "scene_embedding_train"
 SCRIPTS = ("vae", "vqvae", "pointnet2")
@@ -139,14 +139,14 @@ def test_each_decoder_of_the_vae_sees_all_cameras_and_of_the_vqvae_its_own():
 
 
 def test_errors_of_the_evaluation(observations):
-    images, cameras = vae.load_images(Observations(observations), 16)
+    images, cameras = pictures.load_pictures(Observations(observations), 16)
     assert images.shape == (20, 4, 16, 16, 3) and cameras == ["front", "left", "back", "right"]
     rows = np.arange(3, 10)
     truth = torch.from_numpy(images[rows]).permute(0, 1, 4, 2, 3) / 255.0
     mean_image = torch.rand(4, 3, 16, 16)
     model = torch.nn.Module()
     model.forward = lambda batch: batch * 0.5
-    found = vae.evaluate(model, images, rows, mean_image, 2, "cpu")
+    found = pictures.reconstruction_errors(model, images, rows, mean_image, 2, "cpu")
     unlike = (truth - mean_image).abs().amax(2) > 0.1
     for name, guess in (("error", truth * 0.5), ("mean_image_error", mean_image)):
         error = (truth - guess).square().mean(2)
@@ -156,19 +156,19 @@ def test_errors_of_the_evaluation(observations):
 
 def test_images_are_those_of_the_shards(observations):
     read = Observations(observations)
-    whole, cameras = vae.load_images(read, 32)
-    averaged, _ = vae.load_images(read, 16)
+    whole, cameras = pictures.load_pictures(read, 32)
+    averaged, _ = pictures.load_pictures(read, 16)
     for shard in range(3):
         rows = slice(*read.offsets[shard : shard + 2])
         for i, name in enumerate(cameras):
-            pictures = read.read(shard, f"{name}/rgb")
-            np.testing.assert_array_equal(whole[rows, i], pictures)
-            corner = pictures[:, 6:8, 10:12].mean((1, 2))
+            taken = read.read(shard, f"{name}/rgb")
+            np.testing.assert_array_equal(whole[rows, i], taken)
+            corner = taken[:, 6:8, 10:12].mean((1, 2))
             assert np.abs(averaged[rows, i, 3, 5] - corner).max() <= 0.5
     rows = np.arange(20)
     np.testing.assert_allclose(
-        vae.averaged(torch.from_numpy(whole.copy()), 16),
-        vae.batch_of(averaged, rows, "cpu"),
+        pictures.averaged(torch.from_numpy(whole.copy()), 16),
+        pictures.batch_of(averaged, rows, "cpu"),
         atol=0.51 / 255,
     )
 
@@ -189,7 +189,7 @@ def test_clouds_are_thinned_out_once(observations):
     points, labels, names = pointnet2.load_clouds(read, 64)
     assert points.shape == (20, 4, 2, 64, 3) and labels.shape == (20, 4, 2, 64)
     for i, name in enumerate(names):
-        cloud, classes = (one[3].numpy() for one in pointnet2.whole_clouds(read, 1, name))
+        cloud, classes = (one[3].numpy() for one in clouds.whole_clouds(read, 1, name))
         hit = classes != pointnet2.NOTHING
         for half, mask in enumerate((hit, hit & (cloud[:, 2] > pointnet2.TABLE_TOP))):
             chosen = np.flatnonzero(mask)[np.arange(64) * mask.sum() // 64]
@@ -254,7 +254,7 @@ def test_interpolation_is_exact_at_centres_and_a_mean_between():
 
 
 def test_scores_of_the_classification(observations):
-    clouds = pointnet2.load_clouds(Observations(observations), 64)
+    thinned = pointnet2.load_clouds(Observations(observations), 64)
     nothing, ignored = pointnet2.NOTHING, pointnet2.IGNORED
 
     class Guess(torch.nn.Module):
@@ -271,10 +271,10 @@ def test_scores_of_the_classification(observations):
                 truth.append(classes)
             return logits, truth
 
-    found = pointnet2.evaluate(Guess(), clouds, np.arange(6), 3, "cpu")
+    found = pointnet2.evaluate(Guess(), thinned, np.arange(6), 3, "cpu")
     truths, guesses = [], []
     for rows in (np.arange(3), np.arange(3, 6)):
-        for one, truth in zip(*Guess()(pointnet2.batch_of(clouds, rows, "cpu")), strict=True):
+        for one, truth in zip(*Guess()(pointnet2.batch_of(thinned, rows, "cpu")), strict=True):
             guesses.append(one.argmax(2))
             truths.append(truth)
     truth, guess = torch.cat(truths), torch.cat(guesses)
@@ -308,9 +308,9 @@ def shared_blocks(name):
 
 def test_shared_blocks_have_not_drifted_apart():
     blocks = shared_blocks("vae")
-    assert shared_blocks("vqvae") == blocks and len(blocks) == 14
-    clouds = shared_blocks("pointnet2")
-    assert len(clouds) == 8 and all(blocks[name] == lines for name, lines in clouds.items())
+    assert shared_blocks("vqvae") == blocks and len(blocks) == 7
+    of_clouds = shared_blocks("pointnet2")
+    assert len(of_clouds) == 4 and all(blocks[name] == of_clouds[name] for name in of_clouds)
 
 
 def test_a_run_leaves_an_encoder_a_result_and_events(run):
@@ -360,11 +360,11 @@ def test_the_saved_encoder_needs_no_script(run, observations):
         inputs = {}
         for sensor in read.sensors:
             if isinstance(read.sensors[sensor], PointCloud):
-                shards = [pointnet2.whole_clouds(read, shard, sensor) for shard in range(3)]
+                shards = [clouds.whole_clouds(read, shard, sensor) for shard in range(3)]
                 points, labels = (torch.cat(one) for one in zip(*shards, strict=True))
                 inputs |= {f"{sensor}_points": points, f"{sensor}_labels": labels}
     else:
-        images, cameras = vae.load_images(read, 32)
+        images, cameras = pictures.load_pictures(read, 32)
         inputs = {one: torch.from_numpy(images[:, i].copy()) for i, one in enumerate(cameras)}
     together = encoder(**inputs)
     assert together.shape == (20, 64) and together.dtype == torch.float32
