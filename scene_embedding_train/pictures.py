@@ -4,22 +4,20 @@ Pictures are averaged down, to save time. `load_pictures` does it once for what 
 `averaged` in the encoder that is saved.
 """
 
-import os
 import sys
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from tqdm import tqdm
 
 from envs.sensors import Camera
+from scene_embedding_train.training_data import unpacked
 
 
 def load_pictures(observations, size):
     """What the cameras saw, averaged down: uint8 (scenes, cameras, size, size, 3); cameras' names.
 
-    Unpacked once into a file beside the shards, which is then mapped into memory: it may be larger
-    than the memory.
+    Unpacked once into a file beside the shards, which is then mapped into memory.
     """
     cameras = [name for name, one in observations.sensors.items() if isinstance(one, Camera)]
     if not cameras:
@@ -30,20 +28,23 @@ def load_pictures(observations, size):
     width, height = sizes.pop()
     if width != height or width % size:
         sys.exit(f"--picture-size {size}: the pictures have {width} x {height} pixels")
-    path = observations.folder / f"images_{len(observations)}_{size}.npy"
-    if not path.exists():
-        temporary = path.with_suffix(".part")
-        shape = (len(observations), len(cameras), size, size, 3)
-        unpacked = np.lib.format.open_memmap(temporary, "w+", np.uint8, shape)
-        for shard in tqdm(range(len(observations.offsets) - 1), desc="unpacking", unit="shard"):
-            rows = slice(*observations.offsets[shard : shard + 2])
-            for i, name in enumerate(cameras):
-                pictures = observations.read(shard, f"{name}/rgb")
-                blocks = pictures.reshape(-1, size, width // size, size, width // size, 3)
-                unpacked[rows, i] = blocks.mean((2, 4)).round()
-        unpacked.flush()
-        os.replace(temporary, path)
-    return np.load(path, mmap_mode="r"), cameras
+    shards = (
+        {"rgb": shrunk_pictures(observations, shard, cameras, size)}
+        for shard in range(len(observations.offsets) - 1)
+    )
+    arrays = {"rgb": (np.uint8, (len(cameras), size, size, 3))}
+    return unpacked(observations, f"pictures_{size}", arrays, shards)["rgb"], cameras
+
+
+def shrunk_pictures(observations, shard, cameras, size):
+    """`load_pictures`'s rows of one shard."""
+    shrunk = []
+    for name in cameras:
+        pictures = observations.read(shard, f"{name}/rgb")
+        block = pictures.shape[1] // size
+        blocks = pictures.reshape(-1, size, block, size, block, 3)
+        shrunk.append(blocks.mean((2, 4)).round().astype(np.uint8))
+    return np.stack(shrunk, axis=1)
 
 
 def batch_of(images, rows, device):

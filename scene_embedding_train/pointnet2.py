@@ -17,7 +17,6 @@ of your own, copy this file and change the parts under `# MODEL`. Parts between 
 """
 
 import math
-import os
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,7 +25,6 @@ import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-from tqdm import tqdm
 
 from envs.observations import sensors_to_json
 from envs.programs import save_program
@@ -44,7 +42,7 @@ from envs.runs import (
 )
 from envs.sensors import NOTHING, OBSTACLE, PointCloud
 from scene_embedding_train.clouds import comparison, whole_clouds
-from scene_embedding_train.training_data import open_observations, split
+from scene_embedding_train.training_data import open_observations, split, unpacked
 
 TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
 APART = 0.05  # m between a cloud and what counts as not being in it
@@ -119,24 +117,25 @@ def load_clouds(observations, num_points):
     names = [name for name, one in observations.sensors.items() if isinstance(one, PointCloud)]
     if not names:
         sys.exit(f"--observations: {observations.folder} has no clouds (collect with --sensors)")
-    start = observations.folder / f"clouds_{len(observations)}_{num_points}"
-    paths = [start.with_name(f"{start.name}_{output}.npy") for output in ("points", "labels")]
-    if not all(path.exists() for path in paths):
-        shape = (len(observations), len(names), 2, num_points)
-        temporary = [path.with_suffix(".part") for path in paths]
-        points = np.lib.format.open_memmap(temporary[0], "w+", np.float32, (*shape, 3))
-        labels = np.lib.format.open_memmap(temporary[1], "w+", np.uint8, shape)
-        for shard in tqdm(range(len(observations.offsets) - 1), desc="clouds", unit="shard"):
-            rows = slice(*observations.offsets[shard : shard + 2])
-            for i, name in enumerate(names):
-                cloud = whole_clouds(observations, shard, name)
-                chosen = torch.stack([thin_out(one, num_points) for one in hits(*cloud)], dim=1)
-                points[rows, i] = gather(cloud[0], chosen)
-                labels[rows, i] = gather(cloud[1].unsqueeze(2), chosen).squeeze(-1)
-        for array, old, new in zip((points, labels), temporary, paths, strict=True):
-            array.flush()
-            os.replace(old, new)
-    return *(np.load(path, mmap_mode="r") for path in paths), names
+    shards = (
+        thinned_clouds(observations, shard, names, num_points)
+        for shard in range(len(observations.offsets) - 1)
+    )
+    shape = (len(names), 2, num_points)
+    arrays = {"points": (np.float32, (*shape, 3)), "labels": (np.uint8, shape)}
+    made = unpacked(observations, f"clouds_{num_points}", arrays, shards)
+    return made["points"], made["labels"], names
+
+
+def thinned_clouds(observations, shard, names, num_points):
+    """`load_clouds`'s points and labels of one shard, a dict."""
+    rows = {"points": [], "labels": []}
+    for name in names:
+        points, labels = whole_clouds(observations, shard, name)
+        chosen = torch.stack([thin_out(one, num_points) for one in hits(points, labels)], dim=1)
+        rows["points"].append(gather(points, chosen))
+        rows["labels"].append(gather(labels.unsqueeze(2), chosen).squeeze(-1))
+    return {output: torch.stack(one, dim=1).numpy() for output, one in rows.items()}
 
 
 def batch_of(clouds, rows, device):

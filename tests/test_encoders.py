@@ -10,6 +10,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -23,7 +24,7 @@ from envs.encoders import MAX_OBSTACLES, PACKAGED, SceneEncoder, oracle
 from envs.observations import Observations
 from envs.programs import ProgramError, load_program, save_program
 from envs.scenes import Scene, Sphere, from_array
-from envs.sensors import PointCloud
+from envs.sensors import OBSTACLE, PointCloud
 from envs.wrappers import SceneEncodingWrapper
 from scene_embedding_train import clouds, collect, pictures
 
@@ -171,6 +172,39 @@ def test_images_are_those_of_the_shards(observations):
         pictures.batch_of(averaged, rows, "cpu"),
         atol=0.51 / 255,
     )
+
+
+def test_other_observations_in_the_same_folder_are_unpacked_anew(observations, tmp_path):
+    for path in observations.glob("shard_*.h5"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    before, _ = pictures.load_pictures(Observations(tmp_path), 16)
+    thinned = pointnet2.load_clouds(Observations(tmp_path), 64)
+    with h5py.File(tmp_path / "shard_00001.h5", "r+") as file:
+        file["left/rgb"][2] = 255 - file["left/rgb"][2]
+        file["left_cloud/segmentation"][2] = OBSTACLE
+    after, _ = pictures.load_pictures(Observations(tmp_path), 16)
+    changed = np.argwhere((before != after).any((2, 3, 4)))
+    np.testing.assert_array_equal(changed, [[10, 1]])
+    other = pointnet2.load_clouds(Observations(tmp_path), 64)
+    assert np.unique(np.argwhere(thinned[1] != other[1])[:, :2], axis=0).tolist() == [[10, 1]]
+
+
+def test_two_trainers_may_unpack_at_once(observations, tmp_path):
+    for path in observations.glob("shard_*.h5"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    one, other = Observations(tmp_path), Observations(tmp_path)
+    made = []
+
+    def read(number, name):
+        if number == 1 and not made:  # one has begun, and the other does it all meanwhile
+            made.append(pictures.load_pictures(other, 16)[0])
+        return Observations.read(one, number, name)
+
+    one.read = read
+    expected, _ = pictures.load_pictures(Observations(observations), 16)
+    np.testing.assert_array_equal(pictures.load_pictures(one, 16)[0], expected)
+    np.testing.assert_array_equal(made[0], expected)
+    assert len([path for path in tmp_path.iterdir() if path.suffix != ".h5"]) == 1
 
 
 def test_points_are_thinned_out_evenly():
