@@ -368,17 +368,17 @@ def evaluate(model, clouds, rows, batch_size, device):
         batch = batch_of(clouds, rows[start : start + batch_size], device)
         for logits, truth in zip(*model(batch), strict=True):
             predicted = logits.argmax(2)
-            own, said = truth[:, :number], predicted[:, :number]
-            hit = own != IGNORED
-            pairs = (NOTHING + 1) * own[hit] + said[hit]
-            confusion += torch.bincount(pairs, minlength=confusion.numel()).cpu().view(NOTHING, -1)
+            said = F.one_hot(predicted, NOTHING + 1)[:, :number]
+            own = [(truth[:, :number] == label).unsqueeze(2) for label in range(NOTHING)]
+            confusion += torch.stack([(one * said).sum((0, 1)) for one in own]).cpu()
             absent = truth == NOTHING
-            asked, told = asked + absent.sum(), told + (predicted == NOTHING)[absent].sum()
+            asked += absent.sum().item()
+            told += (absent & (predicted == NOTHING)).sum().item()
     model.train()
     both = confusion.diagonal()
     iou = both / (confusion[:, :NOTHING].sum(0) + confusion.sum(1) - both).clamp(min=1)
     result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
-    result["absent"] = float(told) / max(1.0, float(asked))
+    result["absent"] = told / max(1, asked)
     names = ("iou_robot", "iou_static", "iou_obstacle")
     return result | dict(zip(names, iou.tolist(), strict=True))
 

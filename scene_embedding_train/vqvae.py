@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn as nn
+import torch.nn.functional as F
 
 from envs.observations import sensors_to_json
 from envs.programs import save_program
@@ -248,7 +249,7 @@ def update(model, optimizer, batch, mean_image, args):
     loss.backward()
     optimizer.step()
     for codebook, chosen in zip(model.codebooks, indices, strict=True):
-        codebook.uses += torch.bincount(chosen, minlength=args.num_codes)
+        codebook.uses += F.one_hot(chosen, args.num_codes).sum(0)
     losses = {"reconstruction": error, "commitment": commitment, "loss": loss}
     return losses, [z.detach() for z in latents]
 

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import h5py
+import meta_device
 import numpy as np
 import pytest
 import torch
@@ -430,6 +432,37 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(run, observations,
         assert torch.equal(one[key], other[key]), key
     refused = subprocess.run([*resume, "--width", "8"], capture_output=True, text=True)
     assert refused.returncode == 1 and "--width is 8 now, the run had 4" in refused.stderr
+
+
+@pytest.fixture
+def torch_as_it_was():
+    """A trainer that runs in this process leaves torch's settings as they were."""
+    state, threads = torch.get_rng_state(), torch.get_num_threads()
+    yield
+    torch.use_deterministic_algorithms(False)
+    torch.set_num_threads(threads)
+    torch.set_rng_state(state)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_nothing_of_a_run_needs_the_cpu(name, observations, tmp_path, monkeypatch, torch_as_it_was):
+    """One update, one evaluation and one resume with the `meta` device in CUDA's place."""
+    _, script, *flags = command(name, observations, tmp_path, "--device", "meta")
+    flags += ["--total-updates", "1", "--eval-every", "1"]
+    flags += ["--restart-every", "1"] if name == "vqvae" else []
+    monkeypatch.setattr("sys.argv", [script, *flags])
+    with meta_device.in_cudas_place():
+        runpy.run_path(script, run_name="__main__")
+    (folder,) = tmp_path.iterdir()
+    assert load_program(folder / "encoder.pt").metadata["step"] == 1
+    args = json.loads((folder / "args.json").read_text())
+    (folder / "args.json").write_text(json.dumps(args | {"total_updates": 2}))
+    monkeypatch.setattr("sys.argv", [script, "--resume", str(folder)])
+    with meta_device.in_cudas_place():
+        runpy.run_path(script, run_name="__main__")
+    assert json.loads((folder / "result.json").read_text())["updates"] == 2
+    weights = torch.load(folder / "checkpoint.pt", weights_only=True)["model"].values()
+    assert all(tensor.is_meta for tensor in weights)
 
 
 # --- In an environment
