@@ -17,7 +17,6 @@ of your own, copy this file and change the parts under `# MODEL`. Parts between 
 """
 
 import math
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -40,11 +39,18 @@ from envs.runs import (
     summary_writer,
     write_json,
 )
-from envs.sensors import NOTHING, OBSTACLE, PointCloud
-from scene_embedding_train.clouds import comparison, whole_clouds
-from scene_embedding_train.training_data import open_observations, split, unpacked
+from envs.sensors import NOTHING, OBSTACLE
+from scene_embedding_train.clouds import (
+    batch_of,
+    comparison,
+    gather,
+    hits,
+    load_clouds,
+    thin_out,
+    whole_clouds,
+)
+from scene_embedding_train.training_data import open_observations, split
 
-TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
 APART = 0.05  # m between a cloud and what counts as not being in it
 IGNORED = -100  # label of points that have no class
 
@@ -105,73 +111,7 @@ class Args:
     # END SHARED
 
 
-def load_clouds(observations, num_points):
-    """Points of what the point cloud sensors saw, and the sensors' names.
-
-    Returns:
-        Points, float32 (scenes, sensors, 2, num_points, 3), m, and labels, uint8 (scenes, sensors,
-        2, num_points), chosen once, into files beside the shards, and mapped into memory: evenly
-        spaced among those that hit something, and among those of them above the table. And the
-        names.
-    """
-    names = [name for name, one in observations.sensors.items() if isinstance(one, PointCloud)]
-    if not names:
-        sys.exit(f"--observations: {observations.folder} has no clouds (collect with --sensors)")
-    shards = (
-        thinned_clouds(observations, shard, names, num_points)
-        for shard in range(len(observations.offsets) - 1)
-    )
-    shape = (len(names), 2, num_points)
-    arrays = {"points": (np.float32, (*shape, 3)), "labels": (np.uint8, shape)}
-    made = unpacked(observations, f"clouds_{num_points}", arrays, shards)
-    return made["points"], made["labels"], names
-
-
-def thinned_clouds(observations, shard, names, num_points):
-    """`load_clouds`'s points and labels of one shard, a dict."""
-    rows = {"points": [], "labels": []}
-    for name in names:
-        points, labels = whole_clouds(observations, shard, name)
-        chosen = torch.stack([thin_out(one, num_points) for one in hits(points, labels)], dim=1)
-        rows["points"].append(gather(points, chosen))
-        rows["labels"].append(gather(labels.unsqueeze(2), chosen).squeeze(-1))
-    return {output: torch.stack(one, dim=1).numpy() for output, one in rows.items()}
-
-
-def batch_of(clouds, rows, device):
-    """Rows of `load_clouds`'s arrays: a list of (points, labels) per sensor, labels int64."""
-    points, labels, names = clouds
-    rows = np.sort(rows)
-    points = torch.as_tensor(points[rows], device=device)
-    labels = torch.as_tensor(labels[rows], device=device).long()
-    return [(points[:, i], labels[:, i]) for i in range(len(names))]
-
-
 # MODEL
-def gather(values, indices):
-    """Rows of values (n, p, f) at indices (n, ...), each row with its own: (n, ..., f)."""
-    flat = indices.flatten(1).unsqueeze(-1).expand(-1, -1, values.shape[2])
-    return torch.gather(values, 1, flat).unflatten(1, indices.shape[1:])
-
-
-def hits(points, labels):
-    """Which points (n, p, 3), labels (n, p), hit something, and which of them above the table."""
-    hit = labels != NOTHING
-    return hit, hit & (points[:, :, 2] > TABLE_TOP)
-
-
-def thin_out(mask, number):
-    """Indices (n, number) evenly spaced among those where mask (n, p) is true.
-
-    If there are fewer, they are repeated; if there are none, it is the first index.
-    """
-    index = torch.arange(mask.shape[1], device=mask.device)
-    order = (index + mask.shape[1] * ~mask).argsort(1)  # those first
-    steps = torch.arange(number, device=mask.device)
-    counts = mask.sum(1, keepdim=True).clamp(min=1)
-    return order.gather(1, (steps * counts).div(number, rounding_mode="floor"))
-
-
 def farthest_point_sampling(points, number):
     """Indices (n, number) of points (n, p, 3): the first, then always the one farthest from all."""
     chosen = [torch.zeros_like(points[:, 0, 0], dtype=torch.int64)]
@@ -279,16 +219,31 @@ class Decoder(nn.Module):
         return torch.cat([waves(points, self.args.num_waves), spread], dim=2)
 
 
-def queries_of(points, labels):
-    """Points to classify (n, 3p, 3) and their classes (n, 3p), of `batch_of`'s for one sensor.
+def distances_to(points, clouds):
+    """From points (n, p, 3) to the nearest ones of clouds (n, q, 3), scene by scene: (n, p)."""
+    squares = [  # less those of the points; a scene at a time, it stays in a CPU's cache
+        torch.addmm(cloud.square().sum(1), asked, cloud.T, alpha=-2).amin(1)
+        for asked, cloud in zip(points, clouds, strict=True)
+    ]
+    return (torch.stack(squares) + points.square().sum(2)).clamp(min=0).sqrt()
+
+
+def queries_of(points, labels, whole, number=None):
+    """Points to classify (n, q, 3) and their classes (n, q), of `batch_of`'s for one sensor.
 
     The scene's own, (n, 2, p), and those above the table of the scene before it in the batch: where
-    these are of an obstacle, and nothing is near, they have the class `NOTHING`. Points without a
-    class are `IGNORED`.
+    these are of an obstacle, and nothing in the whole cloud is near, they have the class `NOTHING`.
+    Points without a class are `IGNORED`. All 3p of them, or `number`, by chance, a third of them
+    the other scene's.
     """
     own, classes = points.flatten(1, 2), labels.flatten(1, 2)
-    others = points[:, 1].roll(1, dims=0)
-    absent = (labels[:, 1].roll(1, dims=0) == OBSTACLE) & (torch.cdist(others, own).amin(2) > APART)
+    others, seen = points[:, 1].roll(1, dims=0), labels[:, 1].roll(1, dims=0)
+    if number is not None:
+        chosen = torch.randperm(own.shape[1], device=own.device)[: number - number // 3]
+        own, classes = own[:, chosen], classes[:, chosen]
+        chosen = torch.randperm(others.shape[1], device=own.device)[: number // 3]
+        others, seen = others[:, chosen], seen[:, chosen]
+    absent = (seen == OBSTACLE) & (distances_to(others, whole) > APART)
     truth = [torch.where(classes == NOTHING, IGNORED, classes)]
     truth.append(torch.where(absent, NOTHING, IGNORED))
     return torch.cat([own, others], dim=1), torch.cat(truth, dim=1)
@@ -306,16 +261,13 @@ class PointNet2(nn.Module):
     def forward(self, clouds, num_queries=None):
         """Of `batch_of`'s list, per sensor: lists of logits (n, q, 4) and classes (n, q).
 
-        Of all of `queries_of`, or of `num_queries` of them, by chance.
+        Of all of `queries_of`'s, or of `num_queries`.
         """
         logits, truth = [], []
-        for (points, labels), encoder, decoder in zip(
+        for (points, labels, whole), encoder, decoder in zip(
             clouds, self.encoders, self.decoders, strict=True
         ):
-            queries, classes = queries_of(points, labels)
-            if num_queries is not None:
-                chosen = torch.randperm(queries.shape[1], device=queries.device)[:num_queries]
-                queries, classes = queries[:, chosen], classes[:, chosen]
+            queries, classes = queries_of(points, labels, whole, num_queries)
             logits.append(decoder(encoder(points[:, 1]), queries))
             truth.append(classes)
         return logits, truth
@@ -361,7 +313,7 @@ def evaluate(model, clouds, rows, batch_size, device):
         share of other scenes' points of which it is said that nothing is there.
     """
     model.eval()
-    number = clouds[0].shape[3]
+    number = clouds.points.shape[3]
     confusion = torch.zeros(NOTHING, NOTHING + 1, dtype=torch.int64)  # truth, prediction
     told = asked = 0
     for start in range(0, len(rows), batch_size):
@@ -387,17 +339,16 @@ if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     observations = open_observations(args.observations)
     clouds = load_clouds(observations, args.num_points)
-    sensors = {name: observations.sensors[name] for name in clouds[2]}
     num_training, validation = split(observations, args)
     run, device = run_folder(args, observations.task), seed_torch(args)
     rng = np.random.default_rng(args.seed)
 
     # MODEL: network and optimiser
-    model = PointNet2(len(sensors), args).to(device)
+    model = PointNet2(len(clouds.sensors), args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     # All that the first sensor saw of the first validation scene, for the picture.
     shard = np.searchsorted(observations.offsets, validation[0], side="right") - 1
-    cloud = whole_clouds(observations, shard, clouds[2][0])
+    cloud = whole_clouds(observations, shard, next(iter(clouds.sensors)))
     row = validation[0] - observations.offsets[shard]
     hit = cloud[1][row] != NOTHING
     pictured, classes = (one[row][hit].unsqueeze(0).to(device) for one in cloud)
@@ -438,12 +389,13 @@ if __name__ == "__main__":
                 progress["best_error"], progress["best_update"] = error, step
                 progress["best"] = result
                 example = {}
-                for name in sensors:
+                for name in clouds.sensors:
                     points, labels = (one[:2] for one in whole_clouds(observations, 0, name))
                     example |= {f"{name}_points": points, f"{name}_labels": labels}
                 metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
-                metadata |= {"sensors": sensors_to_json(sensors), "seed": args.seed, "step": step}
-                encoder = SceneEncoder(model, clouds[2])
+                sensors = sensors_to_json(clouds.sensors)
+                metadata |= {"sensors": sensors, "seed": args.seed, "step": step}
+                encoder = SceneEncoder(model, tuple(clouds.sensors))
                 save_program(run / "encoder.pt", encoder, example, metadata | result)
             bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
             # SHARED: checkpoint and result
