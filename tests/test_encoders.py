@@ -1,5 +1,6 @@
 """The scene encoders' trainers: their mathematics, and runs on a few small pictures."""
 
+import copy
 import importlib.util
 import json
 import os
@@ -117,6 +118,137 @@ def test_unused_codes_start_again_as_vectors():
     for number in (1, 3, 4):
         assert (codebook.codes[number] == vectors).all(1).any()
     assert not codebook.uses.any()
+
+
+def one_update(module, model, batch, args, *inputs):
+    """What `module.update` returns, with Adam."""
+    optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
+    return module.update(model, optimizer, batch, *inputs, args)
+
+
+def check_step(model, before, loss, lr):
+    """`model` is where Adam's first step leads from the weights `before`, whose loss was `loss`.
+
+    That is by the learning rate against the sign of the gradient.
+    """
+    gradients = torch.autograd.grad(loss, list(before.parameters()), allow_unused=True)
+    checked = 0
+    for old, new, gradient in zip(before.parameters(), model.parameters(), gradients, strict=True):
+        gradient = torch.zeros_like(old) if gradient is None else gradient
+        clear = (gradient.abs() > 1e-5) | (gradient == 0)  # beside Adam's epsilon
+        expected = (old - lr * gradient.sign())[clear]
+        torch.testing.assert_close(new[clear], expected, rtol=0, atol=0.02 * lr)
+        checked += int((gradient.abs() > 1e-5).sum())
+    assert checked > 100
+
+
+def test_one_update_of_the_vae():
+    torch.manual_seed(0)
+    args = vae.Args(width=4, kl_weight=0.7, foreground_weight=3.0, learning_rate=0.01)
+    model, mean_image = vae.VAE(2, 16, args), torch.full((2, 3, 16, 16), 0.5)
+    images = 0.35 + 0.3 * torch.rand(5, 2, 3, 16, 16)  # some within 0.1 of the mean picture
+    before = copy.deepcopy(model)
+    torch.manual_seed(1)
+    losses = one_update(vae, model, images, args, mean_image)
+    torch.manual_seed(1)
+    mean, log_variance = before.encode(images)
+    normal = torch.distributions.Normal(mean, (log_variance / 2).exp())
+    decoded = before.decode(mean + normal.stddev * torch.randn(5, 32))
+    far = ((images - 0.5).abs() > 0.1).any(2, keepdim=True).expand_as(images)
+    assert 0.1 < far.float().mean() < 0.99
+    errors = (decoded - images) ** 2
+    error = (errors.sum() + 3.0 * errors[far].sum()) / (far.numel() + 3.0 * far.sum())
+    standard = torch.distributions.Normal(0.0, 1.0)
+    kl = torch.distributions.kl_divergence(normal, standard).mean()
+    torch.testing.assert_close(losses["reconstruction"], error)
+    torch.testing.assert_close(losses["kl"], kl)
+    torch.testing.assert_close(losses["loss"], error + 0.7 * kl)
+    check_step(model, before, error + 0.7 * kl, args.learning_rate)
+
+
+def test_one_update_of_the_vqvae():
+    torch.manual_seed(0)
+    options = {"width": 4, "num_codes": 8, "commitment": 0.6, "foreground_weight": 0.0}
+    args = vqvae.Args(**options, learning_rate=0.01)
+    model, images = vqvae.VQVAE(2, 16, args), torch.rand(5, 2, 3, 16, 16)
+    before = copy.deepcopy(model)
+    losses, latents = one_update(vqvae, model, images, args, torch.zeros(2, 3, 16, 16))
+    error = codes = commitment = 0.0
+    for i in range(2):
+        z, book = before.encoders[i](images[:, i]), before.codebooks[i].codes
+        nearest = (z.unsqueeze(2) - book).square().sum(3).argmin(2)
+        torch.testing.assert_close(latents[i], z.detach())
+        assert model.codebooks[i].uses.tolist() == [(nearest == k).sum() for k in range(8)]
+        quantised = book[nearest]
+        # The value of the codes; the gradient goes to z only.
+        through = quantised.detach() + z - z.detach()
+        decoded = before.decoders[i](through.flatten(1))
+        error = error + (decoded - images[:, i]).square().mean() / 2
+        codes = codes + (quantised - z.detach()).square().mean() / 2
+        commitment = commitment + (quantised.detach() - z).square().mean()
+    loss = error + codes + 0.6 * commitment / 2
+    torch.testing.assert_close(losses["reconstruction"], error)
+    torch.testing.assert_close(losses["commitment"], commitment)
+    torch.testing.assert_close(losses["loss"], loss)
+    check_step(model, before, loss, args.learning_rate)
+
+
+def test_one_update_of_pointnet2():
+    torch.manual_seed(0)
+    sizes = {"num_points": 20, "num_centres": (8, 4), "num_neighbours": 4, "num_queries": 30}
+    args = pointnet2.Args(width=4, learning_rate=0.01, **sizes)
+    model = pointnet2.PointNet2(2, args)
+    before, batch = copy.deepcopy(model), []
+    for _ in range(2):
+        points, labels = torch.rand(3, 2, 20, 3), torch.randint(4, (3, 2, 20))
+        batch.append((points, labels, points.flatten(1, 2)))
+    torch.manual_seed(1)
+    loss = one_update(pointnet2, model, batch, args)
+    torch.manual_seed(1)
+    surprise = []
+    for (points, labels, whole), encoder, decoder in zip(
+        batch, before.encoders, before.decoders, strict=True
+    ):
+        queries, classes = pointnet2.queries_of(points, labels, whole, 30)
+        chances = decoder(encoder(points[:, 1]), queries).softmax(2)
+        for scene, row in zip(chances, classes.tolist(), strict=True):
+            surprise += [-scene[j, k].log() for j, k in enumerate(row) if k != pointnet2.IGNORED]
+    expected = sum(surprise) / len(surprise)
+    torch.testing.assert_close(loss, expected)
+    check_step(model, before, expected, args.learning_rate)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_an_encoder_learns_something_tiny(name, observations):
+    """On the scenes that it is trained on, its error falls to a part of what it was."""
+    torch.manual_seed(0)
+    read, rows = Observations(observations), np.arange(20)
+    if name == "pointnet2":
+        sizes = {"num_points": 32, "num_centres": (12, 6), "num_neighbours": 4, "num_queries": 60}
+        module, args = pointnet2, pointnet2.Args(width=8, **sizes)
+        model, data = pointnet2.PointNet2(4, args), clouds.load_clouds(read, 32)
+        batch, inputs = clouds.batch_of(data, rows, "cpu"), ()
+
+        def error():
+            found = pointnet2.evaluate(model, data, rows, 20, "cpu")
+            return 1 - (found["iou_obstacle"] + found["absent"]) / 2
+
+    else:
+        module, kind = (vae, vae.VAE) if name == "vae" else (vqvae, vqvae.VQVAE)
+        args = module.Args(width=8)
+        model, (data, _) = kind(4, 16, args), pictures.load_pictures(read, 16)
+        batch = pictures.batch_of(data, rows, "cpu")
+        inputs = (pictures.mean_picture(data, 20, "cpu"),)
+
+        def error():
+            measured = (model, data, rows, *inputs, 20, "cpu")
+            return pictures.reconstruction_errors(*measured)["error_foreground"]
+
+    optimizer = torch.optim.Adam(model.parameters(), lr=3e-3, fused=True)
+    before = error()
+    for _ in range(150):
+        module.update(model, optimizer, batch, *inputs, args)
+    assert error() < 0.4 * before
 
 
 @pytest.mark.parametrize(("size", "halvings"), [(224, 5), (64, 4), (112, 4), (16, 2), (8, 1)])
