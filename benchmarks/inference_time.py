@@ -25,8 +25,8 @@ from tqdm import tqdm
 import envs
 from envs.datasets import load_queries
 from envs.encoders import ORACLE, SceneEncoder
+from envs.exported_networks import load_network
 from envs.policies import ENV_ARGUMENTS, policy_file
-from envs.programs import load_program
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "clean_rl_scripts"))
 from evaluate import evaluate
@@ -36,7 +36,7 @@ TASK = "random_boxes_hard"
 
 def policy_times(policy, queries):
     """Means (s) of `rendering`, `encoding`, `action`, `total`; and `success_rate`."""
-    program = load_program(policy_file(policy))
+    program = load_network(policy_file(policy))
     trained = program.metadata["env"]
     arguments = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
     env = envs.make(TASK, **arguments)

@@ -36,8 +36,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from envs.exported_networks import halve_network
 from envs.files import write_atomically
-from envs.programs import halve_program
 
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = Path(__file__).with_name("paper_cells.csv")
@@ -159,7 +159,7 @@ def run(cell, seed, steps, num_queries, runs_dir):
     kept.parent.mkdir(exist_ok=True)
     kept.unlink(missing_ok=True)  # a result is never beside another's policy
     policy = kept.with_suffix(".pt")
-    halve_program(trained / "policy.pt", policy)
+    halve_network(trained / "policy.pt", policy)
     evaluation = evaluate(policy, cell.task, num_queries, folder / "evaluation.json")
     result = summary(cell, trained, evaluation)
     write_atomically(kept, (json.dumps(result, indent=1) + "\n").encode())

@@ -16,7 +16,7 @@ import torch
 
 import envs
 from envs.datasets import load_queries
-from envs.programs import load_program, save_program
+from envs.exported_networks import load_network, save_network
 from envs.runs import write_json
 
 NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
@@ -177,7 +177,7 @@ def save_policy(run, policy, envs, device, args, env_arguments, step):
     metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
     metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
     example = stack([env.reset(seed=0)[0] for env in envs[:2]], device)
-    save_program(run / "policy.pt", policy, example, metadata)
+    save_network(run / "policy.pt", policy, example, metadata)
 
 
 def final_test(run, args, env_arguments, queries, device, progress, steps):
@@ -196,7 +196,7 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
             `best_step`, at which the policy was saved.
         steps: of the run.
     """
-    policy = load_program(run / "policy.pt").to(device)
+    policy = load_network(run / "policy.pt").to(device)
     own = {name: value for name, value in env_arguments.items() if name not in RULES}
     test_envs = make_eval_envs(args.task, **own)
     result = evaluate(policy, test_envs, queries, device)

@@ -10,34 +10,47 @@ propagation classifies points from these numbers and the points' places alone, w
 skip connections, which would lead around them. A point's place says most of its class, so it would
 hardly need the numbers; that is why it is also asked about points of another scene's obstacles,
 and has to say that nothing is there. Places enter as waves too (sines and cosines, as in NeRF),
-without which it learns next to nothing in the time. What is saved, `encoder.pt`, is a program
-(`envs/programs.py`) from the clouds to z_E, the sensors' numbers side by side. To make an encoder
+without which it learns next to nothing in the time. What is saved, `encoder.pt`, is an exported
+network from the clouds to z_E, the sensors' numbers side by side. To make an encoder
 of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
 `# END SHARED` are those of `vae.py`.
 """
 
-import json
 import math
-import os
-import sys
-import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-import tyro
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
-from envs.datasets import DatasetError
-from envs.observations import Observations, sensors_to_json
-from envs.programs import save_program
-from envs.sensors import NOTHING, OBSTACLE, PointCloud
+from envs.exported_networks import save_network
+from envs.observations import sensors_to_json
+from envs.runs import (
+    elapsed,
+    load_checkpoint,
+    parse_args,
+    progress_bar,
+    rate,
+    run_folder,
+    save_checkpoint,
+    seed_torch,
+    summary_writer,
+    write_json,
+)
+from envs.sensors import NOTHING, OBSTACLE
+from scene_embedding_train.clouds import (
+    batch_of,
+    comparison,
+    gather,
+    hits,
+    load_clouds,
+    thin_out,
+    whole_clouds,
+)
+from scene_embedding_train.training_data import open_observations, split
 
-TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
 APART = 0.05  # m between a cloud and what counts as not being in it
 IGNORED = -100  # label of points that have no class
 
@@ -98,100 +111,7 @@ class Args:
     # END SHARED
 
 
-# SHARED: arguments
-def configuration_of(args):
-    """The fields that define what is computed: a run can only be resumed with the same."""
-    free = {"resume", "runs_dir", "threads", "observations"}
-    return {k: v for k, v in asdict(args).items() if k not in free}
-
-
-# END SHARED
-
-
-def load_clouds(observations, num_points):
-    """Points of what the point cloud sensors saw, and the sensors' names.
-
-    Returns:
-        Points, float32 (scenes, sensors, 2, num_points, 3), m, and labels, uint8 (scenes, sensors,
-        2, num_points), chosen once, into files beside the shards, and mapped into memory: evenly
-        spaced among those that hit something, and among those of them above the table. And the
-        names.
-    """
-    names = [name for name, one in observations.sensors.items() if isinstance(one, PointCloud)]
-    if not names:
-        sys.exit(f"--observations: {observations.folder} has no clouds (collect with --sensors)")
-    start = observations.folder / f"clouds_{len(observations)}_{num_points}"
-    paths = [start.with_name(f"{start.name}_{output}.npy") for output in ("points", "labels")]
-    if not all(path.exists() for path in paths):
-        shape = (len(observations), len(names), 2, num_points)
-        temporary = [path.with_suffix(".part") for path in paths]
-        points = np.lib.format.open_memmap(temporary[0], "w+", np.float32, (*shape, 3))
-        labels = np.lib.format.open_memmap(temporary[1], "w+", np.uint8, shape)
-        for shard in tqdm(range(len(observations.offsets) - 1), desc="clouds", unit="shard"):
-            rows = slice(*observations.offsets[shard : shard + 2])
-            for i, name in enumerate(names):
-                cloud = whole_clouds(observations, shard, name)
-                chosen = torch.stack([thin_out(one, num_points) for one in hits(*cloud)], dim=1)
-                points[rows, i] = gather(cloud[0], chosen)
-                labels[rows, i] = gather(cloud[1].unsqueeze(2), chosen).squeeze(-1)
-        for array, old, new in zip((points, labels), temporary, paths, strict=True):
-            array.flush()
-            os.replace(old, new)
-    return *(np.load(path, mmap_mode="r") for path in paths), names
-
-
-def whole_clouds(observations, shard, name):
-    """All that a sensor saw in the scenes of a shard, as `envs.sensors.PointCloud.points` has it.
-
-    Points, float32 (n, samples, 3), and labels, uint8 (n, samples).
-    """
-    sensor = observations.sensors[name]
-    pictures = (
-        observations.read(shard, f"{name}/{output}") for output in ("depth", "segmentation")
-    )
-    seen = [
-        sensor.points(depth * (sensor.far / 65_535), segmentation)
-        for depth, segmentation in zip(*pictures, strict=True)
-    ]
-    return tuple(
-        torch.from_numpy(np.stack([one[key] for one in seen])) for key in ("points", "labels")
-    )
-
-
-def batch_of(clouds, rows, device):
-    """Rows of `load_clouds`'s arrays: a list of (points, labels) per sensor, labels int64."""
-    points, labels, names = clouds
-    rows = np.sort(rows)
-    points = torch.as_tensor(points[rows], device=device)
-    labels = torch.as_tensor(labels[rows], device=device).long()
-    return [(points[:, i], labels[:, i]) for i in range(len(names))]
-
-
 # MODEL
-def gather(values, indices):
-    """Rows of values (n, p, f) at indices (n, ...), each row with its own: (n, ..., f)."""
-    flat = indices.flatten(1).unsqueeze(-1).expand(-1, -1, values.shape[2])
-    return torch.gather(values, 1, flat).unflatten(1, indices.shape[1:])
-
-
-def hits(points, labels):
-    """Which points (n, p, 3), labels (n, p), hit something, and which of them above the table."""
-    hit = labels != NOTHING
-    return hit, hit & (points[:, :, 2] > TABLE_TOP)
-
-
-def thin_out(mask, number):
-    """Indices (n, number) evenly spaced among those where mask (n, p) is true.
-
-    If there are fewer, they are repeated; if there are none, it is the first index.
-    """
-    index = torch.arange(mask.shape[1], device=mask.device)
-    order = (index + mask.shape[1] * ~mask).argsort(1)  # those first
-    steps = torch.arange(number, device=mask.device)
-    counts = mask.sum(1, keepdim=True).clamp(min=1)
-    return order.gather(1, (steps * counts).div(number, rounding_mode="floor"))
-
-
 def farthest_point_sampling(points, number):
     """Indices (n, number) of points (n, p, 3): the first, then always the one farthest from all."""
     chosen = [torch.zeros_like(points[:, 0, 0], dtype=torch.int64)]
@@ -299,16 +219,31 @@ class Decoder(nn.Module):
         return torch.cat([waves(points, self.args.num_waves), spread], dim=2)
 
 
-def queries_of(points, labels):
-    """Points to classify (n, 3p, 3) and their classes (n, 3p), of `batch_of`'s for one sensor.
+def distances_to(points, clouds):
+    """From points (n, p, 3) to the nearest ones of clouds (n, q, 3), scene by scene: (n, p)."""
+    squares = [  # less those of the points; a scene at a time, it stays in a CPU's cache
+        torch.addmm(cloud.square().sum(1), asked, cloud.T, alpha=-2).amin(1)
+        for asked, cloud in zip(points, clouds, strict=True)
+    ]
+    return (torch.stack(squares) + points.square().sum(2)).clamp(min=0).sqrt()
+
+
+def queries_of(points, labels, whole, number=None):
+    """Points to classify (n, q, 3) and their classes (n, q), of `batch_of`'s for one sensor.
 
     The scene's own, (n, 2, p), and those above the table of the scene before it in the batch: where
-    these are of an obstacle, and nothing is near, they have the class `NOTHING`. Points without a
-    class are `IGNORED`.
+    these are of an obstacle, and nothing in the whole cloud is near, they have the class `NOTHING`.
+    Points without a class are `IGNORED`. All 3p of them, or `number`, by chance, a third of them
+    the other scene's.
     """
     own, classes = points.flatten(1, 2), labels.flatten(1, 2)
-    others = points[:, 1].roll(1, dims=0)
-    absent = (labels[:, 1].roll(1, dims=0) == OBSTACLE) & (torch.cdist(others, own).amin(2) > APART)
+    others, seen = points[:, 1].roll(1, dims=0), labels[:, 1].roll(1, dims=0)
+    if number is not None:
+        chosen = torch.randperm(own.shape[1], device=own.device)[: number - number // 3]
+        own, classes = own[:, chosen], classes[:, chosen]
+        chosen = torch.randperm(others.shape[1], device=own.device)[: number // 3]
+        others, seen = others[:, chosen], seen[:, chosen]
+    absent = (seen == OBSTACLE) & (distances_to(others, whole) > APART)
     truth = [torch.where(classes == NOTHING, IGNORED, classes)]
     truth.append(torch.where(absent, NOTHING, IGNORED))
     return torch.cat([own, others], dim=1), torch.cat(truth, dim=1)
@@ -326,16 +261,13 @@ class PointNet2(nn.Module):
     def forward(self, clouds, num_queries=None):
         """Of `batch_of`'s list, per sensor: lists of logits (n, q, 4) and classes (n, q).
 
-        Of all of `queries_of`, or of `num_queries` of them, by chance.
+        Of all of `queries_of`'s, or of `num_queries`.
         """
         logits, truth = [], []
-        for (points, labels), encoder, decoder in zip(
+        for (points, labels, whole), encoder, decoder in zip(
             clouds, self.encoders, self.decoders, strict=True
         ):
-            queries, classes = queries_of(points, labels)
-            if num_queries is not None:
-                chosen = torch.randperm(queries.shape[1], device=queries.device)[:num_queries]
-                queries, classes = queries[:, chosen], classes[:, chosen]
+            queries, classes = queries_of(points, labels, whole, num_queries)
             logits.append(decoder(encoder(points[:, 1]), queries))
             truth.append(classes)
         return logits, truth
@@ -359,40 +291,16 @@ class SceneEncoder(nn.Module):
         return torch.cat(latents, dim=1)
 
 
-# SHARED: files and resuming
-def write_atomically(path, write):
-    """`write(temporary)`, then rename: whoever reads `path` sees the old file or the new one."""
-    temporary = path.with_name(path.name + ".part")
-    write(temporary)
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def parse_args():
-    """Flags, or with --resume those of the run, which must not be contradicted."""
-    args = tyro.cli(Args)
-    if args.resume is None:
-        return args
-    saved_file = args.resume / "args.json"
-    if not saved_file.exists():
-        sys.exit(f"--resume: {args.resume} is no run's folder (it has no args.json)")
-    saved = json.loads(saved_file.read_text())
-    defaults = Args(**{f.name: saved[f.name] for f in fields(Args) if f.name in saved})
-    defaults.resume, defaults.runs_dir = args.resume, Path(defaults.runs_dir)
-    defaults.observations = Path(defaults.observations)
-    args = tyro.cli(Args, default=defaults)
-    contradicted = [
-        f"--{name.replace('_', '-')} is {value!r} now, the run had {saved.get(name)!r}"
-        for name, value in configuration_of(args).items()
-        if value != saved.get(name)
-    ]
-    if contradicted:
-        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
-    return args
-
-
-# END SHARED
+def update(model, optimizer, batch, args):
+    """One step on a batch of `batch_of`; its loss, a scalar."""
+    logits, truth = model(batch, args.num_queries)
+    loss = F.cross_entropy(
+        torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=IGNORED
+    )
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return loss
 
 
 @torch.no_grad()
@@ -405,155 +313,66 @@ def evaluate(model, clouds, rows, batch_size, device):
         share of other scenes' points of which it is said that nothing is there.
     """
     model.eval()
-    number = clouds[0].shape[3]
+    number = clouds.points.shape[3]
     confusion = torch.zeros(NOTHING, NOTHING + 1, dtype=torch.int64)  # truth, prediction
     told = asked = 0
     for start in range(0, len(rows), batch_size):
         batch = batch_of(clouds, rows[start : start + batch_size], device)
         for logits, truth in zip(*model(batch), strict=True):
             predicted = logits.argmax(2)
-            own, said = truth[:, :number], predicted[:, :number]
-            hit = own != IGNORED
-            pairs = (NOTHING + 1) * own[hit] + said[hit]
-            confusion += torch.bincount(pairs, minlength=confusion.numel()).cpu().view(NOTHING, -1)
+            said = F.one_hot(predicted, NOTHING + 1)[:, :number]
+            own = [(truth[:, :number] == label).unsqueeze(2) for label in range(NOTHING)]
+            confusion += torch.stack([(one * said).sum((0, 1)) for one in own]).cpu()
             absent = truth == NOTHING
-            asked, told = asked + absent.sum(), told + (predicted == NOTHING)[absent].sum()
+            asked += absent.sum().item()
+            told += (absent & (predicted == NOTHING)).sum().item()
     model.train()
     both = confusion.diagonal()
     iou = both / (confusion[:, :NOTHING].sum(0) + confusion.sum(1) - both).clamp(min=1)
     result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
-    result["absent"] = float(told) / max(1.0, float(asked))
+    result["absent"] = told / max(1, asked)
     names = ("iou_robot", "iou_static", "iou_obstacle")
     return result | dict(zip(names, iou.tolist(), strict=True))
 
 
-COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [150, 150, 150]], np.uint8)
-
-
-def comparison(points, truth, predicted, size=160):
-    """A picture, uint8: a sensor's points (p, 3) seen from above; true classes left, ours right.
-
-    Robot red, table and floor orange, obstacles yellow, as in the paper's figure; nothing grey.
-    """
-    pictures = []
-    for labels in (truth, predicted):
-        picture = np.full((size, size, 3), 255, np.uint8)
-        order = np.argsort(points[:, 2])  # the highest is drawn last
-        pixels = ((1.2 - points[order, :2]) / 2.4 * size).astype(int)
-        inside = ((pixels >= 0) & (pixels < size - 1)).all(1)
-        for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            picture[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
-        pictures.append(picture)
-    return np.concatenate(pictures, axis=1)
-
-
 if __name__ == "__main__":
-    # SHARED: checks
-    args = parse_args()
-    if args.device == "cuda" and not torch.cuda.is_available():
-        sys.exit("--device cuda: PyTorch sees no CUDA device here")
-    try:
-        observations = Observations(args.observations)
-    except DatasetError as error:
-        sys.exit(f"--observations: {error}")
-    # END SHARED
+    args = parse_args(Args, may_change={"observations"})
+    observations = open_observations(args.observations)
     clouds = load_clouds(observations, args.num_points)
-    sensors = {name: observations.sensors[name] for name in clouds[2]}
-
-    # SHARED: folder and seeds
-    num_training = len(observations) - max(1, round(args.validation_share * len(observations)))
-    validation = np.arange(num_training, len(observations))[: args.eval_scenes]
-    if num_training < 1:
-        sys.exit(f"--observations: {len(observations)} scenes are too few")
-    if args.resume is not None:
-        run = args.resume
-    else:
-        name = f"{observations.task}__{args.exp_name}__{args.seed}__{int(time.time())}"
-        run = args.runs_dir / name
-        run.mkdir(parents=True)
-        text = json.dumps(asdict(args), indent=2, default=str)
-        write_atomically(run / "args.json", lambda path: path.write_text(text))
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed)
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
-    torch.use_deterministic_algorithms(True)
-    device = torch.device(args.device)
+    num_training, validation = split(observations, args)
+    run, device = run_folder(args, observations.task), seed_torch(args)
     rng = np.random.default_rng(args.seed)
-    # END SHARED
 
     # MODEL: network and optimiser
-    model = PointNet2(len(sensors), args).to(device)
+    model = PointNet2(len(clouds.sensors), args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     # All that the first sensor saw of the first validation scene, for the picture.
     shard = np.searchsorted(observations.offsets, validation[0], side="right") - 1
-    cloud = whole_clouds(observations, shard, clouds[2][0])
+    cloud = whole_clouds(observations, shard, next(iter(clouds.sensors)))
     row = validation[0] - observations.offsets[shard]
     hit = cloud[1][row] != NOTHING
     pictured, classes = (one[row][hit].unsqueeze(0).to(device) for one in cloud)
 
-    # SHARED: checkpoints
-    saved_parts = {"model": model, "optimizer": optimizer}
-    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0}
-    progress["best"] = {}
-
-    def save_checkpoint():
-        state = {name: part.state_dict() for name, part in saved_parts.items()}
-        state |= {"progress": progress, "torch_rng": torch.get_rng_state()}
-        state["rng"] = json.dumps(rng.bit_generator.state)
-        if device.type == "cuda":
-            state["cuda_rng"] = torch.cuda.get_rng_state()
-        write_atomically(run / "checkpoint.pt", lambda path: torch.save(state, path))
-
-    if args.resume is not None and (run / "checkpoint.pt").exists():
-        try:
-            state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
-        except Exception as error:  # whatever a damaged file leads to
-            sys.exit(f"--resume: {run / 'checkpoint.pt'} is damaged: {error}")
-        for name, part in saved_parts.items():
-            part.load_state_dict(state[name])
-        progress.update(state["progress"])
-        rng.bit_generator.state = json.loads(state["rng"])
-        torch.set_rng_state(state["torch_rng"].cpu())
-        if device.type == "cuda":
-            torch.cuda.set_rng_state(state["cuda_rng"].cpu())
-        del state
-
-    writer = SummaryWriter(run, purge_step=progress["updates"] + 1)
-    writer.add_text(
-        "hyperparameters",
-        "|param|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in asdict(args).items()),
-    )
-    started, seconds_before = time.time(), progress["seconds"]
-    updates_before = progress["updates"]
-    bar = tqdm(
-        total=args.total_updates,
-        initial=updates_before,
-        unit="update",
-        smoothing=0.05,
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds; a log file needs fewer lines
-    )
+    # SHARED: checkpoint and log
+    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
+    saved_parts = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
+    load_checkpoint(args, saved_parts)
+    seconds_before = progress["seconds"]
+    writer = summary_writer(run, args, progress["updates"])
+    bar = progress_bar(args.total_updates, progress["updates"], "update")
     # END SHARED
 
     while progress["updates"] < args.total_updates:
         # MODEL: learn
         remaining = 1.0 - progress["updates"] / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
-        rows = rng.integers(num_training, size=args.batch_size)
-        logits, truth = model(batch_of(clouds, rows, device), args.num_queries)
-        loss = F.cross_entropy(
-            torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=IGNORED
-        )
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        progress["updates"] += 1
+        batch = batch_of(clouds, rng.integers(num_training, size=args.batch_size), device)
+        loss = update(model, optimizer, batch, args)
+        progress["updates"] = step = progress["updates"] + 1
         bar.update()
-
-        step = progress["updates"]
         if step % 100 == 0:
             writer.add_scalar("losses/loss", loss.item(), step)
-            ups = (step - updates_before) / (time.time() - started)
-            writer.add_scalar("charts/updates_per_second", ups, step)
+            writer.add_scalar("charts/updates_per_second", rate(bar), step)
 
         # Evaluate, keep the best encoder
         if step % args.eval_every == 0 or step == args.total_updates:
@@ -568,27 +387,26 @@ if __name__ == "__main__":
             error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
             if error < progress["best_error"]:
                 progress["best_error"], progress["best_update"] = error, step
-                example = {}
-                for name in sensors:
-                    points, labels = (one[:2] for one in whole_clouds(observations, 0, name))
-                    example[f"{name}_points"] = points.to(device)
-                    example[f"{name}_labels"] = labels.to(device)
-                metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
-                metadata |= {"sensors": sensors_to_json(sensors)}
-                metadata |= {"seed": args.seed, "step": step, **result}
-                save_program(run / "encoder.pt", SceneEncoder(model, clouds[2]), example, metadata)
                 progress["best"] = result
+                example = {}
+                for name in clouds.sensors:
+                    points, labels = (one[:2] for one in whole_clouds(observations, 0, name))
+                    example |= {f"{name}_points": points, f"{name}_labels": labels}
+                metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
+                sensors = sensors_to_json(clouds.sensors)
+                metadata |= {"sensors": sensors, "seed": args.seed, "step": step}
+                encoder = SceneEncoder(model, tuple(clouds.sensors))
+                save_network(run / "encoder.pt", encoder, example, metadata | result)
             bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
-            # SHARED: checkpoint
-            progress["seconds"] = seconds_before + time.time() - started
-            save_checkpoint()
+            # SHARED: checkpoint and result
+            progress["seconds"] = seconds_before + elapsed(bar)
+            save_checkpoint(run, saved_parts)
     bar.close()
 
     result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}
-    result |= {"updates": progress["updates"], "best_update": progress["best_update"]}
-    result |= {"seconds": round(progress["seconds"])}
-    text = json.dumps(result | {"args": asdict(args)}, indent=2, default=str)
-    write_atomically(run / "result.json", lambda path: path.write_text(text))
+    result |= {name: progress[name] for name in ("updates", "best_update")}
+    result["seconds"] = round(progress["seconds"])
+    write_json(run / "result.json", result | {"args": asdict(args)})
     # END SHARED
     shown = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor {iou_static:.3f}, "
     shown += "obstacles {iou_obstacle:.3f}; of other scenes' obstacles {absent:.3f} told"

@@ -14,7 +14,7 @@ from trainers import PATHS, command, load, run_script
 import envs
 from envs import panda
 from envs.datasets import demo_path, load_demos
-from envs.programs import load_program
+from envs.exported_networks import load_network
 from envs.protocol import stack
 
 bc = load("bc")
@@ -72,7 +72,7 @@ def test_it_overfits_five_demonstrations_and_follows_them(tmp_path):
     )
     flags += " --task no_obstacles --goal-type combined --learning-rate 3e-3 --policy-average 0.01"
     run = run_script("bc", tmp_path, *flags.split())
-    policy = load_program(run / "policy.pt")
+    policy = load_network(run / "policy.pt")
     env, demos = envs.make("no_obstacles", goal_type="combined"), load_demos("no_obstacles")
     for i in range(5):
         observation, _ = env.reset_specific(demos.start[i], demos.goal[i])

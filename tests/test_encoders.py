@@ -1,8 +1,10 @@
 """The scene encoders' trainers: their mathematics, and runs on a few small pictures."""
 
+import copy
 import importlib.util
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -10,6 +12,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
+import meta_device
 import numpy as np
 import pytest
 import torch
@@ -23,9 +27,9 @@ from envs.encoders import MAX_OBSTACLES, PACKAGED, SceneEncoder, oracle
 from envs.exported_networks import NetworkError, load_network, save_network
 from envs.observations import Observations
 from envs.scenes import Scene, Sphere, from_array
-from envs.sensors import PointCloud
+from envs.sensors import OBSTACLE, PointCloud
 from envs.wrappers import SceneEncodingWrapper
-from scene_embedding_train import collect
+from scene_embedding_train import clouds, collect, pictures
 
 FOLDER = Path(__file__).parents[1] / "scene_embedding_train"
 SCRIPTS = ("vae", "vqvae", "pointnet2")
@@ -116,6 +120,137 @@ def test_unused_codes_start_again_as_vectors():
     assert not codebook.uses.any()
 
 
+def one_update(module, model, batch, args, *inputs):
+    """What `module.update` returns, with Adam."""
+    optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
+    return module.update(model, optimizer, batch, *inputs, args)
+
+
+def check_step(model, before, loss, lr):
+    """`model` is where Adam's first step leads from the weights `before`, whose loss was `loss`.
+
+    That is by the learning rate against the sign of the gradient.
+    """
+    gradients = torch.autograd.grad(loss, list(before.parameters()), allow_unused=True)
+    checked = 0
+    for old, new, gradient in zip(before.parameters(), model.parameters(), gradients, strict=True):
+        gradient = torch.zeros_like(old) if gradient is None else gradient
+        clear = (gradient.abs() > 1e-5) | (gradient == 0)  # beside Adam's epsilon
+        expected = (old - lr * gradient.sign())[clear]
+        torch.testing.assert_close(new[clear], expected, rtol=0, atol=0.02 * lr)
+        checked += int((gradient.abs() > 1e-5).sum())
+    assert checked > 100
+
+
+def test_one_update_of_the_vae():
+    torch.manual_seed(0)
+    args = vae.Args(width=4, kl_weight=0.7, foreground_weight=3.0, learning_rate=0.01)
+    model, mean_image = vae.VAE(2, 16, args), torch.full((2, 3, 16, 16), 0.5)
+    images = 0.35 + 0.3 * torch.rand(5, 2, 3, 16, 16)  # some within 0.1 of the mean picture
+    before = copy.deepcopy(model)
+    torch.manual_seed(1)
+    losses = one_update(vae, model, images, args, mean_image)
+    torch.manual_seed(1)
+    mean, log_variance = before.encode(images)
+    normal = torch.distributions.Normal(mean, (log_variance / 2).exp())
+    decoded = before.decode(mean + normal.stddev * torch.randn(5, 32))
+    far = ((images - 0.5).abs() > 0.1).any(2, keepdim=True).expand_as(images)
+    assert 0.1 < far.float().mean() < 0.99
+    errors = (decoded - images) ** 2
+    error = (errors.sum() + 3.0 * errors[far].sum()) / (far.numel() + 3.0 * far.sum())
+    standard = torch.distributions.Normal(0.0, 1.0)
+    kl = torch.distributions.kl_divergence(normal, standard).mean()
+    torch.testing.assert_close(losses["reconstruction"], error)
+    torch.testing.assert_close(losses["kl"], kl)
+    torch.testing.assert_close(losses["loss"], error + 0.7 * kl)
+    check_step(model, before, error + 0.7 * kl, args.learning_rate)
+
+
+def test_one_update_of_the_vqvae():
+    torch.manual_seed(0)
+    options = {"width": 4, "num_codes": 8, "commitment": 0.6, "foreground_weight": 0.0}
+    args = vqvae.Args(**options, learning_rate=0.01)
+    model, images = vqvae.VQVAE(2, 16, args), torch.rand(5, 2, 3, 16, 16)
+    before = copy.deepcopy(model)
+    losses, latents = one_update(vqvae, model, images, args, torch.zeros(2, 3, 16, 16))
+    error = codes = commitment = 0.0
+    for i in range(2):
+        z, book = before.encoders[i](images[:, i]), before.codebooks[i].codes
+        nearest = (z.unsqueeze(2) - book).square().sum(3).argmin(2)
+        torch.testing.assert_close(latents[i], z.detach())
+        assert model.codebooks[i].uses.tolist() == [(nearest == k).sum() for k in range(8)]
+        quantised = book[nearest]
+        # The value of the codes; the gradient goes to z only.
+        through = quantised.detach() + z - z.detach()
+        decoded = before.decoders[i](through.flatten(1))
+        error = error + (decoded - images[:, i]).square().mean() / 2
+        codes = codes + (quantised - z.detach()).square().mean() / 2
+        commitment = commitment + (quantised.detach() - z).square().mean()
+    loss = error + codes + 0.6 * commitment / 2
+    torch.testing.assert_close(losses["reconstruction"], error)
+    torch.testing.assert_close(losses["commitment"], commitment)
+    torch.testing.assert_close(losses["loss"], loss)
+    check_step(model, before, loss, args.learning_rate)
+
+
+def test_one_update_of_pointnet2():
+    torch.manual_seed(0)
+    sizes = {"num_points": 20, "num_centres": (8, 4), "num_neighbours": 4, "num_queries": 30}
+    args = pointnet2.Args(width=4, learning_rate=0.01, **sizes)
+    model = pointnet2.PointNet2(2, args)
+    before, batch = copy.deepcopy(model), []
+    for _ in range(2):
+        points, labels = torch.rand(3, 2, 20, 3), torch.randint(4, (3, 2, 20))
+        batch.append((points, labels, points.flatten(1, 2)))
+    torch.manual_seed(1)
+    loss = one_update(pointnet2, model, batch, args)
+    torch.manual_seed(1)
+    surprise = []
+    for (points, labels, whole), encoder, decoder in zip(
+        batch, before.encoders, before.decoders, strict=True
+    ):
+        queries, classes = pointnet2.queries_of(points, labels, whole, 30)
+        chances = decoder(encoder(points[:, 1]), queries).softmax(2)
+        for scene, row in zip(chances, classes.tolist(), strict=True):
+            surprise += [-scene[j, k].log() for j, k in enumerate(row) if k != pointnet2.IGNORED]
+    expected = sum(surprise) / len(surprise)
+    torch.testing.assert_close(loss, expected)
+    check_step(model, before, expected, args.learning_rate)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_an_encoder_learns_something_tiny(name, observations):
+    """On the scenes that it is trained on, its error falls to a part of what it was."""
+    torch.manual_seed(0)
+    read, rows = Observations(observations), np.arange(20)
+    if name == "pointnet2":
+        sizes = {"num_points": 32, "num_centres": (12, 6), "num_neighbours": 4, "num_queries": 60}
+        module, args = pointnet2, pointnet2.Args(width=8, **sizes)
+        model, data = pointnet2.PointNet2(4, args), clouds.load_clouds(read, 32)
+        batch, inputs = clouds.batch_of(data, rows, "cpu"), ()
+
+        def error():
+            found = pointnet2.evaluate(model, data, rows, 20, "cpu")
+            return 1 - (found["iou_obstacle"] + found["absent"]) / 2
+
+    else:
+        module, kind = (vae, vae.VAE) if name == "vae" else (vqvae, vqvae.VQVAE)
+        args = module.Args(width=8)
+        model, (data, _) = kind(4, 16, args), pictures.load_pictures(read, 16)
+        batch = pictures.batch_of(data, rows, "cpu")
+        inputs = (pictures.mean_picture(data, 20, "cpu"),)
+
+        def error():
+            measured = (model, data, rows, *inputs, 20, "cpu")
+            return pictures.reconstruction_errors(*measured)["error_foreground"]
+
+    optimizer = torch.optim.Adam(model.parameters(), lr=3e-3, fused=True)
+    before = error()
+    for _ in range(150):
+        module.update(model, optimizer, batch, *inputs, args)
+    assert error() < 0.4 * before
+
+
 @pytest.mark.parametrize(("size", "halvings"), [(224, 5), (64, 4), (112, 4), (16, 2), (8, 1)])
 def test_sizes(size, halvings):
     assert vae.num_halvings(size) == halvings
@@ -139,14 +274,14 @@ def test_each_decoder_of_the_vae_sees_all_cameras_and_of_the_vqvae_its_own():
 
 
 def test_errors_of_the_evaluation(observations):
-    images, cameras = vae.load_images(Observations(observations), 16)
+    images, cameras = pictures.load_pictures(Observations(observations), 16)
     assert images.shape == (20, 4, 16, 16, 3) and cameras == ["front", "left", "back", "right"]
     rows = np.arange(3, 10)
     truth = torch.from_numpy(images[rows]).permute(0, 1, 4, 2, 3) / 255.0
     mean_image = torch.rand(4, 3, 16, 16)
     model = torch.nn.Module()
     model.forward = lambda batch: batch * 0.5
-    found = vae.evaluate(model, images, rows, mean_image, 2, "cpu")
+    found = pictures.reconstruction_errors(model, images, rows, mean_image, 2, "cpu")
     unlike = (truth - mean_image).abs().amax(2) > 0.1
     for name, guess in (("error", truth * 0.5), ("mean_image_error", mean_image)):
         error = (truth - guess).square().mean(2)
@@ -156,21 +291,55 @@ def test_errors_of_the_evaluation(observations):
 
 def test_images_are_those_of_the_shards(observations):
     read = Observations(observations)
-    whole, cameras = vae.load_images(read, 32)
-    averaged, _ = vae.load_images(read, 16)
+    whole, cameras = pictures.load_pictures(read, 32)
+    averaged, _ = pictures.load_pictures(read, 16)
     for shard in range(3):
         rows = slice(*read.offsets[shard : shard + 2])
         for i, name in enumerate(cameras):
-            pictures = read.read(shard, f"{name}/rgb")
-            np.testing.assert_array_equal(whole[rows, i], pictures)
-            corner = pictures[:, 6:8, 10:12].mean((1, 2))
+            taken = read.read(shard, f"{name}/rgb")
+            np.testing.assert_array_equal(whole[rows, i], taken)
+            corner = taken[:, 6:8, 10:12].mean((1, 2))
             assert np.abs(averaged[rows, i, 3, 5] - corner).max() <= 0.5
     rows = np.arange(20)
     np.testing.assert_allclose(
-        vae.averaged(torch.from_numpy(whole.copy()), 16),
-        vae.batch_of(averaged, rows, "cpu"),
+        pictures.averaged(torch.from_numpy(whole.copy()), 16),
+        pictures.batch_of(averaged, rows, "cpu"),
         atol=0.51 / 255,
     )
+
+
+def test_other_observations_in_the_same_folder_are_unpacked_anew(observations, tmp_path):
+    for path in observations.glob("shard_*.h5"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    before, _ = pictures.load_pictures(Observations(tmp_path), 16)
+    thinned = clouds.load_clouds(Observations(tmp_path), 64)
+    with h5py.File(tmp_path / "shard_00001.h5", "r+") as file:
+        file["left/rgb"][2] = 255 - file["left/rgb"][2]
+        file["left_cloud/segmentation"][2] = OBSTACLE
+    after, _ = pictures.load_pictures(Observations(tmp_path), 16)
+    changed = np.argwhere((before != after).any((2, 3, 4)))
+    np.testing.assert_array_equal(changed, [[10, 1]])
+    other = clouds.load_clouds(Observations(tmp_path), 64)
+    changed = np.argwhere((thinned.labels != other.labels).any((2, 3)))
+    np.testing.assert_array_equal(changed, [[10, 1]])
+
+
+def test_two_trainers_may_unpack_at_once(observations, tmp_path):
+    for path in observations.glob("shard_*.h5"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    one, other = Observations(tmp_path), Observations(tmp_path)
+    made = []
+
+    def read(number, name):
+        if number == 1 and not made:  # one has begun, and the other does it all meanwhile
+            made.append(pictures.load_pictures(other, 16)[0])
+        return Observations.read(one, number, name)
+
+    one.read = read
+    expected, _ = pictures.load_pictures(Observations(observations), 16)
+    np.testing.assert_array_equal(pictures.load_pictures(one, 16)[0], expected)
+    np.testing.assert_array_equal(made[0], expected)
+    assert len([path for path in tmp_path.iterdir() if path.suffix != ".h5"]) == 1
 
 
 def test_points_are_thinned_out_evenly():
@@ -186,15 +355,19 @@ def test_points_are_thinned_out_evenly():
 
 def test_clouds_are_thinned_out_once(observations):
     read = Observations(observations)
-    points, labels, names = pointnet2.load_clouds(read, 64)
+    sensors, points, labels, depths = clouds.load_clouds(read, 64)
     assert points.shape == (20, 4, 2, 64, 3) and labels.shape == (20, 4, 2, 64)
-    for i, name in enumerate(names):
-        cloud, classes = (one[3].numpy() for one in pointnet2.whole_clouds(read, 1, name))
+    for i, name in enumerate(sensors):
+        cloud, classes = (one[3].numpy() for one in clouds.whole_clouds(read, 1, name))
         hit = classes != pointnet2.NOTHING
-        for half, mask in enumerate((hit, hit & (cloud[:, 2] > pointnet2.TABLE_TOP))):
+        for half, mask in enumerate((hit, hit & (cloud[:, 2] > clouds.TABLE_TOP))):
             chosen = np.flatnonzero(mask)[np.arange(64) * mask.sum() // 64]
             np.testing.assert_array_equal(points[11, i, half], cloud[chosen])
             np.testing.assert_array_equal(labels[11, i, half], classes[chosen])
+        stored = torch.from_numpy(depths[11:12, i].astype(np.float32))
+        ends = clouds.ends_of_rays(sensors[name], stored)[0]
+        near = ends.norm(dim=1) < 100.0
+        np.testing.assert_allclose(ends[near], cloud[hit], atol=1e-5)
 
 
 def test_what_is_asked_about():
@@ -203,13 +376,47 @@ def test_what_is_asked_about():
     points[0, 1, 0] = -4.0  # far from scene 1
     points[0, 1, 1] = points[1, 1, 4] + torch.tensor([0.0, 0.03, 0.0])  # near it
     points[0, 1, 2] = points[1, 0, 4] + torch.tensor([0.0, 9.0, 0.0])
-    queries, classes = pointnet2.queries_of(points, labels)
+    queries, classes = pointnet2.queries_of(points, labels, points.flatten(1, 2))
     assert torch.equal(queries[:, :10], points.flatten(1, 2))
     assert torch.equal(queries[1, 10:], points[0, 1]) and torch.equal(queries[0, 10:], points[2, 1])
     nothing, ignored = pointnet2.NOTHING, pointnet2.IGNORED
     assert classes[0].tolist() == [ignored, 1, 1, 1, 1, 2, 2, 2, 1, 1] + [ignored] * 5
     assert classes[1].tolist() == [1] * 10 + [nothing, ignored, nothing, ignored, ignored]
     assert classes[2].tolist() == [1] * 10 + [ignored] * 5
+
+
+def test_nothing_is_where_nothing_of_the_whole_cloud_is(observations):
+    """Also on what thinning left out, such as thin poles; against a loop over all of it."""
+    read = Observations(observations)
+    thinned = clouds.load_clouds(read, 16)
+    batch = clouds.batch_of(thinned, np.arange(8), "cpu")
+    told_by_thinned_alone = 0
+    for name, (points, labels, whole) in zip(thinned.sensors, batch, strict=True):
+        _, classes = pointnet2.queries_of(points, labels, whole)
+        _, of_thinned = pointnet2.queries_of(points, labels, points.flatten(1, 2))
+        cloud, kinds = clouds.whole_clouds(read, 0, name)
+        for i in range(8):
+            seen = cloud[i][kinds[i] != pointnet2.NOTHING].numpy()
+            for j, point in enumerate(points[i - 1, 1].numpy()):
+                distance = np.linalg.norm(seen - point, axis=1).min()
+                absent = labels[i - 1, 1, j] == OBSTACLE and distance > pointnet2.APART
+                if abs(distance - pointnet2.APART) > 1e-4:
+                    expected = pointnet2.NOTHING if absent else pointnet2.IGNORED
+                    assert classes[i, 32 + j] == expected
+        told_by_thinned_alone += (classes != of_thinned).sum()
+    assert told_by_thinned_alone > 0
+
+
+def test_queries_by_chance_are_some_of_all():
+    points, labels = torch.rand(3, 2, 20, 3), torch.randint(4, (3, 2, 20))
+    cloud = (points, labels, points.flatten(1, 2))
+    queries, classes = pointnet2.queries_of(*cloud)
+    some, theirs = pointnet2.queries_of(*cloud, 12)
+    assert some.shape == (3, 12, 3) and theirs.shape == (3, 12)
+    for i in range(3):
+        found = [queries[i].tolist().index(point) for point in some[i].tolist()]
+        assert len(set(found)) == 12 and [one >= 40 for one in found] == [False] * 8 + [True] * 4
+        assert torch.equal(theirs[i], classes[i, found])
 
 
 def test_waves_of_places():
@@ -254,7 +461,7 @@ def test_interpolation_is_exact_at_centres_and_a_mean_between():
 
 
 def test_scores_of_the_classification(observations):
-    clouds = pointnet2.load_clouds(Observations(observations), 64)
+    thinned = clouds.load_clouds(Observations(observations), 64)
     nothing, ignored = pointnet2.NOTHING, pointnet2.IGNORED
 
     class Guess(torch.nn.Module):
@@ -262,8 +469,8 @@ def test_scores_of_the_classification(observations):
 
         def forward(self, batch):
             logits, truth = [], []
-            for points, labels in batch:
-                _, classes = pointnet2.queries_of(points, labels)
+            for cloud in batch:
+                _, classes = pointnet2.queries_of(*cloud)
                 guess = classes.clamp(min=0)
                 guess[:, ::5] = nothing
                 guess[:, ::3] = 2
@@ -271,10 +478,10 @@ def test_scores_of_the_classification(observations):
                 truth.append(classes)
             return logits, truth
 
-    found = pointnet2.evaluate(Guess(), clouds, np.arange(6), 3, "cpu")
+    found = pointnet2.evaluate(Guess(), thinned, np.arange(6), 3, "cpu")
     truths, guesses = [], []
     for rows in (np.arange(3), np.arange(3, 6)):
-        for one, truth in zip(*Guess()(pointnet2.batch_of(clouds, rows, "cpu")), strict=True):
+        for one, truth in zip(*Guess()(clouds.batch_of(thinned, rows, "cpu")), strict=True):
             guesses.append(one.argmax(2))
             truths.append(truth)
     truth, guess = torch.cat(truths), torch.cat(guesses)
@@ -308,9 +515,9 @@ def shared_blocks(name):
 
 def test_shared_blocks_have_not_drifted_apart():
     blocks = shared_blocks("vae")
-    assert shared_blocks("vqvae") == blocks and len(blocks) == 14
-    clouds = shared_blocks("pointnet2")
-    assert len(clouds) == 8 and all(blocks[name] == lines for name, lines in clouds.items())
+    assert shared_blocks("vqvae") == blocks and len(blocks) == 7
+    of_clouds = shared_blocks("pointnet2")
+    assert len(of_clouds) == 4 and all(blocks[name] == of_clouds[name] for name in of_clouds)
 
 
 def test_a_run_leaves_an_encoder_a_result_and_events(run):
@@ -360,11 +567,11 @@ def test_the_saved_encoder_needs_no_script(run, observations):
         inputs = {}
         for sensor in read.sensors:
             if isinstance(read.sensors[sensor], PointCloud):
-                shards = [pointnet2.whole_clouds(read, shard, sensor) for shard in range(3)]
+                shards = [clouds.whole_clouds(read, shard, sensor) for shard in range(3)]
                 points, labels = (torch.cat(one) for one in zip(*shards, strict=True))
                 inputs |= {f"{sensor}_points": points, f"{sensor}_labels": labels}
     else:
-        images, cameras = vae.load_images(read, 32)
+        images, cameras = pictures.load_pictures(read, 32)
         inputs = {one: torch.from_numpy(images[:, i].copy()) for i, one in enumerate(cameras)}
     together = encoder(**inputs)
     assert together.shape == (20, 64) and together.dtype == torch.float32
@@ -396,6 +603,37 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(run, observations,
         assert torch.equal(one[key], other[key]), key
     refused = subprocess.run([*resume, "--width", "8"], capture_output=True, text=True)
     assert refused.returncode == 1 and "--width is 8 now, the run had 4" in refused.stderr
+
+
+@pytest.fixture
+def torch_as_it_was():
+    """A trainer that runs in this process leaves torch's settings as they were."""
+    state, threads = torch.get_rng_state(), torch.get_num_threads()
+    yield
+    torch.use_deterministic_algorithms(False)
+    torch.set_num_threads(threads)
+    torch.set_rng_state(state)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_nothing_of_a_run_needs_the_cpu(name, observations, tmp_path, monkeypatch, torch_as_it_was):
+    """One update, one evaluation and one resume with the `meta` device in CUDA's place."""
+    _, script, *flags = command(name, observations, tmp_path, "--device", "meta")
+    flags += ["--total-updates", "1", "--eval-every", "1"]
+    flags += ["--restart-every", "1"] if name == "vqvae" else []
+    monkeypatch.setattr("sys.argv", [script, *flags])
+    with meta_device.in_cudas_place():
+        runpy.run_path(script, run_name="__main__")
+    (folder,) = tmp_path.iterdir()
+    assert load_network(folder / "encoder.pt").metadata["step"] == 1
+    args = json.loads((folder / "args.json").read_text())
+    (folder / "args.json").write_text(json.dumps(args | {"total_updates": 2}))
+    monkeypatch.setattr("sys.argv", [script, "--resume", str(folder)])
+    with meta_device.in_cudas_place():
+        runpy.run_path(script, run_name="__main__")
+    assert json.loads((folder / "result.json").read_text())["updates"] == 2
+    weights = torch.load(folder / "checkpoint.pt", weights_only=True)["model"].values()
+    assert all(tensor.is_meta for tensor in weights)
 
 
 # --- In an environment

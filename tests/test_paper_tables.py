@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 import envs
-from envs.programs import load_program
+from envs.exported_networks import load_network
 
 ROOT = Path(__file__).resolve().parent.parent
 spec = importlib.util.spec_from_file_location(
@@ -152,7 +152,7 @@ def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
     assert kept["steps"] == 60 and kept["num_queries"] == 4
     assert [step for step, _ in kept["curve"]] == [20, 40, 60]
     assert re.fullmatch(r"[0-9a-f]{7,}\+?", kept["commit"])
-    load_program(tmp_path / "policies" / "bc-config-wall-s5.pt")
+    load_network(tmp_path / "policies" / "bc-config-wall-s5.pt")
     capfd.readouterr()
     paper_tables.run(cell, 5, 60, 4, tmp_path / "runs")
     assert capfd.readouterr().out == "bc-config-wall-s5: done before\n"

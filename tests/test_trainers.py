@@ -15,7 +15,7 @@ from trainers import PATHS, command, load, run_here, run_script
 
 import envs
 from envs.datasets import demo_path
-from envs.programs import load_program
+from envs.exported_networks import load_network
 from envs.protocol import stack
 
 
@@ -93,7 +93,7 @@ def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run, traine
 
 
 def test_the_saved_policy_acts_without_the_script(finished_run, trainer):
-    policy = load_program(finished_run / "policy.pt")
+    policy = load_network(finished_run / "policy.pt")
     assert policy.metadata["kind"] == "policy" and policy.metadata["task"] == "no_obstacles"
     env = envs.make(policy.metadata["task"], **policy.metadata["env"])
     observation, _ = env.reset(seed=0)
@@ -113,7 +113,7 @@ def test_the_running_average_of_the_policy_is_what_is_saved(tmp_path, trainer):
     actor.load_state_dict(state["actor"])
     average.load_state_dict(state["actor_average"])
     observation, goal = torch.randn(8, 10), torch.randn(8, 3)
-    saved = load_program(run / "policy.pt")(
+    saved = load_network(run / "policy.pt")(
         observation=observation, achieved_goal=goal, desired_goal=goal
     )
     torch.testing.assert_close(saved, average(observation, goal, goal))

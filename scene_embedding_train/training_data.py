@@ -1,0 +1,91 @@
+"""What encoders are trained on: a folder's observations, unpacked; which are for validation.
+
+Its functions are for the trainers: where the user is wrong, they end the program with a message.
+"""
+
+import hashlib
+import sys
+import uuid
+
+import numpy as np
+from tqdm import tqdm
+
+from envs.datasets import DatasetError
+from envs.files import replace_atomically
+from envs.observations import Observations, shard_path
+
+
+def open_observations(folder):
+    """The `Observations` in a folder. Raises SystemExit: there are none, or they are damaged."""
+    try:
+        return Observations(folder)
+    except DatasetError as error:
+        sys.exit(f"--observations: {error}")
+
+
+def split(observations, args):
+    """The number of scenes to train on, the first ones, and the rows to validate on.
+
+    Args:
+        observations: `Observations`.
+        args: the flags `validation_share` (of the scenes, the last ones, that is not trained on)
+            and `eval_scenes` (how many of these are looked at, at most).
+    """
+    num_training = len(observations) - max(1, round(args.validation_share * len(observations)))
+    if num_training < 1:
+        sys.exit(f"--observations: {len(observations)} scenes are too few")
+    return num_training, np.arange(num_training, len(observations))[: args.eval_scenes]
+
+
+def unpacked(observations, name, arrays, shards):
+    """Arrays with a row per scene, made once, kept in files beside the shards and memory-mapped.
+
+    The files, `<name>_<array>_<key>.npy`, may be larger than the memory. Their key is of the
+    shards' contents: other observations have other files.
+
+    Args:
+        observations: `Observations`.
+        name: says what is in the arrays and how it was made.
+        arrays: dict from an array's name to its dtype and the shape of a row.
+        shards: iterable of dicts with the arrays' rows, shard after shard. It is not begun if the
+            files are there.
+
+    Returns:
+        A dict from an array's name to the array, which cannot be written to.
+    """
+    key = contents_key(observations)
+    paths = {one: observations.folder / f"{name}_{one}_{key}.npy" for one in arrays}
+    if not all(path.exists() for path in paths.values()):
+        # Names of its own: several trainers may be at this at once. Who is last replaces the same.
+        own = uuid.uuid4().hex
+        temporary = {one: path.with_name(f".{path.name}.{own}.tmp") for one, path in paths.items()}
+        try:
+            whole = {
+                one: np.lib.format.open_memmap(
+                    temporary[one], "w+", dtype, (len(observations), *shape)
+                )
+                for one, (dtype, shape) in arrays.items()
+            }
+            spans = zip(observations.offsets, observations.offsets[1:], strict=False)
+            total = len(observations.offsets) - 1
+            bar = tqdm(zip(spans, shards, strict=True), f"unpacking {name}", total, unit="shard")
+            for (begin, end), rows in bar:
+                for one, array in whole.items():
+                    array[begin:end] = rows[one]
+            for one, array in whole.items():
+                array.flush()
+                replace_atomically(temporary[one], paths[one])
+        finally:
+            for path in temporary.values():
+                path.unlink(missing_ok=True)
+    return {one: np.load(path, mmap_mode="r") for one, path in paths.items()}
+
+
+def contents_key(observations):
+    """A short name, a string, of all that is in the shards of `Observations`."""
+    digest = hashlib.sha256()
+    for shard in range(len(observations.offsets) - 1):
+        with open(shard_path(observations.folder, shard), "rb") as file:
+            while block := file.read(2**20):
+                digest.update(block)
+    return digest.hexdigest()[:16]
