@@ -274,20 +274,30 @@ def test_a_planner_without_time_gives_up():
     assert result["planning_seconds"] > 0 and result["planning_seconds_solved"] is None
 
 
-def test_the_time_of_the_planner_is_shared_by_its_attempts(monkeypatch):
+def test_the_planners_searches_become_longer(monkeypatch):
     now, attempts = [100.0], []
 
     class Never(Planner):
         def plan(self, start, goal, scene, *, seed, caution):
-            attempts.append((self.time_limit, caution, seed))
-            now[0] += self.time_limit
+            attempts.append((self.time_limit, self.max_checks, caution, seed))
+            now[0] += 1.0
             raise PlanningError("no path")
 
     monkeypatch.setattr(demo_generation.planning, "Planner", Never)
     monkeypatch.setattr(evaluation.time, "monotonic", lambda: now[0])
-    evaluate("planner", "wall", queries=_queries((LEFT, RIGHT)), time_limit=8.0)
-    assert [attempt[:2] for attempt in attempts] == [(4.0, 1.0), (2.0, 0.5), (2.0, 0.25)]
-    assert len({seed for *_, seed in attempts}) == 3
+    result = evaluate("planner", "wall", queries=_queries((LEFT, RIGHT)), time_limit=8.0)
+    assert result["success_rate"] == 0
+    assert [attempt[:3] for attempt in attempts] == [
+        (8.0, 8_000, 1.0),
+        (7.0, 8_000, 0.5),
+        (6.0, 8_000, 0.25),
+        (5.0, 16_000, 1.0),
+        (4.0, 16_000, 0.5),
+        (3.0, 16_000, 0.25),
+        (2.0, 32_000, 1.0),
+        (1.0, 32_000, 0.5),
+    ]
+    assert len({seed for *_, seed in attempts}) == 8
 
 
 def test_the_planner_without_ompl(monkeypatch):

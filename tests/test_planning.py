@@ -248,6 +248,60 @@ def test_your_own_planner_may_find_nothing(worlds):
         Planner(worlds["no_obstacles"], lambda *_: None).plan(READY, READY, seed=1)
 
 
+def test_your_own_planner_asks_about_many_at_once(worlds):
+    asked = []
+
+    def batched(is_valid, start, goal, rng):
+        points = rng.uniform(-1, 1, (50, 7))
+        free = is_valid.free(points)
+        assert is_valid.checks == 50
+        assert free.tolist() == [is_valid(point) for point in points]
+        before, free_points = is_valid.checks, points[free]
+        motions = is_valid.motions_free(start, free_points)
+        assert is_valid.checks >= before + len(free_points)
+        one_by_one = [is_valid.motion_free(tuple(start), tuple(point)) for point in free_points]
+        assert motions.tolist() == one_by_one
+        asked.extend([free.mean(), motions.mean()])
+        return [start, free_points[motions.argmax()], goal]
+
+    Planner(worlds["wall"], batched, simplify=0).plan(READY, TURNED, seed=3)
+    assert 0 < asked[0] < 1 and 0 < asked[1] < 1
+
+
+def test_planning_within_a_time(worlds):
+    queries = load_queries("double_walls")
+    planner = Planner(worlds["double_walls"], time_limit=3.0, max_checks=123)
+    paths = [planner.plan_within(60.0, *queries[0], rng=np.random.default_rng(4)) for _ in "ab"]
+    assert is_path_of(paths[0], queries[0].start, queries[0].goal)
+    assert paths[0].tobytes() == paths[1].tobytes()
+    assert (planner.time_limit, planner.max_checks) == (3.0, 123)  # they are of `plan`
+    with pytest.raises(PlanningError, match="no path in 1e-09 s"):
+        planner.plan_within(1e-9, *queries[0], rng=np.random.default_rng(4))
+
+
+def test_a_path_longer_than_an_episode_is_planned_again(monkeypatch):
+    env = envs.make("double_walls", horizon=200)
+    start, goal, _ = load_queries("double_walls")[0]
+    planner, cautions = Planner(env), []
+    there = panda.denormalise(np.random.default_rng(0).uniform(-1, 1, (6, 7))).astype(np.float32)
+    detour, short = np.stack([start, *there, goal]), np.stack([start, goal])
+    assert length(detour) > 200 * 0.03 > length(short)
+
+    def plan(*query, seed, caution):
+        cautions.append(caution)
+        return short if caution in good else detour
+
+    monkeypatch.setattr(planner, "plan", plan)
+    good = (0.5,)
+    path = planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1))
+    assert path.tobytes() == short.tobytes() and cautions == [1, 0.5]
+    cautions.clear()
+    good = ()
+    path = planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1))
+    assert path.tobytes() == detour.tobytes() and cautions == [1, 0.5, 0.25]
+    env.close()
+
+
 # --- Clearance
 
 
