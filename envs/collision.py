@@ -52,7 +52,8 @@ _FAR = 1e9  # m: farther than anything
 # A row describes a convex shape: kind, centre 3, rotation 9 (row-major), half edges of its core 3,
 # rounding, and of a link which one. The shape is all that is within `rounding` of the core, which
 # is a box or a cylinder less its rounding, a sphere's centre, or a link's hull.
-_BOX, _CYLINDER, _SPHERE, _LINK = 0, 1, 2, 3
+# Kinds are those of `envs.scenes.to_array`, and one more.
+_CYLINDER, _LINK = 1, 3
 _ROW = 18
 # Directions fall into this many cells squared on each face of a cube, see `_cells`.
 _CELLS = 8
