@@ -4,11 +4,11 @@
     python benchmarks/planning.py    # random_boxes_hard; some 3 minutes
     python benchmarks/planning.py --task benchmaker_bookshelf_thin --split original
 
-Ours is `demo_generation.planning.Planner.plan_within`: RRT-Connect with one round of shortening, at
-most three attempts, each keeping less distance. Two others are the same but for their collision
-checks, one configuration at a time in PyBullet's world, asked from Python, as it was before
-`envs.collision`: one with today's options, and one with OMPL's own range and three rounds of
-shortening, as `evaluate.py --policy planner` had them then (`pybullet_checked`).
+Ours is `demo_generation.planning.Planner.plan_within`: RRT-Connect with one round of shortening,
+which keeps less and less distance. Two others check one configuration at a time in PyBullet's
+world, asked from Python, and make three searches of less and less distance, as it was before
+`envs.collision`: one with today's range and shortening, and one with OMPL's own range and three
+rounds of shortening, as `evaluate.py --policy planner` had them then (`pybullet_checked`).
 
 The others plan the first `--peer` queries, in turns with ours. A mean is over all queries of a
 planner, those without a plan included; a ratio is over the queries that both have had. Times are
@@ -43,10 +43,10 @@ from envs.scenes import Box, Cylinder, Scene
 class PyBulletValidity:
     """Whether a normalised configuration is free, by the contacts that PyBullet reports."""
 
-    def __init__(self, world, margin, ends, planner):
+    def __init__(self, world, margin, ends, time_limit, max_checks):
         self.world, self.margin, self.checks = world, margin, 0
         self.ends = [(panda.normalise(end), self.distance(end) - 1e-5) for end in ends]
-        self.deadline, self.max_checks = time.monotonic() + planner.time_limit, planner.max_checks
+        self.deadline, self.max_checks = time.monotonic() + time_limit, max_checks
 
     def distance(self, configuration):
         client, robot = self.world.client, self.world.robot
@@ -67,20 +67,32 @@ class PyBulletValidity:
     def exhausted(self):
         return self.checks >= self.max_checks or time.monotonic() > self.deadline
 
+    def insist(self):
+        """Nothing to do: what it keeps does not change."""
+
 
 class PyBulletPlanner(Planner):
-    """`Planner` as it was: the clearance is kept by inflating the scene."""
+    """The planner as it was: the clearance is kept by inflating the scene, searches begin anew."""
 
     def __init__(self, env, **options):
         super().__init__(env, **options)
         self.inflated = envs.RoboArmEnv(env.scene)
 
-    def _validity(self, start, goal, caution):
+    def plan_within(self, seconds, *query, rng):
+        deadline = time.monotonic() + seconds
+        for share, caution in ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25)):
+            self.time_limit = share * (deadline - time.monotonic())
+            with contextlib.suppress(PlanningError):
+                return self.plan(*query, seed=int(rng.integers(1, 2**32)), caution=caution)
+        raise PlanningError(f"no path in {seconds} s")
+
+    def _validity(self, start, goal, cautions, time_limit, max_checks):
+        ((_, caution),) = cautions
         world = self.env
         self.inflated.set_scene(inflate(self.env.scene, caution * self.clearance))
         if not any(self.inflated.in_collision(end) for end in (start, goal)):
             world = self.inflated
-        return PyBulletValidity(world, caution * MARGIN, (start, goal), self)
+        return PyBulletValidity(world, caution * MARGIN, (start, goal), time_limit, max_checks)
 
     def _space(self, is_valid):
         information = ob.SpaceInformation(planning.normalised_space())
@@ -134,7 +146,7 @@ def main():
         parser.error("--num must be at least 1, --peer at least 0, --limits positive")
     env, other_env = envs.make(args.task), envs.make(args.task)
     ways = {
-        "ours": Planner(env, max_checks=math.inf),
+        "ours": Planner(env),
         "pybullet_checked": PyBulletPlanner(
             other_env, max_checks=math.inf, planner_range=0, simplify=3
         ),

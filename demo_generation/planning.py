@@ -13,7 +13,6 @@ within a fraction of a millimetre and is some twenty times faster; the environme
 last word on start and goal. Planning happens in the normalised configuration space [-1, 1]^7.
 """
 
-import itertools
 import math
 import time
 
@@ -47,10 +46,12 @@ MARGIN = 0.003
 # Around a start or goal that is nearer than that, the margin grows by this much (m) per unit of
 # normalised distance from it: all of it is kept again some three steps away.
 MARGIN_GROWTH = 0.03
-# `plan_within` tries with all of the distances to keep, with half of them, and with a quarter, each
-# time looking at so many configurations at most (some 15 ms), then with twice as many, and so on.
-# (4,000 and 16,000 differ by little on validation queries of `random_boxes_hard`, `pole_shelves`.)
-CAUTIONS, FIRST_CHECKS = (1.0, 0.5, 0.25), 8_000
+# `Planner.plan_within` gives up these distances bit by bit as a search goes on, because one that
+# takes long is likely to go on for long: after so many configurations it keeps this share of them.
+# (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmarks.md.)
+CAUTIONS = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
+# Searches that it makes at most for a path that can be followed within an episode.
+SEARCHES = 3
 # Steps by which the arm may come later than its last sub-goal.
 LAG = 10
 # Trials of cutting a corner in one round of simplification, and how many may fail in a row. Bounded
@@ -71,15 +72,16 @@ class Validity:
 
     Args:
         checker: a `CollisionChecker`.
-        rule: `margin`, `clearance` and `relaxed` of its methods.
+        rules: pairs of a number of checks and, to be kept from then on, a dict of `margin`,
+            `clearance` and `relaxed` of the checker's methods; the first from 0 on.
         time_limit, max_checks: as for `Planner`.
     """
 
-    def __init__(self, checker, rule, time_limit, max_checks):
-        self._checker, self._rule = checker, rule
-        self._check = checker.motion_checker(**rule)
+    def __init__(self, checker, rules, time_limit, max_checks):
+        self._checker, self._rules, self._later = checker, rules, list(rules)
         self._deadline, self._max_checks = time.monotonic() + time_limit, max_checks
         self.checks = 0
+        self._relax()
 
     def __call__(self, state):
         """Whether a configuration is free."""
@@ -91,24 +93,42 @@ class Validity:
 
         Both are tuples of 7 floats.
         """
+        if self.checks >= self._next:
+            self._relax()
         checks = self._check(start, end)
         self.checks += abs(checks)
         return checks > 0
 
     def free(self, states):
         """Which configurations (..., 7) are free: bool (...)."""
+        if self.checks >= self._next:
+            self._relax()
         free = self._checker.is_free(states, **self._rule)
         self.checks += free.size
         return free
 
     def motions_free(self, starts, ends):
         """Which straight motions from `starts` (..., 7) to `ends` (..., 7) are free: bool (...)."""
+        if self.checks >= self._next:
+            self._relax()
         checks = self._checker.motion_checks(starts, ends, **self._rule)
         self.checks += int(np.abs(checks).sum())
         return checks > 0
 
     def exhausted(self):
         return self.checks >= self._max_checks or time.monotonic() > self._deadline
+
+    def insist(self):
+        """From now on, the first rule is kept: for what improves a path that is there."""
+        self._later = [self._rules[0]]
+        self._relax()
+
+    def _relax(self):
+        """Keep the next rule."""
+        while self._later and self._later[0][0] <= self.checks:
+            self._rule = self._later.pop(0)[1]
+        self._next = self._later[0][0] if self._later else math.inf
+        self._check = self._checker.motion_checker(**self._rule)
 
 
 class _States(ob.StateValidityChecker):
@@ -210,16 +230,43 @@ class Planner:
                 path from start to goal.
             PlanningError: no path within `time_limit` and `max_checks`.
         """
-        if not seed > 0:
-            raise ValueError(f"seed must be positive, got {seed!r}")  # OMPL ignores others
         if not 0 <= caution <= 1:
             raise ValueError(f"caution must be in [0, 1], got {caution!r}")
+        cautions = ((0, caution),)
+        return self._plan(start, goal, scene, seed, cautions, self.time_limit, self.max_checks)
+
+    def plan_within(self, seconds, start, goal, scene=None, *, rng):
+        """A path found in `seconds`, which are its only limit; it keeps what `CAUTIONS` say.
+
+        The same path comes out on every machine that has the time. If it takes longer to follow
+        than an episode lasts, there is another search, up to `SEARCHES`, and the shortest is
+        returned. `rng`, a NumPy Generator, gives the seeds; the rest is as for `plan`, which may
+        be a little late itself.
+        """
+        deadline, best = time.monotonic() + seconds, None
+        for _ in range(SEARCHES):
+            seed, left = int(rng.integers(1, 2**32)), deadline - time.monotonic()
+            try:
+                path = self._plan(start, goal, scene, seed, CAUTIONS, left, math.inf)
+            except PlanningError:
+                break
+            if best is None or len(subgoals(path)) < len(subgoals(best)):
+                best = path
+            if len(subgoals(best)) <= self.env.horizon - LAG:
+                break
+        if best is None:
+            raise PlanningError(f"no path in {seconds} s")
+        return best
+
+    def _plan(self, start, goal, scene, seed, cautions, time_limit, max_checks):
+        if not seed > 0:
+            raise ValueError(f"seed must be positive, got {seed!r}")  # OMPL ignores others
         if np.shape(goal) == (3,):  # a position, with which an episode may begin
             raise ValueError("goal must have 7 numbers, got shape (3,)")
         # Both are refused here as an episode would refuse them.
         self.env.reset_specific(start, goal, scene)
         start, goal = (np.asarray(end, dtype=np.float32) for end in (start, goal))
-        is_valid = self._validity(start, goal, caution)
+        is_valid = self._validity(start, goal, cautions, time_limit, max_checks)
         states = panda.normalise(start), panda.normalise(goal)
         # For the random number generators that OMPL makes from here on. Spaces make some, for the
         # projections of KPIECE1 and its kin; how many must not matter to the planner.
@@ -233,66 +280,34 @@ class Planner:
             kind = getattr(og, self.planner)
             path = _solve(kind, self.planner_range, space, is_valid, *states)
         if path is not None and self.simplify:
+            is_valid.insist()
             path = _simplify(space, path, self.simplify)
         self.checks = is_valid.checks
         if path is None:
             raise PlanningError(
-                f"no path in {is_valid.checks} collision checks (limits: {self.max_checks} checks, "
-                f"{self.time_limit} s)"
+                f"no path in {is_valid.checks} collision checks (limits: {max_checks} checks, "
+                f"{time_limit} s)"
             )
         path = panda.denormalise(path).astype(np.float32)
         path[0], path[-1] = start, goal
         return path
 
-    def plan_within(self, seconds, start, goal, scene=None, *, rng):
-        """A path found in `seconds`, by attempts of different caution (`CAUTIONS`).
-
-        Short attempts come first, because a search that takes long is likely to go on for long. The
-        same path comes out on every machine that has the time. One that takes longer to follow than
-        an episode lasts is only returned if the other cautions give no shorter one. `rng`, a NumPy
-        Generator, gives the seeds; the rest is as for `plan`, which may be a little late itself.
-        """
-        deadline, limits = time.monotonic() + seconds, (self.time_limit, self.max_checks)
-        longest, best = self.env.horizon - LAG, None
-        try:
-            for attempt in itertools.count():
-                rounds, turn = divmod(attempt, len(CAUTIONS))
-                self.time_limit = deadline - time.monotonic()
-                if self.time_limit <= 0 or (turn == 0 and best is not None):
-                    break
-                self.max_checks = FIRST_CHECKS * 2**rounds
-                seed = int(rng.integers(1, 2**32))
-                try:
-                    path = self.plan(start, goal, scene, seed=seed, caution=CAUTIONS[turn])
-                except PlanningError:
-                    continue
-                if best is None or len(subgoals(path)) < len(subgoals(best)):
-                    best = path
-                if len(subgoals(best)) <= longest:
-                    break
-        finally:
-            self.time_limit, self.max_checks = limits
-        if best is None:
-            raise PlanningError(f"no path in {seconds} s")
-        return best
-
-    def _validity(self, start, goal, caution):
+    def _validity(self, start, goal, cautions, time_limit, max_checks):
         if self._checker.scene is not self.env.scene:
             self._checker = CollisionChecker(self.env.scene)
         ends = np.clip(np.stack([panda.normalise(start), panda.normalise(goal)]), -1.0, 1.0)
         near = self._checker.nearest(ends).distance.min(-1)
         from_scene = self._checker.nearest(ends, self_collisions=False).distance.min(-1)
-        clearance = caution * self.clearance
-        if from_scene.min() < clearance:
-            clearance = 0.0
-        # Less a hair, because the ends are checked again after normalising, which rounds.
-        distances = np.minimum(near, from_scene - clearance) - 1e-5
-        rule = {
-            "margin": caution * MARGIN,
-            "clearance": clearance,
-            "relaxed": (ends, distances, MARGIN_GROWTH),
-        }
-        return Validity(self._checker, rule, self.time_limit, self.max_checks)
+        clearance = cautions[0][1] * self.clearance
+        clearance = self.clearance if from_scene.min() >= clearance else 0.0
+        rules = []
+        for checks, caution in cautions:
+            # Less a hair, because the ends are checked again after normalising, which rounds.
+            distances = np.minimum(near, from_scene - caution * clearance) - 1e-5
+            relaxed = ends, distances, MARGIN_GROWTH
+            rule = dict(margin=caution * MARGIN, clearance=caution * clearance, relaxed=relaxed)
+            rules.append((checks, rule))
+        return Validity(self._checker, rules, time_limit, max_checks)
 
     def _space(self, is_valid):
         """OMPL's `SpaceInformation`, which asks `is_valid`."""

@@ -163,7 +163,7 @@ def _via_points(seed, tries):
 
 def _planner(env, seed, time_limit):
     planning = _import_planning()
-    planner = planning.Planner(env, max_checks=math.inf)
+    planner = planning.Planner(env)
 
     def begin(number, query):
         rng = np.random.default_rng([seed, number])

@@ -17,7 +17,7 @@ from torch import nn
 import demo_generation
 import envs
 from demo_generation.following import follow
-from demo_generation.planning import Planner, PlanningError
+from demo_generation.planning import Planner
 from envs import panda
 from envs.datasets import load_queries, write_queries
 from envs.exported_networks import save_network
@@ -253,7 +253,7 @@ def test_the_planner_solves_double_walls_and_follows_its_plan():
     assert "ompl" in result["versions"] and "ompl" not in straight["versions"]
 
     env, rows = envs.make("double_walls"), []
-    planner = Planner(env, max_checks=math.inf)
+    planner = Planner(env)
     for index, query in enumerate(queries):
         path = planner.plan_within(60.0, *query, rng=np.random.default_rng([2, index]))
         states = panda.denormalise(follow(env, path).states)
@@ -272,32 +272,6 @@ def test_a_planner_without_time_gives_up():
     assert result["success_rate"] == result["collision_rate"] == 0
     assert result["mean_steps"] is None and result["ms_per_action"] is None
     assert result["planning_seconds"] > 0 and result["planning_seconds_solved"] is None
-
-
-def test_the_planners_searches_become_longer(monkeypatch):
-    now, attempts = [100.0], []
-
-    class Never(Planner):
-        def plan(self, start, goal, scene, *, seed, caution):
-            attempts.append((self.time_limit, self.max_checks, caution, seed))
-            now[0] += 1.0
-            raise PlanningError("no path")
-
-    monkeypatch.setattr(demo_generation.planning, "Planner", Never)
-    monkeypatch.setattr(evaluation.time, "monotonic", lambda: now[0])
-    result = evaluate("planner", "wall", queries=_queries((LEFT, RIGHT)), time_limit=8.0)
-    assert result["success_rate"] == 0
-    assert [attempt[:3] for attempt in attempts] == [
-        (8.0, 8_000, 1.0),
-        (7.0, 8_000, 0.5),
-        (6.0, 8_000, 0.25),
-        (5.0, 16_000, 1.0),
-        (4.0, 16_000, 0.5),
-        (3.0, 16_000, 0.25),
-        (2.0, 32_000, 1.0),
-        (1.0, 32_000, 0.5),
-    ]
-    assert len({seed for *_, seed in attempts}) == 8
 
 
 def test_the_planner_without_ompl(monkeypatch):

@@ -11,7 +11,7 @@ import pybullet as p
 import pytest
 
 import envs
-from demo_generation.planning import PLANNERS, Planner, PlanningError
+from demo_generation.planning import CAUTIONS, MARGIN, PLANNERS, Planner, PlanningError
 from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
@@ -274,7 +274,6 @@ def test_planning_within_a_time(worlds):
     paths = [planner.plan_within(60.0, *queries[0], rng=np.random.default_rng(4)) for _ in "ab"]
     assert is_path_of(paths[0], queries[0].start, queries[0].goal)
     assert paths[0].tobytes() == paths[1].tobytes()
-    assert (planner.time_limit, planner.max_checks) == (3.0, 123)  # they are of `plan`
     with pytest.raises(PlanningError, match="no path in 1e-09 s"):
         planner.plan_within(1e-9, *queries[0], rng=np.random.default_rng(4))
 
@@ -282,24 +281,52 @@ def test_planning_within_a_time(worlds):
 def test_a_path_longer_than_an_episode_is_planned_again(monkeypatch):
     env = envs.make("double_walls", horizon=200)
     start, goal, _ = load_queries("double_walls")[0]
-    planner, cautions = Planner(env), []
     there = panda.denormalise(np.random.default_rng(0).uniform(-1, 1, (6, 7))).astype(np.float32)
-    detour, short = np.stack([start, *there, goal]), np.stack([start, goal])
-    assert length(detour) > 200 * 0.03 > length(short)
+    detour, longer = np.stack([start, *there, goal]), np.stack([start, *there, start, goal])
+    short = np.stack([start, goal])
+    assert length(longer) > length(detour) > 200 * 0.03 > length(short)
 
-    def plan(*query, seed, caution):
-        cautions.append(caution)
-        return short if caution in good else detour
+    def searched(*paths):
+        """What comes out of searches that find these paths, and how many it takes."""
+        left = list(paths)
 
-    monkeypatch.setattr(planner, "plan", plan)
-    good = (0.5,)
-    path = planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1))
-    assert path.tobytes() == short.tobytes() and cautions == [1, 0.5]
-    cautions.clear()
-    good = ()
-    path = planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1))
-    assert path.tobytes() == detour.tobytes() and cautions == [1, 0.5, 0.25]
+        def search(is_valid, start, goal, rng):
+            return panda.normalise(left.pop(0))
+
+        planner = Planner(env, search, simplify=0)
+        return planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1)), len(left)
+
+    for paths, best, left in (
+        ((detour, short, detour), short, 1),
+        ((longer, detour, longer, short), detour, 1),
+    ):
+        path, unused = searched(*paths)
+        np.testing.assert_allclose(path, best, atol=1e-6)
+        assert unused == left
     env.close()
+
+
+def test_a_long_search_keeps_less_and_less_distance(worlds):
+    env, (start, goal, _) = worlds["wall"], load_queries("wall")[0]
+    points = np.random.default_rng(0).uniform(-1, 1, (20_000, 7))
+    distances = CollisionChecker(env.scene).nearest(points).distance.min(-1)
+    near = np.abs(distances - 0.003) < 0.006  # of what a margin decides about, all there is
+    kept, asked = [], []
+
+    def search(is_valid, start, goal, rng):
+        for checks, _ in CAUTIONS:
+            while is_valid.checks < checks:
+                is_valid.free(points[:500])
+            kept.append(distances[near][is_valid.free(points[near])].min())
+        asked.append(is_valid)
+        return [start, goal]
+
+    planner = Planner(env, search, clearance=0.0)
+    planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1))
+    # What shortens the path keeps everything.
+    kept.append(distances[near][asked[0].free(points[near])].min())
+    wanted = np.array([caution for _, caution in CAUTIONS] + [1.0]) * MARGIN
+    assert (kept >= wanted).all() and np.abs(kept - wanted).max() < 0.0005
 
 
 # --- Clearance
