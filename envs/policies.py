@@ -16,7 +16,6 @@
 
 import importlib.resources
 import itertools
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
