@@ -19,14 +19,18 @@ Policies to compare a trained one with:
   free of collisions, or else by way of the first of `--tries` random configurations for which the
   motion is free; if there is none it goes straight all the same;
 - planner: plans before it moves, with OMPL's RRT-Connect, and follows the plan. It may search for
-  `--time-limit` seconds per query: a short search for a plan that keeps away from obstacles, one
-  for a plan that keeps half as far away, one for a quarter as far, then the same three for twice
-  as long, and so on. (Shortening a plan may take some milliseconds more.) Without a plan it gives
-  up: a failure of 0 steps. As the limit is wall-clock time, the numbers may depend on the machine,
-  and on what else it is doing.
+  `--time-limit` seconds per query; the longer it searches, the less it keeps away from obstacles.
+  (Shortening a plan may take some milliseconds more.) Without a plan it gives up: a failure of 0
+  steps. As the limit is wall-clock time, the numbers may depend on the machine, and on what else it
+  is doing.
 
 The last two check collisions with the true obstacles (`envs.collision`), which a trained policy
-does not see.
+does not see; with `--encoder points`, with what four point clouds see of them: look, then plan.
+
+Around any policy, `--keep-distance` puts a last layer (`envs.last_layer`): no link comes nearer to
+anything than so many metres, and the arm leaves dead ends. It knows the true obstacles, too, or
+with `--encoder points` what is seen.
+
 What comes out:
 
 - success: share of episodes that reached the goal, with a 95% Wilson interval;
@@ -53,7 +57,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -68,6 +72,7 @@ import envs
 from envs import panda, workers
 from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
 from envs.files import check_writable, write_atomically
+from envs.last_layer import LastLayer
 from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy
 from envs.scenes import Scene
 from envs.tasks import get_task, task_name
@@ -97,8 +102,15 @@ class Args:
     """processes; each uses one core"""
     stop_on_collision: bool = False
     """end an episode at the first touch"""
+    encoder: Literal["points"] | None = None
+    """what `planner`, `via-points` and the last layer know of the scene: `points` that sensors see;
+    by default the true obstacles"""
+    keep_distance: float | None = None
+    """put a last layer around the policy that keeps this distance (m), e.g. 0.01"""
+    way_out: bool = True
+    """the last layer also leaves dead ends, by a detour into a random direction"""
     seed: int = 0
-    """of `random`, `via-points` and `planner`"""
+    """of what is random: `random`, `via-points`, `planner`, ways out"""
     tries: int = TRIES
     """random configurations that `via-points` tries per query"""
     time_limit: float = TIME_LIMIT
@@ -170,6 +182,8 @@ class _Job:
     seed: int
     tries: int
     time_limit: float
+    encoder: str | None
+    last_layer: LastLayer | None
     start: np.ndarray
     goal: np.ndarray
     scenes: Sequence[Scene]
@@ -178,7 +192,8 @@ class _Job:
 
     def make(self, **kwargs):
         env = envs.make(self.task, **self.env, **kwargs)
-        return env, make_policy(self.policy, env, self.seed, self.tries, self.time_limit)
+        options = self.seed, self.tries, self.time_limit, self.encoder, self.last_layer
+        return env, make_policy(self.policy, env, *options)
 
     def query(self, index):
         return Query(self.start[index], self.goal[index], self.scenes[index])
@@ -283,6 +298,8 @@ def evaluate(
     seed=0,
     tries=TRIES,
     time_limit=TIME_LIMIT,
+    encoder=None,
+    last_layer=None,
     workers=1,
     env=None,
     progress=False,
@@ -303,9 +320,12 @@ def evaluate(
         split: `test`, `validation` or `original`; which queries of the file.
         num_queries: only the first so many of them.
         stop_on_collision: end an episode at the first touch.
-        seed: of `random`, `via-points` and `planner`; each query has its own generator.
+        seed: of what is random; each query has its own generator.
         tries: random configurations that `via-points` tries per query, >= 1.
         time_limit: seconds that `planner` may search per query, > 0.
+        encoder: `points`: `planner`, `via-points` and the last layer know only what sensors see;
+            None: the true obstacles.
+        last_layer: an `envs.last_layer.LastLayer` around the policy.
         workers: processes. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
         env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
@@ -330,6 +350,8 @@ def evaluate(
         seed,
         tries,
         time_limit,
+        encoder,
+        last_layer,
         workers,
         env,
     )
@@ -347,6 +369,8 @@ def _prepare(
     seed,
     tries,
     time_limit,
+    encoder,
+    last_layer,
     workers,
     env,
 ):
@@ -373,13 +397,19 @@ def _prepare(
                     )
                 env, goal_type = trained, trained["goal_type"]
         env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
+        if last_layer is not None:
+            env["proximity"] = encoder or "obstacles"
+        elif encoder is not None and policy not in PLANNING:
+            raise EvaluationError(
+                "encoder is for via-points, planner and a last layer: a trained policy has its own"
+            )
         if queries is None:
             queries = load_queries(task, split)
         elif isinstance(queries, (str, Path)):
             validate(queries, task)  # they are for this task, with the scene it has now
             queries = load_queries(queries, split)
         arm = envs.make(task, **env)
-        make_policy(policy, arm)  # or it raises
+        make_policy(policy, arm, encoder=encoder, last_layer=last_layer)  # or it raises
         arm.close()
     except (TypeError, ValueError) as error:
         raise EvaluationError(str(error)) from error
@@ -402,6 +432,8 @@ def _prepare(
         seed,
         tries,
         time_limit,
+        encoder,
+        last_layer,
         queries.start[:count],
         queries.goal[:count],
         scenes,
@@ -453,7 +485,9 @@ def _summary(job, outcomes):
             for name, standard in STANDARD_RULES.items()
             if job.env.get(name, standard) != standard
         },
-        "seed": job.seed if job.policy in ("random", *PLANNING) else None,
+        "encoder": job.encoder,
+        "last_layer": job.last_layer and asdict(job.last_layer),
+        "seed": job.seed if job.policy in ("random", *PLANNING) or job.last_layer else None,
         "tries": job.tries if job.policy == "via-points" else None,
         "time_limit": job.time_limit if job.policy == "planner" else None,
         "versions": {
@@ -543,6 +577,8 @@ def main(arguments=None):
             args.seed,
             args.tries,
             args.time_limit,
+            args.encoder,
+            args.keep_distance and LastLayer(args.keep_distance, args.way_out),
             args.workers,
             env=None,
         )

@@ -176,6 +176,8 @@ class Planner:
             those that have such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with
             RRTConnect, docs/benchmarks.md.)
         simplify: rounds of removing vertices and cutting corners; 0 for none.
+        checker_of: from a `Scene` to the `CollisionChecker` that is asked, by default that of the
+            true obstacles; `envs.seeing.seen_checker` knows only what sensors see.
 
     Raises:
         ValueError: unknown planner, a limit that is not positive, or another number out of range.
@@ -190,6 +192,7 @@ class Planner:
         clearance=0.005,
         planner_range=0.4,
         simplify=1,
+        checker_of=CollisionChecker,
     ):
         if not callable(planner) and planner not in PLANNERS:
             raise ValueError(f"unknown planner {planner!r}: one of {', '.join(PLANNERS)}")
@@ -206,7 +209,7 @@ class Planner:
         self.time_limit, self.max_checks = time_limit, max_checks
         self.clearance = clearance
         self.planner_range, self.simplify = planner_range, simplify
-        self._checker = CollisionChecker(env.scene)
+        self._checker_of, self._scene, self._checker = checker_of, env.scene, checker_of(env.scene)
         # What is compiled at its first call is compiled now, not in a plan's time.
         state = (0.0,) * panda.NUM_JOINTS
         self._checker.nearest(state)
@@ -293,8 +296,8 @@ class Planner:
         return path
 
     def _validity(self, start, goal, cautions, time_limit, max_checks):
-        if self._checker.scene is not self.env.scene:
-            self._checker = CollisionChecker(self.env.scene)
+        if self._scene is not self.env.scene:
+            self._scene, self._checker = self.env.scene, self._checker_of(self.env.scene)
         ends = np.clip(np.stack([panda.normalise(start), panda.normalise(goal)]), -1.0, 1.0)
         near = self._checker.nearest(ends).distance.min(-1)
         from_scene = self._checker.nearest(ends, self_collisions=False).distance.min(-1)

@@ -8,26 +8,38 @@ from envs.tasks import TASKS, get_task
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
 
 
-def make(task, encoder=None, **kwargs):
+def make(task, encoder=None, proximity=None, **kwargs):
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
     Args:
         task: name of a task (`TASKS`), or path of a scene file (docs/your_own_scene.md).
-        encoder: what is appended to `observation` about the scene: path of an encoder's network, or
-            `oracle` (`envs.encoders`); None for nothing.
+        encoder: what is appended to `observation` about the scene: path of an encoder's network,
+            `oracle` or `points` (`envs.encoders`); None for nothing.
+        proximity: add `proximity` to observations, how far each link is from the nearest thing
+            (`envs.wrappers.ProximityWrapper`): of the true `obstacles`, or of the `points` that
+            four sensors saw of them; None for nothing.
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:
         ValueError: unknown task, malformed scene file, an argument out of its range, or a file
             that is no encoder.
     """
+    if proximity not in (None, "obstacles", "points"):
+        raise ValueError(f"proximity must be None, 'obstacles' or 'points', got {proximity!r}")
     env = RoboArmEnv(get_task(task).scene, **kwargs)
-    if encoder is None:
-        return env
-    from envs.encoders import scene_encoder  # here, because it imports torch
-    from envs.wrappers import SceneEncodingWrapper
+    # What takes long to import is imported only where it is needed.
+    if encoder is not None:
+        from envs.encoders import scene_encoder
+        from envs.wrappers import SceneEncodingWrapper
 
-    return SceneEncodingWrapper(env, scene_encoder(encoder))
+        env = SceneEncodingWrapper(env, scene_encoder(encoder))
+    if proximity is not None:
+        from envs import seeing
+        from envs.wrappers import ProximityWrapper
+
+        checker_of = seeing.seen_checker if proximity == "points" else seeing.true_checker
+        env = ProximityWrapper(env, checker_of)
+    return env
 
 
 def gymnasium_id(task):

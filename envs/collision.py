@@ -45,7 +45,7 @@ MAX_MARGIN = 0.5
 LINKS = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10)
 """PyBullet's indices of the links that may touch something, in the order of `Nearest`: the seven
 that the joints move, the hand, the two fingers."""
-NOTHING, TABLE, FLOOR, ARM = -1, -2, -3, -4
+NOTHING, TABLE, FLOOR, ARM, POINT = -1, -2, -3, -4, -5
 """What `Nearest.thing` says where it is not the index of an obstacle."""
 
 _FAR = 1e9  # m: farther than anything
@@ -53,8 +53,10 @@ _FAR = 1e9  # m: farther than anything
 # rounding, and of a link which one. The shape is all that is within `rounding` of the core, which
 # is a box or a cylinder less its rounding, a sphere's centre, or a link's hull.
 # Kinds are those of `envs.scenes.to_array`, and one more.
-_CYLINDER, _LINK = 1, 3
+_CYLINDER, _SPHERE, _LINK = 1, 2, 3
 _ROW = 18
+# Points are looked at in groups of about this size (m).
+_GROUP_SIZE = 0.16
 # Directions fall into this many cells squared on each face of a cube, see `_cells`.
 _CELLS = 8
 # GJK stops at this precision (m), after 3 to 10 iterations in nearly all cases; EPA at its own.
@@ -72,13 +74,16 @@ class Nearest(NamedTuple):
             the link to get away. Zeros where there is nothing.
         point: m, (..., 10, 3), in the base's frame: the point of the link's hull that is nearest,
             or deepest. Zeros where there is nothing.
+        gradient: m per unit of normalised configuration, (..., 10, 7): how `distance` changes with
+            each joint. Zeros where there is nothing.
         thing: (..., 10): the index of an obstacle, or `TABLE`, `FLOOR`, `ARM` (another link),
-            `NOTHING`.
+            `POINT` (one of the points), `NOTHING`.
     """
 
     distance: np.ndarray
     direction: np.ndarray
     point: np.ndarray
+    gradient: np.ndarray
     thing: np.ndarray
 
 
@@ -90,15 +95,18 @@ class CollisionChecker:
 
     Args:
         scene: a `Scene`.
+        points: m, (n, 3), in the base's frame: balls that are there, too, such as the points of
+            obstacles that a sensor saw.
+        point_radius: m, theirs, in [0, `MAX_MARGIN`).
 
     Raises:
-        TypeError: it is none.
+        TypeError: the scene is none.
         ValueError: an obstacle, the table or the floor has a size that is not positive, or numbers
-            that are not finite. Of all methods: states of another shape, not finite, or outside
-            the limits; a margin out of its range.
+            that are not finite; so with the points. Of all methods: states of another shape, not
+            finite, or outside the limits; a margin out of its range.
     """
 
-    def __init__(self, scene):
+    def __init__(self, scene, points=(), point_radius=0.0):
         if not isinstance(scene, Scene):
             raise TypeError(f"a scene must be an envs.scenes.Scene, got {scene!r}")
         self.scene = scene
@@ -109,8 +117,8 @@ class CollisionChecker:
         if scene.floor is not None:
             shapes.append(floor_box(scene.floor))
             things.append(FLOOR)
-        self._rows = _rows(shapes)
-        self._things = np.array([*things, ARM, NOTHING])
+        self._things = np.array([*things, ARM, POINT, NOTHING])
+        self._world = _rows(shapes), *_cloud(points, point_radius)
 
     def is_free(self, states, margin=0.0, clearance=0.0, relaxed=None):
         """Whether the arm is at least `margin` away from everything: bool (...).
@@ -128,7 +136,7 @@ class CollisionChecker:
         states = _states("states", states)
         free = np.empty(states.shape[:-1], dtype=np.bool_)
         rule = _rule(margin, clearance, relaxed)
-        _free_batch(states.reshape(-1, 7), *rule, *_arm(), self._rows, free.reshape(-1))
+        _free_batch(states.reshape(-1, 7), *rule, *_arm(), *self._world, free.reshape(-1))
         return free
 
     def is_motion_free(
@@ -154,7 +162,7 @@ class CollisionChecker:
         rule = _rule(margin, clearance, relaxed, resolution)
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
         flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
-        _motion_batch(*flat, *rule, *_arm(), self._rows, checks.reshape(-1))
+        _motion_batch(*flat, *rule, *_arm(), *self._world, checks.reshape(-1))
         return checks
 
     def motion_checker(self, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION):
@@ -164,7 +172,7 @@ class CollisionChecker:
         looked at again; and it does not look at its arguments.
         """
         rule = _rule(margin, clearance, relaxed, resolution)
-        rest = (*rule, *_arm(), self._rows)
+        rest = (*rule, *_arm(), *self._world)
 
         def check(start, end):
             return _motion(start, end, *rest)
@@ -182,17 +190,19 @@ class CollisionChecker:
         batch = (*states.shape[:-1], len(LINKS))
         distance, which = np.empty(batch), np.empty(batch, dtype=np.int64)
         direction, point = np.empty((*batch, 3)), np.empty((*batch, 3))
+        gradient = np.empty((*batch, panda.NUM_JOINTS))
         _nearest_batch(
             states.reshape(-1, 7),
             bool(self_collisions),
             *_arm(),
-            self._rows,
+            *self._world,
             distance.reshape(-1, len(LINKS)),
             direction.reshape(-1, len(LINKS), 3),
             point.reshape(-1, len(LINKS), 3),
+            gradient.reshape(-1, len(LINKS), panda.NUM_JOINTS),
             which.reshape(-1, len(LINKS)),
         )
-        return Nearest(distance, direction, point, self._things[which])
+        return Nearest(distance, direction, point, gradient, self._things[which])
 
 
 def _states(name, states):
@@ -329,12 +339,38 @@ def _rows(obstacles):
     return rows
 
 
+def _cloud(points, radius):
+    """Points, in groups that lie together, as the compiled functions take them. Raises ValueError.
+
+    Returns:
+        `points`: float64 (n, 3), m. `groups`: float64 (g, 6): the centre (m) of a group, how far
+        its points are from it at most, the first of them, and the one after the last. `ball`:
+        float64 (1, `_ROW`), a point as a shape.
+    """
+    points = np.asarray(points, dtype=np.float64).reshape(len(points), 3)
+    if not (np.isfinite(points).all() and 0 <= radius < MAX_MARGIN):
+        raise ValueError("points need finite numbers, and a radius from 0 to under half a metre")
+    _, cell = np.unique(
+        np.floor(points / _GROUP_SIZE).astype(np.int64), axis=0, return_inverse=True
+    )
+    points = points[np.argsort(cell.ravel(), kind="stable")]
+    offsets = np.cumsum([0, *np.bincount(cell.ravel())])
+    groups = np.empty((len(offsets) - 1, 6))
+    for group, first, end in zip(groups, offsets[:-1], offsets[1:], strict=True):
+        middle = (points[first:end].min(0) + points[first:end].max(0)) / 2
+        reach = np.linalg.norm(points[first:end] - middle, axis=1).max()
+        group[:] = (*middle, reach, first, end)
+    ball = np.zeros((1, _ROW))
+    ball[0, 0], ball[0, 16] = _SPHERE, radius
+    return points, groups, ball
+
+
 # --- Compiled. Working memory is float64: `frames` (8, 12), a rotation (row-major) and a position
 # each; `centres` (11, 3), of the bodies; `pose` (12,), of a shape in a body's frame; `simplex`, see
 # `_gjk`; `other` (1, `_ROW`), a link as the shape that another link may hit.
 
 
-def _compiled(function):
+def compiled(function):
     """Numba's `njit`, cached on disk if there is a folder for that which can be written to."""
     options = {"nogil": True, "error_model": "numpy"}
     try:
@@ -350,19 +386,19 @@ _JOINTS = tuple(
 )
 
 
-@_compiled
+@compiled
 def _memory():
     """(frames, centres, pose, simplex, other)"""
     return (
         np.zeros((8, 12)),
         np.empty((11, 3)),
-        np.empty(12),
+        np.zeros(12),
         np.empty(31),
         np.zeros((1, _ROW)),
     )
 
 
-@_compiled
+@compiled
 def _place(q, bodies, frames, centres):
     """Write the frames and the bodies' centres of a normalised configuration."""
     frames[0, 0] = frames[0, 4] = frames[0, 8] = 1.0
@@ -386,7 +422,7 @@ def _place(q, bodies, frames, centres):
             centres[body, i] = f[9 + i] + f[3 * i] * x + f[3 * i + 1] * y + f[3 * i + 2] * z
 
 
-@_compiled
+@compiled
 def _sphere_gap(rows, j, centres, k):
     """Squared distance (m^2) of a body's centre from the box around a shape's core."""
     x, y, z = centres[k, 0] - rows[j, 1], centres[k, 1] - rows[j, 2], centres[k, 2] - rows[j, 3]
@@ -396,7 +432,25 @@ def _sphere_gap(rows, j, centres, k):
     return u * u + v * v + w * w
 
 
-@_compiled
+@compiled
+def _box_gap(bodies, k, frames, centres, points, j, pose):
+    """Distance (m) of a point from the box around a body. Writes its place to `pose`."""
+    f = frames[int(bodies[k, 0])]
+    x, y, z = (
+        points[j, 0] - centres[k, 0],
+        points[j, 1] - centres[k, 1],
+        points[j, 2] - centres[k, 2],
+    )
+    pose[9] = f[0] * x + f[3] * y + f[6] * z
+    pose[10] = f[1] * x + f[4] * y + f[7] * z
+    pose[11] = f[2] * x + f[5] * y + f[8] * z
+    u = max(abs(pose[9]) - bodies[k, 5], 0.0)
+    v = max(abs(pose[10]) - bodies[k, 6], 0.0)
+    w = max(abs(pose[11]) - bodies[k, 7], 0.0)
+    return math.sqrt(u * u + v * v + w * w)
+
+
+@compiled
 def _relative(rows, j, frames, f, centres, k, pose):
     """Write the pose of a shape as a body sees it: rotation (row-major) and place."""
     x, y, z = rows[j, 1] - centres[k, 0], rows[j, 2] - centres[k, 1], rows[j, 3] - centres[k, 2]
@@ -407,7 +461,7 @@ def _relative(rows, j, frames, f, centres, k, pose):
             pose[3 * i + n] = a * rows[j, 4 + n] + b * rows[j, 7 + n] + c * rows[j, 10 + n]
 
 
-@_compiled
+@compiled
 def _boxes_apart(bodies, k, rows, j, pose, gap):
     """Whether a face of the body's box, or of that around the core, lies between them by `gap`."""
     for i in range(3):
@@ -426,7 +480,7 @@ def _boxes_apart(bodies, k, rows, j, pose, gap):
     return False
 
 
-@_compiled
+@compiled
 def _begin(rows, j, pose, s):
     """Write to s[28:31] a vector from a core towards a body, for `_gjk` to begin with."""
     # From the nearest point of the box around the core to the body's centre, in the core's axes.
@@ -445,7 +499,7 @@ def _begin(rows, j, pose, s):
         s[28] = 1.0
 
 
-@_compiled
+@compiled
 def _farthest(vertices, cells, k, x, y, z):
     """Index of the vertex of a body that is farthest along (x, y, z)."""
     u, v, w = abs(x), abs(y), abs(z)
@@ -469,7 +523,7 @@ def _farthest(vertices, cells, k, x, y, z):
     return found
 
 
-@_compiled
+@compiled
 def _support(vertices, cells, k, rows, j, pose, x, y, z):
     """The point of body minus core that is farthest along (x, y, z), and the body's vertex."""
     i = _farthest(vertices, cells, k, x, y, z)
@@ -499,7 +553,7 @@ def _support(vertices, cells, k, rows, j, pose, x, y, z):
     )
 
 
-@_compiled
+@compiled
 def _triangle(s, a, b, c):
     """The triangle of the points at s[a], s[b], s[c]: its point nearest to the origin.
 
@@ -541,7 +595,7 @@ def _triangle(s, a, b, c):
     return squared, u, v, w
 
 
-@_compiled
+@compiled
 def _reduce(s, n):
     """Keep of a simplex of `n` points those that span its point nearest to the origin.
 
@@ -597,7 +651,7 @@ def _reduce(s, n):
     return left
 
 
-@_compiled
+@compiled
 def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
     """Distance (m) of a body's hull from a shape's core; 0 where they overlap.
 
@@ -637,7 +691,7 @@ def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
     return bound, n
 
 
-@_compiled
+@compiled
 def _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
     """Whether a body's hull is at least `gap` (m) away from a shape's core."""
     _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
@@ -647,7 +701,7 @@ def _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap
     return _gjk(vertices, cells, k, rows, j, pose, s, gap, gap)[0] >= gap
 
 
-@_compiled
+@compiled
 def _as_row(bodies, k, frames, centres, row):
     """Write a body as a shape."""
     row[0, 0], row[0, 16], row[0, 17] = _LINK, BULLET_MARGIN, k
@@ -657,8 +711,8 @@ def _as_row(bodies, k, frames, centres, row):
         row[0, 4 + i] = frames[int(bodies[k, 0]), i]
 
 
-@_compiled
-def _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
+@compiled
+def _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball, memory):
     """`CollisionChecker.is_free` of one state."""
     frames, centres, pose, s, other = memory
     margin, clearance, growth = rule[0], rule[1], rule[2]
@@ -676,6 +730,16 @@ def _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
                 continue
             if not _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
                 return False
+        for g in range(groups.shape[0]):
+            gap = margin + clearance + ball[0, 16] + BULLET_MARGIN
+            if _box_gap(bodies, k, frames, centres, groups, g, pose) >= groups[g, 3] + gap:
+                continue
+            for j in range(int(groups[g, 4]), int(groups[g, 5])):
+                if _box_gap(bodies, k, frames, centres, points, j, pose) >= gap:
+                    continue
+                _begin(ball, 0, pose, s)
+                if _gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
+                    return False
     gap = margin + 2 * BULLET_MARGIN
     for i in range(pairs.shape[0]):
         a, b = pairs[i, 0], pairs[i, 1]
@@ -690,15 +754,30 @@ def _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
     return True
 
 
-@_compiled
-def _free_batch(states, rule, relaxed, bodies, pairs, vertices, cells, rows, free):
+@compiled
+def _free_batch(
+    states, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball, free
+):
     memory = _memory()
     for i in range(states.shape[0]):
-        free[i] = _is_free(states[i], rule, relaxed, bodies, pairs, vertices, cells, rows, memory)
+        free[i] = _is_free(
+            states[i],
+            rule,
+            relaxed,
+            bodies,
+            pairs,
+            vertices,
+            cells,
+            rows,
+            points,
+            groups,
+            ball,
+            memory,
+        )
 
 
-@_compiled
-def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows):
+@compiled
+def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball):
     """How many states of a motion were looked at, not counting its start; negative: not free."""
     memory, q = _memory(), np.empty(7)
     squared = 0.0
@@ -715,7 +794,9 @@ def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows):
             for j in range(7):
                 q[j] = start[j] + (end[j] - start[j]) * share
             looked_at += 1
-            if not _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
+            if not _is_free(
+                q, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball, memory
+            ):
                 return -looked_at
         part += 2
         if part > parts:
@@ -724,21 +805,49 @@ def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows):
             parts, part = 2 * parts, 1
 
 
-@_compiled
-def _motion_batch(starts, stops, rule, relaxed, bodies, pairs, vertices, cells, rows, checks):
+@compiled
+def _motion_batch(
+    starts, stops, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball, checks
+):
     memory = _memory()
     for i in range(starts.shape[0]):
-        if not _is_free(starts[i], rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
+        if not _is_free(
+            starts[i],
+            rule,
+            relaxed,
+            bodies,
+            pairs,
+            vertices,
+            cells,
+            rows,
+            points,
+            groups,
+            ball,
+            memory,
+        ):
             checks[i] = -1
             continue
-        more = _motion(starts[i], stops[i], rule, relaxed, bodies, pairs, vertices, cells, rows)
+        more = _motion(
+            starts[i],
+            stops[i],
+            rule,
+            relaxed,
+            bodies,
+            pairs,
+            vertices,
+            cells,
+            rows,
+            points,
+            groups,
+            ball,
+        )
         checks[i] = more + 1 if more > 0 else more - 1
 
 
 # --- Compiled: distances
 
 
-@_compiled
+@compiled
 def _add_face(s, faces, n, a, b, c):
     """Append a face of EPA's polytope: its points, unit normal, distance from the origin."""
     f = faces[n]
@@ -756,7 +865,7 @@ def _add_face(s, faces, n, a, b, c):
     return n + 1
 
 
-@_compiled
+@compiled
 def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
     """Depth (m) of a body's hull in a shape's core, from a simplex of `_gjk` around the origin.
 
@@ -826,7 +935,7 @@ def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
     return depth
 
 
-@_compiled
+@compiled
 def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope):
     """Distance (m) of a body's hull from a shape's core, minus the depth where they overlap.
 
@@ -841,6 +950,12 @@ def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose,
     _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
     if _boxes_apart(bodies, k, rows, j, pose, far):
         return _FAR
+    return _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope)
+
+
+@compiled
+def _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope):
+    """`_signed_distance` of a shape that may be near; `pose` is the core's."""
     _begin(rows, j, pose, s)
     distance, n = _gjk(vertices, cells, k, rows, j, pose, s, -1.0, far)
     if distance >= far:
@@ -866,7 +981,21 @@ def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose,
     return distance
 
 
-@_compiled
+@compiled
+def _gradient(frames, first, last, direction, point, gradient):
+    """Write how fast a point moves along a direction with each joint, from `first` to `last`."""
+    gradient[:] = 0.0
+    for joint in range(first, last):
+        f = frames[joint + 1]  # it turns about its z
+        x, y, z = point[0] - f[9], point[1] - f[10], point[2] - f[11]
+        gradient[joint] = (
+            direction[0] * (f[5] * z - f[8] * y)
+            + direction[1] * (f[8] * x - f[2] * z)
+            + direction[2] * (f[2] * y - f[5] * x)
+        ) * (0.5 * _SPAN[joint])
+
+
+@compiled
 def _write(frames, f, centres, k, s, sign, back, direction, point):
     """Direction and point of `_signed_distance`, in the base's frame; `back` (m) from the point."""
     for i in range(3):
@@ -877,9 +1006,23 @@ def _write(frames, f, centres, k, s, sign, back, direction, point):
         direction[i], point[i] = sign * out, centres[k, i] + at - back * out
 
 
-@_compiled
+@compiled
 def _nearest_batch(
-    states, self_collisions, bodies, pairs, vertices, cells, rows, distance, direction, point, which
+    states,
+    self_collisions,
+    bodies,
+    pairs,
+    vertices,
+    cells,
+    rows,
+    points,
+    groups,
+    ball,
+    distance,
+    direction,
+    point,
+    gradient,
+    which,
 ):
     frames, centres, pose, s, other = _memory()
     polytope = (
@@ -887,8 +1030,8 @@ def _nearest_batch(
         np.empty((_EPA_FACES, 7)),
         np.empty((_EPA_FACES, 2), np.int64),
     )
-    distance[:], direction[:], point[:] = np.inf, 0.0, 0.0
-    which[:] = rows.shape[0] + 1
+    arm = rows.shape[0]
+    distance[:], direction[:], point[:], which[:] = np.inf, 0.0, 0.0, arm + 2
     for i in range(states.shape[0]):
         _place(states[i], bodies, frames, centres)
         for k in range(1, bodies.shape[0]):
@@ -908,6 +1051,34 @@ def _nearest_batch(
                 if core < far:
                     distance[i, link], which[i, link] = core - rounding, j
                     _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
+            # The points, again the one that is probably nearest first.
+            rounding = ball[0, 16] + BULLET_MARGIN
+            first, least = -1, min(distance[i, link] + rounding, _FAR)
+            for g in range(groups.shape[0]):
+                if _box_gap(bodies, k, frames, centres, groups, g, pose) - groups[g, 3] < least:
+                    for j in range(int(groups[g, 4]), int(groups[g, 5])):
+                        gap = _box_gap(bodies, k, frames, centres, points, j, pose)
+                        if gap < least:
+                            first, least = j, gap
+            for g in range(-1 if first >= 0 else groups.shape[0], groups.shape[0]):
+                begin, end = first, first + 1
+                if g >= 0:
+                    begin, end = int(groups[g, 4]), int(groups[g, 5])
+                    gap = _box_gap(bodies, k, frames, centres, groups, g, pose)
+                    # (From inside of the box, no length is known to be a way out.)
+                    if gap > 0.0 and gap - groups[g, 3] >= distance[i, link] + rounding:
+                        continue
+                for j in range(begin, end):
+                    far = min(distance[i, link] + rounding, _FAR)
+                    gap = _box_gap(bodies, k, frames, centres, points, j, pose)
+                    if (g >= 0 and j == first) or (gap > 0.0 and gap >= far):
+                        continue
+                    core = _core_distance(vertices, cells, k, ball, 0, pose, s, far, polytope)
+                    if core < far:
+                        distance[i, link], which[i, link] = core - rounding, arm + 1
+                        there, at = direction[i, link], point[i, link]
+                        _write(frames, f, centres, k, s, 1.0, 0.0, there, at)
+            _gradient(frames, 0, f, direction[i, link], point[i, link], gradient[i, link])
         rounding = 2 * BULLET_MARGIN
         for j in range(pairs.shape[0] if self_collisions else 0):
             a, b = pairs[j, 0], pairs[j, 1]
@@ -917,9 +1088,15 @@ def _nearest_batch(
             core = _signed_distance(
                 bodies, vertices, cells, a, other, 0, frames, centres, pose, s, far, polytope
             )
+            fa, fb = int(bodies[a, 0]), int(bodies[b, 0])
             for body, sign, back in ((a, 1.0, 0.0), (b, -1.0, core)):
                 link = body - 1
                 if link >= 0 and core < _FAR and core - rounding < distance[i, link]:
-                    distance[i, link], which[i, link] = core - rounding, rows.shape[0]
-                    f = int(bodies[a, 0])
-                    _write(frames, f, centres, a, s, sign, back, direction[i, link], point[i, link])
+                    distance[i, link], which[i, link] = core - rounding, arm
+                    there, at = direction[i, link], point[i, link]
+                    _write(frames, fa, centres, a, s, sign, back, there, at)
+                    # Joints that move both change nothing. What those between them move is one of
+                    # the two: the other way round for the one that they do not move.
+                    _gradient(frames, min(fa, fb), max(fa, fb), there, at, gradient[i, link])
+                    if bodies[body, 0] < max(fa, fb):
+                        gradient[i, link] *= -1.0

@@ -24,15 +24,13 @@ from envs.exported_networks import NetworkError, load_network
 from envs.files import write_atomically
 from envs.observations import sensors_from_json
 from envs.scenes import ROW, to_array
-from envs.sensors import PointCloud, SensorWorld
+from envs.sensors import POSE, PointCloud, SensorWorld
 
 ORACLE = "oracle"
 # Only data are found there: `envs` imports no trainer.
 PACKAGED = Path(importlib.resources.files("scene_embedding_train") / "encoders")
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
-# Of the arm when an encoder looks, rad: always the same, so that z_E depends on the scene alone.
-POSE = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
 CACHED_SCENES = 20_000
 
 

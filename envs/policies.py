@@ -12,6 +12,9 @@
   way of the first of some random configurations for which the motion is free; if there is none,
   straight all the same;
 - planner: OMPL's RRT-Connect plans, within a time limit, and the plan is followed.
+
+The last two know the true obstacles, or only the points that sensors see of them. Around any of
+them there may be a last layer, which keeps the arm away from things (`envs.last_layer`).
 """
 
 import importlib.resources
@@ -26,11 +29,11 @@ from envs import panda
 from envs.subgoals import subgoals
 
 PLANNING = ("via-points", "planner")
-"""The policies that look for a motion before they move; they know the true obstacles."""
+"""The policies that look for a motion before they move."""
 UNTRAINED = ("go-to-goal", "random", *PLANNING)
 # What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
 # they decide what a success is.
-ENV_ARGUMENTS = ("goal_type", "action_mode", "max_step", "velocities", "encoder")
+ENV_ARGUMENTS = ("goal_type", "action_mode", "max_step", "velocities", "encoder", "proximity")
 # Packages with a folder `policies`. Only data are found there: `envs` imports no trainer.
 PACKAGES = ("bc_script", "clean_rl_scripts")
 TRIES = 16  # of `via-points`, by default
@@ -95,7 +98,9 @@ def find_policy(name):
     return path, _load(path)[1]
 
 
-def make_policy(policy, env, seed=0, tries=TRIES, time_limit=TIME_LIMIT):
+def make_policy(
+    policy, env, seed=0, tries=TRIES, time_limit=TIME_LIMIT, encoder=None, last_layer=None
+):
     """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
 
     It is called once per episode, before the environment is put to the start: `planner` moves
@@ -105,21 +110,40 @@ def make_policy(policy, env, seed=0, tries=TRIES, time_limit=TIME_LIMIT):
         policy: one of `UNTRAINED`, the path of a policy network, or a function from an observation
             to an action (7,).
         env: the `RoboArmEnv` it will act in.
-        seed: of `random`, `via-points` and `planner`; each query has its own generator.
+        seed: of what is random; each query has its own generator.
         tries: random configurations that `via-points` tries per query.
         time_limit: seconds that `planner` may search per query.
+        encoder: `points`: `via-points` and `planner` know only what sensors see
+            (`envs.seeing`); None: the true obstacles.
+        last_layer: an `envs.last_layer.LastLayer` around the policy. The environment must have
+            `proximity` then.
 
     Raises:
-        PolicyError: the network cannot act in this environment.
+        PolicyError: the policy cannot act in this environment.
     """
+    begin = _make_policy(policy, env, seed, tries, time_limit, encoder)
+    if last_layer is None:
+        return begin
+    if "proximity" not in env.observation_space.spaces:
+        raise PolicyError("a last layer needs proximity in observations: envs.make(proximity=...)")
+
+    def begin_safely(number, query):
+        act, found = begin(number, query)
+        rng = np.random.default_rng([seed, number])
+        return EpisodePolicy(act and last_layer.around(act, rng), found)
+
+    return begin_safely
+
+
+def _make_policy(policy, env, seed, tries, time_limit, encoder):
     if policy == "go-to-goal":
         return lambda number, query: EpisodePolicy(_go_to_goal(query.goal))
     if policy == "random":
         return lambda number, query: EpisodePolicy(_random(np.random.default_rng([seed, number])))
     if policy == "via-points":
-        return _via_points(seed, tries)
+        return _via_points(seed, tries, _checker_of(encoder))
     if policy == "planner":
-        return _planner(env, seed, time_limit)
+        return _planner(env, seed, time_limit, _checker_of(encoder))
     act = policy if callable(policy) else _trained(policy, env)
     return lambda number, query: EpisodePolicy(act)
 
@@ -136,17 +160,19 @@ def _random(rng):
     return lambda observation: rng.uniform(-1.0, 1.0, panda.NUM_JOINTS)
 
 
-def _via_points(seed, tries):
-    from envs.collision import CollisionChecker  # here, because Numba takes a while to import
+def _checker_of(encoder):
+    from envs import seeing  # here, because Numba takes a while to import
 
-    checker = None
+    if encoder not in (None, "points"):
+        raise PolicyError(f"a planner knows the true obstacles or `points`, not {encoder!r}")
+    return seeing.seen_checker if encoder == "points" else seeing.true_checker
 
+
+def _via_points(seed, tries, checker_of):
     # No margin is kept, which would reject more than it saves: with 3 mm, clean success was 2 to 5
     # points lower on `wall`, `double_walls` and `boxes`.
     def begin(number, query):
-        nonlocal checker
-        if checker is None or checker.scene != query.scene:
-            checker = CollisionChecker(query.scene)
+        checker = checker_of(query.scene)
         # float32 may round a limit to just beyond it.
         start, goal = np.clip(panda.normalise(np.stack([query.start, query.goal])), -1.0, 1.0)
         if checker.is_motion_free(start, goal):
@@ -160,9 +186,9 @@ def _via_points(seed, tries):
     return begin
 
 
-def _planner(env, seed, time_limit):
+def _planner(env, seed, time_limit, checker_of):
     planning = _import_planning()
-    planner = planning.Planner(env)
+    planner = planning.Planner(env, checker_of=checker_of)
 
     def begin(number, query):
         rng = np.random.default_rng([seed, number])

@@ -23,6 +23,9 @@ OUTPUTS = ("rgb", "depth", "segmentation")
 # Cardinal directions as seen by the robot: x is forward, y left.
 CARDINAL = {"front": (1, 0), "left": (0, 1), "back": (-1, 0), "right": (0, -1)}
 DISTANCE, HEIGHT = 1.6, 0.8  # of the default sensors' places, m
+# Of the arm when a scene is looked at, rad: always the same, so that what is seen depends on the
+# scene alone.
+POSE = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
 
 
 @dataclass(frozen=True)

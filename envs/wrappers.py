@@ -6,6 +6,9 @@ import numpy as np
 from envs import panda
 from envs.sensors import SensorWorld, cardinal
 
+PROXIMITY_RANGE = 0.3
+"""m. Things farther away than that are as good as none."""
+
 
 class SensorWrapper(gym.Wrapper):
     """Adds `sensors` to the observation: a dict of sensor's name -> its observation (a dict).
@@ -65,7 +68,34 @@ class SensorWrapper(gym.Wrapper):
         super().close()
 
 
-class SceneEncodingWrapper(gym.Wrapper):
+class _ObservingWrapper(gym.Wrapper):
+    """An env with more in its observations; otherwise with all of its attributes.
+
+    `_with_more` is given an observation of the env, and gives one of its own.
+    """
+
+    def __getattr__(self, name):
+        if name == "env":  # before there is one
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def reset(self, *, seed=None, options=None):
+        """As `RoboArmEnv.reset`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._with_more(observation), info
+
+    def reset_specific(self, start, goal, scene=None):
+        """As `RoboArmEnv.reset_specific`."""
+        observation, info = self.env.reset_specific(start, goal, scene)
+        return self._with_more(observation), info
+
+    def step(self, action):
+        """As `RoboArmEnv.step`."""
+        observation, *rest = self.env.step(action)
+        return self._with_more(observation), *rest
+
+
+class SceneEncodingWrapper(_ObservingWrapper):
     """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
 
     It is encoded once per scene. Otherwise this is its `RoboArmEnv`, with all of its attributes.
@@ -83,26 +113,52 @@ class SceneEncodingWrapper(gym.Wrapper):
         spaces["observation"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.observation_space = gym.spaces.Dict(spaces)
 
-    def __getattr__(self, name):
-        if name == "env":  # before there is one
-            raise AttributeError(name)
-        return getattr(self.env, name)
-
-    def _with_scene(self, observation):
+    def _with_more(self, observation):
         z = self.encoder(self.unwrapped.scene)
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
-    def reset(self, *, seed=None, options=None):
-        """As `RoboArmEnv.reset`."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self._with_scene(observation), info
 
-    def reset_specific(self, start, goal, scene=None):
-        """As `RoboArmEnv.reset_specific`."""
-        observation, info = self.env.reset_specific(start, goal, scene)
-        return self._with_scene(observation), info
+class ProximityWrapper(_ObservingWrapper):
+    """Adds `proximity` to the observation: how far each link is from the nearest thing.
 
-    def step(self, action):
-        """As `RoboArmEnv.step`."""
-        observation, *rest = self.env.step(action)
-        return self._with_scene(observation), *rest
+    float32 (10, 8), a row per `envs.collision.LINKS`: the distance from obstacles, table and floor
+    in m, clipped to `PROXIMITY_RANGE`, and its gradient, m per unit of normalised configuration
+    (zeros beyond the range). If the goal is a configuration, `goal_proximity` is the same there.
+    Otherwise this is its `RoboArmEnv`, with all of its attributes.
+
+    Args:
+        env: a `RoboArmEnv`, possibly in a `SceneEncodingWrapper`.
+        checker_of: from a `Scene` to the `CollisionChecker` that tells: `envs.seeing.true_checker`
+            or `seen_checker`.
+    """
+
+    def __init__(self, env, checker_of):
+        super().__init__(env)
+        self._checker_of = checker_of
+        names = ["proximity"] + ["goal_proximity"] * (env.goal_type != "ee")
+        # (Inside of something, a distance is at least minus the way out.)
+        space = gym.spaces.Box(-np.inf, np.inf, (10, 8), np.float32)
+        self.observation_space = gym.spaces.Dict(
+            env.observation_space.spaces | {name: space for name in names}
+        )
+        self._goal, self._of_goal = None, None
+
+    def _proximity(self, state):
+        # float32 may round a limit to just beyond it.
+        state = np.clip(state, -1.0, 1.0)
+        nearest = self._checker_of(self.unwrapped.scene).nearest(state, self_collisions=False)
+        proximity = np.zeros((10, 8), np.float32)
+        proximity[:, 0] = np.minimum(nearest.distance, PROXIMITY_RANGE)
+        near = nearest.distance < PROXIMITY_RANGE
+        proximity[near, 1:] = nearest.gradient[near]
+        return proximity
+
+    def _with_more(self, observation):
+        more = {"proximity": self._proximity(observation["observation"][: panda.NUM_JOINTS])}
+        if self.goal_type != "ee":
+            goal = observation["desired_goal"][: panda.NUM_JOINTS]
+            key = self.unwrapped.scene, goal.tobytes()
+            if self._goal != key:
+                self._goal, self._of_goal = key, self._proximity(goal)
+            more["goal_proximity"] = self._of_goal.copy()
+        return {**observation, **more}
