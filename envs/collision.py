@@ -124,10 +124,11 @@ class CollisionChecker:
             relaxed: None, or `(states (k, 7), distances (k,), growth)`. Near these states the
                 margin is smaller: `distance + growth * d` at most, where d is how far away they are
                 (L2, normalised). For queries that begin or end nearer to something than `margin`.
+                Each configuration, or motion, may have its own: (..., k, 7) and (..., k).
         """
         states = _states("states", states)
         free = np.empty(states.shape[:-1], dtype=np.bool_)
-        rule = _rule(margin, clearance, relaxed)
+        rule = _rule(margin, clearance, relaxed, batch=states.shape[:-1])
         _free_batch(states.reshape(-1, 7), *rule, *_arm(), self._rows, free.reshape(-1))
         return free
 
@@ -151,7 +152,7 @@ class CollisionChecker:
     ):
         """How many configurations `is_motion_free` looks at, int64 (...); negative: not free."""
         starts, ends = np.broadcast_arrays(_states("starts", starts), _states("ends", ends))
-        rule = _rule(margin, clearance, relaxed, resolution)
+        rule = _rule(margin, clearance, relaxed, resolution, batch=starts.shape[:-1])
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
         flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
         _motion_batch(*flat, *rule, *_arm(), self._rows, checks.reshape(-1))
@@ -163,8 +164,8 @@ class CollisionChecker:
         It is `motion_checks` for one motion from a start that is known to be free, which is not
         looked at again; and it does not look at its arguments.
         """
-        rule = _rule(margin, clearance, relaxed, resolution)
-        rest = (*rule, *_arm(), self._rows)
+        rule, relaxed = _rule(margin, clearance, relaxed, resolution)
+        rest = (rule, relaxed[0], *_arm(), self._rows)
 
         def check(start, end):
             return _motion(start, end, *rest)
@@ -212,10 +213,11 @@ def _states(name, states):
     return states
 
 
-def _rule(margin, clearance, relaxed, resolution=RESOLUTION):
+def _rule(margin, clearance, relaxed, resolution=RESOLUTION, batch=()):
     """What is asked for, as the compiled functions take it. Raises ValueError.
 
-    Returns float64 (4,): margin, clearance, growth, resolution; and (k, 8): states and distances.
+    Returns float64 (4,): margin, clearance, growth, resolution; and (n, k, 8): states and distances
+    for each of a batch, or n = 1 for all of it.
     """
     for name, value in (("margin", margin), ("clearance", clearance)):
         if not 0 <= value < MAX_MARGIN:
@@ -223,15 +225,18 @@ def _rule(margin, clearance, relaxed, resolution=RESOLUTION):
     if not 0 < resolution < math.inf:
         raise ValueError(f"resolution must be positive, got {resolution!r}")
     if relaxed is None:
-        return np.array([margin, clearance, 0.0, resolution]), np.empty((0, 8))
+        return np.array([margin, clearance, 0.0, resolution]), np.empty((1, 0, 8))
     states, distances, growth = relaxed
     states = _states("relaxed states", states)
     distances = np.asarray(distances, dtype=np.float64)
-    if states.ndim != 2 or distances.shape != states.shape[:1] or np.isnan(distances).any():
+    fits = states.ndim == 2 or (states.ndim > 2 and states.shape[:-2] == batch)
+    if not fits or distances.shape != states.shape[:-1] or np.isnan(distances).any():
         raise ValueError(f"relaxed: {states.shape} states and {distances.shape} distances")
     if not 0 <= growth < math.inf:
         raise ValueError(f"relaxed: growth must be finite and not negative, got {growth!r}")
-    return np.array([margin, clearance, growth, resolution]), np.c_[states, distances]
+    relaxed = np.concatenate([states, distances[..., None]], axis=-1)
+    relaxed = relaxed.reshape(-1 if states.ndim > 2 else 1, *relaxed.shape[-2:])
+    return np.array([margin, clearance, growth, resolution]), relaxed
 
 
 # --- The arm and the scene as arrays
@@ -694,7 +699,8 @@ def _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
 def _free_batch(states, rule, relaxed, bodies, pairs, vertices, cells, rows, free):
     memory = _memory()
     for i in range(states.shape[0]):
-        free[i] = _is_free(states[i], rule, relaxed, bodies, pairs, vertices, cells, rows, memory)
+        near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        free[i] = _is_free(states[i], rule, near, bodies, pairs, vertices, cells, rows, memory)
 
 
 @_compiled
@@ -728,10 +734,11 @@ def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows):
 def _motion_batch(starts, stops, rule, relaxed, bodies, pairs, vertices, cells, rows, checks):
     memory = _memory()
     for i in range(starts.shape[0]):
-        if not _is_free(starts[i], rule, relaxed, bodies, pairs, vertices, cells, rows, memory):
+        near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        if not _is_free(starts[i], rule, near, bodies, pairs, vertices, cells, rows, memory):
             checks[i] = -1
             continue
-        more = _motion(starts[i], stops[i], rule, relaxed, bodies, pairs, vertices, cells, rows)
+        more = _motion(starts[i], stops[i], rule, near, bodies, pairs, vertices, cells, rows)
         checks[i] = more + 1 if more > 0 else more - 1
 
 
