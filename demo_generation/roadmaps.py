@@ -1,5 +1,9 @@
 """Roadmaps: many short paths in one scene, and how to go on from any configuration in it.
 
+    python -m demo_generation.roadmaps --task random_boxes_hard --scenes 6000 --output roadmaps
+
+collects paths of many scenes (read by `envs.roadmap_paths.load_roadmap_paths`). In Python:
+
     from demo_generation.roadmaps import Roadmap
 
     roadmap = Roadmap(scene, rng)
@@ -14,13 +18,33 @@ then pruned and cut short.
 Paths keep `margin` from everything where there is room. A node, a start or a goal that is nearer
 to something than that is not lost: around it, a path may come as near as it is itself, and has to
 get away by `MARGIN_GROWTH`.
+
+Scene i of a collection and its paths depend on the seed, the options and i only, so the files are
+the same whatever the number of workers. They are written a shard at a time, each in one piece; a
+run that was interrupted or killed goes on when it is started again, and one that is finished can be
+continued with more scenes.
 """
 
+import contextlib
+import copy
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
+import tyro
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from tqdm import tqdm
 
+import envs
+from envs import roadmap_paths, workers
 from envs.collision import CollisionChecker
+from envs.datasets import attribute
+from envs.files import write_atomically
+from envs.scenes import Scene
+from envs.shards import shard_path
 
 # Around a configuration that is nearer to something than the margin, the margin grows by this much
 # (m) per unit of normalised distance from it.
@@ -32,12 +56,16 @@ NARROW = 2.0
 # A configuration that is deeper (m) in something is moved out of it before anything else, until it
 # is NODE_MARGIN away, in steps of OUT_STEP (normalised).
 INSIDE, OUT_STEP, MAX_OUT_STEPS = 0.001, 0.01, 100
-# Random goals of `random_paths` for each path: each costs a search of the whole roadmap.
-GOALS_PER_PATH = 0.13
+# A way begins and ends at one of so many nearest nodes.
+JOINED = 30
+# Where there is none: nodes that are added near the ends, and how near (normalised) they are drawn,
+# the largest standard deviation of each joint.
+GROWN, GROWN_SCALE = 400, 0.3
+# `random_paths`: goals for each path (each costs a search of the whole roadmap), queries for each
+# path that is wanted, and how often it draws more of them before it gives up.
+GOALS_PER_PATH, SPARE, MAX_ROUNDS = 0.13, 1.2, 10
 # Random chords tried on each path, and the share of its length that each has to save.
 CHORDS, LEAST_GAIN = 40, 0.005
-# `random_paths` gives up after so many rounds of queries.
-MAX_ROUNDS = 10
 _HAIR = 1e-5  # m: what rounding may take from a distance
 _STEP = 1e-4  # normalised: of finite differences
 
@@ -64,15 +92,33 @@ class Roadmap:
             raise ValueError(f"margin must be at least {NODE_MARGIN} m, got {margin!r}")
         self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
         self._checker = CollisionChecker(scene)
-        self.nodes = self.sample(num_nodes, rng, NODE_MARGIN)
-        self._room = self._rooms(self.nodes)
-        near = self._nearest_nodes(self.nodes, num_neighbours + 1)  # the first is the node itself
-        edges = np.stack([np.repeat(np.arange(num_nodes), num_neighbours), near[:, 1:].ravel()])
-        one, other = np.unique(np.sort(edges, axis=0), axis=1)
-        nodes, room = self.nodes, self._room
-        cost = self._costs(nodes[one], nodes[other], room[one], room[other])
-        free = np.isfinite(cost)
-        self._edges = one[free], other[free], cost[free]
+        self.nodes, self._room = np.empty((0, 7)), np.empty(0)
+        self._edges = np.empty((2, 0), np.int64), np.empty(0)
+        self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
+
+    def _add_nodes(self, nodes):
+        """Join free configurations (n, 7) to the nearest nodes."""
+        first = len(self.nodes)
+        self.nodes = np.concatenate([self.nodes, nodes])
+        self._room = np.concatenate([self._room, self._rooms(nodes)])
+        near = self._nearest_nodes(nodes, self.num_neighbours + 1)  # one is the node itself
+        one = np.repeat(np.arange(first, len(self.nodes)), near.shape[1])
+        edges = np.stack([one, near.ravel()])
+        one, other = np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
+        motions = self.nodes[one], self.nodes[other], self._room[one], self._room[other]
+        free = self._joined(*motions)
+        edges, costs = self._edges
+        edges = np.concatenate([edges, np.stack([one, other])[:, free]], axis=1)
+        self._edges = edges, np.concatenate([costs, self._costs(*motions)[free]])
+
+    def _grown(self, around, rng):
+        """A roadmap with more nodes, near configurations that could not be joined to this one."""
+        centres = around[np.arange(GROWN) % len(around)]
+        scale = rng.uniform(0.0, GROWN_SCALE, (GROWN, 1))
+        new = np.clip(centres + scale * rng.standard_normal((GROWN, 7)), -1.0, 1.0)
+        roadmap = copy.copy(self)
+        roadmap._add_nodes(new[self._checker.is_free(new, NODE_MARGIN)])
+        return roadmap
 
     def sample(self, number, rng, margin=0.0):
         """Random free configurations, float64 (number, 7). Raises RuntimeError: there are none."""
@@ -95,13 +141,13 @@ class Roadmap:
         goals = self.sample(int(np.ceil(GOALS_PER_PATH * number)), rng)
         paths = []
         for _ in range(MAX_ROUNDS):
-            missing = number - len(paths)
-            if missing == 0:
-                break
-            which = rng.integers(len(goals), size=missing)
-            found = self.paths(self.sample(missing, rng), goals[which], rng)
+            tried = int(np.ceil(SPARE * (number - len(paths))))
+            which = rng.integers(len(goals), size=tried)
+            found = self.paths(self.sample(tried, rng), goals[which], rng)
             paths += [path for path in found if path is not None]
-        return paths
+            if len(paths) >= number:
+                break
+        return paths[:number]
 
     def paths(self, starts, goals, rng):
         """Smoothed paths from starts (n, 7) to goals (n, 7): a list of float32 (k, 7), k > 1, or
@@ -111,15 +157,19 @@ class Roadmap:
         """
         starts, goals = (np.array(x, dtype=np.float64).reshape(-1, 7) for x in (starts, goals))
         begins = self._moved_out(starts)
-        points, room, found = self._search(begins, goals)
-        points, room = points[found], room[found]
-        points = self._cut_short(self._prune(points, room), points, room, rng)
-        paths = [None] * len(starts)
-        for i, path in zip(np.flatnonzero(found), points, strict=True):
-            path = np.concatenate([starts[i : i + 1], path])
-            moves = (path[1:] != path[:-1]).any(1)
-            # A path whose start is its goal has two points, too.
-            paths[i] = path[np.r_[True, moves] if moves.any() else [0, -1]].astype(np.float32)
+        paths = self._ways(begins, goals, rng)
+        lost = [i for i, path in enumerate(paths) if path is None]
+        if lost:
+            roadmap = self._grown(np.concatenate([begins[lost], goals[lost]]), rng)
+            for i, path in zip(lost, roadmap._ways(begins[lost], goals[lost], rng), strict=True):
+                paths[i] = path
+        for i, path in enumerate(paths):
+            if path is not None:
+                path = np.concatenate([starts[i : i + 1], path])
+                moves = (path[1:] != path[:-1]).any(1)
+                # A path whose start is its goal has two points, too.
+                path = path[np.r_[True, moves]] if moves.any() else path[:2]
+                paths[i] = path.astype(np.float32)
         return paths
 
     def labels(self, states, goals, rng):
@@ -160,60 +210,65 @@ class Roadmap:
         return self._checker.is_motion_free(starts, ends, self.margin, relaxed=relaxed)
 
     def _costs(self, starts, ends, start_room, end_room):
-        """Of straight motions (n, 7); infinite where they are not free."""
-        room = np.stack([start_room, end_room], axis=1)
-        free = self._free(starts, ends, np.stack([starts, ends], axis=1), room)
-        tightness = 1.0 - np.clip(room.min(1) / self.margin, 0.0, 1.0)
-        costs = np.linalg.norm(ends - starts, axis=1) * (1.0 + NARROW * tightness)
-        return np.where(free, costs, np.inf)
+        """Of straight motions (..., 7), if they are free."""
+        tightness = 1.0 - np.clip(np.minimum(start_room, end_room) / self.margin, 0.0, 1.0)
+        return np.linalg.norm(ends - starts, axis=-1) * (1.0 + NARROW * tightness)
+
+    def _joined(self, starts, ends, start_room, end_room):
+        """Whether straight motions (n, 7) are free, as near as both of their ends allow."""
+        states, room = np.stack([starts, ends], axis=1), np.stack([start_room, end_room], axis=1)
+        return self._free(starts, ends, states, room)
 
     def _nearest_nodes(self, states, number):
-        """(n, number), by distance."""
-        nodes = self.nodes
-        squared = (states**2).sum(1)[:, None] + (nodes**2).sum(1) - 2.0 * states @ nodes.T
-        return np.argsort(squared, axis=1, kind="stable")[:, :number]
+        """(n, number), in any order."""
+        squared = (self.nodes**2).sum(1) - 2.0 * states @ self.nodes.T
+        return np.argpartition(squared, number, axis=1)[:, :number]
 
-    def _join(self, states, room):
-        """The nodes that states (n, 7) are joined to and what that costs, both (n, k)."""
-        near = self._nearest_nodes(states, self.num_neighbours)
-        which, nodes = np.repeat(np.arange(len(states)), near.shape[1]), near.ravel()
-        costs = self._costs(states[which], self.nodes[nodes], room[which], self._room[nodes])
-        return near, costs.reshape(near.shape)
+    def _ways(self, starts, goals, rng):
+        """Smoothed paths (k, 7), which may repeat points; None where there is none."""
+        points, room, found = self._search(starts, goals)
+        points, room = points[found], room[found]
+        ways = iter(self._cut_short(self._prune(points, room), points, room, rng))
+        return [next(ways) if there else None for there in found]
 
     def _search(self, starts, goals):
         """Shortest paths: points (n, k, 7), padded with the goal, their room (n, k), found (n,)."""
         goals, which = np.unique(goals, axis=0, return_inverse=True)
         start_room, goal_room = self._rooms(starts), self._rooms(goals)
-        near, near_costs = self._join(starts, start_room)
-        ways, way_costs = self._join(goals, goal_room)
-        way_costs[goal_room < -INSIDE] = np.inf
+        states, room = np.concatenate([self.nodes, goals]), np.concatenate([self._room, goal_room])
         # Edges lead from goals to nodes and not back: no path goes through another query's goal.
-        count, (one, other, costs) = len(self.nodes), self._edges
-        goal, way = np.nonzero(np.isfinite(way_costs))
-        tails = np.concatenate([one, other, count + goal])
-        heads = np.concatenate([other, one, ways[goal, way]])
-        costs = np.concatenate([costs, costs, way_costs[goal, way]])
-        graph = csr_array((costs, (tails, heads)), shape=(count + len(goals),) * 2)
+        goal = np.repeat(np.arange(len(goals)), JOINED)
+        node = self._nearest_nodes(goals, JOINED).ravel()
+        ways = goals[goal], self.nodes[node], goal_room[goal], self._room[node]
+        free = self._joined(*ways) & (goal_room[goal] >= -INSIDE)
+        count, ((one, other), costs) = len(self.nodes), self._edges
+        tails = np.concatenate([one, other, count + goal[free]])
+        heads = np.concatenate([other, one, node[free]])
+        costs = np.concatenate([costs, costs, self._costs(*ways)[free]])
+        graph = csr_array((costs, (tails, heads)), shape=(len(states), len(states)))
         indices = count + np.arange(len(goals))
         rest, before = dijkstra(graph, indices=indices, return_predecessors=True)
-        costs = near_costs + rest[which[:, None], near]
-        best = costs.argmin(1)
-        least = costs.min(1)
-        node = near[np.arange(len(starts)), best]
-        straight = self._costs(starts, goals[which], start_room, goal_room[which])
-        straight[goal_room[which] < -INSIDE] = np.inf
-        node = np.where(straight <= least, count + which, node)
-        found = np.isfinite(np.minimum(straight, least))
-        node[~found] = count + which[~found]
+        rest[goal_room < -INSIDE] = np.inf
+        # The first step is to the goal itself or to a node: the best one that is free.
+        first = np.c_[count + which, self._nearest_nodes(starts, JOINED)]
+        costs = self._costs(starts[:, None], states[first], start_room[:, None], room[first])
+        costs += rest[which[:, None], first]
+        order = np.argsort(costs, axis=1, kind="stable")
+        node, found = count + which, np.zeros(len(starts), bool)
+        waiting = np.arange(len(starts))
+        for choice in order.T:
+            waiting = waiting[np.isfinite(costs[waiting, choice[waiting]])]
+            tried = first[waiting, choice[waiting]]
+            free = self._joined(starts[waiting], states[tried], start_room[waiting], room[tried])
+            node[waiting[free]], found[waiting[free]] = tried[free], True
+            waiting = waiting[~free]
         route = [node]
-        while (route[-1] < count).any():
-            on_way = route[-1] < count
-            route.append(np.where(on_way, before[which, route[-1]], route[-1]))
+        while (node < count).any():
+            node = np.where(node < count, before[which, node], node)
+            route.append(node)
         route = np.stack(route, axis=1)
-        points = np.concatenate([self.nodes, goals])[route]
-        room = np.concatenate([self._room, goal_room])[route]
-        points = np.concatenate([starts[:, None], points], axis=1)
-        return points, np.concatenate([start_room[:, None], room], axis=1), found
+        points = np.concatenate([starts[:, None], states[route]], axis=1)
+        return points, np.concatenate([start_room[:, None], room[route]], axis=1), found
 
     def _prune(self, points, room):
         """Paths (n, k, 7), padded, without the vertices that straight motions can leave out."""
@@ -291,3 +346,155 @@ class Roadmap:
 
 
 _DIFFERENCES = _STEP * np.stack([-np.eye(7), np.eye(7)])
+
+
+# Streams 1 to 4 of random numbers are those of queries, demonstrations and observations. Seeds are
+# below 2^32, so each is one word of what NumPy seeds with: no scene is one of another stream's.
+STREAM, MAX_SEED = 5, 2**32 - 1
+
+
+@dataclass
+class Args:
+    output: Path
+    """Folder to write to."""
+    task: str = "random_boxes_hard"
+    """Name of a task, or path of a scene file. Where scenes do not vary, each has a new roadmap."""
+    scenes: int = 6000
+    """Number of scenes."""
+    paths_per_scene: int = 300
+    """Paths in each of them."""
+    num_nodes: int = 1000
+    """Nodes of a roadmap."""
+    num_neighbours: int = 14
+    """Nearest nodes that each is joined to, where the motion is free."""
+    margin: float = 0.015
+    """Metres that paths keep from everything, where there is room."""
+    shard_size: int = 50
+    """Scenes in each file."""
+    seed: int = 0
+    """Seed of scenes and roadmaps."""
+    workers: int = 2
+    """Number of processes. The files do not depend on it."""
+    ray_address: str | None = None
+    """Work on the Ray cluster at this address (`auto`, `HOST:PORT`) and not in local processes."""
+
+
+# What a shard depends on, besides its number.
+OPTIONS = (
+    "task",
+    "paths_per_scene",
+    "num_nodes",
+    "num_neighbours",
+    "margin",
+    "shard_size",
+    "seed",
+)
+
+
+def random_paths_of_scene(index, options):
+    """`(Scene, paths)` of scene `index` of a collection. `options`: a dict with keys `OPTIONS`."""
+    rng = np.random.default_rng([options["seed"], STREAM, index])
+    scene = envs.get_task(options["task"]).scene
+    scene = scene if isinstance(scene, Scene) else scene.sample(rng)
+    arguments = {name: options[name] for name in ("num_nodes", "num_neighbours", "margin")}
+    roadmap = Roadmap(scene, rng, **arguments)
+    return scene, roadmap.random_paths(options["paths_per_scene"], rng)
+
+
+class Collector:
+    """Makes shards; a job is (number of the shard, first scene, scene after the last)."""
+
+    def __init__(self, options, made_by):
+        self.options, self.made_by = options, made_by
+
+    def __call__(self, job):
+        """`(number, paths in it, contents of the file)`."""
+        number, first, end = job
+        made = [random_paths_of_scene(index, self.options) for index in range(first, end)]
+        scenes, paths = zip(*made, strict=True)
+        task, seed = self.options["task"], self.options["seed"]
+        contents = roadmap_paths.shard_bytes(task, seed, first, scenes, paths, self.made_by)
+        return number, sum(map(len, paths)), contents
+
+
+def _is_there(folder, job, made_by):
+    """Whether a shard was made before. Raises ValueError if it is damaged or another one."""
+    number, first, end = job
+    path = shard_path(folder, number)
+    if not path.exists():
+        return False
+    with roadmap_paths.open_shard(path) as file:
+        if attribute(file, "made_by") != made_by:
+            raise ValueError(f"{path} was made by another command: {attribute(file, 'made_by')}")
+        return len(file["path_count"]) >= end - first  # the last one may have had fewer
+
+
+def collect(args, progress=True):
+    """Make the shards that are missing; returns all `RoadmapPaths`.
+
+    Raises:
+        ValueError: arguments that cannot work; the folder holds other paths, or damaged ones.
+        RuntimeError: a scene leaves no room for the arm, or workers keep dying.
+        ConnectionError: there is no Ray cluster.
+        OSError: the folder cannot be written. What was written is safe.
+    """
+    for name in ("scenes", "paths_per_scene", "num_neighbours", "shard_size", "workers"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+    if not 0 <= args.seed <= MAX_SEED:
+        raise ValueError(f"--seed must be in [0, {MAX_SEED}]")
+    if args.num_nodes <= max(args.num_neighbours, JOINED):
+        raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
+    if not args.margin >= NODE_MARGIN:
+        raise ValueError(f"--margin must be at least {NODE_MARGIN} m")
+    if not envs.get_task(args.task).trainable:
+        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
+    package = Path(envs.__file__).parent.resolve()
+    if package in (args.output.resolve(), *args.output.resolve().parents):
+        raise ValueError(
+            f"{args.output} is in {package}: the repository's own files stay as they are"
+        )
+    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
+        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+    args.output.mkdir(parents=True, exist_ok=True)
+    options = {name: getattr(args, name) for name in OPTIONS}
+    flags = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
+    made_by = " ".join(["python -m demo_generation.roadmaps", *flags])
+    firsts = range(0, args.scenes, args.shard_size)
+    jobs = [(i, k, min(k + args.shard_size, args.scenes)) for i, k in enumerate(firsts)]
+    missing = [job for job in jobs if not _is_there(args.output, job, made_by)]
+    there = args.scenes - sum(end - first for _, first, end in missing)
+    bar = tqdm(
+        desc=args.task,
+        total=args.scenes * args.paths_per_scene,
+        initial=there * args.paths_per_scene,
+        unit=" paths",
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+        disable=not progress,
+    )
+    if args.ray_address is None:
+        results = workers.run(Collector, (options, made_by), missing, args.workers, warn=bar.write)
+    else:
+        results = workers.run_on_ray(args.ray_address, Collector, (options, made_by), missing)
+    with bar, contextlib.closing(results):
+        for number, count, contents in results:
+            write_atomically(shard_path(args.output, number), contents)
+            bar.update(count)
+    return roadmap_paths.load_roadmap_paths(args.output)
+
+
+def main(args):
+    try:
+        made = collect(args)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
+    count = len(made.offsets) - 1
+    print(f"{args.output}: {len(made)} scenes, {count} paths, {size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m demo_generation.roadmaps", description=__doc__))
