@@ -27,6 +27,7 @@ continued with more scenes.
 
 import contextlib
 import copy
+import functools
 import importlib.util
 import sys
 from dataclasses import dataclass
@@ -60,10 +61,12 @@ INSIDE, OUT_STEP, MAX_OUT_STEPS = 0.001, 0.01, 100
 JOINED = 30
 # Where there is none: nodes that are added near the ends, and how near (normalised) they are drawn,
 # the largest standard deviation of each joint.
-GROWN, GROWN_SCALE = 400, 0.3
+GROWN, GROWN_SCALE = 400, 0.6
+# Normalised, along ways through narrow places: where it is asked how narrow they are.
+DENSE = 0.15
 # `random_paths`: goals for each path (each costs a search of the whole roadmap), queries for each
 # path that is wanted, and how often it draws more of them before it gives up.
-GOALS_PER_PATH, SPARE, MAX_ROUNDS = 0.13, 1.2, 10
+GOALS_PER_PATH, SPARE, MAX_ROUNDS = 0.13, 1.1, 10
 # Random chords tried on each path, and the share of its length that each has to save.
 CHORDS, LEAST_GAIN = 40, 0.005
 _HAIR = 1e-5  # m: what rounding may take from a distance
@@ -92,8 +95,10 @@ class Roadmap:
             raise ValueError(f"margin must be at least {NODE_MARGIN} m, got {margin!r}")
         self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
         self._checker = CollisionChecker(scene)
+        self._kept = margin  # by the edges
         self.nodes, self._room = np.empty((0, 7)), np.empty(0)
-        self._edges = np.empty((2, 0), np.int64), np.empty(0)
+        self._edges, self._blocked = (np.empty((2, 0), np.int64) for _ in range(2))
+        self._edge_costs = np.empty(0)
         self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
 
     def _add_nodes(self, nodes):
@@ -104,15 +109,27 @@ class Roadmap:
         near = self._nearest_nodes(nodes, self.num_neighbours + 1)  # one is the node itself
         one = np.repeat(np.arange(first, len(self.nodes)), near.shape[1])
         edges = np.stack([one, near.ravel()])
-        one, other = np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
-        motions = self.nodes[one], self.nodes[other], self._room[one], self._room[other]
+        edges = np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
+        motions = *self.nodes[edges], *self._room[edges]
         free = self._joined(*motions)
-        edges, costs = self._edges
-        edges = np.concatenate([edges, np.stack([one, other])[:, free]], axis=1)
-        self._edges = edges, np.concatenate([costs, self._costs(*motions)[free]])
+        self._blocked = np.concatenate([self._blocked, edges[:, ~free]], axis=1)
+        self._edges = np.concatenate([self._edges, edges[:, free]], axis=1)
+        self._edge_costs = np.concatenate([self._edge_costs, self._costs(*motions)[free]])
+
+    @functools.cached_property
+    def _narrow(self):
+        """This roadmap with the edges, too, that keep no more than `NODE_MARGIN`."""
+        roadmap = copy.copy(self)
+        roadmap._kept = NODE_MARGIN
+        edges = self._blocked
+        edges = edges[:, roadmap._joined(*self.nodes[edges], *self._room[edges])]
+        costs = self._costs(*self.nodes[edges], np.zeros(edges.shape[1]), 0.0)
+        roadmap._edges = np.concatenate([self._edges, edges], axis=1)
+        roadmap._edge_costs = np.concatenate([self._edge_costs, costs])
+        return roadmap
 
     def _grown(self, around, rng):
-        """A roadmap with more nodes, near configurations that could not be joined to this one."""
+        """This roadmap with more nodes, near configurations that could not be joined to it."""
         centres = around[np.arange(GROWN) % len(around)]
         scale = rng.uniform(0.0, GROWN_SCALE, (GROWN, 1))
         new = np.clip(centres + scale * rng.standard_normal((GROWN, 7)), -1.0, 1.0)
@@ -157,11 +174,20 @@ class Roadmap:
         """
         starts, goals = (np.array(x, dtype=np.float64).reshape(-1, 7) for x in (starts, goals))
         begins = self._moved_out(starts)
-        paths = self._ways(begins, goals, rng)
-        lost = [i for i, path in enumerate(paths) if path is None]
-        if lost:
-            roadmap = self._grown(np.concatenate([begins[lost], goals[lost]]), rng)
-            for i, path in zip(lost, roadmap._ways(begins[lost], goals[lost], rng), strict=True):
+        points, room, found = self._search(begins, goals)
+        paths = [None] * len(starts)
+        ways = self._smooth(points[found], points[found], room[found], rng)
+        for i, path in zip(np.flatnonzero(found), ways, strict=True):
+            paths[i] = path
+        lost = np.flatnonzero(~found)
+        if len(lost):
+            # Through narrow places, where the margin is not kept. Away from them it is.
+            roadmap = self._narrow._grown(np.concatenate([begins[lost], goals[lost]]), rng)
+            points, _, found = roadmap._search(begins[lost], goals[lost])
+            states = _dense(points[found])
+            room = self._rooms(states.reshape(-1, 7)).reshape(states.shape[:2])
+            ways = self._smooth(points[found], states, room, rng)
+            for i, path in zip(lost[found], ways, strict=True):
                 paths[i] = path
         for i, path in enumerate(paths):
             if path is not None:
@@ -207,7 +233,7 @@ class Roadmap:
     def _free(self, starts, ends, states, room):
         """Whether motions (n, 7) are free, each as near as its own states (n, k, 7) allow."""
         relaxed = (states, room - _HAIR, MARGIN_GROWTH)
-        return self._checker.is_motion_free(starts, ends, self.margin, relaxed=relaxed)
+        return self._checker.is_motion_free(starts, ends, self._kept, relaxed=relaxed)
 
     def _costs(self, starts, ends, start_room, end_room):
         """Of straight motions (..., 7), if they are free."""
@@ -224,12 +250,11 @@ class Roadmap:
         squared = (self.nodes**2).sum(1) - 2.0 * states @ self.nodes.T
         return np.argpartition(squared, number, axis=1)[:, :number]
 
-    def _ways(self, starts, goals, rng):
-        """Smoothed paths (k, 7), which may repeat points; None where there is none."""
-        points, room, found = self._search(starts, goals)
-        points, room = points[found], room[found]
-        ways = iter(self._cut_short(self._prune(points, room), points, room, rng))
-        return [next(ways) if there else None for there in found]
+    def _smooth(self, points, states, room, rng):
+        """Paths (n, k, 7), padded, made shorter, as near as the states (n, m, 7) allow that they
+        come by.
+        """
+        return self._cut_short(self._prune(points, states, room), states, room, rng)
 
     def _search(self, starts, goals):
         """Shortest paths: points (n, k, 7), padded with the goal, their room (n, k), found (n,)."""
@@ -241,7 +266,7 @@ class Roadmap:
         node = self._nearest_nodes(goals, JOINED).ravel()
         ways = goals[goal], self.nodes[node], goal_room[goal], self._room[node]
         free = self._joined(*ways) & (goal_room[goal] >= -INSIDE)
-        count, ((one, other), costs) = len(self.nodes), self._edges
+        count, (one, other), costs = len(self.nodes), self._edges, self._edge_costs
         tails = np.concatenate([one, other, count + goal[free]])
         heads = np.concatenate([other, one, node[free]])
         costs = np.concatenate([costs, costs, self._costs(*ways)[free]])
@@ -270,7 +295,7 @@ class Roadmap:
         points = np.concatenate([starts[:, None], states[route]], axis=1)
         return points, np.concatenate([start_room[:, None], room[route]], axis=1), found
 
-    def _prune(self, points, room):
+    def _prune(self, points, states, room):
         """Paths (n, k, 7), padded, without the vertices that straight motions can leave out."""
         n, size = points.shape[:2]
         lengths = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
@@ -280,7 +305,7 @@ class Roadmap:
         first, last = np.triu_indices(size, 2)
         path, pair = np.nonzero(moves[:, last - 1, last] > 0.0)  # not to where the goal is repeated
         first, last = first[pair], last[pair]
-        free = self._free(points[path, first], points[path, last], points[path], room[path])
+        free = self._free(points[path, first], points[path, last], states[path], room[path])
         path, first, last = path[free], first[free], last[free]
         moves[path, first, last] = lengths[path, first, last]
         # The shortest way through what is left, by dynamic programming.
@@ -343,6 +368,15 @@ class Roadmap:
             states[inside] = np.clip(states[inside] + OUT_STEP * uphill, -1.0, 1.0)
             inside = inside[self._distances(states[inside]) < NODE_MARGIN]
         return states
+
+
+def _dense(points):
+    """Points along paths (n, k, 7), at most DENSE apart: (n, m, 7)."""
+    moves = np.diff(points, axis=1)[:, :, None]
+    pieces = max(int(np.ceil(np.linalg.norm(moves, axis=-1).max(initial=0.0) / DENSE)), 1)
+    dense = points[:, :-1, None] + np.arange(pieces)[:, None] / pieces * moves
+    dense = dense.reshape(len(points), moves.shape[1] * pieces, 7)
+    return np.concatenate([dense, points[:, -1:]], axis=1)
 
 
 _DIFFERENCES = _STEP * np.stack([-np.eye(7), np.eye(7)])
