@@ -69,6 +69,8 @@ DENSE = 0.15
 GOALS_PER_PATH, SPARE, MAX_ROUNDS = 0.13, 1.1, 10
 # Random chords tried on each path, and the share of its length that each has to save.
 CHORDS, LEAST_GAIN = 40, 0.005
+# A label's direction is that of so much (normalised) of its way, a third of a step of the arm.
+AHEAD = 0.01
 _HAIR = 1e-5  # m: what rounding may take from a distance
 _STEP = 1e-4  # normalised: of finite differences
 
@@ -191,11 +193,10 @@ class Roadmap:
                 paths[i] = path
         for i, path in enumerate(paths):
             if path is not None:
-                path = np.concatenate([starts[i : i + 1], path])
+                path = np.concatenate([starts[i : i + 1], path]).astype(np.float32)
                 moves = (path[1:] != path[:-1]).any(1)
                 # A path whose start is its goal has two points, too.
-                path = path[np.r_[True, moves]] if moves.any() else path[:2]
-                paths[i] = path.astype(np.float32)
+                paths[i] = path[np.r_[True, moves]] if moves.any() else path[:2]
         return paths
 
     def labels(self, states, goals, rng):
@@ -205,18 +206,19 @@ class Roadmap:
         as near as it is. From really inside something, it first goes the shortest way out.
 
         Returns:
-            directions: float32 (n, 7), unit vectors: the first move of the way. Zeros where the
-                state is its goal, NaN where there is no way.
+            directions: float32 (n, 7), unit vectors: to where the way is after `AHEAD`. Zeros where
+                the state is its goal, NaN where there is no way.
             lengths: float32 (n,), of the way, L2, normalised. NaN where there is none.
         """
         directions = np.full((len(states), 7), np.nan, np.float32)
         lengths = np.full(len(states), np.nan, np.float32)
         for i, path in enumerate(self.paths(states, goals, rng)):
             if path is not None:
-                moves = np.diff(path, axis=0)
-                steps = np.linalg.norm(moves, axis=1)
-                directions[i] = moves[0] / max(steps[0], 1e-12)
-                lengths[i] = steps.sum()
+                steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+                come = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+                move = [np.interp(AHEAD, come, values) for values in path.T] - path[0]
+                directions[i] = move / max(np.linalg.norm(move), 1e-12)
+                lengths[i] = come[-1]
         return directions, lengths
 
     def _distances(self, states):
@@ -265,7 +267,7 @@ class Roadmap:
         goal = np.repeat(np.arange(len(goals)), JOINED)
         node = self._nearest_nodes(goals, JOINED).ravel()
         ways = goals[goal], self.nodes[node], goal_room[goal], self._room[node]
-        free = self._joined(*ways) & (goal_room[goal] >= -INSIDE)
+        free = self._joined(*ways)
         count, (one, other), costs = len(self.nodes), self._edges, self._edge_costs
         tails = np.concatenate([one, other, count + goal[free]])
         heads = np.concatenate([other, one, node[free]])
@@ -273,11 +275,13 @@ class Roadmap:
         graph = csr_array((costs, (tails, heads)), shape=(len(states), len(states)))
         indices = count + np.arange(len(goals))
         rest, before = dijkstra(graph, indices=indices, return_predecessors=True)
+        # From or to the inside of something there is no way.
         rest[goal_room < -INSIDE] = np.inf
         # The first step is to the goal itself or to a node: the best one that is free.
         first = np.c_[count + which, self._nearest_nodes(starts, JOINED)]
         costs = self._costs(starts[:, None], states[first], start_room[:, None], room[first])
         costs += rest[which[:, None], first]
+        costs[start_room < -INSIDE] = np.inf
         order = np.argsort(costs, axis=1, kind="stable")
         node, found = count + which, np.zeros(len(starts), bool)
         waiting = np.arange(len(starts))
