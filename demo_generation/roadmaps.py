@@ -175,7 +175,7 @@ class Roadmap:
         Starts may be in contact, as for `labels`. Fast for many queries with few different goals.
         """
         starts, goals = (np.array(x, dtype=np.float64).reshape(-1, 7) for x in (starts, goals))
-        begins = self._moved_out(starts)
+        begins = self._moved_out(starts, -INSIDE)
         points, room, found = self._search(begins, goals)
         paths = [None] * len(starts)
         ways = self._smooth(points[found], points[found], room[found], rng)
@@ -184,7 +184,9 @@ class Roadmap:
         lost = np.flatnonzero(~found)
         if len(lost):
             # Through narrow places, where the margin is not kept. Away from them it is.
-            roadmap = self._narrow._grown(np.concatenate([begins[lost], goals[lost]]), rng)
+            begins[lost] = self._moved_out(begins[lost], NODE_MARGIN)
+            ends = np.unique(np.concatenate([begins[lost], goals[lost]]), axis=0)
+            roadmap = self._narrow._grown(ends, rng)
             points, _, found = roadmap._search(begins[lost], goals[lost])
             states = _dense(points[found])
             room = self._rooms(states.reshape(-1, 7)).reshape(states.shape[:2])
@@ -357,10 +359,10 @@ class Roadmap:
                 points = points[:, :-1]
         return points
 
-    def _moved_out(self, states):
-        """The states, but those that are inside of something moved the shortest way out of it."""
+    def _moved_out(self, states, room):
+        """The states, those with less room (m) moved to `NODE_MARGIN` by the shortest way."""
         states = states.copy()
-        inside = np.flatnonzero(self._rooms(states) < -INSIDE)
+        inside = np.flatnonzero(self._rooms(states) < room)
         for _ in range(MAX_OUT_STEPS):
             if not len(inside):
                 break
