@@ -72,7 +72,7 @@ CHORDS, LEAST_GAIN = 40, 0.005
 # A label's direction is that of so much (normalised) of its way, a third of a step of the arm.
 AHEAD = 0.01
 _HAIR = 1e-5  # m: what rounding may take from a distance
-_STEP = 1e-4  # normalised: of finite differences
+_DIFFERENCES = 1e-4 * np.stack([-np.eye(7), np.eye(7)])  # normalised: (2, 7, 7)
 
 
 class Roadmap:
@@ -174,7 +174,11 @@ class Roadmap:
 
         Starts may be in contact, as for `labels`. Fast for many queries with few different goals.
         """
-        starts, goals = (np.array(x, dtype=np.float64).reshape(-1, 7) for x in (starts, goals))
+        # The simulated arm may be a little beyond its limits.
+        starts, goals = (
+            np.clip(np.asarray(x, dtype=np.float64), -1.0, 1.0).reshape(-1, 7)
+            for x in (starts, goals)
+        )
         begins = self._moved_out(starts, -INSIDE)
         points, room, found = self._search(begins, goals)
         paths = [None] * len(starts)
@@ -383,9 +387,6 @@ def _dense(points):
     dense = points[:, :-1, None] + np.arange(pieces)[:, None] / pieces * moves
     dense = dense.reshape(len(points), moves.shape[1] * pieces, 7)
     return np.concatenate([dense, points[:, -1:]], axis=1)
-
-
-_DIFFERENCES = _STEP * np.stack([-np.eye(7), np.eye(7)])
 
 
 # Streams 1 to 4 of random numbers are those of queries, demonstrations and observations. Seeds are

@@ -169,6 +169,11 @@ def test_the_same_seed_gives_the_same_labels(roadmap):
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_trainer_that_asks_for_labels_needs_no_ompl():
+    check = "import sys, demo_generation.roadmaps; sys.exit('ompl' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], cwd=ROOT).returncode == 0
+
+
 def test_a_margin_below_that_of_the_nodes_is_refused():
     with pytest.raises(ValueError, match="margin"):
         Roadmap(Scene(), np.random.default_rng(0), margin=0.001)
