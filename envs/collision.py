@@ -132,11 +132,12 @@ class CollisionChecker:
             relaxed: None, or `(states (k, 7), distances (k,), growth)`. Near these states the
                 margin is smaller: `distance + growth * d` at most, where d is how far away they are
                 (L2, normalised). For queries that begin or end nearer to something than `margin`.
+                Each configuration, or motion, may have its own: (..., k, 7) and (..., k).
         """
         states = _states("states", states)
         free = np.empty(states.shape[:-1], dtype=np.bool_)
-        rule = _rule(margin, clearance, relaxed)
-        _free_batch(states.reshape(-1, 7), *rule, *_arm(), *self._world, free.reshape(-1))
+        rule = _rule(margin, clearance, relaxed, batch=states.shape[:-1])
+        _free_batch(states.reshape(-1, 7), *rule, _arm(), self._world, free.reshape(-1))
         return free
 
     def is_motion_free(
@@ -159,10 +160,10 @@ class CollisionChecker:
     ):
         """How many configurations `is_motion_free` looks at, int64 (...); negative: not free."""
         starts, ends = np.broadcast_arrays(_states("starts", starts), _states("ends", ends))
-        rule = _rule(margin, clearance, relaxed, resolution)
+        rule = _rule(margin, clearance, relaxed, resolution, batch=starts.shape[:-1])
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
         flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
-        _motion_batch(*flat, *rule, *_arm(), *self._world, checks.reshape(-1))
+        _motion_batch(*flat, *rule, _arm(), self._world, checks.reshape(-1))
         return checks
 
     def motion_checker(self, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION):
@@ -171,8 +172,8 @@ class CollisionChecker:
         It is `motion_checks` for one motion from a start that is known to be free, which is not
         looked at again; and it does not look at its arguments.
         """
-        rule = _rule(margin, clearance, relaxed, resolution)
-        rest = (*rule, *_arm(), *self._world)
+        rule, relaxed = _rule(margin, clearance, relaxed, resolution)
+        rest = (rule, relaxed[0], _arm(), self._world)
 
         def check(start, end):
             return _motion(start, end, *rest)
@@ -194,8 +195,8 @@ class CollisionChecker:
         _nearest_batch(
             states.reshape(-1, 7),
             bool(self_collisions),
-            *_arm(),
-            *self._world,
+            _arm(),
+            self._world,
             distance.reshape(-1, len(LINKS)),
             direction.reshape(-1, len(LINKS), 3),
             point.reshape(-1, len(LINKS), 3),
@@ -222,10 +223,11 @@ def _states(name, states):
     return states
 
 
-def _rule(margin, clearance, relaxed, resolution=RESOLUTION):
+def _rule(margin, clearance, relaxed, resolution=RESOLUTION, batch=()):
     """What is asked for, as the compiled functions take it. Raises ValueError.
 
-    Returns float64 (4,): margin, clearance, growth, resolution; and (k, 8): states and distances.
+    Returns float64 (4,): margin, clearance, growth, resolution; and (n, k, 8): states and distances
+    for each of a batch, or n = 1 for all of it.
     """
     for name, value in (("margin", margin), ("clearance", clearance)):
         if not 0 <= value < MAX_MARGIN:
@@ -233,15 +235,18 @@ def _rule(margin, clearance, relaxed, resolution=RESOLUTION):
     if not 0 < resolution < math.inf:
         raise ValueError(f"resolution must be positive, got {resolution!r}")
     if relaxed is None:
-        return np.array([margin, clearance, 0.0, resolution]), np.empty((0, 8))
+        return np.array([margin, clearance, 0.0, resolution]), np.empty((1, 0, 8))
     states, distances, growth = relaxed
     states = _states("relaxed states", states)
     distances = np.asarray(distances, dtype=np.float64)
-    if states.ndim != 2 or distances.shape != states.shape[:1] or np.isnan(distances).any():
+    fits = states.ndim == 2 or (states.ndim > 2 and states.shape[:-2] == batch)
+    if not fits or distances.shape != states.shape[:-1] or np.isnan(distances).any():
         raise ValueError(f"relaxed: {states.shape} states and {distances.shape} distances")
     if not 0 <= growth < math.inf:
         raise ValueError(f"relaxed: growth must be finite and not negative, got {growth!r}")
-    return np.array([margin, clearance, growth, resolution]), np.c_[states, distances]
+    relaxed = np.concatenate([states, distances[..., None]], axis=-1)
+    relaxed = relaxed.reshape(-1 if states.ndim > 2 else 1, *relaxed.shape[-2:])
+    return np.array([margin, clearance, growth, resolution]), relaxed
 
 
 # --- The arm and the scene as arrays
@@ -712,8 +717,10 @@ def _as_row(bodies, k, frames, centres, row):
 
 
 @compiled
-def _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball, memory):
+def _is_free(q, rule, relaxed, arm, world, memory):
     """`CollisionChecker.is_free` of one state."""
+    bodies, pairs, vertices, cells = arm
+    rows, points, groups, ball = world
     frames, centres, pose, s, other = memory
     margin, clearance, growth = rule[0], rule[1], rule[2]
     for i in range(relaxed.shape[0]):
@@ -755,29 +762,15 @@ def _is_free(q, rule, relaxed, bodies, pairs, vertices, cells, rows, points, gro
 
 
 @compiled
-def _free_batch(
-    states, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball, free
-):
+def _free_batch(states, rule, relaxed, arm, world, free):
     memory = _memory()
     for i in range(states.shape[0]):
-        free[i] = _is_free(
-            states[i],
-            rule,
-            relaxed,
-            bodies,
-            pairs,
-            vertices,
-            cells,
-            rows,
-            points,
-            groups,
-            ball,
-            memory,
-        )
+        near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        free[i] = _is_free(states[i], rule, near, arm, world, memory)
 
 
 @compiled
-def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball):
+def _motion(start, end, rule, relaxed, arm, world):
     """How many states of a motion were looked at, not counting its start; negative: not free."""
     memory, q = _memory(), np.empty(7)
     squared = 0.0
@@ -794,9 +787,7 @@ def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows, poi
             for j in range(7):
                 q[j] = start[j] + (end[j] - start[j]) * share
             looked_at += 1
-            if not _is_free(
-                q, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball, memory
-            ):
+            if not _is_free(q, rule, relaxed, arm, world, memory):
                 return -looked_at
         part += 2
         if part > parts:
@@ -806,41 +797,14 @@ def _motion(start, end, rule, relaxed, bodies, pairs, vertices, cells, rows, poi
 
 
 @compiled
-def _motion_batch(
-    starts, stops, rule, relaxed, bodies, pairs, vertices, cells, rows, points, groups, ball, checks
-):
+def _motion_batch(starts, stops, rule, relaxed, arm, world, checks):
     memory = _memory()
     for i in range(starts.shape[0]):
-        if not _is_free(
-            starts[i],
-            rule,
-            relaxed,
-            bodies,
-            pairs,
-            vertices,
-            cells,
-            rows,
-            points,
-            groups,
-            ball,
-            memory,
-        ):
+        near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        if not _is_free(starts[i], rule, near, arm, world, memory):
             checks[i] = -1
             continue
-        more = _motion(
-            starts[i],
-            stops[i],
-            rule,
-            relaxed,
-            bodies,
-            pairs,
-            vertices,
-            cells,
-            rows,
-            points,
-            groups,
-            ball,
-        )
+        more = _motion(starts[i], stops[i], rule, near, arm, world)
         checks[i] = more + 1 if more > 0 else more - 1
 
 
@@ -1010,28 +974,24 @@ def _write(frames, f, centres, k, s, sign, back, direction, point):
 def _nearest_batch(
     states,
     self_collisions,
-    bodies,
-    pairs,
-    vertices,
-    cells,
-    rows,
-    points,
-    groups,
-    ball,
+    arm,
+    world,
     distance,
     direction,
     point,
     gradient,
     which,
 ):
+    bodies, pairs, vertices, cells = arm
+    rows, points, groups, ball = world
     frames, centres, pose, s, other = _memory()
     polytope = (
         np.empty((_EPA_VERTICES, 6)),
         np.empty((_EPA_FACES, 7)),
         np.empty((_EPA_FACES, 2), np.int64),
     )
-    arm = rows.shape[0]
-    distance[:], direction[:], point[:], which[:] = np.inf, 0.0, 0.0, arm + 2
+    of_arm = rows.shape[0]
+    distance[:], direction[:], point[:], which[:] = np.inf, 0.0, 0.0, of_arm + 2
     for i in range(states.shape[0]):
         _place(states[i], bodies, frames, centres)
         for k in range(1, bodies.shape[0]):
@@ -1075,7 +1035,7 @@ def _nearest_batch(
                         continue
                     core = _core_distance(vertices, cells, k, ball, 0, pose, s, far, polytope)
                     if core < far:
-                        distance[i, link], which[i, link] = core - rounding, arm + 1
+                        distance[i, link], which[i, link] = core - rounding, of_arm + 1
                         there, at = direction[i, link], point[i, link]
                         _write(frames, f, centres, k, s, 1.0, 0.0, there, at)
             _gradient(frames, 0, f, direction[i, link], point[i, link], gradient[i, link])
@@ -1092,7 +1052,7 @@ def _nearest_batch(
             for body, sign, back in ((a, 1.0, 0.0), (b, -1.0, core)):
                 link = body - 1
                 if link >= 0 and core < _FAR and core - rounding < distance[i, link]:
-                    distance[i, link], which[i, link] = core - rounding, arm
+                    distance[i, link], which[i, link] = core - rounding, of_arm
                     there, at = direction[i, link], point[i, link]
                     _write(frames, fa, centres, a, s, sign, back, there, at)
                     # Joints that move both change nothing. What those between them move is one of

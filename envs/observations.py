@@ -16,26 +16,20 @@ compressed one by one, with a checksum each, so that any of them can be read alo
 
 import io
 import json
-import re
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from envs import scenes
+from envs import scenes, shards
 from envs.datasets import DatasetError, attribute, scene_from_json, scene_to_json
 from envs.sensors import Camera, PointCloud
+from envs.shards import read_array, shard_path, shard_paths, write_attributes
 from envs.tasks import get_task, task_name
 
 SCHEMA, SCHEMA_VERSION = "roboarm-nmp observations", 1
 _KINDS = {"camera": Camera, "point_cloud": PointCloud}
-_SHARD = re.compile(r"shard_(\d{5})\.h5")
-
-
-def shard_path(folder, number):
-    """Path of a folder's shard."""
-    return Path(folder) / f"shard_{number:05d}.h5"
 
 
 def sensors_to_json(sensors):
@@ -104,8 +98,7 @@ def shard_bytes(task, seed, first, sensors, scenes_seen, configurations, observa
     }
     contents = io.BytesIO()
     with h5py.File(contents, "w", libver=("v110", "v110")) as file:
-        for name, value in attributes.items():
-            file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+        write_attributes(file, attributes)
         for name, array in arrays.items():
             file.create_dataset(name, data=array, track_times=False, fletcher32=array.size > 0)
         for name in observations[0]:
@@ -125,15 +118,7 @@ def shard_bytes(task, seed, first, sensors, scenes_seen, configurations, observa
 
 def open_shard(path):
     """An `h5py.File` of a shard. Raises DatasetError: damaged, or something else."""
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
-    schema = attribute(file, "schema"), attribute(file, "schema_version")
-    if schema != (SCHEMA, SCHEMA_VERSION):
-        file.close()
-        raise DatasetError(f"{path}: not observations of version {SCHEMA_VERSION}: {schema}")
-    return file
+    return shards.open_shard(path, "observations", SCHEMA, SCHEMA_VERSION)
 
 
 class Observations:
@@ -149,26 +134,18 @@ class Observations:
 
     def __init__(self, folder):
         self.folder = Path(folder)
-        numbers = sorted(
-            int(match[1]) for path in self.folder.glob("*") if (match := _SHARD.match(path.name))
-        )
-        if not numbers:
-            raise DatasetError(f"{folder}: no observations (shard_00000.h5, ...) in this folder")
-        if numbers != list(range(len(numbers))):
-            missing = next(i for i, number in enumerate(numbers) if i != number)
-            raise DatasetError(f"{shard_path(folder, missing)}: no such file, but later ones exist")
-        self.offsets = np.zeros(len(numbers) + 1, np.int64)
+        paths = shard_paths(folder, "observations")
+        self.offsets = np.zeros(len(paths) + 1, np.int64)
         """Number of the first scene of each shard, and of all scenes."""
         first = None
-        for number in numbers:
-            with open_shard(shard_path(self.folder, number)) as file:
+        for number, path in enumerate(paths):
+            with open_shard(path) as file:
                 found = {name: attribute(file, name) for name in ("task", "seed", "sensors")}
                 found["scene"] = attribute(file, "scene")
                 self.offsets[number + 1] = self.offsets[number] + len(file["configuration"])
             first = first or found
             for name, value in found.items():
                 if value != first[name]:
-                    path = shard_path(folder, number)
                     raise DatasetError(f"{path}: another {name} than that of the first shard")
         self.task, self.seed = first["task"], first["seed"]
         self.sensors = sensors_from_json(first["sensors"])
@@ -180,12 +157,9 @@ class Observations:
 
     def read(self, number, name):
         """One array of a shard, e.g. `read(3, "front/rgb")`. Raises DatasetError if it is bad."""
-        with open_shard(shard_path(self.folder, number)) as file:
-            try:
-                return file[name][()]
-            except (KeyError, OSError) as error:
-                path = shard_path(self.folder, number)
-                raise DatasetError(f"{path}: {name} is missing or corrupt ({error})") from error
+        path = shard_path(self.folder, number)
+        with open_shard(path) as file:
+            return read_array(file, path, name)
 
     def scenes(self, number):
         """The `Scene`s of a shard, a list."""

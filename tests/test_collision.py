@@ -332,6 +332,27 @@ def test_less_is_asked_near_relaxed_states():
     assert 0.1 < (got >= asked).mean() < 0.9
 
 
+def test_each_motion_may_have_its_own_relaxed_states():
+    scene = envs.get_task("boxes").scene
+    checker, rng = CollisionChecker(scene), np.random.default_rng(6)
+    states = rng.uniform(-1, 1, (4000, 7))
+    ends = states[checker.is_free(states)][:200].reshape(100, 2, 7)
+    distances = checker.nearest(ends).distance.min(-1) - 1e-6
+    starts, stops = ends[:, 0], ends[:, 0] + 0.05 * (ends[:, 1] - ends[:, 0])
+    free = checker.is_motion_free(starts, stops, 0.015, relaxed=(ends, distances, 0.1))
+    alone = [
+        checker.is_motion_free(starts[i], stops[i], 0.015, relaxed=(ends[i], distances[i], 0.1))
+        for i in range(100)
+    ]
+    np.testing.assert_array_equal(free, alone)
+    assert (free & ~checker.is_motion_free(starts, stops, 0.015)).sum() > 0
+    assert (~free).sum() > 0
+    single = checker.is_free(starts, 0.015, relaxed=(ends, distances, 0.1))
+    assert single.all()
+    with pytest.raises(ValueError, match="relaxed"):
+        checker.is_free(starts, 0.015, relaxed=(ends[:50], distances[:50], 0.1))
+
+
 # --- Motions
 
 # The first joint turns from one side of a thin board, which stands upright, to the other.

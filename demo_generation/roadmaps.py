@@ -1,0 +1,541 @@
+"""Roadmaps: many short paths in one scene, and how to go on from any configuration in it.
+
+    python -m demo_generation.roadmaps --task random_boxes_hard --scenes 6000 --output roadmaps
+
+collects paths of many scenes (read by `envs.roadmap_paths.load_roadmap_paths`). In Python:
+
+    from demo_generation.roadmaps import Roadmap
+
+    roadmap = Roadmap(scene, rng)
+    roadmap.random_paths(300, rng)           # so many paths, each (k, 7), normalised
+    roadmap.paths(starts, goals, rng)        # the same for given queries; None where there is none
+    roadmap.labels(states, goals, rng)       # the direction to go on in, and how long the rest is
+
+A probabilistic roadmap (Kavraki et al., 1996): random free configurations, each joined to its
+nearest neighbours where the straight motion is free, and shortest paths in that graph, which are
+then pruned and cut short.
+
+Paths keep `margin` from everything where there is room. A node, a start or a goal that is nearer
+to something than that is not lost: around it, a path may come as near as it is itself, and has to
+get away by `MARGIN_GROWTH`.
+
+Scene i of a collection and its paths depend on the seed, the options and i only, so the files are
+the same whatever the number of workers. They are written a shard at a time, each in one piece; a
+run that was interrupted or killed goes on when it is started again, and one that is finished can be
+continued with more scenes.
+"""
+
+import contextlib
+import copy
+import functools
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from tqdm import tqdm
+
+import envs
+from envs import roadmap_paths, workers
+from envs.collision import CollisionChecker
+from envs.datasets import attribute
+from envs.files import write_atomically
+from envs.scenes import Scene
+from envs.shards import shard_path
+
+# Around a configuration that is nearer to something than the margin, the margin grows by this much
+# (m) per unit of normalised distance from it.
+MARGIN_GROWTH = 0.05
+# Nodes keep at least this (m), as plans do (`demo_generation.planning.MARGIN`).
+NODE_MARGIN = 0.003
+# A motion costs up to 1 + NARROW times its length, where one of its ends has no room at all.
+NARROW = 2.0
+# A configuration that is deeper (m) in something is moved out of it before anything else, until it
+# is NODE_MARGIN away, in steps of OUT_STEP (normalised).
+INSIDE, OUT_STEP, MAX_OUT_STEPS = 0.001, 0.01, 100
+# A way begins and ends at one of so many nearest nodes.
+JOINED = 30
+# Where there is none: nodes that are added near the ends, and how near (normalised) they are drawn,
+# the largest standard deviation of each joint.
+GROWN, GROWN_SCALE = 400, 0.6
+# Normalised, along ways through narrow places: where it is asked how narrow they are.
+DENSE = 0.15
+# `random_paths`: goals for each path (each costs a search of the whole roadmap), queries for each
+# path that is wanted, and how often it draws more of them before it gives up.
+GOALS_PER_PATH, SPARE, MAX_ROUNDS = 0.13, 1.1, 10
+# Random chords tried on each path, and the share of its length that each has to save.
+CHORDS, LEAST_GAIN = 40, 0.005
+# A label's direction is that of so much (normalised) of its way, a third of a step of the arm.
+AHEAD = 0.01
+_HAIR = 1e-5  # m: what rounding may take from a distance
+_DIFFERENCES = 1e-4 * np.stack([-np.eye(7), np.eye(7)])  # normalised: (2, 7, 7)
+
+
+class Roadmap:
+    """The roadmap of a scene. Configurations are normalised.
+
+    The same scene, arguments and generators give the same answers.
+
+    Args:
+        scene: a `Scene`.
+        rng: a NumPy Generator.
+        num_nodes: random free configurations.
+        num_neighbours: of the nearest nodes, how many each node, start and goal is joined to.
+        margin: m, at least `NODE_MARGIN`: what paths keep from everything, the arm itself included.
+
+    Raises:
+        ValueError: the margin is smaller.
+        RuntimeError: the scene leaves no room for the arm.
+    """
+
+    def __init__(self, scene, rng, num_nodes=1000, num_neighbours=14, margin=0.015):
+        if not margin >= NODE_MARGIN:
+            raise ValueError(f"margin must be at least {NODE_MARGIN} m, got {margin!r}")
+        self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
+        self._checker = CollisionChecker(scene)
+        self._kept = margin  # by the edges
+        self.nodes, self._room = np.empty((0, 7)), np.empty(0)
+        self._edges, self._blocked = (np.empty((2, 0), np.int64) for _ in range(2))
+        self._edge_costs = np.empty(0)
+        self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
+
+    def _add_nodes(self, nodes):
+        """Join free configurations (n, 7) to the nearest nodes."""
+        first = len(self.nodes)
+        self.nodes = np.concatenate([self.nodes, nodes])
+        self._room = np.concatenate([self._room, self._rooms(nodes)])
+        near = self._nearest_nodes(nodes, self.num_neighbours + 1)  # one is the node itself
+        one = np.repeat(np.arange(first, len(self.nodes)), near.shape[1])
+        edges = np.stack([one, near.ravel()])
+        edges = np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
+        motions = *self.nodes[edges], *self._room[edges]
+        free = self._joined(*motions)
+        self._blocked = np.concatenate([self._blocked, edges[:, ~free]], axis=1)
+        self._edges = np.concatenate([self._edges, edges[:, free]], axis=1)
+        self._edge_costs = np.concatenate([self._edge_costs, self._costs(*motions)[free]])
+
+    @functools.cached_property
+    def _narrow(self):
+        """This roadmap with the edges, too, that keep no more than `NODE_MARGIN`."""
+        roadmap = copy.copy(self)
+        roadmap._kept = NODE_MARGIN
+        edges = self._blocked
+        edges = edges[:, roadmap._joined(*self.nodes[edges], *self._room[edges])]
+        costs = self._costs(*self.nodes[edges], np.zeros(edges.shape[1]), 0.0)
+        roadmap._edges = np.concatenate([self._edges, edges], axis=1)
+        roadmap._edge_costs = np.concatenate([self._edge_costs, costs])
+        return roadmap
+
+    def _grown(self, around, rng):
+        """This roadmap with more nodes, near configurations that could not be joined to it."""
+        centres = around[np.arange(GROWN) % len(around)]
+        scale = rng.uniform(0.0, GROWN_SCALE, (GROWN, 1))
+        new = np.clip(centres + scale * rng.standard_normal((GROWN, 7)), -1.0, 1.0)
+        roadmap = copy.copy(self)
+        roadmap._add_nodes(new[self._checker.is_free(new, NODE_MARGIN)])
+        return roadmap
+
+    def sample(self, number, rng, margin=0.0):
+        """Random free configurations, float64 (number, 7). Raises RuntimeError: there are none."""
+        found, missing = [np.empty((0, 7))], number
+        for _ in range(1000):
+            if missing == 0:
+                break
+            states = rng.uniform(-1.0, 1.0, (4 * missing, 7))
+            found.append(states[self._checker.is_free(states, margin)][:missing])
+            missing -= len(found[-1])
+        else:
+            raise RuntimeError("the scene leaves no room for the arm")
+        return np.concatenate(found)
+
+    def random_paths(self, number, rng):
+        """`number` smoothed paths between random free configurations: a list of float32 (k, 7).
+
+        Fewer, where hardly any configurations can be joined.
+        """
+        goals = self.sample(int(np.ceil(GOALS_PER_PATH * number)), rng)
+        paths = []
+        for _ in range(MAX_ROUNDS):
+            tried = int(np.ceil(SPARE * (number - len(paths))))
+            which = rng.integers(len(goals), size=tried)
+            found = self.paths(self.sample(tried, rng), goals[which], rng)
+            paths += [path for path in found if path is not None]
+            if len(paths) >= number:
+                break
+        return paths[:number]
+
+    def paths(self, starts, goals, rng):
+        """Smoothed paths from starts (n, 7) to goals (n, 7): a list of float32 (k, 7), k > 1, or
+        None where there is no way.
+
+        Starts may be in contact, as for `labels`. Fast for many queries with few different goals.
+        """
+        # The simulated arm may be a little beyond its limits.
+        starts, goals = (
+            np.clip(np.asarray(x, dtype=np.float64), -1.0, 1.0).reshape(-1, 7)
+            for x in (starts, goals)
+        )
+        begins = self._moved_out(starts, -INSIDE)
+        points, room, found = self._search(begins, goals)
+        paths = [None] * len(starts)
+        ways = self._smooth(points[found], points[found], room[found], rng)
+        for i, path in zip(np.flatnonzero(found), ways, strict=True):
+            paths[i] = path
+        lost = np.flatnonzero(~found)
+        if len(lost):
+            # Through narrow places, where the margin is not kept. Away from them it is.
+            begins[lost] = self._moved_out(begins[lost], NODE_MARGIN)
+            ends = np.unique(np.concatenate([begins[lost], goals[lost]]), axis=0)
+            roadmap = self._narrow._grown(ends, rng)
+            points, _, found = roadmap._search(begins[lost], goals[lost])
+            states = _dense(points[found])
+            room = self._rooms(states.reshape(-1, 7)).reshape(states.shape[:2])
+            ways = self._smooth(points[found], states, room, rng)
+            for i, path in zip(lost[found], ways, strict=True):
+                paths[i] = path
+        for i, path in enumerate(paths):
+            if path is not None:
+                path = np.concatenate([starts[i : i + 1], path]).astype(np.float32)
+                moves = (path[1:] != path[:-1]).any(1)
+                # A path whose start is its goal has two points, too.
+                paths[i] = path[np.r_[True, moves]] if moves.any() else path[:2]
+        return paths
+
+    def labels(self, states, goals, rng):
+        """How to go on from each of the states (n, 7) to its goal (n, 7).
+
+        States may be in contact. Where one is nearer to something than the margin, the way begins
+        as near as it is. From really inside something, it first goes the shortest way out.
+
+        Returns:
+            directions: float32 (n, 7), unit vectors: to where the way is after `AHEAD`. Zeros where
+                the state is its goal, NaN where there is no way.
+            lengths: float32 (n,), of the way, L2, normalised. NaN where there is none.
+        """
+        directions = np.full((len(states), 7), np.nan, np.float32)
+        lengths = np.full(len(states), np.nan, np.float32)
+        for i, path in enumerate(self.paths(states, goals, rng)):
+            if path is not None:
+                steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+                come = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+                move = [np.interp(AHEAD, come, values) for values in path.T] - path[0]
+                directions[i] = move / max(np.linalg.norm(move), 1e-12)
+                lengths[i] = come[-1]
+        return directions, lengths
+
+    def _distances(self, states):
+        """m, of the arm from the nearest thing; negative inside of it."""
+        return self._checker.nearest(states).distance.min(-1)
+
+    def _rooms(self, states):
+        """The distances, at most the margin."""
+        room = np.full(len(states), self.margin)
+        near = ~self._checker.is_free(states, self.margin)
+        room[near] = np.minimum(self._distances(states[near]), self.margin)
+        return room
+
+    def _free(self, starts, ends, states, room):
+        """Whether motions (n, 7) are free, each as near as its own states (n, k, 7) allow."""
+        relaxed = (states, room - _HAIR, MARGIN_GROWTH)
+        return self._checker.is_motion_free(starts, ends, self._kept, relaxed=relaxed)
+
+    def _costs(self, starts, ends, start_room, end_room):
+        """Of straight motions (..., 7), if they are free."""
+        tightness = 1.0 - np.clip(np.minimum(start_room, end_room) / self.margin, 0.0, 1.0)
+        return np.linalg.norm(ends - starts, axis=-1) * (1.0 + NARROW * tightness)
+
+    def _joined(self, starts, ends, start_room, end_room):
+        """Whether straight motions (n, 7) are free, as near as both of their ends allow."""
+        states, room = np.stack([starts, ends], axis=1), np.stack([start_room, end_room], axis=1)
+        return self._free(starts, ends, states, room)
+
+    def _nearest_nodes(self, states, number):
+        """(n, number), in any order."""
+        squared = (self.nodes**2).sum(1) - 2.0 * states @ self.nodes.T
+        return np.argpartition(squared, number, axis=1)[:, :number]
+
+    def _smooth(self, points, states, room, rng):
+        """Paths (n, k, 7), padded, made shorter, as near as the states (n, m, 7) allow that they
+        come by.
+        """
+        return self._cut_short(self._prune(points, states, room), states, room, rng)
+
+    def _search(self, starts, goals):
+        """Shortest paths: points (n, k, 7), padded with the goal, their room (n, k), found (n,)."""
+        goals, which = np.unique(goals, axis=0, return_inverse=True)
+        start_room, goal_room = self._rooms(starts), self._rooms(goals)
+        states, room = np.concatenate([self.nodes, goals]), np.concatenate([self._room, goal_room])
+        # Edges lead from goals to nodes and not back: no path goes through another query's goal.
+        goal = np.repeat(np.arange(len(goals)), JOINED)
+        node = self._nearest_nodes(goals, JOINED).ravel()
+        ways = goals[goal], self.nodes[node], goal_room[goal], self._room[node]
+        free = self._joined(*ways)
+        count, (one, other), costs = len(self.nodes), self._edges, self._edge_costs
+        tails = np.concatenate([one, other, count + goal[free]])
+        heads = np.concatenate([other, one, node[free]])
+        costs = np.concatenate([costs, costs, self._costs(*ways)[free]])
+        graph = csr_array((costs, (tails, heads)), shape=(len(states), len(states)))
+        indices = count + np.arange(len(goals))
+        rest, before = dijkstra(graph, indices=indices, return_predecessors=True)
+        # From or to the inside of something there is no way.
+        rest[goal_room < -INSIDE] = np.inf
+        # The first step is to the goal itself or to a node: the best one that is free.
+        first = np.c_[count + which, self._nearest_nodes(starts, JOINED)]
+        costs = self._costs(starts[:, None], states[first], start_room[:, None], room[first])
+        costs += rest[which[:, None], first]
+        costs[start_room < -INSIDE] = np.inf
+        order = np.argsort(costs, axis=1, kind="stable")
+        node, found = count + which, np.zeros(len(starts), bool)
+        waiting = np.arange(len(starts))
+        for choice in order.T:
+            waiting = waiting[np.isfinite(costs[waiting, choice[waiting]])]
+            tried = first[waiting, choice[waiting]]
+            free = self._joined(starts[waiting], states[tried], start_room[waiting], room[tried])
+            node[waiting[free]], found[waiting[free]] = tried[free], True
+            waiting = waiting[~free]
+        route = [node]
+        while (node < count).any():
+            node = np.where(node < count, before[which, node], node)
+            route.append(node)
+        route = np.stack(route, axis=1)
+        points = np.concatenate([starts[:, None], states[route]], axis=1)
+        return points, np.concatenate([start_room[:, None], room[route]], axis=1), found
+
+    def _prune(self, points, states, room):
+        """Paths (n, k, 7), padded, without the vertices that straight motions can leave out."""
+        n, size = points.shape[:2]
+        lengths = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+        moves = np.full((n, size, size), np.inf)
+        steps = np.arange(size - 1)
+        moves[:, steps, steps + 1] = lengths[:, steps, steps + 1]
+        first, last = np.triu_indices(size, 2)
+        path, pair = np.nonzero(moves[:, last - 1, last] > 0.0)  # not to where the goal is repeated
+        first, last = first[pair], last[pair]
+        free = self._free(points[path, first], points[path, last], states[path], room[path])
+        path, first, last = path[free], first[free], last[free]
+        moves[path, first, last] = lengths[path, first, last]
+        # The shortest way through what is left, by dynamic programming.
+        costs, before = np.zeros((n, size)), np.zeros((n, size), np.int64)
+        for i in range(1, size):
+            through = costs[:, :i] + moves[:, :i, i]
+            before[:, i], costs[:, i] = through.argmin(1), through.min(1)
+        kept, at = np.zeros((n, size), bool), np.full(n, size - 1)
+        for _ in range(size):
+            kept[np.arange(n), at] = True
+            at = before[np.arange(n), at]
+        order = np.argsort(~kept, axis=1, kind="stable")
+        order[np.arange(size) >= kept.sum(1)[:, None]] = size - 1
+        pruned = np.take_along_axis(points, order[:, :, None], axis=1)
+        return pruned[:, : max(kept.sum(1).max(initial=0), 2)]
+
+    def _cut_short(self, points, states, room, rng):
+        """Paths (n, k, 7), padded, after trying random chords; as near as their states allow."""
+        rows = np.arange(len(points))
+        for _ in range(CHORDS):
+            steps = np.linalg.norm(np.diff(points, axis=1), axis=-1)
+            ends = np.cumsum(steps, axis=1)
+            total = ends[:, -1]
+            along = np.sort(rng.random((len(points), 2)), axis=1) * total[:, None]
+            edge = (ends[:, None] <= along[:, :, None]).sum(-1).clip(max=points.shape[1] - 2)
+            rest = (ends[rows[:, None], edge] - along) / np.maximum(
+                steps[rows[:, None], edge], 1e-9
+            )
+            tail, head = points[rows[:, None], edge], points[rows[:, None], edge + 1]
+            chord = head - (head - tail) * rest[:, :, None]
+            gain = along[:, 1] - along[:, 0] - np.linalg.norm(chord[:, 1] - chord[:, 0], axis=1)
+            tried = np.flatnonzero(gain > LEAST_GAIN * total)
+            free = self._free(chord[tried, 0], chord[tried, 1], states[tried], room[tried])
+            cut = tried[free]
+            points = np.concatenate([points, points[:, -1:]], axis=1)
+            # Vertices up to the chord, its two ends, vertices from there on.
+            place = np.arange(points.shape[1])
+            i, j = edge[cut, 0, None], edge[cut, 1, None]
+            old = np.where(place <= i, place, (place - i - 2 + j).clip(0, points.shape[1] - 1))
+            new = points[cut[:, None], old]
+            new[np.arange(len(cut)), i[:, 0] + 1] = chord[cut, 0]
+            new[np.arange(len(cut)), i[:, 0] + 2] = chord[cut, 1]
+            points[cut] = new
+            while points.shape[1] > 2 and (points[:, -1] == points[:, -2]).all():
+                points = points[:, :-1]
+        return points
+
+    def _moved_out(self, states, room):
+        """The states, those with less room (m) moved to `NODE_MARGIN` by the shortest way."""
+        states = states.copy()
+        inside = np.flatnonzero(self._rooms(states) < room)
+        for _ in range(MAX_OUT_STEPS):
+            if not len(inside):
+                break
+            # Uphill in distance, by central differences.
+            around = np.clip(states[inside, None, None] + _DIFFERENCES, -1.0, 1.0)
+            low, high = np.moveaxis(self._distances(around.reshape(-1, 7)).reshape(-1, 2, 7), 1, 0)
+            uphill = high - low
+            uphill /= np.maximum(np.linalg.norm(uphill, axis=1, keepdims=True), 1e-12)
+            states[inside] = np.clip(states[inside] + OUT_STEP * uphill, -1.0, 1.0)
+            inside = inside[self._distances(states[inside]) < NODE_MARGIN]
+        return states
+
+
+def _dense(points):
+    """Points along paths (n, k, 7), at most DENSE apart: (n, m, 7)."""
+    moves = np.diff(points, axis=1)[:, :, None]
+    pieces = max(int(np.ceil(np.linalg.norm(moves, axis=-1).max(initial=0.0) / DENSE)), 1)
+    dense = points[:, :-1, None] + np.arange(pieces)[:, None] / pieces * moves
+    dense = dense.reshape(len(points), moves.shape[1] * pieces, 7)
+    return np.concatenate([dense, points[:, -1:]], axis=1)
+
+
+# Streams 1 to 4 of random numbers are those of queries, demonstrations and observations. Seeds are
+# below 2^32, so each is one word of what NumPy seeds with: no scene is one of another stream's.
+STREAM, MAX_SEED = 5, 2**32 - 1
+
+
+@dataclass
+class Args:
+    output: Path
+    """Folder to write to."""
+    task: str = "random_boxes_hard"
+    """Name of a task, or path of a scene file. Where scenes do not vary, each has a new roadmap."""
+    scenes: int = 6000
+    """Number of scenes."""
+    paths_per_scene: int = 300
+    """Paths in each of them."""
+    num_nodes: int = 1000
+    """Nodes of a roadmap."""
+    num_neighbours: int = 14
+    """Nearest nodes that each is joined to, where the motion is free."""
+    margin: float = 0.015
+    """Metres that paths keep from everything, where there is room."""
+    shard_size: int = 50
+    """Scenes in each file."""
+    seed: int = 0
+    """Seed of scenes and roadmaps."""
+    workers: int = 2
+    """Number of processes. The files do not depend on it."""
+    ray_address: str | None = None
+    """Work on the Ray cluster at this address (`auto`, `HOST:PORT`) and not in local processes."""
+
+
+# What a shard depends on, besides its number.
+OPTIONS = (
+    "task",
+    "paths_per_scene",
+    "num_nodes",
+    "num_neighbours",
+    "margin",
+    "shard_size",
+    "seed",
+)
+
+
+def random_paths_of_scene(index, options):
+    """`(Scene, paths)` of scene `index` of a collection. `options`: a dict with keys `OPTIONS`."""
+    rng = np.random.default_rng([options["seed"], STREAM, index])
+    scene = envs.get_task(options["task"]).scene
+    scene = scene if isinstance(scene, Scene) else scene.sample(rng)
+    arguments = {name: options[name] for name in ("num_nodes", "num_neighbours", "margin")}
+    roadmap = Roadmap(scene, rng, **arguments)
+    return scene, roadmap.random_paths(options["paths_per_scene"], rng)
+
+
+class Collector:
+    """Makes shards; a job is (number of the shard, first scene, scene after the last)."""
+
+    def __init__(self, options, made_by):
+        self.options, self.made_by = options, made_by
+
+    def __call__(self, job):
+        """`(number, paths in it, contents of the file)`."""
+        number, first, end = job
+        made = [random_paths_of_scene(index, self.options) for index in range(first, end)]
+        scenes, paths = zip(*made, strict=True)
+        task, seed = self.options["task"], self.options["seed"]
+        contents = roadmap_paths.shard_bytes(task, seed, first, scenes, paths, self.made_by)
+        return number, sum(map(len, paths)), contents
+
+
+def _is_there(folder, job, made_by):
+    """Whether a shard was made before. Raises ValueError if it is damaged or another one."""
+    number, first, end = job
+    path = shard_path(folder, number)
+    if not path.exists():
+        return False
+    with roadmap_paths.open_shard(path) as file:
+        if attribute(file, "made_by") != made_by:
+            raise ValueError(f"{path} was made by another command: {attribute(file, 'made_by')}")
+        return len(file["path_count"]) >= end - first  # the last one may have had fewer
+
+
+def collect(args, progress=True):
+    """Make the shards that are missing; returns all `RoadmapPaths`.
+
+    Raises:
+        ValueError: arguments that cannot work; the folder holds other paths, or damaged ones.
+        RuntimeError: a scene leaves no room for the arm, or workers keep dying.
+        ConnectionError: there is no Ray cluster.
+        OSError: the folder cannot be written. What was written is safe.
+    """
+    for name in ("scenes", "paths_per_scene", "num_neighbours", "shard_size", "workers"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+    if not 0 <= args.seed <= MAX_SEED:
+        raise ValueError(f"--seed must be in [0, {MAX_SEED}]")
+    if args.num_nodes <= max(args.num_neighbours, JOINED):
+        raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
+    if not args.margin >= NODE_MARGIN:
+        raise ValueError(f"--margin must be at least {NODE_MARGIN} m")
+    if not envs.get_task(args.task).trainable:
+        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
+    package = Path(envs.__file__).parent.resolve()
+    if package in (args.output.resolve(), *args.output.resolve().parents):
+        raise ValueError(
+            f"{args.output} is in {package}: the repository's own files stay as they are"
+        )
+    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
+        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+    args.output.mkdir(parents=True, exist_ok=True)
+    options = {name: getattr(args, name) for name in OPTIONS}
+    flags = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
+    made_by = " ".join(["python -m demo_generation.roadmaps", *flags])
+    firsts = range(0, args.scenes, args.shard_size)
+    jobs = [(i, k, min(k + args.shard_size, args.scenes)) for i, k in enumerate(firsts)]
+    missing = [job for job in jobs if not _is_there(args.output, job, made_by)]
+    there = args.scenes - sum(end - first for _, first, end in missing)
+    bar = tqdm(
+        desc=args.task,
+        total=args.scenes * args.paths_per_scene,
+        initial=there * args.paths_per_scene,
+        unit=" paths",
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+        disable=not progress,
+    )
+    if args.ray_address is None:
+        results = workers.run(Collector, (options, made_by), missing, args.workers, warn=bar.write)
+    else:
+        results = workers.run_on_ray(args.ray_address, Collector, (options, made_by), missing)
+    with bar, contextlib.closing(results):
+        for number, count, contents in results:
+            write_atomically(shard_path(args.output, number), contents)
+            bar.update(count)
+    return roadmap_paths.load_roadmap_paths(args.output)
+
+
+def main(args):
+    try:
+        made = collect(args)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
+    count = len(made.offsets) - 1
+    print(f"{args.output}: {len(made)} scenes, {count} paths, {size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, prog="python -m demo_generation.roadmaps", description=__doc__))
