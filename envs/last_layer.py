@@ -5,9 +5,9 @@
     action = act(observation)
 
 An action is changed as little as possible (L2) such that, as far as the gradients of the links'
-distances tell, no link comes nearer to anything than `keep`, and one that is nearer than that moves
-away. That alone stands still where it cannot go on; so where the arm has hardly moved for some
-steps, it goes into a random direction for a while.
+distances tell, each link slows down towards whatever it comes near to, none comes nearer than
+`keep`, and one that is nearer than that moves away. That alone stands still where it cannot go on;
+so where the arm has hardly moved for some steps, it goes into a random direction for a while.
 """
 
 from collections import deque
@@ -20,7 +20,9 @@ from envs.collision import compiled
 from envs.subgoals import MAX_STEP
 
 # The numbers below were chosen on validation queries of `random_boxes_hard`: docs/last_layer.md.
-NEAR = 0.03  # m, from where on a link is looked at
+NEAR = 0.15  # m, from where on a link is looked at
+# Share of the way that is left that one step may take: the arm does not stop at once.
+BRAKE = 0.2
 PUSH = 0.002  # m per step, by which a link that is too near moves away
 # Near a goal that is itself nearer to something than what is kept, as much is kept as there, and
 # this much (m) more per unit of normalised distance from it, as planners do.
@@ -110,7 +112,7 @@ def _project(actions, proximity, keep, max_step):
                 for j in range(7):
                     squared += row[1 + j] * row[1 + j]
                     along += row[1 + j] * action[j]
-                short = min(keep[i, link] - row[0], PUSH) - along
+                short = min(BRAKE * (keep[i, link] - row[0]), PUSH) - along
                 if short > 0.0 and squared > 1e-12:
                     for j in range(7):
                         action[j] += row[1 + j] * short / squared

@@ -8,7 +8,7 @@ import envs
 from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
-from envs.last_layer import DETOUR, NEAR, PATIENCE, PUSH, LastLayer
+from envs.last_layer import BRAKE, DETOUR, NEAR, PATIENCE, PUSH, LastLayer
 from envs.seeing import seen_checker
 from envs.wrappers import PROXIMITY_RANGE
 
@@ -111,15 +111,16 @@ def action(*numbers):
 
 def test_a_point_approaches_a_plane():
     layer, straight = LastLayer(keep=0.01), action(-0.02, 0.02)
-    # The distance falls by 0.5 m per unit of the first joint: from 20 mm to 10 mm, just so.
-    assert layer(straight, proximity((0.02, 0.5))) == pytest.approx(straight)
-    # From 15 mm only half as much.
-    assert layer(straight, proximity((0.015, 0.5))) == pytest.approx(action(-0.01, 0.02))
+    # The distance falls by 0.5 m per unit of the first joint, so by 10 mm: a fifth of the 50 mm
+    # that are left before 10 mm, just so.
+    assert layer(straight, proximity((0.06, 0.5))) == pytest.approx(straight)
+    # Of 25 mm only half as much.
+    assert layer(straight, proximity((0.035, 0.5))) == pytest.approx(action(-0.01, 0.02))
     # Away from it, anything; and what is far does not matter.
     assert layer(-straight, proximity((0.011, 0.5))) == pytest.approx(-straight)
     assert layer(straight, proximity((NEAR, 9.0))) == pytest.approx(straight)
     # Too near, or already inside: away, by `PUSH` at most.
-    for distance, out in ((0.0095, 0.0005), (0.004, PUSH), (-0.03, PUSH)):
+    for distance, out in ((0.005, 0.001), (-0.01, PUSH), (-0.03, PUSH)):
         assert layer(straight, proximity((distance, 0.5)))[0] == pytest.approx(out / 0.5)
 
 
@@ -127,14 +128,14 @@ def test_the_change_is_the_smallest_one():
     rng, layer = np.random.default_rng(0), LastLayer(keep=0.01, max_step=1.0)
     wanted, gradient = rng.normal(0, 0.01, 7), rng.normal(0, 0.3, 7)
     wanted -= gradient * (gradient @ wanted + 0.008) / (gradient @ gradient)  # 8 mm nearer
-    done = layer(wanted, np.array([[0.013, *gradient]]))
-    by = 0.008 - 0.003  # m: it may come 3 mm nearer
+    done = layer(wanted, np.array([[0.025, *gradient]]))
+    by = 0.008 - BRAKE * 0.015  # m: it may come 3 mm nearer
     assert done == pytest.approx(wanted + gradient * by / (gradient @ gradient), abs=1e-7)
 
 
 def test_between_two_opposing_planes():
     """Along them it goes on; towards either it does not."""
-    both = proximity((0.012, 0.5, 0.0), (0.012, -0.5, 0.0))
+    both = proximity((0.02, 0.5, 0.0), (0.02, -0.5, 0.0))
     for towards in (-0.02, 0.02):
         done = LastLayer(keep=0.01)(action(towards, 0.02), both)
         assert done[1] == pytest.approx(0.02) and abs(done[0]) == pytest.approx(0.004)
