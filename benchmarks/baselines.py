@@ -5,7 +5,7 @@
     python benchmarks/baselines.py --table                      # only writes the table
 
 Each cell is a call of `clean_rl_scripts/evaluate.py` (goal `ee`): `go-to-goal` on all test queries,
-`via-points` and `planner` on the first `--num`. Results go to docs/baselines.json at once, so an
+the others on the first `--num`. Results go to docs/baselines.json at once, so an
 interrupted run goes on where it was; docs/baselines.md is the table of what is there. The planner's
 numbers depend on the machine, so nothing else should run beside it. Times are per query.
 """
@@ -29,11 +29,16 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS, TABLE = ROOT / "docs" / "baselines.json", ROOT / "docs" / "baselines.md"
 CELLS = {
     "go-to-goal": ["--policy", "go-to-goal"],
+    "reactive, points": [
+        *("--policy", "go-to-goal", "--keep-distance", "0.02", "--encoder", "points")
+    ],
+    "reactive, obstacles": ["--policy", "go-to-goal", "--keep-distance", "0.01"],
     "via-points, K = 16": ["--policy", "via-points", "--tries", "16"],
     "via-points, K = 64": ["--policy", "via-points", "--tries", "64"],
     "RRT-Connect, 0.05 s": ["--policy", "planner", "--time-limit", "0.05"],
     "RRT-Connect, 0.5 s": ["--policy", "planner", "--time-limit", "0.5"],
     "RRT-Connect, 5 s": ["--policy", "planner", "--time-limit", "5"],
+    "look, then plan, 5 s": ["--policy", "planner", "--time-limit", "5", "--encoder", "points"],
 }
 # Success of go-to-goal in the paper, sections 5.2 to 5.4, which give none for the bookshelves.
 PAPER = {
