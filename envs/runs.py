@@ -111,6 +111,8 @@ def seed_torch(args):
     torch.manual_seed(args.seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
     torch.use_deterministic_algorithms(True)
+    # Else every new tensor is filled with NaN first, to show who reads what was never written.
+    torch.utils.deterministic.fill_uninitialized_memory = False
     return torch.device(args.device)
 
 
