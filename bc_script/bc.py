@@ -122,22 +122,25 @@ class Features(nn.Module):
 
 
 class MLP(nn.Module):
-    def __init__(self, num_inputs, num_outputs, args):
+    def __init__(self, num_inputs, num_outputs, args, layer_norm):
         super().__init__()
         sizes = [num_inputs] + [args.hidden_size] * args.num_hidden_layers
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        norm = nn.LayerNorm if layer_norm else lambda _: nn.Identity()
+        self.norms = nn.ModuleList(norm(args.hidden_size) for _ in self.layers)
         self.head = nn.Linear(args.hidden_size, num_outputs)
         self.bf16 = args.bf16
 
     def forward(self, x):
-        for i, layer in enumerate(self.layers):
+        bf16 = self.bf16 and self.training
+        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
             # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
             # No kernel gets two types: CUDA's refuse that.
-            if self.bf16 and self.training and i > 0:
+            if bf16 and i > 0:
                 x = F.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
             else:
                 x = layer(x)
-            x = F.relu(x)
+            x = F.relu(norm(x))
         return self.head(x)
 
 
@@ -155,7 +158,7 @@ class Actor(nn.Module):
         super().__init__()
         self.features = Features(args, scene_size)
         self.num_modes = args.num_modes
-        self.mlp = MLP(self.features.size, 15 * args.num_modes, args)
+        self.mlp = MLP(self.features.size, 15 * args.num_modes, args, layer_norm=False)
 
     def modes(self, observation, desired_goal):
         """Means and log standard deviations (N, K, 7), log weights (N, K)."""

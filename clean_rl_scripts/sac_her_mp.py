@@ -165,22 +165,25 @@ class Features(nn.Module):
 
 
 class MLP(nn.Module):
-    def __init__(self, num_inputs, num_outputs, args):
+    def __init__(self, num_inputs, num_outputs, args, layer_norm):
         super().__init__()
         sizes = [num_inputs] + [args.hidden_size] * args.num_hidden_layers
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        norm = nn.LayerNorm if layer_norm else lambda _: nn.Identity()
+        self.norms = nn.ModuleList(norm(args.hidden_size) for _ in self.layers)
         self.head = nn.Linear(args.hidden_size, num_outputs)
         self.bf16 = args.bf16
 
     def forward(self, x):
-        for i, layer in enumerate(self.layers):
+        bf16 = self.bf16 and self.training
+        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
             # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
             # No kernel gets two types: CUDA's refuse that.
-            if self.bf16 and self.training and i > 0:
+            if bf16 and i > 0:
                 x = F.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
             else:
                 x = layer(x)
-            x = F.relu(x)
+            x = F.relu(norm(x))
         return self.head(x)
 
 
@@ -188,57 +191,18 @@ class MLP(nn.Module):
 
 
 # SHARED: critics
-class BatchedLinear(nn.Module):
-    """Two linear layers in one product: (2, N, in) -> (2, N, out), each begun as `nn.Linear` is.
-
-    It computes in the type of its inputs; the weights themselves stay in float32.
-    """
-
-    def __init__(self, num_inputs, num_outputs):
-        super().__init__()
-        layers = [nn.Linear(num_inputs, num_outputs) for _ in range(2)]
-        self.weight = nn.Parameter(torch.stack([layer.weight.detach().T for layer in layers]))
-        self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in layers])[:, None])
-
-    def forward(self, x):
-        return torch.baddbmm(self.bias.to(x.dtype), x, self.weight.to(x.dtype))
-
-
-class BatchedLayerNorm(nn.Module):
-    def __init__(self, size):
-        super().__init__()
-        self.weight, self.bias = (nn.Parameter(one(2, size)) for one in (torch.ones, torch.zeros))
-
-    def forward(self, x):
-        # In two kernels: one would not scale and shift, which takes longer afterwards.
-        both = zip(x, self.weight, self.bias, strict=True)
-        return torch.stack([F.layer_norm(x, x.shape[1:], *affine) for x, *affine in both])
-
-
 class Critics(nn.Module):
-    """Both critics, Q1 and Q2, as one network: half as many operations, of twice the size."""
+    """Q1 and Q2."""
 
     def __init__(self, args, num_features):
         super().__init__()
         self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
-        sizes = [num_features + 7] + [args.hidden_size] * args.num_hidden_layers
-        self.layers = nn.ModuleList(
-            BatchedLinear(a, b) for a, b in zip(sizes, sizes[1:], strict=False)
-        )
-        norm = BatchedLayerNorm if args.layer_norm else lambda _: nn.Identity()
-        self.norms = nn.ModuleList(norm(args.hidden_size) for _ in self.layers)
-        self.head = BatchedLinear(args.hidden_size, 1)
-        self.bf16 = args.bf16
+        self.mlps = nn.ModuleList(MLP(num_features + 7, 1, args, args.layer_norm) for _ in range(2))
 
-    def forward(self, features, action):
-        """(N, f), (N, 7) -> (2, N)."""
-        x = torch.cat([features, action / self.action_scale], dim=1).expand(2, -1, -1)
-        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
-            if self.bf16 and self.training and i > 0:  # as in `MLP`
-                x = x.bfloat16()
-            x = F.relu(norm(layer(x).float()))
-        # As head(x), with both sides transposed: for few outputs that is several times faster.
-        return torch.baddbmm(self.head.bias.mT, self.head.weight.mT, x.mT).squeeze(1)
+    def forward(self, features, action, number=2):
+        """(N, f), (N, 7) -> (number, N); of Q1 only with `number` 1."""
+        inputs = torch.cat([features, action / self.action_scale], dim=1)
+        return torch.stack([mlp(inputs).squeeze(-1) for mlp in self.mlps[:number]])
 
 
 # END SHARED
@@ -253,7 +217,7 @@ class Actor(nn.Module):
         super().__init__()
         self.features = Features(args, scene_size)
         self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
-        self.mlp = MLP(self.features.size, 14, args)
+        self.mlp = MLP(self.features.size, 14, args, layer_norm=False)
 
     def sample(self, features):
         """A random action (N, 7) and its log-density (N,) before scaling by `action_scale`."""

@@ -173,19 +173,6 @@ def test_bfloat16_products_stay_close_to_float32():
     assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
 
 
-def test_critics_begin_as_two_networks_of_linear_layers():
-    """Uniform in +-1 / sqrt(inputs), weights and biases, and not the same in both."""
-    critics = sac.Critics(sac.Args(hidden_size=64), 30)
-    for layer, num_inputs in zip([*critics.layers, critics.head], (37, 64, 64), strict=True):
-        assert layer.weight.shape[:2] == (2, num_inputs) and layer.bias.shape[:2] == (2, 1)
-        bound = num_inputs**-0.5
-        for one in layer.weight.detach():
-            assert 0.9 * bound < one.abs().max() <= bound
-            assert one.std() == pytest.approx(bound / 3**0.5, rel=0.2)
-        assert 0 < layer.bias.abs().max() <= bound
-        assert (layer.weight[0] != layer.weight[1]).all()
-
-
 def test_updates_fall_due_from_the_first_stored_episode_on():
     env = envs.make("no_obstacles")
     buffer = sac.HerReplayBuffer(env, 1000, 0.8, np.random.default_rng(0))

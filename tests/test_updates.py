@@ -38,10 +38,8 @@ def make(module, kind, **flags):
 
 
 def take_apart(agent, *names):
-    """As if it had learned: targets that are not what they follow, a LayerNorm for each critic."""
+    """As if it had learned: targets that are not what they follow."""
     with torch.no_grad():
-        for parameter in agent.critics.norms.parameters():
-            parameter.add_(0.2 * torch.randn(parameter.shape))
         for parameter in (one for name in names for one in getattr(agent, name).parameters()):
             parameter.mul_(1.3)
 
@@ -58,16 +56,13 @@ def inputs_of(actor, data):
 
 
 def values(critics, features, action):
-    """Of both critics, (2, N), one after the other, by plain layers."""
+    """Of both critics, (2, N), layer by layer."""
     both = []
-    for one in range(2):
+    for mlp in critics.mlps:
         x = torch.cat([features, action / 0.06], dim=1)
-        for layer, norm in zip(critics.layers, critics.norms, strict=True):
-            x = F.linear(x, layer.weight[one].T, layer.bias[one, 0])
-            if not isinstance(norm, torch.nn.Identity):
-                x = F.layer_norm(x, x.shape[1:], norm.weight[one], norm.bias[one])
-            x = F.relu(x)
-        both.append(F.linear(x, critics.head.weight[one].T, critics.head.bias[one, 0])[:, 0])
+        for layer, norm in zip(mlp.layers, mlp.norms, strict=True):
+            x = torch.relu(F.layer_norm(layer(x), (16,), norm.weight, norm.bias))
+        both.append(mlp.head(x)[:, 0])
     return torch.stack(both)
 
 
