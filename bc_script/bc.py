@@ -291,10 +291,10 @@ if __name__ == "__main__":
 
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every == 0 or step == args.total_updates:
-            success, best = protocol.validate(
+            success = protocol.validate(
                 actor_average, eval_envs, validation, device, writer, step, progress
             )
-            if best:
+            if progress["best_step"] == step:
                 protocol.save_policy(
                     run, actor_average, eval_envs, device, args, env_arguments, step
                 )

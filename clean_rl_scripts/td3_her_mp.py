@@ -10,12 +10,9 @@ under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are those of `
 is imported from `envs` is the benchmark, not the algorithm.
 """
 
-import json
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -23,46 +20,19 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from envs import panda, protocol, runs
-from envs.demo_episodes import DemoQueriesWrapper, demo_transitions, load_demos_for
+from envs.demo_episodes import demo_transitions, transition
+from envs.encoders import LatentTable
 from envs.tasks import task_name
 
 
 @dataclass
-class Args:
-    # The run
+class Args(runs.RunFlags, protocol.EnvFlags):
+    # Those of the run's folder are in `envs/runs.py`, those of the MDP in `envs/protocol.py`.
     exp_name: str = "td3_her_mp"
     """name of the experiment, part of the run's folder"""
-    # SHARED: the run and the task
-    seed: int = 1
-    """seed of everything random; the same seed gives the same run on the same machine and device"""
-    runs_dir: Path = Path("runs")
-    """the run's folder is made in here: TensorBoard events, checkpoint, policy.pt, result.json"""
-    resume: Path | None = None
-    """continue the run in this folder from its last checkpoint; its own flags are used"""
-    device: str = "cpu"
-    """`cpu` or `cuda`"""
-    threads: int = 1
-    """torch threads; one is fastest for networks of this size, and leaves the other cores alone"""
-
-    # The task (the paper's MDP; `docs/environment.md`)
+    # SHARED: the task
     task: str = "no_obstacles"
     """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
-    goal_type: Literal["ee", "config", "combined"] = "ee"
-    """what the goal is: end-effector position, configuration, or both"""
-    action_mode: Literal["relative", "subgoal"] = "relative"
-    """action: a displacement of the normalised configuration, or the next one itself"""
-    max_step: float = 0.03
-    """longest displacement per step (L2, normalised configuration)"""
-    horizon: int = 400
-    """steps after which an episode is cut off"""
-    stop_on_collision: bool = False
-    """end an episode at the first touch"""
-    velocities: bool = False
-    """joint velocities in the observation"""
-    encoder: str | None = None
-    """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
-    `vqvae`, `pointnet2`, or the path of your own `encoder.pt`, docs/sensors.md), or `oracle`, the
-    obstacles themselves; by default nothing"""
     num_envs: int = 4
     """environments stepped together; every one of their steps counts"""
     # END SHARED
@@ -249,9 +219,8 @@ class HerReplayBuffer:
         self.columns = {n: slice(end - sizes[n], end) for n, end in zip(sizes, ends, strict=True)}
         self.rows = np.zeros((capacity, ends[-1]), np.float32)
         self.remaining = np.zeros(capacity, np.int32)
-        self.scene_size = env.observation_space["observation"].shape[0] - observation_size
-        self.latents = np.zeros((1, self.scene_size), np.float32)
-        self.row_of_latent = {}  # the latent's bytes -> its row in `latents`
+        seen_size = env.observation_space["observation"].shape[0]
+        self.latents = LatentTable(seen_size - observation_size)
         self.latent_row = np.zeros(capacity, np.int32)  # of each transition
         self.env, self.rng = env, rng
         self.capacity, self.her_probability = capacity, her_probability
@@ -264,19 +233,13 @@ class HerReplayBuffer:
             width = columns.stop - columns.start  # without the encoded scene
             values = [np.atleast_1d(transition[name])[:width] for transition in transitions]
             self.rows[index, columns] = np.stack(values)
-        self.latent_row[index] = self.store_latent(transitions[0]["observation"])
+        observation_size = self.columns["observation"].stop
+        self.latent_row[index] = self.latents.row_of(
+            transitions[0]["observation"][observation_size:]
+        )
         self.remaining[index] = np.arange(len(transitions))[::-1]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
-
-    def store_latent(self, observation):
-        """Store the encoded scene at the end of an observation; its row in `latents`."""
-        latent = np.float32(observation[len(observation) - self.latents.shape[1] :])
-        row = self.row_of_latent.setdefault(latent.tobytes(), len(self.row_of_latent))
-        if row == len(self.latents):
-            self.latents = np.concatenate([self.latents, np.zeros_like(self.latents)])
-        self.latents[row] = latent
-        return row
 
     def sample(self, batch_size):
         """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
@@ -292,8 +255,8 @@ class HerReplayBuffer:
         info = {"collision": batch["collision"][:, 0] > 0}
         batch["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
         batch["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
-        if self.latents.shape[1] > 0:
-            latent = self.latents[self.latent_row[index]]
+        if self.latents.size > 0:
+            latent = self.latents.rows[self.latent_row[index]]
             for name in ("observation", "next_observation"):
                 batch[name] = np.hstack([batch[name], latent])
         return batch
@@ -303,9 +266,8 @@ class HerReplayBuffer:
             "rows": torch.from_numpy(self.rows[: self.size]),
             "remaining": torch.from_numpy(self.remaining[: self.size]),
             "scene": torch.from_numpy(self.latent_row[: self.size]),
-            "codes": torch.from_numpy(self.latents[: len(self.row_of_latent)]),
+            "codes": torch.from_numpy(self.latents.rows),
             "position": self.position,
-            "rng": json.dumps(self.rng.bit_generator.state),
         }
 
     def load_state_dict(self, state):
@@ -314,8 +276,7 @@ class HerReplayBuffer:
         self.remaining[: self.size] = state["remaining"].numpy()
         self.latent_row[: self.size] = state["scene"].numpy()
         for latent in state["codes"].numpy():
-            self.store_latent(latent)
-        self.rng.bit_generator.state = json.loads(state["rng"])
+            self.latents.row_of(latent)
 
 
 # ALGO LOGIC: demonstrations
@@ -377,12 +338,10 @@ def batches(buffer, number, batch_size, device):
     """Draw `number` batches, dicts of tensors, from the buffer: some at once, which is faster."""
     for first in range(0, number, DRAWN_TOGETHER):
         count = min(DRAWN_TOGETHER, number - first)
-        drawn = {
-            name: torch.as_tensor(array, device=device).split(batch_size)
-            for name, array in buffer.sample(count * batch_size).items()
-        }
-        for i in range(count):
-            yield {name: tensors[i] for name, tensors in drawn.items()}
+        drawn = buffer.sample(count * batch_size)
+        parts = [torch.as_tensor(a, device=device).split(batch_size) for a in drawn.values()]
+        for batch in zip(*parts, strict=True):
+            yield dict(zip(drawn, batch, strict=True))
 
 
 # END SHARED
@@ -476,43 +435,26 @@ if __name__ == "__main__":
     args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = runs.seed_torch(args)
     validation, test = protocol.load_task(args)
-    if args.buffer_size < args.horizon:
-        sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
-    if args.demo_prob is not None and not 0 <= args.demo_prob <= 1:
-        sys.exit(f"--demo-prob {args.demo_prob}: a probability is in [0, 1]")
-    if args.demos is not None and args.demo_prob is None:
-        sys.exit("--demos goes with --demo-prob")
-    names = "goal_type action_mode max_step horizon stop_on_collision velocities encoder"
-    env_arguments = {name: getattr(args, name) for name in names.split()}
-    envs = protocol.make_envs(args.task, args.num_envs, **env_arguments)
+    env_arguments = protocol.env_arguments_of(args)
+    envs = protocol.make_training_envs(args)
     eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
-    if args.demo_prob is not None:
-        try:
-            demos = load_demos_for(eval_envs[0], args.demos or args.task, args.task)
-        except ValueError as error:
-            sys.exit(f"--demo-prob: {error}")
-        envs = [DemoQueriesWrapper(env, demos) for env in envs]
-        if args.encoder is not None:
-            eval_envs[0].encoder.encode_demos(demos)  # once, not in the loop
     run = runs.run_folder(args, task_name(args.task))
     if args.bf16 is None:
         args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
-    buffer = HerReplayBuffer(
-        eval_envs[0], args.buffer_size, args.her_probability, np.random.default_rng(args.seed)
-    )
+    rng = np.random.default_rng(args.seed)
+    buffer = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
     progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
     progress |= {"best_success": -1.0, "best_step": 0, "demos_injected": 0}
     # END SHARED
 
-    agent = TD3(args, buffer.scene_size, device)
+    agent = TD3(args, buffer.latents.size, device)
 
     # SHARED: resuming and episodes
-    saved_parts = agent.saved_parts() | {"buffer": buffer, "progress": progress}
+    saved_parts = agent.saved_parts() | {"buffer": buffer, "rng": rng, "progress": progress}
     runs.load_checkpoint(args, saved_parts)
     writer = runs.summary_writer(run, args, progress["global_step"])
     observations = protocol.begin_episodes(envs, args.seed, progress["global_step"])
-    staged = [[] for _ in envs]  # transitions of the running episodes
-    returns = [0.0] * args.num_envs
+    staged, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
     recent_success, losses, stop = [], {}, False
     seconds_before = progress["seconds"]
     bar = runs.progress_bar(args.total_timesteps, progress["global_step"], "step")
@@ -527,39 +469,24 @@ if __name__ == "__main__":
 
         # SHARED: a step in every environment
         for i, env in enumerate(envs):
-            next_observation, reward, terminated, truncated, info = env.step(actions[i])
-            staged[i].append(
-                {
-                    "observation": observations[i]["observation"],
-                    "action": actions[i],
-                    "next_observation": next_observation["observation"],
-                    "next_achieved_goal": next_observation["achieved_goal"],
-                    "desired_goal": next_observation["desired_goal"],
-                    "collision": info["collision"],
-                }
-            )
-            observations[i] = next_observation
+            before = observations[i]
+            observations[i], reward, terminated, truncated, info = env.step(actions[i])
+            staged[i].append(transition(before, actions[i], observations[i], info["collision"]))
             returns[i] += reward
             if terminated or truncated:
                 buffer.add_episode(staged[i])
-                recent_success = [*recent_success[-99:], info["is_success"]]
                 step = progress["global_step"] + i + 1
-                writer.add_scalar("charts/episodic_return", returns[i], step)
-                writer.add_scalar("charts/episodic_length", info["elapsed_steps"], step)
-                writer.add_scalar("charts/success", np.mean(recent_success), step)
+                protocol.log_episode(writer, step, returns[i], info, recent_success)
                 if args.demo_prob is not None:
                     if inject_demonstration(info["is_success"], args.demo_prob, env.np_random):
                         buffer.add_episode(demo_transitions(env.demo, env.env))
                         progress["demos_injected"] += 1
                     writer.add_scalar("charts/demos_injected", progress["demos_injected"], step)
-                staged[i], returns[i] = [], 0.0
-                observations[i] = env.reset()[0]
+                staged[i], returns[i], observations[i] = [], 0.0, env.reset()[0]
         progress["global_step"] += args.num_envs
         bar.update(args.num_envs)
         step = progress["global_step"]
-
-        number = updates_due(step, buffer, args)
-        for batch in batches(buffer, number, args.batch_size, device):
+        for batch in batches(buffer, updates_due(step, buffer, args), args.batch_size, device):
             losses |= agent.update(batch, progress["updates"])
             progress["updates"] += 1
             if progress["updates"] % 1000 == 0:
@@ -570,15 +497,15 @@ if __name__ == "__main__":
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
             policy = agent.actor_average
-            success, best = protocol.validate(
+            success = protocol.validate(
                 policy, eval_envs, validation, device, writer, step, progress
             )
-            if best:
+            if progress["best_step"] == step:
                 protocol.save_policy(run, policy, eval_envs, device, args, env_arguments, step)
             bar.set_postfix(eval=success, best=progress["best_success"])
             for episode in filter(None, staged):
                 buffer.add_episode(episode)
-            staged, returns = [[] for _ in envs], [0.0] * args.num_envs
+            staged, returns = [[] for _ in envs], [0.0 for _ in envs]
             progress["seconds"] = seconds_before + runs.elapsed(bar)
             runs.save_checkpoint(run, saved_parts)
             # A resumed run goes on exactly as this one does: with new episodes.

@@ -10,9 +10,8 @@
     ...
     save_checkpoint(run, saved_parts)
 
-Every trainer uses these. Its `Args`, a dataclass, has at least the fields `exp_name`, `seed`,
-`runs_dir`, `resume`, `device` and `threads`. These functions are for scripts: where the user is
-wrong, they end the program with a message.
+Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `exp_name` at least.
+These functions are for scripts: where the user is wrong, they end the program with a message.
 """
 
 import json
@@ -20,7 +19,7 @@ import os
 import sys
 import time
 import typing
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +29,24 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from envs.files import replace_atomically, write_atomically
+
+
+@dataclass
+class RunFlags:
+    """The flags of every trainer's run."""
+
+    seed: int = 1
+    """seed of everything random; the same seed gives the same run on the same machine and device"""
+    runs_dir: Path = Path("runs")
+    """the run's folder is made in here: TensorBoard events, checkpoint, the best network
+    (`policy.pt` or `encoder.pt`), result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint; its own flags are used"""
+    device: str = "cpu"
+    """`cpu` or `cuda`"""
+    threads: int = 1
+    """torch threads; one is fastest for small networks, and leaves the other cores alone"""
+
 
 MAY_CHANGE = {"resume", "runs_dir", "threads"}  # they do not change what is computed
 
