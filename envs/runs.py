@@ -14,6 +14,7 @@ Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `ex
 These functions are for scripts: where the user is wrong, they end the program with a message.
 """
 
+import importlib.util
 import json
 import os
 import sys
@@ -46,9 +47,11 @@ class RunFlags:
     """`cpu` or `cuda`"""
     threads: int = 1
     """torch threads; one is fastest for small networks, and leaves the other cores alone"""
+    track: bool = False
+    """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-MAY_CHANGE = {"resume", "runs_dir", "threads"}  # they do not change what is computed
+MAY_CHANGE = {"resume", "runs_dir", "threads", "track"}  # they do not change what is computed
 
 
 def parse_args(Args, may_change=()):
@@ -59,13 +62,15 @@ def parse_args(Args, may_change=()):
         may_change: names of further flags with which a run may be resumed at another value.
 
     Raises:
-        SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device.
+        SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
     """
     args = tyro.cli(Args)
     if args.resume is not None:
         args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
     if args.device == "cuda" and not torch.cuda.is_available():
         sys.exit("--device cuda: PyTorch sees no CUDA device here")
+    if args.track and importlib.util.find_spec("wandb") is None:
+        sys.exit("--track: wandb is not installed (pip install wandb)")
     return args
 
 
@@ -201,8 +206,16 @@ def _restore(part, state):
 def summary_writer(run, args, step):
     """TensorBoard's writer for a run that is at `step`, with a table of the flags.
 
-    What an earlier process wrote after its last checkpoint is hidden.
+    What an earlier process wrote after its last checkpoint is hidden. With `args.track`, what is
+    written goes to Weights & Biases too.
     """
+    if args.track:
+        import wandb
+
+        config = json.loads(_to_json(asdict(args)))
+        # Under the run's name, so that a resumed run goes on there as well.
+        names = {"project": "roboarm-nmp", "name": run.name, "id": run.name, "dir": str(run)}
+        wandb.init(**names, config=config, resume="allow", sync_tensorboard=True)
     writer = SummaryWriter(run, purge_step=step + 1)
     rows = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
     writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
