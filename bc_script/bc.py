@@ -27,20 +27,9 @@ from envs.tasks import task_name
 
 
 @dataclass
-class Args:
-    # The run
+class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     exp_name: str = "bc"
     """name of the experiment, part of the run's folder"""
-    seed: int = 1
-    """seed of everything random; the same seed gives the same run on the same machine and device"""
-    runs_dir: Path = Path("runs")
-    """the run's folder is made in here: TensorBoard events, checkpoint, policy.pt, result.json"""
-    resume: Path | None = None
-    """continue the run in this folder from its last checkpoint; its own flags are used"""
-    device: str = "cpu"
-    """`cpu` or `cuda`; the demonstrations go there too"""
-    threads: int = 1
-    """torch threads; one is fastest for networks of this size, and leaves the other cores alone"""
 
     # The task (the paper's MDP; `docs/environment.md`)
     task: str = "no_obstacles"
@@ -291,10 +280,10 @@ if __name__ == "__main__":
 
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every == 0 or step == args.total_updates:
-            success, best = protocol.validate(
+            success = protocol.validate(
                 actor_average, eval_envs, validation, device, writer, step, progress
             )
-            if best:
+            if progress["best_step"] == step:
                 protocol.save_policy(
                     run, actor_average, eval_envs, device, args, env_arguments, step
                 )

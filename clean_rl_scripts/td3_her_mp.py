@@ -10,12 +10,9 @@ under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are those of `
 is imported from `envs` is the benchmark, not the algorithm.
 """
 
-import json
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -23,46 +20,19 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from envs import panda, protocol, runs
-from envs.demo_episodes import DemoQueriesWrapper, demo_transitions, load_demos_for
+from envs.demo_episodes import demo_transitions, transition
+from envs.encoders import LatentTable
 from envs.tasks import task_name
 
 
 @dataclass
-class Args:
-    # The run
+class Args(runs.RunFlags, protocol.EnvFlags):
+    # Those of the run's folder are in `envs/runs.py`, those of the MDP in `envs/protocol.py`.
     exp_name: str = "td3_her_mp"
     """name of the experiment, part of the run's folder"""
-    # SHARED: the run and the task
-    seed: int = 1
-    """seed of everything random; the same seed gives the same run on the same machine and device"""
-    runs_dir: Path = Path("runs")
-    """the run's folder is made in here: TensorBoard events, checkpoint, policy.pt, result.json"""
-    resume: Path | None = None
-    """continue the run in this folder from its last checkpoint; its own flags are used"""
-    device: str = "cpu"
-    """`cpu` or `cuda`"""
-    threads: int = 1
-    """torch threads; one is fastest for networks of this size, and leaves the other cores alone"""
-
-    # The task (the paper's MDP; `docs/environment.md`)
+    # SHARED: the task
     task: str = "no_obstacles"
     """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
-    goal_type: Literal["ee", "config", "combined"] = "ee"
-    """what the goal is: end-effector position, configuration, or both"""
-    action_mode: Literal["relative", "subgoal"] = "relative"
-    """action: a displacement of the normalised configuration, or the next one itself"""
-    max_step: float = 0.03
-    """longest displacement per step (L2, normalised configuration)"""
-    horizon: int = 400
-    """steps after which an episode is cut off"""
-    stop_on_collision: bool = False
-    """end an episode at the first touch"""
-    velocities: bool = False
-    """joint velocities in the observation"""
-    encoder: str | None = None
-    """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
-    `vqvae`, `pointnet2`, or the path of your own `encoder.pt`, docs/sensors.md), or `oracle`, the
-    obstacles themselves; by default nothing"""
     num_envs: int = 4
     """environments stepped together; every one of their steps counts"""
     # END SHARED
@@ -194,18 +164,19 @@ class MLP(nn.Module):
 # END SHARED
 
 
-# SHARED: critic
-class QNetwork(nn.Module):
-    def __init__(self, args, scene_size=0):
-        super().__init__()
-        self.features = Features(args, scene_size)
-        self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
-        self.mlp = MLP(self.features.size + 7, 1, args, args.layer_norm)
+# SHARED: critics
+class Critics(nn.Module):
+    """Q1 and Q2."""
 
-    def forward(self, observation, desired_goal, action):
-        """(N, o), (N, g), (N, 7) -> (N,)."""
-        inputs = [self.features(observation, desired_goal), action / self.action_scale]
-        return self.mlp(torch.cat(inputs, dim=1)).squeeze(-1)
+    def __init__(self, args, num_features):
+        super().__init__()
+        self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
+        self.mlps = nn.ModuleList(MLP(num_features + 7, 1, args, args.layer_norm) for _ in range(2))
+
+    def forward(self, features, action, number=2):
+        """(N, f), (N, 7) -> (number, N); of Q1 only with `number` 1."""
+        inputs = torch.cat([features, action / self.action_scale], dim=1)
+        return torch.stack([mlp(inputs).squeeze(-1) for mlp in self.mlps[:number]])
 
 
 # END SHARED
@@ -220,11 +191,7 @@ class Actor(nn.Module):
 
     def forward(self, observation, achieved_goal, desired_goal):
         """The action (N, 7) without noise; this is what policy.pt contains."""
-        return self.squashed(self.preactivation(observation, desired_goal))
-
-    def preactivation(self, observation, desired_goal):
-        """(N, o), (N, g) -> (N, 7), unbounded."""
-        return self.mlp(self.features(observation, desired_goal))
+        return self.squashed(self.mlp(self.features(observation, desired_goal)))
 
     def squashed(self, preactivation):
         return self.action_scale * torch.tanh(preactivation)
@@ -252,9 +219,8 @@ class HerReplayBuffer:
         self.columns = {n: slice(end - sizes[n], end) for n, end in zip(sizes, ends, strict=True)}
         self.rows = np.zeros((capacity, ends[-1]), np.float32)
         self.remaining = np.zeros(capacity, np.int32)
-        self.scene_size = env.observation_space["observation"].shape[0] - observation_size
-        self.latents = np.zeros((1, self.scene_size), np.float32)
-        self.row_of_latent = {}  # the latent's bytes -> its row in `latents`
+        seen_size = env.observation_space["observation"].shape[0]
+        self.latents = LatentTable(seen_size - observation_size)
         self.latent_row = np.zeros(capacity, np.int32)  # of each transition
         self.env, self.rng = env, rng
         self.capacity, self.her_probability = capacity, her_probability
@@ -267,19 +233,13 @@ class HerReplayBuffer:
             width = columns.stop - columns.start  # without the encoded scene
             values = [np.atleast_1d(transition[name])[:width] for transition in transitions]
             self.rows[index, columns] = np.stack(values)
-        self.latent_row[index] = self.store_latent(transitions[0]["observation"])
+        observation_size = self.columns["observation"].stop
+        self.latent_row[index] = self.latents.row_of(
+            transitions[0]["observation"][observation_size:]
+        )
         self.remaining[index] = np.arange(len(transitions))[::-1]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
-
-    def store_latent(self, observation):
-        """Store the encoded scene at the end of an observation; its row in `latents`."""
-        latent = np.float32(observation[len(observation) - self.latents.shape[1] :])
-        row = self.row_of_latent.setdefault(latent.tobytes(), len(self.row_of_latent))
-        if row == len(self.latents):
-            self.latents = np.concatenate([self.latents, np.zeros_like(self.latents)])
-        self.latents[row] = latent
-        return row
 
     def sample(self, batch_size):
         """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
@@ -295,8 +255,8 @@ class HerReplayBuffer:
         info = {"collision": batch["collision"][:, 0] > 0}
         batch["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
         batch["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
-        if self.latents.shape[1] > 0:
-            latent = self.latents[self.latent_row[index]]
+        if self.latents.size > 0:
+            latent = self.latents.rows[self.latent_row[index]]
             for name in ("observation", "next_observation"):
                 batch[name] = np.hstack([batch[name], latent])
         return batch
@@ -306,9 +266,8 @@ class HerReplayBuffer:
             "rows": torch.from_numpy(self.rows[: self.size]),
             "remaining": torch.from_numpy(self.remaining[: self.size]),
             "scene": torch.from_numpy(self.latent_row[: self.size]),
-            "codes": torch.from_numpy(self.latents[: len(self.row_of_latent)]),
+            "codes": torch.from_numpy(self.latents.rows),
             "position": self.position,
-            "rng": json.dumps(self.rng.bit_generator.state),
         }
 
     def load_state_dict(self, state):
@@ -317,8 +276,7 @@ class HerReplayBuffer:
         self.remaining[: self.size] = state["remaining"].numpy()
         self.latent_row[: self.size] = state["scene"].numpy()
         for latent in state["codes"].numpy():
-            self.store_latent(latent)
-        self.rng.bit_generator.state = json.loads(state["rng"])
+            self.latents.row_of(latent)
 
 
 # ALGO LOGIC: demonstrations
@@ -342,9 +300,12 @@ def smoothed(action, noise, noise_clip, action_scale):
     return (action + action_scale * noise).clamp(-action_scale, action_scale)
 
 
-def td_target(reward, terminated, next_q1, next_q2, gamma):
-    """The critics' target r + gamma (1 - terminated) min(Q1', Q2'), all (N,)."""
-    return reward + gamma * (1.0 - terminated) * torch.minimum(next_q1, next_q2)
+def td_target(reward, terminated, next_q, gamma):
+    """The critics' target r + gamma (1 - terminated) min(Q1', Q2').
+
+    `next_q` (2, N) has Q1' and Q2'; all others, and the target, are (N,).
+    """
+    return reward + gamma * (1.0 - terminated) * next_q.amin(0)
 
 
 # SHARED: averaging
@@ -377,12 +338,10 @@ def batches(buffer, number, batch_size, device):
     """Draw `number` batches, dicts of tensors, from the buffer: some at once, which is faster."""
     for first in range(0, number, DRAWN_TOGETHER):
         count = min(DRAWN_TOGETHER, number - first)
-        drawn = {
-            name: torch.as_tensor(array, device=device).split(batch_size)
-            for name, array in buffer.sample(count * batch_size).items()
-        }
-        for i in range(count):
-            yield {name: tensors[i] for name, tensors in drawn.items()}
+        drawn = buffer.sample(count * batch_size)
+        parts = [torch.as_tensor(a, device=device).split(batch_size) for a in drawn.values()]
+        for batch in zip(*parts, strict=True):
+            yield dict(zip(drawn, batch, strict=True))
 
 
 # END SHARED
@@ -396,17 +355,16 @@ class TD3:
         self.actor_target.load_state_dict(self.actor.state_dict())
         self.actor_average = Actor(args, scene_size).to(device).eval()  # evaluated and saved
         self.actor_average.load_state_dict(self.actor.state_dict())
-        self.qf1, self.qf2, self.qf1_target, self.qf2_target = (
-            QNetwork(args, scene_size).to(device) for _ in range(4)
+        self.critics, self.critics_target = (
+            Critics(args, self.actor.features.size).to(device) for _ in range(2)
         )
-        self.qf1_target.load_state_dict(self.qf1.state_dict())
-        self.qf2_target.load_state_dict(self.qf2.state_dict())
+        self.critics_target.load_state_dict(self.critics.state_dict())
 
         self.actor_parameters = list(self.actor.parameters())
         self.average_parameters = list(self.actor_average.parameters())
-        self.q_parameters = [*self.qf1.parameters(), *self.qf2.parameters()]
-        self.parameters = [*self.actor_parameters, *self.q_parameters]
-        targets = (self.actor_target, self.qf1_target, self.qf2_target)
+        self.q_parameters = list(self.critics.parameters())
+        self.parameters = self.actor_parameters + self.q_parameters
+        targets = (self.actor_target, self.critics_target)
         self.target_parameters = [one for network in targets for one in network.parameters()]
         self.q_optimizer = torch.optim.Adam(self.q_parameters, lr=args.q_lr, fused=True)
         self.actor_optimizer = torch.optim.Adam(
@@ -415,7 +373,7 @@ class TD3:
 
     def saved_parts(self):
         """What a checkpoint has of it."""
-        names = "actor actor_target actor_average qf1 qf2 qf1_target qf2_target q_optimizer"
+        names = "actor actor_target actor_average critics critics_target q_optimizer"
         return {name: getattr(self, name) for name in [*names.split(), "actor_optimizer"]}
 
     @torch.no_grad()
@@ -427,58 +385,48 @@ class TD3:
         noise = self.args.exploration_noise * torch.randn_like(action)
         return smoothed(action, noise, math.inf, self.actor.action_scale).cpu().numpy()
 
-    def update_critics(self, batch):
-        """One step on a batch of the replay buffer; tensors for TensorBoard, by tag."""
-        goal = batch["desired_goal"]
+    def update_critics(self, batch, features):
+        """One step on a batch of the replay buffer; tensors whose means are logged, by tag.
+
+        `features`: the networks' inputs for its observations and goals.
+        """
         with torch.no_grad():
-            next_action = self.actor_target(batch["next_observation"], None, goal)
+            next_features = self.actor.features(batch["next_observation"], batch["desired_goal"])
+            next_action = self.actor_target.squashed(self.actor_target.mlp(next_features))
             noise = self.args.policy_noise * torch.randn_like(next_action)
             scale = self.actor.action_scale
             next_action = smoothed(next_action, noise, self.args.noise_clip, scale)
-            target = td_target(
-                batch["reward"],
-                batch["terminated"],
-                self.qf1_target(batch["next_observation"], goal, next_action),
-                self.qf2_target(batch["next_observation"], goal, next_action),
-                self.args.gamma,
-            )
-        q1 = self.qf1(batch["observation"], goal, batch["action"])
-        q2 = self.qf2(batch["observation"], goal, batch["action"])
-        qf1_loss, qf2_loss = F.mse_loss(q1, target), F.mse_loss(q2, target)
+            next_q = self.critics_target(next_features, next_action)
+            target = td_target(batch["reward"], batch["terminated"], next_q, self.args.gamma)
+        q = self.critics(features, batch["action"])
+        loss = (q - target).square().mean(1)  # of Q1 and of Q2
         self.q_optimizer.zero_grad()
-        (qf1_loss + qf2_loss).backward()
+        loss.sum().backward()
         self.q_optimizer.step()
-        return {
-            "qf1_values": q1.mean(),
-            "qf2_values": q2.mean(),
-            "qf1_loss": qf1_loss,
-            "qf2_loss": qf2_loss,
-            "qf_loss": (qf1_loss + qf2_loss) / 2,
-        }
+        tensors = {"qf1_values": q[0], "qf2_values": q[1], "qf1_loss": loss[0], "qf2_loss": loss[1]}
+        return tensors | {"qf_loss": loss}
 
-    def update_policy(self, batch):
+    def update_policy(self, features):
         """One step of the policy, and of all targets; as `update_critics`."""
-        for parameter in self.q_parameters:  # the policy's gradient needs none into the critics
-            parameter.requires_grad_(False)
-        preactivation = self.actor.preactivation(batch["observation"], batch["desired_goal"])
-        action = self.actor.squashed(preactivation)
-        q = self.qf1(batch["observation"], batch["desired_goal"], action)
+        self.critics.requires_grad_(False)  # the policy's gradient needs none into the critics
+        preactivation = self.actor.mlp(features)
+        q = self.critics(features, self.actor.squashed(preactivation), number=1)
         penalty = self.args.preactivation_penalty * preactivation.square().mean()
         actor_loss = penalty - q.mean()
         self.actor_optimizer.zero_grad()
         actor_loss.backward()
         self.actor_optimizer.step()
-        for parameter in self.q_parameters:
-            parameter.requires_grad_(True)
+        self.critics.requires_grad_(True)
         polyak_update(self.average_parameters, self.actor_parameters, self.args.policy_average)
         polyak_update(self.target_parameters, self.parameters, self.args.tau)
-        return {"actor_loss": actor_loss, "preactivation": preactivation.abs().mean()}
+        return {"actor_loss": actor_loss, "preactivation": preactivation.abs()}
 
     def update(self, batch, count):
         """Update number `count` of the run."""
-        losses = self.update_critics(batch)
+        features = self.actor.features(batch["observation"], batch["desired_goal"])
+        losses = self.update_critics(batch, features)
         if count % self.args.policy_frequency == 0:
-            losses |= self.update_policy(batch)
+            losses |= self.update_policy(features)
         return losses
 
 
@@ -487,43 +435,26 @@ if __name__ == "__main__":
     args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = runs.seed_torch(args)
     validation, test = protocol.load_task(args)
-    if args.buffer_size < args.horizon:
-        sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
-    if args.demo_prob is not None and not 0 <= args.demo_prob <= 1:
-        sys.exit(f"--demo-prob {args.demo_prob}: a probability is in [0, 1]")
-    if args.demos is not None and args.demo_prob is None:
-        sys.exit("--demos goes with --demo-prob")
-    names = "goal_type action_mode max_step horizon stop_on_collision velocities encoder"
-    env_arguments = {name: getattr(args, name) for name in names.split()}
-    envs = protocol.make_envs(args.task, args.num_envs, **env_arguments)
+    env_arguments = protocol.env_arguments_of(args)
+    envs = protocol.make_training_envs(args)
     eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
-    if args.demo_prob is not None:
-        try:
-            demos = load_demos_for(eval_envs[0], args.demos or args.task, args.task)
-        except ValueError as error:
-            sys.exit(f"--demo-prob: {error}")
-        envs = [DemoQueriesWrapper(env, demos) for env in envs]
-        if args.encoder is not None:
-            eval_envs[0].encoder.encode_demos(demos)  # once, not in the loop
     run = runs.run_folder(args, task_name(args.task))
     if args.bf16 is None:
         args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
-    buffer = HerReplayBuffer(
-        eval_envs[0], args.buffer_size, args.her_probability, np.random.default_rng(args.seed)
-    )
+    rng = np.random.default_rng(args.seed)
+    buffer = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
     progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
     progress |= {"best_success": -1.0, "best_step": 0, "demos_injected": 0}
     # END SHARED
 
-    agent = TD3(args, buffer.scene_size, device)
+    agent = TD3(args, buffer.latents.size, device)
 
     # SHARED: resuming and episodes
-    saved_parts = agent.saved_parts() | {"buffer": buffer, "progress": progress}
+    saved_parts = agent.saved_parts() | {"buffer": buffer, "rng": rng, "progress": progress}
     runs.load_checkpoint(args, saved_parts)
     writer = runs.summary_writer(run, args, progress["global_step"])
     observations = protocol.begin_episodes(envs, args.seed, progress["global_step"])
-    staged = [[] for _ in envs]  # transitions of the running episodes
-    returns = [0.0] * args.num_envs
+    staged, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
     recent_success, losses, stop = [], {}, False
     seconds_before = progress["seconds"]
     bar = runs.progress_bar(args.total_timesteps, progress["global_step"], "step")
@@ -538,58 +469,43 @@ if __name__ == "__main__":
 
         # SHARED: a step in every environment
         for i, env in enumerate(envs):
-            next_observation, reward, terminated, truncated, info = env.step(actions[i])
-            staged[i].append(
-                {
-                    "observation": observations[i]["observation"],
-                    "action": actions[i],
-                    "next_observation": next_observation["observation"],
-                    "next_achieved_goal": next_observation["achieved_goal"],
-                    "desired_goal": next_observation["desired_goal"],
-                    "collision": info["collision"],
-                }
-            )
-            observations[i] = next_observation
+            before = observations[i]
+            observations[i], reward, terminated, truncated, info = env.step(actions[i])
+            staged[i].append(transition(before, actions[i], observations[i], info["collision"]))
             returns[i] += reward
             if terminated or truncated:
                 buffer.add_episode(staged[i])
-                recent_success = [*recent_success[-99:], info["is_success"]]
                 step = progress["global_step"] + i + 1
-                writer.add_scalar("charts/episodic_return", returns[i], step)
-                writer.add_scalar("charts/episodic_length", info["elapsed_steps"], step)
-                writer.add_scalar("charts/success", np.mean(recent_success), step)
+                protocol.log_episode(writer, step, returns[i], info, recent_success)
                 if args.demo_prob is not None:
                     if inject_demonstration(info["is_success"], args.demo_prob, env.np_random):
                         buffer.add_episode(demo_transitions(env.demo, env.env))
                         progress["demos_injected"] += 1
                     writer.add_scalar("charts/demos_injected", progress["demos_injected"], step)
-                staged[i], returns[i] = [], 0.0
-                observations[i] = env.reset()[0]
+                staged[i], returns[i], observations[i] = [], 0.0, env.reset()[0]
         progress["global_step"] += args.num_envs
         bar.update(args.num_envs)
         step = progress["global_step"]
-
-        number = updates_due(step, buffer, args)
-        for batch in batches(buffer, number, args.batch_size, device):
+        for batch in batches(buffer, updates_due(step, buffer, args), args.batch_size, device):
             losses |= agent.update(batch, progress["updates"])
             progress["updates"] += 1
             if progress["updates"] % 1000 == 0:
                 for name, value in losses.items():
-                    writer.add_scalar(f"losses/{name}", value.item(), step)
+                    writer.add_scalar(f"losses/{name}", value.mean().item(), step)
                 writer.add_scalar("charts/SPS", int(runs.rate(bar)), step)
 
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
             policy = agent.actor_average
-            success, best = protocol.validate(
+            success = protocol.validate(
                 policy, eval_envs, validation, device, writer, step, progress
             )
-            if best:
+            if progress["best_step"] == step:
                 protocol.save_policy(run, policy, eval_envs, device, args, env_arguments, step)
             bar.set_postfix(eval=success, best=progress["best_success"])
             for episode in filter(None, staged):
                 buffer.add_episode(episode)
-            staged, returns = [[] for _ in envs], [0.0] * args.num_envs
+            staged, returns = [[] for _ in envs], [0.0 for _ in envs]
             progress["seconds"] = seconds_before + runs.elapsed(bar)
             runs.save_checkpoint(run, saved_parts)
             # A resumed run goes on exactly as this one does: with new episodes.

@@ -81,20 +81,27 @@ def demo_episode(demo, env):
     )
 
 
+def transition(before, action, after, collision):
+    """As a replay buffer keeps it: `action` led from observation `before` (a dict) to `after`."""
+    return {
+        "observation": before["observation"],
+        "action": action,
+        "next_observation": after["observation"],
+        "next_achieved_goal": after["achieved_goal"],
+        "desired_goal": before["desired_goal"],
+        "collision": collision,
+    }
+
+
 def demo_transitions(demo, env):
-    """The same as a list of transitions, dicts as a replay buffer stores them."""
+    """The same as a list of such transitions."""
     episode = demo_episode(demo, env)
-    return [
-        {
-            "observation": episode.observation[t],
-            "action": episode.action[t],
-            "next_observation": episode.observation[t + 1],
-            "next_achieved_goal": episode.achieved_goal[t + 1],
-            "desired_goal": episode.desired_goal,
-            "collision": False,
-        }
-        for t in range(len(episode.action))
+    seen = [
+        {"observation": one, "achieved_goal": achieved, "desired_goal": episode.desired_goal}
+        for one, achieved in zip(episode.observation, episode.achieved_goal, strict=True)
     ]
+    steps = zip(seen[:-1], episode.action, seen[1:], strict=True)
+    return [transition(before, action, after, False) for before, action, after in steps]
 
 
 class DemoQueriesWrapper(gym.Wrapper):

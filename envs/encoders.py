@@ -171,3 +171,24 @@ class SceneEncoder:
         """Close the world it looks into."""
         if self._world is not None:
             self._world.close()
+
+
+class LatentTable:
+    """Latents of scenes, each stored once: `rows` (n, size) has them, in the order they came."""
+
+    def __init__(self, size):
+        self.size, self._row_of = size, {}  # the latent's bytes -> its row
+        self._latents = np.zeros((1, size), np.float32)
+
+    @property
+    def rows(self):
+        return self._latents[: len(self._row_of)]
+
+    def row_of(self, latent):
+        """The row of a latent (size,), which is added if it is new."""
+        latent = np.float32(latent)
+        row = self._row_of.setdefault(latent.tobytes(), len(self._row_of))
+        if row == len(self._latents):
+            self._latents = np.concatenate([self._latents, np.zeros_like(self._latents)])
+        self._latents[row] = latent
+        return row

@@ -9,19 +9,48 @@ the program with a message.
 """
 
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, fields
+from typing import Literal
 
 import numpy as np
 import torch
 
 import envs
 from envs.datasets import load_queries
+from envs.demo_episodes import DemoQueriesWrapper, load_demos_for
 from envs.exported_networks import load_network, save_network
 from envs.runs import write_json
 
 NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
 PICTURE_SIZE = (240, 180)
 RULES = ("horizon", "stop_on_collision")  # which decide what a success is
+
+
+@dataclass
+class EnvFlags:
+    """The arguments of `envs.make` among a trainer's flags: the paper's MDP and what is seen."""
+
+    goal_type: Literal["ee", "config", "combined"] = "ee"
+    """what the goal is: end-effector position, configuration, or both"""
+    action_mode: Literal["relative", "subgoal"] = "relative"
+    """action: a displacement of the normalised configuration, or the next one itself"""
+    max_step: float = 0.03
+    """longest displacement per step (L2, normalised configuration)"""
+    horizon: int = 400
+    """steps after which an episode is cut off"""
+    stop_on_collision: bool = False
+    """end an episode at the first touch"""
+    velocities: bool = False
+    """joint velocities in the observation"""
+    encoder: str | None = None
+    """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
+    `vqvae`, `pointnet2`, or the path of your own `encoder.pt`, docs/sensors.md), or `oracle`, the
+    obstacles themselves; by default nothing"""
+
+
+def env_arguments_of(args):
+    """The `EnvFlags` in a trainer's flags as a dict, for `envs.make`."""
+    return {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
 
 
 def load_task(args):
@@ -57,6 +86,30 @@ def make_eval_envs(task, **kwargs):
     return pictured + make_envs(task, NUM_ENVS - 1, **kwargs)
 
 
+def make_training_envs(args):
+    """`args.num_envs` environments; with `args.demo_prob` on the queries of demonstrations.
+
+    Raises:
+        SystemExit: an argument is refused, or the demonstrations do not fit.
+    """
+    if args.buffer_size < args.horizon:
+        sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
+    if args.demo_prob is None and args.demos is not None:
+        sys.exit("--demos goes with --demo-prob")
+    if args.demo_prob is not None and not 0 <= args.demo_prob <= 1:
+        sys.exit(f"--demo-prob {args.demo_prob}: a probability is in [0, 1]")
+    made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
+    if args.demo_prob is None:
+        return made
+    try:
+        demos = load_demos_for(made[0], args.demos or args.task, args.task)
+    except ValueError as error:
+        sys.exit(f"--demo-prob: {error}")
+    if args.encoder is not None:
+        made[0].encoder.encode_demos(demos)  # once, not in the loop
+    return [DemoQueriesWrapper(env, demos) for env in made]
+
+
 def begin_episodes(envs, seed, step):
     """First observations of fresh episodes, from random numbers that depend on seed and step alone.
 
@@ -73,6 +126,22 @@ def stack(observations, device):
         name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
         for name in observations[0]
     }
+
+
+def log_episode(writer, step, episode_return, info, recent_success):
+    """Write a finished training episode to TensorBoard.
+
+    Args:
+        writer: TensorBoard's.
+        step: of the training.
+        episode_return: sum of its rewards.
+        info: of its last step.
+        recent_success: list of the outcomes of the last 100 episodes, which gets this one too.
+    """
+    recent_success[:] = [*recent_success[-99:], info["is_success"]]
+    writer.add_scalar("charts/episodic_return", episode_return, step)
+    writer.add_scalar("charts/episodic_length", info["elapsed_steps"], step)
+    writer.add_scalar("charts/success", np.mean(recent_success), step)
 
 
 @torch.no_grad()
@@ -148,7 +217,7 @@ def validate(policy, envs, queries, device, writer, step, progress):
         progress: dict with `best_success` and `best_step`, which are set if this is the best.
 
     Returns:
-        The success rate, and whether it is the best so far.
+        The success rate.
     """
     result = evaluate(policy, envs, queries, device)
     for name, value in result.items():
@@ -156,10 +225,9 @@ def validate(policy, envs, queries, device, writer, step, progress):
     picture = picture_of_rollout(policy, envs[0], queries[0], device)
     writer.add_image("eval/rollout", picture, step, dataformats="HWC")
     success = result["success_rate"]
-    best = success > progress["best_success"]
-    if best:
+    if success > progress["best_success"]:
         progress |= {"best_success": success, "best_step": step}
-    return success, best
+    return success
 
 
 def save_policy(run, policy, envs, device, args, env_arguments, step):

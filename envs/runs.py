@@ -10,17 +10,17 @@
     ...
     save_checkpoint(run, saved_parts)
 
-Every trainer uses these. Its `Args`, a dataclass, has at least the fields `exp_name`, `seed`,
-`runs_dir`, `resume`, `device` and `threads`. These functions are for scripts: where the user is
-wrong, they end the program with a message.
+Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `exp_name` at least.
+These functions are for scripts: where the user is wrong, they end the program with a message.
 """
 
+import importlib.util
 import json
 import os
 import sys
 import time
 import typing
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,27 @@ from tqdm import tqdm
 
 from envs.files import replace_atomically, write_atomically
 
-MAY_CHANGE = {"resume", "runs_dir", "threads"}  # they do not change what is computed
+
+@dataclass
+class RunFlags:
+    """The flags of every trainer's run."""
+
+    seed: int = 1
+    """seed of everything random; the same seed gives the same run on the same machine and device"""
+    runs_dir: Path = Path("runs")
+    """the run's folder is made in here: TensorBoard events, checkpoint, the best network
+    (`policy.pt` or `encoder.pt`), result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint; its own flags are used"""
+    device: str = "cpu"
+    """`cpu` or `cuda`"""
+    threads: int = 1
+    """torch threads; one is fastest for small networks, and leaves the other cores alone"""
+    track: bool = False
+    """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
+
+
+MAY_CHANGE = {"resume", "runs_dir", "threads", "track"}  # they do not change what is computed
 
 
 def parse_args(Args, may_change=()):
@@ -42,13 +62,15 @@ def parse_args(Args, may_change=()):
         may_change: names of further flags with which a run may be resumed at another value.
 
     Raises:
-        SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device.
+        SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
     """
     args = tyro.cli(Args)
     if args.resume is not None:
         args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
     if args.device == "cuda" and not torch.cuda.is_available():
         sys.exit("--device cuda: PyTorch sees no CUDA device here")
+    if args.track and importlib.util.find_spec("wandb") is None:
+        sys.exit("--track: wandb is not installed (pip install wandb)")
     return args
 
 
@@ -111,6 +133,8 @@ def seed_torch(args):
     torch.manual_seed(args.seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
     torch.use_deterministic_algorithms(True)
+    # Else every new tensor is filled with NaN first, to show who reads what was never written.
+    torch.utils.deterministic.fill_uninitialized_memory = False
     return torch.device(args.device)
 
 
@@ -182,8 +206,16 @@ def _restore(part, state):
 def summary_writer(run, args, step):
     """TensorBoard's writer for a run that is at `step`, with a table of the flags.
 
-    What an earlier process wrote after its last checkpoint is hidden.
+    What an earlier process wrote after its last checkpoint is hidden. With `args.track`, what is
+    written goes to Weights & Biases too.
     """
+    if args.track:
+        import wandb
+
+        config = json.loads(_to_json(asdict(args)))
+        # Under the run's name, so that a resumed run goes on there as well.
+        names = {"project": "roboarm-nmp", "name": run.name, "id": run.name, "dir": str(run)}
+        wandb.init(**names, config=config, resume="allow", sync_tensorboard=True)
     writer = SummaryWriter(run, purge_step=step + 1)
     rows = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
     writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")

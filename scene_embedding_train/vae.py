@@ -22,6 +22,7 @@ import torch.nn as nn
 from envs.exported_networks import save_network
 from envs.observations import sensors_to_json
 from envs.runs import (
+    RunFlags,
     elapsed,
     load_checkpoint,
     parse_args,
@@ -46,22 +47,11 @@ from scene_embedding_train.training_data import open_observations, split
 
 
 @dataclass
-class Args:
-    # The run
+class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     exp_name: str = "vae"
     """name of the experiment, part of the run's folder"""
-    # SHARED: the run and the data
-    seed: int = 1
-    """seed of everything random; the same seed gives the same run on the same machine and device"""
-    runs_dir: Path = Path("runs")
-    """the run's folder is made in here: TensorBoard events, checkpoint, encoder.pt, result.json"""
-    resume: Path | None = None
-    """continue the run in this folder from its last checkpoint; its own flags are used"""
-    device: str = "cpu"
-    """`cpu` or `cuda`"""
-    threads: int = 1
-    """torch threads"""
 
+    # SHARED: the data
     # The data
     observations: Path = Path("observations")
     """folder that `scene_embedding_train.collect` wrote"""

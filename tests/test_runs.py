@@ -1,6 +1,7 @@
 """envs/runs.py: flags of a run, what a checkpoint brings back. (Whole runs: test_trainers.py.)"""
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -14,13 +15,8 @@ from envs import runs
 
 
 @dataclass
-class Args:
+class Args(runs.RunFlags):
     exp_name: str = "test"
-    seed: int = 1
-    runs_dir: Path = Path("runs")
-    resume: Path | None = None
-    device: str = "cpu"
-    threads: int = 1
     data: Path | None = None
     files: tuple[Path, ...] = ()
     radii: tuple[float, float] = (0.1, 0.2)
@@ -58,7 +54,7 @@ def test_flags_come_back_as_they_were(parse, tmp_path):
         (["--radii", "0.3", "0.4"], r"--radii is \[0.3, 0.4\] now, the run had \[0.1, 0.2\]"),
         (["--files", "e.h5"], r"--files is \['e.h5'\] now, the run had \[\]"),
         (["--name", "y"], "--name is 'y' now, the run had None"),
-        (["--seed", "2", "--exp-name", "z"], "--exp-name is 'z' .*; --seed is 2 now"),
+        (["--seed", "2", "--exp-name", "z"], "--seed is 2 now, .*; --exp-name is 'z'"),
     ],
 )
 def test_a_run_is_not_resumed_as_another(parse, tmp_path, flags, message):
@@ -154,3 +150,22 @@ def test_events_of_steps_that_are_done_again_are_hidden(parse, tmp_path):
     assert found == [(1, 1), (2, 2), (3, 23), (4, 24), (5, 25)]
     table = events.Tensors("hyperparameters/text_summary")[0].tensor_proto.string_val[0].decode()
     assert "|radii|(0.1, 0.2)|" in table
+
+
+def test_tracking_with_weights_and_biases(parse, tmp_path, monkeypatch):
+    with pytest.raises(SystemExit, match=r"--track: wandb is not installed \(pip install wandb\)"):
+        parse("--track")
+    (tmp_path / "wandb.py").write_text("calls = []\ndef init(**kw): calls.append(kw)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    args = parse("--runs-dir", tmp_path / "runs", "--data", "a.h5")
+    run = runs.run_folder(args, "wall")
+    runs.summary_writer(run, args, 0).close()
+    assert "wandb" not in sys.modules  # off by default
+
+    args = parse("--resume", run, "--track")
+    runs.summary_writer(run, args, 0).close()
+    (call,) = sys.modules.pop("wandb").calls
+    assert call["sync_tensorboard"] and call["id"] == run.name and call["resume"] == "allow"
+    assert (call["config"]["data"], call["config"]["steps"]) == ("a.h5", 10)
+    json.dumps(call)  # plain values only

@@ -25,8 +25,7 @@ def test_td_target_by_hand():
     target = sac.td_target(
         torch.tensor([-1.0, 0.0]),
         torch.tensor([0.0, 1.0]),
-        torch.tensor([-3.0, -9.0]),
-        torch.tensor([-4.0, -8.0]),
+        torch.tensor([[-3.0, -9.0], [-4.0, -8.0]]),
         torch.tensor([2.0, 2.0]),
         alpha=0.1,
         gamma=0.5,
@@ -46,7 +45,7 @@ def test_log_probability_is_the_squashed_gaussians():
     torch.manual_seed(0)
     actor = sac.Actor(sac.Args(bf16=False)).eval()
     observation, goal = torch.randn(64, 10), torch.randn(64, 3)
-    action, log_prob = actor.sample(observation, goal)
+    action, log_prob = actor.sample(actor.features(observation, goal))
     mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
     std = (-5 + 3.5 * (torch.tanh(log_std) + 1)).exp()
     squashed = torch.distributions.TransformedDistribution(
@@ -79,10 +78,11 @@ def test_networks_fit_every_observation(goal_type, velocities):
     args = sac.Args(goal_type=goal_type, velocities=velocities, num_hidden_layers=4)
     env = envs.make("wall", goal_type=goal_type, velocities=velocities)
     batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
-    action = sac.Actor(args)(**batch)
+    actor = sac.Actor(args)
+    action = actor(**batch)
     assert action.shape == (2, 7)
-    value = sac.QNetwork(args)(batch["observation"], batch["desired_goal"], action)
-    assert value.shape == (2,)
+    features = actor.features(batch["observation"], batch["desired_goal"])
+    assert sac.Critics(args, actor.features.size)(features, action).shape == (2, 2)
 
 
 def episode(length, offset, env):
@@ -166,9 +166,9 @@ def test_a_million_transitions_fit_into_400_mb():
 def test_bfloat16_products_stay_close_to_float32():
     torch.manual_seed(0)
     args = sac.Args(bf16=True)
-    q = sac.QNetwork(args)
-    inputs = torch.randn(256, 10), torch.randn(256, 3), torch.rand(256, 7) * 0.06
-    in_training, exact = q.train()(*inputs), q.eval()(*inputs)
+    critics = sac.Critics(args, 30)
+    inputs = torch.randn(256, 30), torch.rand(256, 7) * 0.06
+    in_training, exact = critics.train()(*inputs), critics.eval()(*inputs)
     assert 0 < (in_training - exact).abs().max() < 0.02
     assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
 

@@ -12,8 +12,7 @@ def test_td_target_by_hand():
     target = td3.td_target(
         torch.tensor([-1.0, 0.0]),
         torch.tensor([0.0, 1.0]),
-        torch.tensor([-3.0, -9.0]),
-        torch.tensor([-4.0, -8.0]),
+        torch.tensor([[-3.0, -9.0], [-4.0, -8.0]]),
         gamma=0.5,
     )
     # -1 + 0.5 min(-3, -4); a terminal state has no value
@@ -39,7 +38,7 @@ def test_policy_and_targets_are_updated_with_delay(tmp_path):
         for key, value in state["actor"].items():
             torch.testing.assert_close(state["actor_target"][key], value, rtol=0, atol=0)
         # With tau 1 the targets are what the critics were at the last update of the policy.
-        equal = [torch.equal(state["qf1_target"][k], v) for k, v in state["qf1"].items()]
+        equal = [torch.equal(state["critics_target"][k], v) for k, v in state["critics"].items()]
         assert all(equal) == same
 
 
@@ -75,7 +74,7 @@ def test_the_penalty_keeps_the_tanh_from_saturating(tmp_path):
         actor.load_state_dict(state["actor"])
         rows = state["buffer"]["rows"]
         with torch.no_grad():
-            preactivation = actor.preactivation(rows[:, :10], rows[:, -4:-1])
+            preactivation = actor.mlp(actor.features(rows[:, :10], rows[:, -4:-1]))
             action = actor(rows[:, :10], None, rows[:, -4:-1])
         torch.testing.assert_close(action, 0.06 * torch.tanh(preactivation))
         sizes[penalty] = preactivation.square().mean()

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 from trainers import load
@@ -36,14 +37,33 @@ def make(module, kind, **flags):
     return getattr(module, kind)(args, 0, torch.device("cpu"))
 
 
+def take_apart(agent, *names):
+    """As if it had learned: targets that are not what they follow."""
+    with torch.no_grad():
+        for parameter in (one for name in names for one in getattr(agent, name).parameters()):
+            parameter.mul_(1.3)
+
+
 def state(agent):
     """All that an update may change, copied."""
     return copy.deepcopy({k: v for k, v in agent.saved_parts().items() if "optimizer" not in k})
 
 
-def values(critics, *inputs):
-    """Of both critics, (2, N)."""
-    return torch.stack([critic(*inputs) for critic in critics])
+def inputs_of(actor, data):
+    """The networks' inputs for observations and for next observations."""
+    goal = data["desired_goal"]
+    return tuple(actor.features(data[name], goal) for name in ("observation", "next_observation"))
+
+
+def values(critics, features, action):
+    """Of both critics, (2, N), layer by layer."""
+    both = []
+    for mlp in critics.mlps:
+        x = torch.cat([features, action / 0.06], dim=1)
+        for layer, norm in zip(mlp.layers, mlp.norms, strict=True):
+            x = torch.relu(F.layer_norm(layer(x), (16,), norm.weight, norm.bias))
+        both.append(mlp.head(x)[:, 0])
+    return torch.stack(both)
 
 
 def assert_adam_step(before, after, loss, rate):
@@ -61,9 +81,9 @@ def assert_moved(old, new, toward, share):
         torch.testing.assert_close(b, (1 - share) * a + share * c, rtol=1e-4, atol=1e-7)
 
 
-def squashed_gaussian(actor, observation, goal, noise):
+def squashed_gaussian(actor, features, noise):
     """The policy's action for given normal numbers, and its log-density, by torch.distributions."""
-    mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
+    mean, log_std = actor.mlp(features).chunk(2, dim=1)
     std = torch.exp(-5 + 3.5 * (torch.tanh(log_std) + 1))
     unsquashed = mean + std * noise
     density = TransformedDistribution(Normal(mean, std), TanhTransform(cache_size=1))
@@ -74,32 +94,29 @@ def squashed_gaussian(actor, observation, goal, noise):
 @pytest.mark.parametrize("autotune", [True, False])
 def test_an_update_of_sac(autotune):
     agent = make(sac, "SAC", gamma=0.9, alpha=0.3, tau=0.1, policy_average=0.2, autotune=autotune)
-    with torch.no_grad():  # targets that are not the critics
-        for parameter in (*agent.qf1_target.parameters(), *agent.qf2_target.parameters()):
-            parameter.mul_(1.3)
+    take_apart(agent, "critics_target")
     old, data = state(agent), batch()
     torch.manual_seed(5)
     losses = agent.update(data, 0)
     torch.manual_seed(5)
     noises = torch.randn(N, 7), torch.randn(N, 7)
-    new, goal = state(agent), data["desired_goal"]
+    new = state(agent)
+    now, later = inputs_of(old["actor"], data)
 
-    critics, targets = ((old["qf1" + end], old["qf2" + end]) for end in ("", "_target"))
-    following, density = squashed_gaussian(old["actor"], data["next_observation"], goal, noises[0])
-    future = values(targets, data["next_observation"], goal, following).amin(0) - 0.3 * density
+    following, density = squashed_gaussian(old["actor"], later, noises[0])
+    future = values(old["critics_target"], later, following).amin(0) - 0.3 * density
     target = (data["reward"] + 0.9 * (1 - data["terminated"]) * future).detach()
-    errors = (values(critics, data["observation"], goal, data["action"]) - target).square().mean(1)
+    errors = (values(old["critics"], now, data["action"]) - target).square().mean(1)
     torch.testing.assert_close(
         torch.stack([losses["qf1_loss"], losses["qf2_loss"]]), errors, rtol=1e-3, atol=1e-5
     )
-    for name, error in zip(("qf1", "qf2"), errors, strict=True):
-        before, after = (list(one[name].parameters()) for one in (old, new))
-        assert_adam_step(before, after, error, agent.args.q_lr)
-        assert_moved(old[f"{name}_target"], new[f"{name}_target"], new[name], 0.1)
+    before, after = (list(one["critics"].parameters()) for one in (old, new))
+    assert_adam_step(before, after, errors.sum(), agent.args.q_lr)
+    assert_moved(old["critics_target"], new["critics_target"], new["critics"], 0.1)
 
     # The policy's step is against the critics that were just updated.
-    action, density = squashed_gaussian(old["actor"], data["observation"], goal, noises[1])
-    q = values((new["qf1"], new["qf2"]), data["observation"], goal, action)
+    action, density = squashed_gaussian(old["actor"], now, noises[1])
+    q = values(new["critics"], now, action)
     loss = (0.3 * density - q.amin(0)).mean()
     torch.testing.assert_close(losses["actor_loss"], loss, rtol=1e-3, atol=1e-4)
     before, after = (list(one["actor"].parameters()) for one in (old, new))
@@ -123,35 +140,30 @@ def test_alpha_follows_the_target_entropy(target_entropy, direction):
 def test_an_update_of_td3():
     flags = {"tau": 0.1, "policy_average": 0.2, "preactivation_penalty": 0.4, "policy_noise": 0.6}
     agent = make(td3, "TD3", gamma=0.9, **flags)
-    names = ("actor_target", "qf1_target", "qf2_target")
-    with torch.no_grad():
-        for parameter in (p for name in names for p in getattr(agent, name).parameters()):
-            parameter.mul_(1.3)
+    take_apart(agent, "actor_target", "critics_target")
     old, data = state(agent), batch()
     torch.manual_seed(5)
     losses = agent.update(data, 0)
     torch.manual_seed(5)
     noise = np.clip(0.6 * torch.randn(N, 7).numpy(), -0.5, 0.5)
-    new, goal = state(agent), data["desired_goal"]
+    new = state(agent)
+    now, later = inputs_of(old["actor"], data)
 
-    following = old["actor_target"](data["next_observation"], None, goal).detach().numpy()
+    following = old["actor_target"](data["next_observation"], None, data["desired_goal"])
+    following = following.detach().numpy()
     following = torch.from_numpy(np.clip(following + 0.06 * noise, -0.06, 0.06))
-    targets = (old["qf1_target"], old["qf2_target"])
-    future = values(targets, data["next_observation"], goal, following).amin(0)
+    future = values(old["critics_target"], later, following).amin(0)
     target = (data["reward"] + 0.9 * (1 - data["terminated"]) * future).detach()
-    critics = (old["qf1"], old["qf2"])
-    errors = (values(critics, data["observation"], goal, data["action"]) - target).square().mean(1)
+    errors = (values(old["critics"], now, data["action"]) - target).square().mean(1)
     torch.testing.assert_close(
         torch.stack([losses["qf1_loss"], losses["qf2_loss"]]), errors, rtol=1e-3, atol=1e-5
     )
-    for name, error in zip(("qf1", "qf2"), errors, strict=True):
-        before, after = (list(one[name].parameters()) for one in (old, new))
-        assert_adam_step(before, after, error, agent.args.q_lr)
-        assert_moved(old[f"{name}_target"], new[f"{name}_target"], new[name], 0.1)
+    before, after = (list(one["critics"].parameters()) for one in (old, new))
+    assert_adam_step(before, after, errors.sum(), agent.args.q_lr)
+    assert_moved(old["critics_target"], new["critics_target"], new["critics"], 0.1)
 
-    features = old["actor"].features(data["observation"], goal)
-    preactivation = old["actor"].mlp(features)
-    q = new["qf1"](data["observation"], goal, 0.06 * torch.tanh(preactivation))
+    preactivation = old["actor"].mlp(now)
+    q = values(new["critics"], now, 0.06 * torch.tanh(preactivation))[0]
     loss = 0.4 * preactivation.square().mean() - q.mean()
     torch.testing.assert_close(losses["actor_loss"], loss, rtol=1e-3, atol=1e-4)
     before, after = (list(one["actor"].parameters()) for one in (old, new))
@@ -175,10 +187,10 @@ def test_the_policy_is_updated_every_so_often(module, kind):
             if name != "log_alpha"
         }
         due = count % 3 == 0
-        assert moved["qf1"] and moved["qf2"]
+        assert moved["critics"]
         assert moved["actor"] == moved["actor_average"] == ("actor_loss" in losses) == due
-        assert moved["qf1_target"] == moved["qf2_target"] == (kind == "SAC" or due)
-        assert all(parameter.requires_grad for parameter in agent.qf1.parameters())
+        assert moved["critics_target"] == (kind == "SAC" or due)
+        assert all(parameter.requires_grad for parameter in agent.critics.parameters())
 
 
 @pytest.mark.parametrize("module, kind", [(sac, "SAC"), (td3, "TD3")])
