@@ -922,7 +922,7 @@ def _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope):
     """`_signed_distance` of a shape that may be near; `pose` is the core's."""
     _begin(rows, j, pose, s)
     distance, n = _gjk(vertices, cells, k, rows, j, pose, s, -1.0, far)
-    if distance >= far:
+    if distance != 0.0 and distance >= far:  # (where they overlap, only the depth tells)
         return _FAR
     if distance == 0.0:
         if n < 4:  # the origin is on a face or an edge of the simplex: move it off, by 0.1 um

@@ -3,6 +3,7 @@
     encoder = SceneEncoder("vae")                     # of `scene_embedding_train/encoders`
     encoder = SceneEncoder("runs/.../encoder.pt")     # trained by a script of scene_embedding_train
     encoder = SceneEncoder("oracle")                  # the obstacles themselves
+    encoder = SceneEncoder("points")                  # points of them that four sensors see
     env = SceneEncodingWrapper(envs.make("random_boxes_hard"), encoder)
 
 Paper: sections 5.1 and 5.3. `SceneEncodingWrapper` is in `envs.wrappers`.
@@ -12,6 +13,7 @@ import functools
 import hashlib
 import importlib.resources
 import io
+import re
 import sys
 import zipfile
 from pathlib import Path
@@ -24,9 +26,12 @@ from envs.exported_networks import NetworkError, load_network
 from envs.files import write_atomically
 from envs.observations import sensors_from_json
 from envs.scenes import ROW, to_array
+from envs.seeing import farthest_points, seen_points
 from envs.sensors import POSE, PointCloud, SensorWorld
 
-ORACLE = "oracle"
+ORACLE, POINTS = "oracle", "points"
+NUM_POINTS = 64
+"""Of `points`; `points:32` has 32."""
 # Only data are found there: `envs` imports no trainer.
 PACKAGED = Path(importlib.resources.files("scene_embedding_train") / "encoders")
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
@@ -49,6 +54,14 @@ def oracle(scene):
     return rows.ravel()
 
 
+def points(scene, number=NUM_POINTS):
+    """Points of a scene's obstacles that four sensors see, as far apart as can be: (number * 3,).
+
+    float32, m, in the base's frame, see `envs.seeing.farthest_points`.
+    """
+    return farthest_points(seen_points(scene), number).ravel()
+
+
 def _read_latents(path, key):
     """What `SceneEncoder.encode_demos` kept; None if it is not there, damaged or out of date."""
     try:
@@ -68,11 +81,12 @@ class SceneEncoder:
     """Encodes scenes; an equal scene is encoded once.
 
     Args:
-        name: `oracle`, the name of an encoder in `PACKAGED`, or the path of a network (encoder.pt).
+        name: `oracle`, `points`, the name of an encoder in `PACKAGED`, or the path of a network
+            (encoder.pt).
 
     Attributes:
         name: as given, a string.
-        path: of the network; None for the oracle.
+        path: of the network; None for `oracle` and `points`.
         size: of z_E.
 
     Raises:
@@ -85,6 +99,9 @@ class SceneEncoder:
         self._of_demos = {}  # scene -> z_E
         if self.name == ORACLE:
             self._encode, self.size = oracle, MAX_OBSTACLES * (1 + ROW)
+        elif match := re.fullmatch(rf"{POINTS}(:[1-9]\d{{0,3}})?", self.name):
+            number = int(match[1][1:]) if match[1] else NUM_POINTS
+            self._encode, self.size = functools.partial(points, number=number), 3 * number
         else:
             packaged = PACKAGED / f"{name}.pt"
             self.path = packaged if packaged.exists() else Path(name)
@@ -115,15 +132,19 @@ class SceneEncoder:
         `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others.
         """
         seen = [demos.scenes[i] for i in range(len(demos))]
+
+        def encode():
+            quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
+            bar = tqdm(seen, desc=f"encoding {demos.task}", unit="scene", mininterval=quiet)
+            return np.stack([self(scene) for scene in bar])
+
         if self.path is None:
-            return np.stack([self(scene) for scene in seen])
+            return encode()
         path = self.path.with_suffix(f".{demos.task}.npz")
         key = hashlib.sha256(self.path.read_bytes() + repr(seen).encode()).hexdigest()
         latents = _read_latents(path, key)
         if latents is None:
-            quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
-            bar = tqdm(seen, desc=f"encoding {demos.task}", unit="scene", mininterval=quiet)
-            latents = np.stack([self(scene) for scene in bar])
+            latents = encode()
             file = io.BytesIO()
             np.savez(file, key=key, codes=latents)
             write_atomically(path, file.getvalue())

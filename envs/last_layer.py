@@ -53,13 +53,12 @@ class LastLayer:
             proximity: (..., links, 8), as `envs.wrappers.ProximityWrapper` has it.
             keep: m, (..., links), instead of the layer's: see `kept`.
         """
-        actions = np.array(actions, dtype=np.float64)
-        flat = actions.reshape(-1, panda.NUM_JOINTS)
-        rows = np.asarray(proximity, dtype=np.float64).reshape(len(flat), -1, 8)
-        keep = np.broadcast_to(self.keep if keep is None else keep, np.shape(proximity)[:-1])
-        keep = keep.astype(np.float64).reshape(rows.shape[:2])
-        _project(flat, rows, keep, self.max_step)
-        return flat.reshape(actions.shape).astype(np.float32)
+        actions, rows = np.array(actions, np.float64), np.asarray(proximity, np.float64)
+        links = rows.shape[-2]
+        keep = np.broadcast_to(self.keep if keep is None else keep, rows.shape[:-1])
+        keep = keep.astype(np.float64).reshape(-1, links)
+        _project(actions.reshape(-1, 7), rows.reshape(-1, links, 8), keep, self.max_step)
+        return actions.astype(np.float32)
 
     def around(self, act, rng):
         """`act`, a function from an observation to an action (7,), with this layer: another one.

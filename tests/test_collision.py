@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -233,6 +234,21 @@ def test_the_arm_inside(hulls, kind):
             ways, axes = ways[[2, 5]], axes[[2, 5]]
         assert distance == pytest.approx(-ways.min() - BULLET_MARGIN, abs=1e-5)
         np.testing.assert_allclose(direction, axes[ways.argmin()], atol=1e-3)
+
+
+def test_of_several_things_the_nearest_or_deepest_counts():
+    rng = np.random.default_rng(5)
+    scene = Scene(tuple(o for _ in range(5) for o in random_scene(rng).obstacles), None, None)
+    states = rng.uniform(-1, 1, (1000, 7))
+    together = CollisionChecker(scene).nearest(states, self_collisions=False)
+    alone = np.stack(
+        [
+            CollisionChecker(replace(scene, obstacles=(one,))).nearest(states, False).distance
+            for one in scene.obstacles
+        ]
+    )
+    assert ((alone < -0.02).sum(0) > 1).sum() > 100  # in two of them at once
+    np.testing.assert_allclose(together.distance, alone.min(0), atol=1e-6)
 
 
 def test_a_sphere_at_a_hulls_centre(hulls):

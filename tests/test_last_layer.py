@@ -1,0 +1,236 @@
+"""Proximity in observations, and the last layer that keeps away from things by it."""
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import envs
+from envs import panda
+from envs.collision import CollisionChecker
+from envs.datasets import load_queries
+from envs.last_layer import DETOUR, NEAR, PATIENCE, PUSH, LastLayer
+from envs.seeing import seen_checker
+from envs.wrappers import PROXIMITY_RANGE
+
+# --- Gradients and proximity
+
+
+def test_gradients_are_differences():
+    env = envs.make("random_boxes_hard")
+    env.reset(seed=4)
+    checker, rng = CollisionChecker(env.scene), np.random.default_rng(0)
+    env.close()
+    states, step = rng.uniform(-0.95, 0.95, (200, 7)), 1e-5
+    for self_collisions in (False, True):
+        here = checker.nearest(states, self_collisions)
+        for joint in range(7):
+            move = np.zeros(7)
+            move[joint] = step
+            a = checker.nearest(states + move, self_collisions)
+            b = checker.nearest(states - move, self_collisions)
+            same = (a.thing == here.thing) & (b.thing == here.thing) & (here.distance > 0.001)
+            slope = (a.distance - b.distance) / (2 * step)
+            # (Now and then another point of the same thing is the nearest.)
+            assert np.quantile(np.abs(slope - here.gradient[..., joint])[same], 0.99) < 1e-5
+            assert same.mean() > 0.7
+    nothing = CollisionChecker(envs.scenes.Scene(table=None, floor=None)).nearest(states, False)
+    assert not nothing.gradient.any()
+
+
+@pytest.mark.parametrize("knows", ["obstacles", "points"])
+@pytest.mark.parametrize("goal_type", ["ee", "combined"])
+def test_proximity_in_observations(knows, goal_type):
+    env = envs.make("random_boxes_hard", proximity=knows, goal_type=goal_type)
+    check_env(env, skip_render_check=True)
+    observation, _ = env.reset(seed=2)
+    for _ in range(3):
+        scene = env.unwrapped.scene
+        checker = CollisionChecker(scene) if knows == "obstacles" else seen_checker(scene)
+        places = {"proximity": observation["observation"][:7]}
+        if goal_type != "ee":
+            places["goal_proximity"] = observation["desired_goal"][:7]
+        for name, state in places.items():
+            nearest = checker.nearest(state, self_collisions=False)
+            near = nearest.distance < PROXIMITY_RANGE
+            distances = np.minimum(nearest.distance, PROXIMITY_RANGE).astype(np.float32)
+            assert observation[name].shape == (10, 8) and near.any()
+            assert observation[name][:, 0].tolist() == distances.tolist()
+            expected = np.where(near[:, None], nearest.gradient, 0.0).astype(np.float32)
+            assert observation[name][:, 1:].tolist() == expected.tolist()
+        assert ("goal_proximity" in observation) == (goal_type != "ee")
+        observation, *_ = env.step(np.full(7, 0.01))
+    # In another scene it is another one.
+    query = load_queries("random_boxes_hard")[0]
+    observation, _ = env.reset_specific(*query)
+    checker = CollisionChecker(query.scene) if knows == "obstacles" else seen_checker(query.scene)
+    least = checker.nearest(panda.normalise(query.start), False).distance.min()
+    assert observation["proximity"][:, 0].min() == pytest.approx(least, abs=1e-6)
+    env.close()
+
+
+def test_what_is_far_away_is_as_good_as_nothing():
+    env = envs.make("no_obstacles", proximity="obstacles")
+    seen = np.stack([env.reset(seed=seed)[0]["proximity"] for seed in range(20)]).reshape(-1, 8)
+    env.close()
+    far = seen[:, 0] == np.float32(PROXIMITY_RANGE)
+    assert 20 < far.sum() < 180 and not seen[far, 1:].any() and seen[~far, 1:].any()
+
+
+def test_proximity_changes_no_episode():
+    plain = envs.make("wall")
+    more = envs.make("wall", encoder="oracle", proximity="obstacles")
+    (a, _), (b, _) = plain.reset(seed=5), more.reset(seed=5)
+    for step in range(20):
+        assert a["observation"].tolist() == b["observation"][:10].tolist()
+        action = np.random.default_rng(step).uniform(-0.03, 0.03, 7)
+        a, b = plain.step(action)[0], more.step(action)[0]
+    assert more.in_collision(more.start_configuration) is False
+    plain.close()
+    more.close()
+
+
+def test_unknown_proximity_is_refused():
+    with pytest.raises(ValueError, match="proximity must be None, 'obstacles' or 'points'"):
+        envs.make("wall", proximity="lidar")
+
+
+# --- The projection, worked out by hand
+
+
+def proximity(*rows):
+    """(distance, gradient's first numbers) for each link -> (links, 8)."""
+    table = np.zeros((len(rows), 8))
+    for line, (distance, *gradient) in zip(table, rows, strict=True):
+        line[0], line[1 : 1 + len(gradient)] = distance, gradient
+    return table
+
+
+def action(*numbers):
+    return np.array([*numbers, *[0.0] * (7 - len(numbers))])
+
+
+def test_a_point_approaches_a_plane():
+    layer, straight = LastLayer(keep=0.01), action(-0.02, 0.02)
+    # The distance falls by 0.5 m per unit of the first joint: from 20 mm to 10 mm, just so.
+    assert layer(straight, proximity((0.02, 0.5))) == pytest.approx(straight)
+    # From 15 mm only half as much.
+    assert layer(straight, proximity((0.015, 0.5))) == pytest.approx(action(-0.01, 0.02))
+    # Away from it, anything; and what is far does not matter.
+    assert layer(-straight, proximity((0.011, 0.5))) == pytest.approx(-straight)
+    assert layer(straight, proximity((NEAR, 9.0))) == pytest.approx(straight)
+    # Too near, or already inside: away, by `PUSH` at most.
+    for distance, out in ((0.0095, 0.0005), (0.004, PUSH), (-0.03, PUSH)):
+        assert layer(straight, proximity((distance, 0.5)))[0] == pytest.approx(out / 0.5)
+
+
+def test_the_change_is_the_smallest_one():
+    rng, layer = np.random.default_rng(0), LastLayer(keep=0.01, max_step=1.0)
+    wanted, gradient = rng.normal(0, 0.01, 7), rng.normal(0, 0.3, 7)
+    wanted -= gradient * (gradient @ wanted + 0.008) / (gradient @ gradient)  # 8 mm nearer
+    done = layer(wanted, np.array([[0.013, *gradient]]))
+    by = 0.008 - 0.003  # m: it may come 3 mm nearer
+    assert done == pytest.approx(wanted + gradient * by / (gradient @ gradient), abs=1e-7)
+
+
+def test_between_two_opposing_planes():
+    """Along them it goes on; towards either it does not."""
+    both = proximity((0.012, 0.5, 0.0), (0.012, -0.5, 0.0))
+    for towards in (-0.02, 0.02):
+        done = LastLayer(keep=0.01)(action(towards, 0.02), both)
+        assert done[1] == pytest.approx(0.02) and abs(done[0]) == pytest.approx(0.004)
+    # Where there is too little room for both, it stays about where it is.
+    tight = proximity((0.005, 0.5, 0.0), (0.005, -0.5, 0.0))
+    done = LastLayer(keep=0.01)(action(0.02, 0.02), tight)
+    assert abs(done[0]) <= PUSH / 0.5 + 1e-9 and done[1] == pytest.approx(0.02)
+
+
+def test_no_step_becomes_too_long_and_a_batch_is_each_alone():
+    rng, layer = np.random.default_rng(0), LastLayer(keep=0.01)
+    actions = rng.normal(0, 0.03, (500, 7))
+    rows = np.concatenate(
+        [rng.uniform(-0.01, 0.05, (500, 10, 1)), rng.normal(size=(500, 10, 7))], 2
+    )
+    done = layer(actions, rows)
+    assert done.dtype == np.float32 and np.linalg.norm(done, axis=1).max() < 0.03 + 1e-6
+    assert all(
+        (layer(a, row) == one).all() for a, row, one in zip(actions, rows, done, strict=True)
+    )
+    assert (actions != done).any()  # and its arguments are left alone
+    assert layer(np.zeros((0, 7)), np.zeros((0, 10, 8))).shape == (0, 7)
+
+
+def test_less_is_kept_near_a_goal_that_is_near_to_something():
+    layer = LastLayer(keep=0.01)
+    observation = {
+        "observation": np.zeros(10, np.float32),
+        "desired_goal": np.zeros(10, np.float32),
+        "proximity": np.zeros((3, 8)),
+        "goal_proximity": proximity((0.3,), (0.004,), (-0.001,)),
+    }
+    assert layer.kept(observation) == pytest.approx([0.01, 0.004, -0.001])
+    observation["observation"][0] = 0.1
+    assert layer.kept(observation) == pytest.approx([0.01, 0.007, 0.002])
+    del observation["goal_proximity"]
+    assert layer.kept(observation) == pytest.approx([0.01] * 3)
+
+
+# --- In episodes
+
+
+def run(env, query, layer, seed=0):
+    """Straight to the goal, with the layer or without: states, and the last info."""
+    target = panda.normalise(query.goal)
+
+    def act(observation):
+        return target - observation["observation"][:7]
+
+    if layer is not None:
+        act = layer.around(act, np.random.default_rng(seed))
+    observation, info = env.reset_specific(*query)
+    states, done = [observation["observation"][:7]], info["is_success"]
+    while not done:
+        observation, _, terminated, truncated, info = env.step(act(observation))
+        states.append(observation["observation"][:7])
+        done = terminated or truncated
+    return np.array(states), info
+
+
+def test_it_keeps_clear_and_gets_further():
+    queries = load_queries("random_boxes_hard", "validation")[:30]
+    env = envs.make("random_boxes_hard", proximity="obstacles", goal_type="combined")
+    reached, touched = {}, {}
+    for name, layer in {
+        "bare": None,
+        "layer": LastLayer(way_out=False),
+        "way out": LastLayer(),
+    }.items():
+        infos = [run(env, query, layer)[1] for query in queries]
+        reached[name] = sum(info["is_success"] for info in infos)
+        touched[name] = sum(info["collision_so_far"] for info in infos)
+    env.close()
+    assert reached["bare"] < reached["layer"] < reached["way out"]
+    assert touched["layer"] < 0.75 * touched["bare"]
+
+
+def test_out_of_a_dead_end():
+    """It stands for `PATIENCE` steps, is away for `DETOUR`, and a seed gives the same way."""
+    layer, asked = LastLayer(), []
+
+    def stay(observation):
+        asked.append(None)
+        return np.zeros(7)
+
+    def walk(seed):
+        act, state, moves = layer.around(stay, np.random.default_rng(seed)), np.zeros(10), []
+        for _ in range(PATIENCE + DETOUR + 1):
+            moves.append(act({"observation": state, "proximity": proximity((1.0,))}))
+            state[:7] += moves[-1]
+        return np.array(moves)
+
+    moves = walk(1)
+    assert not moves[:PATIENCE].any() and not moves[-1].any()
+    detour = moves[PATIENCE:-1]
+    assert len(detour) == DETOUR and (detour == detour[0]).all()
+    assert np.linalg.norm(detour[0]) == pytest.approx(0.03)
+    assert len(asked) == PATIENCE + 1
+    assert (walk(1) == moves).all() and (walk(2) != moves).any()
