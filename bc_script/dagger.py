@@ -22,7 +22,7 @@ import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-from tqdm import trange
+from tqdm import tqdm
 
 from demo_generation.roadmaps import Roadmap
 from envs import panda, protocol, runs, seeing
@@ -255,24 +255,22 @@ class Examples:
     def visit(self, actor, env, last_layer, step):
         """Examples of a round of DAgger, and the share of its queries that the policy reached."""
         rng = np.random.default_rng([self.args.seed, ROUND, step])
-        parts, reached = [], []
+        parts, reached, visited = [], [], []
+
+        def act(**observed):
+            visited.append(observed["observation"][0, :7].cpu().numpy())
+            return actor(**observed)
+
         while len(reached) < self.args.round_queries:
             number, first, last = self._choose(rng, 1)
             scene, ends = self.paths.scenes[number], self.paths.points[np.r_[first, last]]
-            if not seeing.true_checker(scene).is_free(ends, 0.001).all():
-                continue
-            start, goal = panda.denormalise(ends).astype(np.float32)
-            visited = []
-
-            def act(visited=visited, **observed):
-                visited.append(observed["observation"][0, :7].cpu().numpy())
-                return actor(**observed)
-
-            result = protocol.evaluate(
-                act, [env], [Query(start, goal, scene)], self.device, last_layer
-            )
+            if not seeing.true_checker(scene).is_free(ends, margin=0.001).all():
+                continue  # rounded, the environment might refuse it
+            query = Query(*panda.denormalise(ends).astype(np.float32), scene)
+            visited.clear()
+            result = protocol.evaluate(act, [env], [query], self.device, last_layer)
             reached.append(result["success_rate"])
-            states = np.array(visited).reshape(-1, 7)
+            states = np.array(visited)
             chances = np.ones(len(states))
             moved = np.linalg.norm(states[PATIENCE:] - states[:-PATIENCE], axis=1)
             chances[PATIENCE:][moved < PROGRESS] = STUCK
@@ -281,11 +279,9 @@ class Examples:
             goals = np.repeat(ends[1:], count, axis=0)
             directions, lengths = Roadmap(scene, rng).labels(states, goals, rng)
             kept = lengths > 0.0  # there is a way, and it is not at the goal
-            parts.append(
-                self._examples(number, *(x[kept] for x in (states, goals, directions, lengths)))
-            )
-        examples = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        return examples, np.mean(reached)
+            labelled = (x[kept] for x in (states, goals, directions, lengths))
+            parts.append(self._examples(number, *labelled))
+        return joined(parts), np.mean(reached)
 
     def _choose(self, rng, number):
         """A scene, and the first and the last point of some of its paths (number,)."""
@@ -307,6 +303,11 @@ class Examples:
             "scene": np.full(len(states), scene),
         }
         return {name: torch.as_tensor(x, device=self.device) for name, x in examples.items()}
+
+
+def joined(parts):
+    """Examples of several dicts in one."""
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
 def some(examples, number):
@@ -355,6 +356,8 @@ if __name__ == "__main__":
     for name in ("total_updates", "batch_size", "examples_per_update", "eval_every"):
         if getattr(args, name) < 1:
             sys.exit(f"--{name.replace('_', '-')} must be at least 1")
+    if args.encoder != "oracle" and not args.encoder.startswith("points"):
+        sys.exit(f"--encoder must be `oracle` or `points`, got {args.encoder!r}")
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:
         sys.exit("--pool-size must be at least --examples-per-update")
@@ -385,10 +388,10 @@ if __name__ == "__main__":
     latents = torch.as_tensor(eval_envs[0].encoder.encode_demos(paths), device=device)
     examples = Examples(paths, args, device)
     pool = [None] * num_draws
-    for number in trange(progress["updates"], progress["updates"] + num_draws, desc="examples"):
+    firsts = range(progress["updates"], progress["updates"] + num_draws)
+    for number in tqdm(firsts, desc="drawing examples", mininterval=2.0):
         pool[number % num_draws] = examples.draw(number)
-    pool = {name: torch.stack([part[name] for part in pool]) for name in pool[0]}
-    flat_pool = {name: tensor.flatten(0, 1) for name, tensor in pool.items()}  # the same memory
+    pool = joined(pool)
 
     writer = runs.summary_writer(run, args, progress["updates"])
     seconds_before = progress["seconds"]
@@ -401,16 +404,17 @@ if __name__ == "__main__":
         if args.anneal:
             remaining = 1.0 - progress["updates"] / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
-        old = int(args.round_share * args.batch_size) if visited else 0
-        batch = some(flat_pool, args.batch_size - old)
-        if old:
-            more = some(visited, old)
-            batch = {name: torch.cat([tensor, more[name]]) for name, tensor in batch.items()}
+        share = args.round_share if visited else 0.0
+        count = args.batch_size - int(share * args.batch_size)
+        batch = some(pool, count)
+        if count < args.batch_size:
+            batch = joined([batch, some(visited, args.batch_size - count)])
         batch = with_scene(batch, latents, actor.num_numbers)
         direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
         polyak_update(average_parameters, parameters, args.policy_average)
+        oldest = progress["updates"] % num_draws * args.examples_per_update
         for name, tensor in drawn.result().items():
-            pool[name][progress["updates"] % num_draws] = tensor
+            pool[name][oldest : oldest + len(tensor)] = tensor
         progress["updates"] += 1
         bar.update()
 
@@ -424,10 +428,7 @@ if __name__ == "__main__":
         # ALGO LOGIC: a round of DAgger
         if args.round_every and step % args.round_every == 0 and step < args.total_updates:
             found, reached = examples.visit(actor_average, eval_envs[0], last_layer, step)
-            visited |= {
-                name: torch.cat([visited[name], new]) if visited else new
-                for name, new in found.items()
-            }
+            visited |= joined([visited, found]) if visited else found
             writer.add_scalar("charts/round_success", reached, step)
 
         # Evaluate, keep the best policy, checkpoint

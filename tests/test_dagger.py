@@ -57,8 +57,7 @@ def some(request, folder):
     paths = load_roadmap_paths(folder)
     args = dagger.Args(encoder=request.param, token_size=16, hidden_size=32, bf16=False)
     examples = dagger.Examples(paths, args, "cpu")
-    parts = [examples.draw(number) for number in range(6)]
-    batch = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    batch = dagger.joined([examples.draw(number) for number in range(6)])
     assert set(batch["scene"].tolist()) == {0, 2}
     torch.manual_seed(1)
     actor = dagger.Actor(args)
@@ -262,6 +261,7 @@ def test_a_run_killed_and_resumed_its_policy_by_name(tmp_path, folder):
     [
         (["--paths", "nowhere"], "--paths: nowhere"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
+        (["--encoder", "vae"], "--encoder must be `oracle` or `points`, got 'vae'"),
         (["--batch-size", "0"], "--batch-size must be at least 1"),
         (["--pool-size", "5"], "--pool-size must be at least --examples-per-update"),
     ],
