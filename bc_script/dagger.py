@@ -106,8 +106,8 @@ class Args:
     """queries of a round, each in a scene of the paths"""
     round_labels: int = 16
     """of the states that the policy came to on a query, how many are labelled"""
-    round_share: float = 0.25
-    """share of such states in batches, from the first round on"""
+    round_weight: float = 5.0
+    """how much likelier such a state is in a batch than an example of the pool"""
 
     # Evaluation and bookkeeping
     eval_every: int = 3_000
@@ -404,11 +404,12 @@ if __name__ == "__main__":
         if args.anneal:
             remaining = 1.0 - progress["updates"] / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
-        share = args.round_share if visited else 0.0
-        count = args.batch_size - int(share * args.batch_size)
-        batch = some(pool, count)
-        if count < args.batch_size:
-            batch = joined([batch, some(visited, args.batch_size - count)])
+        batch = some(pool, args.batch_size)
+        if visited:
+            weight = args.round_weight * len(visited["scene"])
+            count = int(args.batch_size * weight / (weight + len(pool["scene"])))
+            batch = joined([some(visited, count), batch])
+            batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
         batch = with_scene(batch, latents, actor.num_numbers)
         direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
         polyak_update(average_parameters, parameters, args.policy_average)
