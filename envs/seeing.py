@@ -20,7 +20,7 @@ CELL = 0.025
 """m. Of the points in a cube of this size, one is kept: some 1,500 on `random_boxes_hard`."""
 POINT_RADIUS = 0.01
 """m. A point stands for what is around it: with this radius there is hardly a hole in a surface."""
-_CACHED_SCENES, _CACHED_CHECKERS = 20_000, 256  # some 20 and 500 kB each
+_CACHED_SCENES, _CACHED_CHECKERS = 20_000, 256  # some 20 and 60 kB each
 
 
 @functools.cache
