@@ -74,8 +74,9 @@ class Args:
     evaluated and saved (1: no averaging)"""
     pool_size: int = 200_000
     """examples at hand, of which batches are drawn"""
-    examples_per_update: int = 96
-    """new examples per update, all of one scene; they replace the oldest"""
+    examples_per_update: int = 384
+    """new examples per update, all of one scene; they replace the oldest. With an eighth of a batch
+    they are learned by heart (docs/training.md)"""
     noise: float = 0.03
     """standard deviation of the configurations drawn around paths (normalised, each joint)"""
     length_weight: float = 0.1
