@@ -22,6 +22,11 @@ def train_bc():
     runpy.run_module("bc_script.bc", run_name="__main__", alter_sys=True)
 
 
+def train_dagger():
+    """Imitation of a roadmap planner: `bc_script/dagger.py`."""
+    runpy.run_module("bc_script.dagger", run_name="__main__", alter_sys=True)
+
+
 def collect_demonstrations():
     """Collecting demonstrations: `demo_generation/collect.py`."""
     runpy.run_module("demo_generation.collect", run_name="__main__", alter_sys=True)

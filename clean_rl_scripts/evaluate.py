@@ -73,7 +73,7 @@ from envs import panda, workers
 from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
 from envs.files import check_writable, write_atomically
 from envs.last_layer import LastLayer
-from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy
+from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy, own_layer
 from envs.scenes import Scene
 from envs.tasks import get_task, task_name
 
@@ -106,7 +106,8 @@ class Args:
     """what `planner`, `via-points` and the last layer know of the scene: `points` that sensors see;
     by default the true obstacles"""
     keep_distance: float | None = None
-    """put a last layer around the policy that keeps this distance (m), e.g. 0.01"""
+    """put a last layer around the policy that keeps this distance (m), e.g. 0.01; by default the
+    one that is part of the policy, if it has one (0: none at all)"""
     way_out: bool = True
     """the last layer also leaves dead ends, by a detour into a random direction"""
     seed: int = 0
@@ -325,7 +326,8 @@ def evaluate(
         time_limit: seconds that `planner` may search per query, > 0.
         encoder: `points`: `planner`, `via-points` and the last layer know only what sensors see;
             None: the true obstacles.
-        last_layer: an `envs.last_layer.LastLayer` around the policy.
+        last_layer: an `envs.last_layer.LastLayer` around the policy; None: the one that is part of
+            it, if it has one; False: none.
         workers: processes. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
         env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
@@ -397,8 +399,10 @@ def _prepare(
                     )
                 env, goal_type = trained, trained["goal_type"]
         env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
-        if last_layer is not None:
-            env["proximity"] = encoder or "obstacles"
+        if last_layer is None:
+            last_layer = own_layer(policy)
+        if last_layer:
+            env["proximity"] = encoder or env.get("proximity", "obstacles")
         elif encoder is not None and policy not in PLANNING:
             raise EvaluationError(
                 "encoder is for via-points, planner and a last layer: a trained policy has its own"
@@ -486,7 +490,7 @@ def _summary(job, outcomes):
             if job.env.get(name, standard) != standard
         },
         "encoder": job.encoder,
-        "last_layer": job.last_layer and asdict(job.last_layer),
+        "last_layer": asdict(job.last_layer) if job.last_layer else None,
         "seed": job.seed if job.policy in ("random", *PLANNING) or job.last_layer else None,
         "tries": job.tries if job.policy == "via-points" else None,
         "time_limit": job.time_limit if job.policy == "planner" else None,
@@ -559,6 +563,13 @@ def _draw(job):
     return png.getvalue()
 
 
+def _last_layer(args):
+    """As `evaluate` takes it."""
+    if not args.keep_distance:
+        return None if args.keep_distance is None else False
+    return LastLayer(args.keep_distance, args.way_out)
+
+
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 for arguments that make no sense."""
     args = tyro.cli(Args, args=arguments, description=__doc__)
@@ -578,7 +589,7 @@ def main(arguments=None):
             args.tries,
             args.time_limit,
             args.encoder,
-            args.keep_distance and LastLayer(args.keep_distance, args.way_out),
+            _last_layer(args),
             args.workers,
             env=None,
         )

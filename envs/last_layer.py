@@ -97,6 +97,21 @@ class LastLayer:
         return np.minimum(self.keep, observation["goal_proximity"][:, 0] + GROWTH * away)
 
 
+def layer_of(metadata):
+    """The `LastLayer` that is part of a policy, from its file's metadata; None: it has none.
+
+    Its options are in `last_layer`, a dict with `keep` and `way_out`. Raises ValueError: they make
+    no sense.
+    """
+    options = metadata.get("last_layer")
+    if options is None:
+        return None
+    try:
+        return LastLayer(float(options["keep"]), bool(options["way_out"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"its last layer makes no sense: {options!r}") from error
+
+
 @compiled
 def _project(actions, proximity, keep, max_step):
     """Change actions (n, 7) in place."""

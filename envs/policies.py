@@ -14,7 +14,8 @@
 - planner: OMPL's RRT-Connect plans, within a time limit, and the plan is followed.
 
 The last two know the true obstacles, or only the points that sensors see of them. Around any of
-them there may be a last layer, which keeps the arm away from things (`envs.last_layer`).
+them there may be a last layer, which keeps the arm away from things (`envs.last_layer`); a trained
+policy may have one of its own.
 """
 
 import importlib.resources
@@ -98,6 +99,14 @@ def find_policy(name):
     return path, _load(path)[1]
 
 
+def own_layer(policy):
+    """The `envs.last_layer.LastLayer` that is part of a policy; None if it has none.
+
+    `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
+    """
+    return None if callable(policy) or policy in UNTRAINED else _load(policy)[2]
+
+
 def make_policy(
     policy, env, seed=0, tries=TRIES, time_limit=TIME_LIMIT, encoder=None, last_layer=None
 ):
@@ -115,14 +124,17 @@ def make_policy(
         time_limit: seconds that `planner` may search per query.
         encoder: `points`: `via-points` and `planner` know only what sensors see
             (`envs.seeing`); None: the true obstacles.
-        last_layer: an `envs.last_layer.LastLayer` around the policy. The environment must have
-            `proximity` then.
+        last_layer: an `envs.last_layer.LastLayer` around the policy; None: the one that is part of
+            a trained policy, if it has one; False: none. With one, the environment must have
+            `proximity`.
 
     Raises:
         PolicyError: the policy cannot act in this environment.
     """
     begin = _make_policy(policy, env, seed, tries, time_limit, encoder)
     if last_layer is None:
+        last_layer = own_layer(policy)
+    if not last_layer:
         return begin
     if "proximity" not in env.observation_space.spaces:
         raise PolicyError("a last layer needs proximity in observations: envs.make(proximity=...)")
@@ -222,19 +234,23 @@ def _follow(path):
 
 
 def _load(path):
-    """A policy network, and the arguments of the environment it was trained in."""
+    """A policy network, the arguments of the environment it was trained in, its last layer."""
     from envs.exported_networks import NetworkError, load_network
+    from envs.last_layer import layer_of
 
     try:
         network = load_network(path)
+        last_layer = layer_of(network.metadata)
     except NetworkError as error:
         raise PolicyError(str(error)) from error
+    except ValueError as error:
+        raise PolicyError(f"{path}: {error}") from error
     trained = network.metadata.get("env")
     if network.metadata.get("kind") != "policy" or not isinstance(trained, dict):
         raise PolicyError(f"{path}: a network, but not a policy")
     if "goal_type" not in trained:
         raise PolicyError(f"{path}: does not say which goal type it was trained with")
-    return network, {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
+    return network, {name: trained[name] for name in ENV_ARGUMENTS if name in trained}, last_layer
 
 
 def _trained(path, env):
@@ -243,7 +259,7 @@ def _trained(path, env):
 
     from envs.exported_networks import NetworkError
 
-    network, _ = _load(path)
+    network = _load(path)[0]
 
     # One observation at a time: in a batch its last bits would depend on the batch's size, for a
     # gain of a tenth of the time at most.

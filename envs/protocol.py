@@ -19,6 +19,7 @@ import envs
 from envs.datasets import load_queries
 from envs.demo_episodes import DemoQueriesWrapper, load_demos_for
 from envs.exported_networks import load_network, save_network
+from envs.last_layer import layer_of
 from envs.runs import write_json
 
 NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
@@ -145,34 +146,40 @@ def log_episode(writer, step, episode_return, info, recent_success):
 
 
 @torch.no_grad()
-def evaluate(policy, envs, queries, device):
+def evaluate(policy, envs, queries, device, last_layer=None):
     """Run a deterministic policy on every query, each env one at a time; mean results.
 
     Args:
-        policy: from `observation`, `achieved_goal`, `desired_goal`, tensors (N, ...), to actions
-            (N, 7); a module or a program.
+        policy: from `observation`, `achieved_goal`, `desired_goal` and what else is observed,
+            tensors (N, ...), to actions (N, 7); a module or a program.
         envs: the environments to do it in.
-        queries: `envs.datasets.Queries`.
+        queries: `envs.datasets.Queries`, or a list of `Query`.
         device: of the policy.
+        last_layer: an `envs.last_layer.LastLayer` around the policy, or None.
 
     Returns:
         A dict of floats: `success_rate`, `clean_success_rate` (without a touch), `collision_rate`
         and `episode_length` in steps.
     """
     waiting = iter(range(len(queries)))
-    running, results = {}, []
+    running, proposed, acts, results = {}, {}, {}, []  # env -> observation, action, function
 
     def start(env):
         i = next(waiting, None)
         running.pop(env, None)
         if i is not None:
             running[env] = env.reset_specific(*queries[i])[0]
+            acts[env] = lambda observation: proposed[env]
+            if last_layer is not None:
+                acts[env] = last_layer.around(acts[env], np.random.default_rng([0, i]))
 
     for env in envs:
         start(env)
     while running:
         actions = policy(**stack(list(running.values()), device)).cpu().numpy()
         for env, action in zip(list(running), actions, strict=True):
+            proposed[env] = action
+            action = acts[env](running[env])
             running[env], _, terminated, truncated, info = env.step(action)
             if terminated or truncated:
                 results.append(
@@ -189,15 +196,21 @@ def evaluate(policy, envs, queries, device):
 
 
 @torch.no_grad()
-def picture_of_rollout(policy, env, query, device, frames=8):
+def picture_of_rollout(policy, env, query, device, last_layer=None, frames=8):
     """An image strip (height, frames * width, 3), uint8, of the policy on one query.
 
     `env`: one that renders.
     """
+
+    def act(observation):
+        return policy(**stack([observation], device))[0].cpu().numpy()
+
+    if last_layer is not None:
+        act = last_layer.around(act, np.random.default_rng([0, 0]))
     observation, _ = env.reset_specific(*query)
     pictures, done = [env.render()], False
     while not done:
-        action = policy(**stack([observation], device))[0].cpu().numpy()
+        action = act(observation)
         observation, _, terminated, truncated, info = env.step(action)
         done = terminated or truncated
         if info["elapsed_steps"] % 10 == 0 or done:
@@ -206,11 +219,13 @@ def picture_of_rollout(policy, env, query, device, frames=8):
     return np.concatenate([pictures[i] for i in chosen], axis=1)
 
 
-def validate(policy, envs, queries, device, writer, step, progress):
+def validate(policy, envs, queries, device, writer, step, progress, last_layer=None):
     """`evaluate` on validation queries, with results and a picture of the first in TensorBoard.
 
+    A policy with a last layer is evaluated without it, too (`eval/..._without_layer`).
+
     Args:
-        policy, queries, device: as for `evaluate`.
+        policy, queries, device, last_layer: as for `evaluate`.
         envs: of `make_eval_envs`.
         writer: TensorBoard's.
         step: of the training.
@@ -219,10 +234,13 @@ def validate(policy, envs, queries, device, writer, step, progress):
     Returns:
         The success rate.
     """
-    result = evaluate(policy, envs, queries, device)
+    result = evaluate(policy, envs, queries, device, last_layer)
     for name, value in result.items():
         writer.add_scalar(f"eval/{name}", value, step)
-    picture = picture_of_rollout(policy, envs[0], queries[0], device)
+    if last_layer is not None:
+        for name, value in evaluate(policy, envs, queries, device).items():
+            writer.add_scalar(f"eval/{name}_without_layer", value, step)
+    picture = picture_of_rollout(policy, envs[0], queries[0], device, last_layer)
     writer.add_image("eval/rollout", picture, step, dataformats="HWC")
     success = result["success_rate"]
     if success > progress["best_success"]:
@@ -230,19 +248,23 @@ def validate(policy, envs, queries, device, writer, step, progress):
     return success
 
 
-def save_policy(run, policy, envs, device, args, env_arguments, step):
+def save_policy(run, policy, envs, device, args, env_arguments, step, last_layer=None):
     """Write `policy.pt` for `evaluate.py` and others.
 
     Args:
         run: the run's folder.
-        policy: the module, `forward(observation, achieved_goal, desired_goal)`.
+        policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else is
+            observed.
         envs: some of its environments, for examples of observations.
         device: of the policy.
         args: the flags; `task`, `exp_name` and `seed` are noted in the file.
         env_arguments: of `envs.make`, noted too: the policy is evaluated with them.
         step: of the training.
+        last_layer: an `envs.last_layer.LastLayer` that is part of the policy, or None.
     """
     metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
+    if last_layer is not None:
+        metadata["last_layer"] = {"keep": last_layer.keep, "way_out": last_layer.way_out}
     metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
     example = stack([env.reset(seed=0)[0] for env in envs[:2]], device)
     save_network(run / "policy.pt", policy, example, metadata)
@@ -267,7 +289,8 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
     policy = load_network(run / "policy.pt").to(device)
     own = {name: value for name, value in env_arguments.items() if name not in RULES}
     test_envs = make_eval_envs(args.task, **own)
-    result = evaluate(policy, test_envs, queries, device)
+    last_layer = layer_of(policy.metadata)
+    result = evaluate(policy, test_envs, queries, device, last_layer)
     rules = {name: getattr(test_envs[0], name) for name in RULES}
     trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}
     result |= {"rules": rules, "rules_in_training": trained}

@@ -20,7 +20,7 @@ CELL = 0.025
 """m. Of the points in a cube of this size, one is kept: some 1,500 on `random_boxes_hard`."""
 POINT_RADIUS = 0.01
 """m. A point stands for what is around it: with this radius there is hardly a hole in a surface."""
-_CACHED_SCENES = 256
+_CACHED_SCENES, _CACHED_CHECKERS = 20_000, 256  # some 20 and 60 kB each
 
 
 @functools.cache
@@ -42,13 +42,13 @@ def seen_points(scene):
     return points[np.sort(kept)]
 
 
-@functools.lru_cache(_CACHED_SCENES)
+@functools.lru_cache(_CACHED_CHECKERS)
 def seen_checker(scene):
     """A `CollisionChecker` of table, floor, and what is seen of a `Scene`'s obstacles."""
     return CollisionChecker(replace(scene, obstacles=()), seen_points(scene), POINT_RADIUS)
 
 
-@functools.lru_cache(_CACHED_SCENES)
+@functools.lru_cache(_CACHED_CHECKERS)
 def true_checker(scene):
     """The `CollisionChecker` of a `Scene`."""
     return CollisionChecker(scene)

@@ -118,6 +118,21 @@ class SceneEncodingWrapper(_ObservingWrapper):
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
 
+def link_proximity(checker, states):
+    """`proximity` as `ProximityWrapper` has it, of normalised configurations: float32 (..., 10, 8).
+
+    Args:
+        checker: an `envs.collision.CollisionChecker`.
+        states: (..., 7).
+    """
+    # float32 may round a limit to just beyond it.
+    nearest = checker.nearest(np.clip(states, -1.0, 1.0), self_collisions=False)
+    near = (nearest.distance < PROXIMITY_RANGE)[..., None]
+    distance = np.minimum(nearest.distance, PROXIMITY_RANGE)[..., None]
+    proximity = np.concatenate([distance, np.where(near, nearest.gradient, 0.0)], axis=-1)
+    return proximity.astype(np.float32)
+
+
 class ProximityWrapper(_ObservingWrapper):
     """Adds `proximity` to the observation: how far each link is from the nearest thing.
 
@@ -143,22 +158,13 @@ class ProximityWrapper(_ObservingWrapper):
         )
         self._goal, self._of_goal = None, None
 
-    def _proximity(self, state):
-        # float32 may round a limit to just beyond it.
-        state = np.clip(state, -1.0, 1.0)
-        nearest = self._checker_of(self.unwrapped.scene).nearest(state, self_collisions=False)
-        proximity = np.zeros((10, 8), np.float32)
-        proximity[:, 0] = np.minimum(nearest.distance, PROXIMITY_RANGE)
-        near = nearest.distance < PROXIMITY_RANGE
-        proximity[near, 1:] = nearest.gradient[near]
-        return proximity
-
     def _with_more(self, observation):
-        more = {"proximity": self._proximity(observation["observation"][: panda.NUM_JOINTS])}
+        checker = self._checker_of(self.unwrapped.scene)
+        more = {"proximity": link_proximity(checker, observation["observation"][:7])}
         if self.goal_type != "ee":
-            goal = observation["desired_goal"][: panda.NUM_JOINTS]
+            goal = observation["desired_goal"][:7]
             key = self.unwrapped.scene, goal.tobytes()
             if self._goal != key:
-                self._goal, self._of_goal = key, self._proximity(goal)
+                self._goal, self._of_goal = key, link_proximity(checker, goal)
             more["goal_proximity"] = self._of_goal.copy()
         return {**observation, **more}

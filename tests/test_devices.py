@@ -8,7 +8,7 @@ import json
 
 import pytest
 import torch
-from trainers import PATHS, command, run_here
+from trainers import PATHS, TRAINERS, command, run_here
 
 import envs.protocol
 
@@ -36,7 +36,7 @@ def flags(trainer):
 
 
 @pytest.mark.parametrize("seeing", [False, True])
-@pytest.mark.parametrize("trainer", PATHS)
+@pytest.mark.parametrize("trainer", TRAINERS)
 def test_update_evaluation_and_resume_on_another_device(
     trainer, seeing, tmp_path, meta, monkeypatch
 ):
@@ -79,7 +79,7 @@ class OneType(torch.overrides.TorchFunctionMode):
         return function(*args, **kwargs)
 
 
-@pytest.mark.parametrize("trainer", PATHS)
+@pytest.mark.parametrize("trainer", TRAINERS)
 def test_no_kernel_gets_two_types(trainer, tmp_path, monkeypatch):
     few = [flag for flag in flags(trainer) if flag not in ("--device", "meta")]
     given = command(trainer, tmp_path, *few, "--bf16", *(["True"] if trainer != "bc" else []))[1:]

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from trainers import PATHS, ROOT, command, load, run_script
+from trainers import PATHS, ROOT, TRAINERS, command, load, run_script
 
 import envs
 from envs.datasets import load_demos
@@ -81,7 +81,7 @@ def flags(trainer):
     return more if trainer == "bc" else [*more, "--demo-prob", "1"]
 
 
-@pytest.mark.parametrize("trainer", PATHS)
+@pytest.mark.parametrize("trainer", TRAINERS)
 def test_trained_resumed_and_evaluated(trainer, tmp_path):
     run = run_script(trainer, tmp_path / "whole", *flags(trainer), "--goal-type", "combined")
     program = torch.load(run / "policy.pt", weights_only=True)
@@ -113,7 +113,7 @@ def test_trained_resumed_and_evaluated(trainer, tmp_path):
     assert all(torch.equal(one[key], other[key]) for key in one)
 
 
-@pytest.mark.parametrize("trainer", PATHS)
+@pytest.mark.parametrize("trainer", TRAINERS)
 def test_what_is_no_encoder_is_refused(trainer, tmp_path):
     (tmp_path / "encoder.pt").write_text("nothing")
     given = command(trainer, tmp_path / "runs", "--encoder", str(tmp_path / "encoder.pt"))

@@ -10,6 +10,7 @@ import torch
 import envs
 from envs import protocol
 from envs.datasets import load_queries
+from envs.last_layer import LastLayer
 
 
 class Toward(torch.nn.Module):
@@ -49,6 +50,36 @@ def test_what_is_counted_is_what_happens_query_by_query(number):
             "episode_length": np.mean([steps for _, _, steps in outcomes]),
         }
     )
+
+
+def test_a_last_layer_has_its_own_state_in_every_episode():
+    queries = load_queries("random_boxes_hard", "validation")[:7]
+    straight, layer = Toward(0.03), LastLayer(0.012)
+
+    def policy(observation, achieved_goal, desired_goal, **_):
+        return straight(observation, achieved_goal, desired_goal)
+
+    several, one = (
+        protocol.make_envs("random_boxes_hard", number, goal_type="config", proximity="obstacles")
+        for number in (3, 1)
+    )
+    found, outcomes = protocol.evaluate(policy, several, queries, "cpu", layer), []
+    for i, query in enumerate(queries):
+
+        def act(seen):
+            return policy(**protocol.stack([seen], "cpu"))[0].numpy()
+
+        act = layer.around(act, np.random.default_rng([0, i]))
+        observation, _ = one[0].reset_specific(*query)
+        over = False
+        while not over:
+            observation, _, terminated, truncated, info = one[0].step(act(observation))
+            over = terminated or truncated
+        outcomes.append((info["is_success"], info["elapsed_steps"]))
+    success, steps = np.mean(outcomes, axis=0)
+    assert found["success_rate"] == success and found["episode_length"] == steps
+    bare = protocol.evaluate(policy, several, queries, "cpu")
+    assert found["collision_rate"] < bare["collision_rate"]
 
 
 def result_of(run, capsys, **env_arguments):

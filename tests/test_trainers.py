@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import PATHS, command, load, run_here, run_script
+from trainers import PATHS, TRAINERS, command, load, run_here, run_script
 
 import envs
 from envs.datasets import demo_path
@@ -19,7 +19,7 @@ from envs.exported_networks import load_network
 from envs.protocol import stack
 
 
-@pytest.fixture(params=PATHS)
+@pytest.fixture(params=TRAINERS)
 def trainer(request):
     return request.param
 

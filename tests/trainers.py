@@ -11,11 +11,17 @@ PATHS = {
     "sac_her_mp": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
     "td3_her_mp": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
     "bc": ROOT / "bc_script" / "bc.py",
+    "dagger": ROOT / "bc_script" / "dagger.py",
 }
+# Those that need nothing but a task; dagger.py needs roadmap paths.
+TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
 TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
 TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1800"
 TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --eval-queries 3"
 TINY_BC += " --test-queries 4 --total-updates 1800"
+TINY_DAGGER = "--hidden-size 16 --token-size 16 --num-blocks 1 --batch-size 16 --pool-size 100"
+TINY_DAGGER += " --examples-per-update 10 --total-updates 40 --round-every 15 --round-queries 1"
+TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1"
 
 
 def load(trainer):
@@ -29,7 +35,7 @@ def load(trainer):
 
 def command(trainer, folder, *flags):
     """A run of seconds; later flags win."""
-    tiny = (TINY_BC if trainer == "bc" else TINY).split()
+    tiny = {"bc": TINY_BC, "dagger": TINY_DAGGER}.get(trainer, TINY).split()
     return [sys.executable, str(PATHS[trainer]), "--runs-dir", str(folder), *tiny, *flags]
 
 

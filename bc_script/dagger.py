@@ -1,0 +1,451 @@
+"""Imitation of a roadmap planner, with rounds of DAgger. One file: read it top to bottom.
+
+    python -m demo_generation.roadmaps --task random_boxes_hard --scenes 1500 --output roadmaps
+    python bc_script/dagger.py --paths roadmaps --encoder oracle
+
+A policy for scenes that it never saw. It learns the direction in which a roadmap's smoothed path
+goes on, from configurations anywhere on such paths, and from those that it came to by itself
+(DAgger: Ross et al., 2011). It is told what is there (`--encoder`), and how far each link is from
+the nearest thing, here and at the goal (`envs.wrappers.ProximityWrapper`). Part of it is a last
+layer that keeps links away from things (`envs.last_layer`). To make an algorithm of your own, copy
+this file and change the parts under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are
+those of `bc_script/bc.py`.
+"""
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+from tqdm import tqdm
+
+from demo_generation.roadmaps import Roadmap
+from envs import panda, protocol, runs, seeing
+from envs.datasets import MAX_STEP, DatasetError
+from envs.demo_episodes import observed
+from envs.last_layer import PATIENCE, PROGRESS, LastLayer
+from envs.queries import Query
+from envs.roadmap_paths import load_roadmap_paths
+from envs.scenes import ROW
+from envs.tasks import task_name
+from envs.wrappers import link_proximity
+
+
+@dataclass
+class Args:
+    # The run
+    exp_name: str = "dagger"
+    """name of the experiment, part of the run's folder"""
+    seed: int = 1
+    """seed of everything random; the same seed gives the same run on the same machine and device"""
+    runs_dir: Path = Path("runs")
+    """the run's folder is made in here: TensorBoard events, checkpoint, policy.pt, result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint; its own flags are used"""
+    device: str = "cpu"
+    """`cpu` or `cuda`"""
+    threads: int = 1
+    """torch threads; examples are drawn in one more"""
+
+    # The task (the paper's MDP; `docs/environment.md`)
+    task: str = "random_boxes_hard"
+    """task to evaluate on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
+    goal_type: Literal["config", "combined"] = "combined"
+    """what the goal is: configuration, or that and the end-effector's position"""
+    paths: Path = Path("roadmaps")
+    """folder of roadmap paths to learn from (demo_generation.roadmaps), in whatever scenes"""
+
+    # The algorithm
+    total_updates: int = 12_000
+    """batches of the whole run"""
+    batch_size: int = 768
+    """examples per batch"""
+    learning_rate: float = 1e-3
+    """learning rate (Adam) at the start"""
+    anneal: bool = True
+    """let the learning rate fall linearly, to zero at the end"""
+    policy_average: float = 0.003
+    """share of the policy that moves into its running average per update; the average is what is
+    evaluated and saved (1: no averaging)"""
+    pool_size: int = 200_000
+    """examples at hand, of which batches are drawn"""
+    examples_per_update: int = 384
+    """new examples per update, all of one scene; they replace the oldest. With an eighth of a batch
+    they are learned by heart (docs/training.md)"""
+    noise: float = 0.03
+    """standard deviation of the configurations drawn around paths (normalised, each joint)"""
+    length_weight: float = 0.1
+    """of the second loss, that of the remaining length"""
+    encoder: str = "oracle"
+    """what the policy sees of the scene: `oracle`, the obstacles themselves, or `points` of them
+    that four sensors see; proximity is that of the same"""
+    token_size: int = 128
+    """width of the layers that look at one obstacle or point each"""
+    hidden_size: int = 384
+    """width of the residual blocks"""
+    num_blocks: int = 3
+    """number of residual blocks"""
+    bf16: bool | None = None
+    """train with hidden products in bfloat16; by default where the hardware has it"""
+    velocities: ClassVar[bool] = False  # paths have none
+
+    # The last layer
+    keep_distance: float = 0.01
+    """m, that it keeps"""
+    way_out: bool = True
+    """whether it leaves dead ends"""
+
+    # DAgger
+    round_every: int = 3_000
+    """updates between rounds (0: none)"""
+    round_queries: int = 50
+    """queries of a round, each in a scene of the paths"""
+    round_labels: int = 16
+    """of the states that the policy came to on a query, how many are labelled"""
+    round_weight: float = 5.0
+    """how much likelier such a state is in a batch than an example of the pool"""
+
+    # Evaluation and bookkeeping
+    eval_every: int = 3_000
+    """updates between evaluations on validation queries; the best policy is kept"""
+    eval_queries: int = 200
+    """validation queries per evaluation"""
+    test_queries: int = 1_000
+    """test queries for the best policy at the end"""
+
+
+# ALGO LOGIC: the policy
+class Hidden(nn.Linear):
+    """A linear layer whose product is computed in bfloat16 in training, if `bf16`."""
+
+    def __init__(self, num_inputs, num_outputs, bf16):
+        super().__init__(num_inputs, num_outputs)
+        self.bf16 = bf16
+
+    def forward(self, x):
+        if not (self.bf16 and self.training):
+            return super().forward(x)
+        return F.linear(x.bfloat16(), self.weight.bfloat16(), self.bias.bfloat16()).float()
+
+
+class Block(nn.Module):
+    """A residual block."""
+
+    def __init__(self, size, bf16):
+        super().__init__()
+        self.norm = nn.LayerNorm(size)
+        self.first, self.second = Hidden(size, size, bf16), Hidden(size, size, bf16)
+
+    def forward(self, x):
+        return x + self.second(F.relu(self.first(self.norm(x))))
+
+
+class Actor(nn.Module):
+    """Straight to the goal, and a learned direction added to that.
+
+    What is seen of the scene are tokens, obstacles or points, zeros where there is none. Each is
+    looked at together with all that is known of the arm; of what comes out, the maximum counts
+    (PointNet: Qi et al., 2017).
+    """
+
+    def __init__(self, args):
+        super().__init__()
+        self.num_numbers = 3 if args.encoder.startswith("points") else 1 + ROW  # of a token
+        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        self.register_buffer("middle", ((high + low) / 2).float())
+        self.register_buffer("half_range", ((high - low) / 2).float())
+        size = 10 + {"config": 7, "combined": 10}[args.goal_type] + 28 + 2 * 80
+        self.of_token = nn.Linear(self.num_numbers, args.token_size)
+        self.of_arm = nn.Linear(size, args.token_size)
+        self.of_both = Hidden(args.token_size, args.token_size, args.bf16)
+        self.first = nn.Linear(size + args.token_size, args.hidden_size)
+        blocks = (Block(args.hidden_size, args.bf16) for _ in range(args.num_blocks))
+        self.blocks = nn.Sequential(*blocks)
+        self.head = nn.Linear(args.hidden_size, 8)
+        nn.init.zeros_(self.head.weight)  # it begins as go-to-goal
+        nn.init.zeros_(self.head.bias)
+
+    def features(self, observation, desired_goal, proximity, goal_proximity):
+        """What is known of the arm, and of the goal."""
+        states = torch.cat([observation[:, :7], desired_goal[:, :7]], dim=1)
+        angles = (states.unflatten(1, (2, 7)) * self.half_range + self.middle).flatten(1)
+        near = torch.stack([proximity, goal_proximity], dim=1)
+        near = torch.cat([10.0 * near[..., :1], near[..., 1:]], dim=-1)  # distances are small
+        inputs = observation[:, :10], desired_goal, torch.sin(angles), torch.cos(angles)
+        return torch.cat([*inputs, near.flatten(1)], dim=1)
+
+    def outputs(self, observation, desired_goal, proximity, goal_proximity):
+        """The direction (N, 7), of any length, and the length of the rest of the way (N,)."""
+        features = self.features(observation, desired_goal, proximity, goal_proximity)
+        tokens = observation[:, 10:].unflatten(1, (-1, self.num_numbers))
+        seen = F.relu(self.of_token(tokens) + self.of_arm(features).unsqueeze(1))
+        seen = F.relu(self.of_both(seen))
+        there = (tokens != 0.0).any(dim=2, keepdim=True)
+        seen = (seen * there).amax(1)  # (nothing is below zero)
+        x = self.blocks(F.relu(self.first(torch.cat([features, seen], dim=1))))
+        outputs = self.head(x)
+        to_goal = desired_goal[:, :7] - observation[:, :7]
+        direction = F.normalize(to_goal, dim=1) + outputs[:, :7]
+        return direction, to_goal.norm(dim=1) + F.softplus(outputs[:, 7])
+
+    def forward(self, observation, achieved_goal, desired_goal, proximity, goal_proximity):
+        """The action (N, 7); this is what policy.pt contains."""
+        direction, _ = self.outputs(observation, desired_goal, proximity, goal_proximity)
+        to_goal = (desired_goal[:, :7] - observation[:, :7]).norm(dim=1, keepdim=True)
+        return F.normalize(direction, dim=1) * to_goal.clamp(max=MAX_STEP)
+
+
+# ALGO LOGIC: examples
+AHEAD = 0.1  # normalised: an example's direction is to where its path is after so much
+PER_PATH = 4  # examples of each path that is chosen: its goal's proximity serves all of them
+STUCK = 5.0  # states that the policy was stuck in are so much likelier to be labelled
+DRAW, ROUND = 6, 7  # streams of random numbers; those before belong to demo_generation's files
+
+
+class Examples:
+    """Makes examples, dicts of tensors, a row each:
+
+    `observation` (n, 10), `desired_goal` (n, g), `proximity` and `goal_proximity` (n, 10, 8); the
+    unit vector to go on, `direction` (n, 7), and the `length` of the rest of the way (n,); the
+    number of the `scene` (n,), int64.
+
+    Args:
+        paths: `envs.roadmap_paths.RoadmapPaths`.
+        args: the flags.
+        device: of the tensors.
+    """
+
+    def __init__(self, paths, args, device):
+        self.paths, self.args, self.device = paths, args, device
+        seen = args.encoder != "oracle"
+        self.checker_of = seeing.seen_checker if seen else seeing.true_checker
+        self.scenes = np.flatnonzero(np.diff(paths.path_offsets))  # that have paths
+        steps = np.linalg.norm(np.diff(paths.points, axis=0), axis=1)
+        steps[paths.offsets[1:-1] - 1] = 1.0  # from the end of a path to the next one: anything
+        self.come = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+
+    def draw(self, number):
+        """Examples anywhere on the paths of one scene; they depend on seed and `number` only."""
+        rng = np.random.default_rng([self.args.seed, DRAW, number])
+        scene, first, last = self._choose(rng, -(-self.args.examples_per_update // PER_PATH))
+        which = np.arange(self.args.examples_per_update) // PER_PATH
+        first, last = first[which], last[which]
+        backwards = (rng.random(len(first)) < 0.5)[which]
+        rest = rng.random(len(first)) * (self.come[last] - self.come[first])
+
+        def at(rest):  # the points on the paths from where so much is left
+            come = np.where(backwards, self.come[first] + rest, self.come[last] - rest)
+            i = np.clip(np.searchsorted(self.come, come, side="right") - 1, first, last - 1)
+            share = (come - self.come[i]) / (self.come[i + 1] - self.come[i])
+            tail, head = self.paths.points[i], self.paths.points[i + 1]
+            return tail + share[:, None] * (head - tail)
+
+        states = at(rest) + self.args.noise * rng.standard_normal((len(first), 7))
+        states = np.clip(states, -1.0, 1.0)
+        rest = np.maximum(rest - AHEAD, 0.0)
+        moves = at(rest) - states
+        lengths = np.linalg.norm(moves, axis=1)
+        goals = self.paths.points[np.where(backwards, first, last)]
+        return self._examples(scene, states, goals, moves / lengths[:, None], lengths + rest)
+
+    def visit(self, actor, env, last_layer, step):
+        """Examples of a round of DAgger, and the share of its queries that the policy reached."""
+        rng = np.random.default_rng([self.args.seed, ROUND, step])
+        parts, reached, visited = [], [], []
+
+        def act(**observed):
+            visited.append(observed["observation"][0, :7].cpu().numpy())
+            return actor(**observed)
+
+        while len(reached) < self.args.round_queries:
+            number, first, last = self._choose(rng, 1)
+            scene, ends = self.paths.scenes[number], self.paths.points[np.r_[first, last]]
+            if not seeing.true_checker(scene).is_free(ends, margin=0.001).all():
+                continue  # rounded, the environment might refuse it
+            query = Query(*panda.denormalise(ends).astype(np.float32), scene)
+            visited.clear()
+            result = protocol.evaluate(act, [env], [query], self.device, last_layer)
+            reached.append(result["success_rate"])
+            states = np.array(visited)
+            chances = np.ones(len(states))
+            moved = np.linalg.norm(states[PATIENCE:] - states[:-PATIENCE], axis=1)
+            chances[PATIENCE:][moved < PROGRESS] = STUCK
+            count = min(self.args.round_labels, len(states))
+            states = states[rng.choice(len(states), count, False, chances / chances.sum())]
+            goals = np.repeat(ends[1:], count, axis=0)
+            directions, lengths = Roadmap(scene, rng).labels(states, goals, rng)
+            kept = lengths > 0.0  # there is a way, and it is not at the goal
+            labelled = (x[kept] for x in (states, goals, directions, lengths))
+            parts.append(self._examples(number, *labelled))
+        return joined(parts), np.mean(reached)
+
+    def _choose(self, rng, number):
+        """A scene, and the first and the last point of some of its paths (number,)."""
+        scene = int(rng.choice(self.scenes))
+        path = rng.integers(*self.paths.path_offsets[scene : scene + 2], number)
+        return scene, self.paths.offsets[path], self.paths.offsets[path + 1] - 1
+
+    def _examples(self, scene, states, goals, directions, lengths):
+        checker = self.checker_of(self.paths.scenes[scene])
+        ends, which = np.unique(goals, axis=0, return_inverse=True)
+        observation, _, goal = observed(states, panda.denormalise(goals), self.args.goal_type)
+        examples = {
+            "observation": observation,
+            "desired_goal": goal,
+            "proximity": link_proximity(checker, states),
+            "goal_proximity": link_proximity(checker, ends)[which],
+            "direction": directions.astype(np.float32),
+            "length": lengths.astype(np.float32),
+            "scene": np.full(len(states), scene),
+        }
+        return {name: torch.as_tensor(x, device=self.device) for name, x in examples.items()}
+
+
+def joined(parts):
+    """Examples of several dicts in one."""
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def some(examples, number):
+    """So many random ones of them."""
+    rows = torch.randint(len(examples["scene"]), (number,), device=examples["scene"].device)
+    return {name: tensor[rows] for name, tensor in examples.items()}
+
+
+def with_scene(batch, latents, num_numbers):
+    """The batch with encoded scenes (scenes, z) in observations, as far as there are any tokens."""
+    tokens = latents[batch["scene"]].unflatten(1, (-1, num_numbers))
+    tokens = tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)]
+    observation = torch.cat([batch["observation"], tokens.flatten(1)], dim=1)
+    return batch | {"observation": observation}
+
+
+# SHARED: averaging
+def polyak_update(target_parameters, parameters, tau):
+    """target <- (1 - tau) target + tau parameter, all tensors at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(target_parameters, parameters, tau)
+
+
+# END SHARED
+
+
+# ALGO LOGIC: one update
+def update(actor, optimizer, batch, length_weight):
+    """One step on a batch of examples; the losses before it, of direction and length."""
+    inputs = ("observation", "desired_goal", "proximity", "goal_proximity")
+    direction, length = actor.outputs(*(batch[name] for name in inputs))
+    direction_loss = 1.0 - F.cosine_similarity(direction, batch["direction"]).mean()
+    length_loss = F.smooth_l1_loss(length, batch["length"])
+    optimizer.zero_grad()
+    (direction_loss + length_weight * length_loss).backward()
+    optimizer.step()
+    return direction_loss, length_loss
+
+
+if __name__ == "__main__":
+    args = runs.parse_args(Args, may_change={"test_queries"})
+    device = runs.seed_torch(args)
+    if args.bf16 is None:
+        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
+    validation, test = protocol.load_task(args)
+    for name in ("total_updates", "batch_size", "examples_per_update", "eval_every"):
+        if getattr(args, name) < 1:
+            sys.exit(f"--{name.replace('_', '-')} must be at least 1")
+    if args.encoder != "oracle" and not args.encoder.startswith("points"):
+        sys.exit(f"--encoder must be `oracle` or `points`, got {args.encoder!r}")
+    num_draws = args.pool_size // args.examples_per_update
+    if num_draws < 1:
+        sys.exit("--pool-size must be at least --examples-per-update")
+    try:
+        paths = load_roadmap_paths(args.paths)
+    except DatasetError as error:
+        sys.exit(f"--paths: {error}")
+    proximity = "obstacles" if args.encoder == "oracle" else "points"
+    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder, "proximity": proximity}
+    eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
+    last_layer = LastLayer(args.keep_distance, args.way_out)
+    run = runs.run_folder(args, task_name(args.task))
+
+    # ALGO LOGIC: network and optimiser
+    actor = Actor(args).to(device)
+    actor_average = Actor(args).to(device).eval()  # evaluated and saved
+    actor_average.load_state_dict(actor.state_dict())
+    parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
+    optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
+    progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
+    visited = {}  # examples of all rounds
+    saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
+    saved_parts |= {"progress": progress, "visited": visited}
+    runs.load_checkpoint(args, saved_parts)
+    visited |= {name: tensor.to(device) for name, tensor in visited.items()}
+
+    # ALGO LOGIC: data. The pool is not in checkpoints: what was drawn is drawn again.
+    latents = torch.as_tensor(eval_envs[0].encoder.encode_demos(paths), device=device)
+    examples = Examples(paths, args, device)
+    pool = [None] * num_draws
+    firsts = range(progress["updates"], progress["updates"] + num_draws)
+    for number in tqdm(firsts, desc="drawing examples", mininterval=2.0):
+        pool[number % num_draws] = examples.draw(number)
+    pool = joined(pool)
+
+    writer = runs.summary_writer(run, args, progress["updates"])
+    seconds_before = progress["seconds"]
+    bar = runs.progress_bar(args.total_updates, progress["updates"], "update")
+    background = ThreadPoolExecutor(1)
+
+    while progress["updates"] < args.total_updates:
+        # ALGO LOGIC: learn, while the next examples are drawn
+        drawn = background.submit(examples.draw, progress["updates"] + num_draws)
+        if args.anneal:
+            remaining = 1.0 - progress["updates"] / args.total_updates
+            optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
+        batch = some(pool, args.batch_size)
+        if visited:
+            weight = args.round_weight * len(visited["scene"])
+            count = int(args.batch_size * weight / (weight + len(pool["scene"])))
+            batch = joined([some(visited, count), batch])
+            batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
+        batch = with_scene(batch, latents, actor.num_numbers)
+        direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
+        polyak_update(average_parameters, parameters, args.policy_average)
+        oldest = progress["updates"] % num_draws * args.examples_per_update
+        for name, tensor in drawn.result().items():
+            pool[name][oldest : oldest + len(tensor)] = tensor
+        progress["updates"] += 1
+        bar.update()
+
+        step = progress["updates"]
+        if step % 100 == 0:
+            writer.add_scalar("losses/direction", direction_loss.item(), step)
+            writer.add_scalar("losses/length", length_loss.item(), step)
+            writer.add_scalar("charts/learning_rate", optimizer.param_groups[0]["lr"], step)
+            writer.add_scalar("charts/SPS", int(runs.rate(bar)), step)
+
+        # ALGO LOGIC: a round of DAgger
+        if args.round_every and step % args.round_every == 0 and step < args.total_updates:
+            found, reached = examples.visit(actor_average, eval_envs[0], last_layer, step)
+            visited |= joined([visited, found]) if visited else found
+            writer.add_scalar("charts/round_success", reached, step)
+
+        # Evaluate, keep the best policy, checkpoint
+        if step % args.eval_every == 0 or step == args.total_updates:
+            success, best = protocol.validate(
+                actor_average, eval_envs, validation, device, writer, step, progress, last_layer
+            )
+            if best:
+                protocol.save_policy(
+                    run, actor_average, eval_envs, device, args, env_arguments, step, last_layer
+                )
+            bar.set_postfix(eval=success, best=progress["best_success"])
+            progress["seconds"] = seconds_before + runs.elapsed(bar)
+            runs.save_checkpoint(run, saved_parts)
+    bar.close()
+    background.shutdown()
+    protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
+    writer.close()
