@@ -406,7 +406,7 @@ if __name__ == "__main__":
             remaining = 1.0 - progress["updates"] / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = some(pool, args.batch_size)
-        if visited:
+        if visited and len(visited["scene"]):
             weight = args.round_weight * len(visited["scene"])
             count = int(args.batch_size * weight / (weight + len(pool["scene"])))
             batch = joined([some(visited, count), batch])
