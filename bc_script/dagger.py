@@ -37,20 +37,10 @@ from envs.wrappers import link_proximity
 
 
 @dataclass
-class Args:
-    # The run
+class Args(runs.RunFlags):
+    # Those of the run's folder are in `envs/runs.py`.
     exp_name: str = "dagger"
     """name of the experiment, part of the run's folder"""
-    seed: int = 1
-    """seed of everything random; the same seed gives the same run on the same machine and device"""
-    runs_dir: Path = Path("runs")
-    """the run's folder is made in here: TensorBoard events, checkpoint, policy.pt, result.json"""
-    resume: Path | None = None
-    """continue the run in this folder from its last checkpoint; its own flags are used"""
-    device: str = "cpu"
-    """`cpu` or `cuda`"""
-    threads: int = 1
-    """torch threads; examples are drawn in one more"""
 
     # The task (the paper's MDP; `docs/environment.md`)
     task: str = "random_boxes_hard"
@@ -435,10 +425,10 @@ if __name__ == "__main__":
 
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every == 0 or step == args.total_updates:
-            success, best = protocol.validate(
+            success = protocol.validate(
                 actor_average, eval_envs, validation, device, writer, step, progress, last_layer
             )
-            if best:
+            if progress["best_step"] == step:
                 protocol.save_policy(
                     run, actor_average, eval_envs, device, args, env_arguments, step, last_layer
                 )

@@ -78,7 +78,7 @@ def inputs_of(batch):
 def test_examples_say_how_paths_go_on_to_either_end(tmp_path):
     scene = envs.get_task(HARD).scene.sample(np.random.default_rng(3))
     paths = load_roadmap_paths(write_paths(tmp_path, [scene], [[CORNER, CORNER + 0.25]]))
-    examples = dagger.Examples(paths, dagger.Args(noise=0.0), "cpu")
+    examples = dagger.Examples(paths, dagger.Args(noise=0.0, examples_per_update=96), "cpu")
     drawn = {name: tensor.numpy() for name, tensor in examples.draw(5).items()}
     states, goals = drawn["observation"][:, :7], drawn["desired_goal"][:, :7]
     offset = states[:, 6:]  # of the second path
