@@ -180,12 +180,13 @@ class CollisionChecker:
 
         return check
 
-    def nearest(self, states, self_collisions=True):
+    def nearest(self, states, self_collisions=True, within=math.inf):
         """How far each of `LINKS` is from the nearest thing, and which way is out: a `Nearest`.
 
         Args:
             states: (..., 7), normalised.
             self_collisions: whether other links are things, too (`panda.SELF_COLLISION_PAIRS`).
+            within: m; nothing is said of what is farther away than that.
         """
         states = _states("states", states)
         batch = (*states.shape[:-1], len(LINKS))
@@ -195,6 +196,7 @@ class CollisionChecker:
         _nearest_batch(
             states.reshape(-1, 7),
             bool(self_collisions),
+            float(within),
             _arm(),
             self._world,
             distance.reshape(-1, len(LINKS)),
@@ -974,6 +976,7 @@ def _write(frames, f, centres, k, s, sign, back, direction, point):
 def _nearest_batch(
     states,
     self_collisions,
+    within,
     arm,
     world,
     distance,
@@ -991,7 +994,7 @@ def _nearest_batch(
         np.empty((_EPA_FACES, 2), np.int64),
     )
     of_arm = rows.shape[0]
-    distance[:], direction[:], point[:], which[:] = np.inf, 0.0, 0.0, of_arm + 2
+    distance[:], direction[:], point[:], which[:] = within, 0.0, 0.0, of_arm + 2
     for i in range(states.shape[0]):
         _place(states[i], bodies, frames, centres)
         for k in range(1, bodies.shape[0]):
@@ -1060,3 +1063,6 @@ def _nearest_batch(
                     _gradient(frames, min(fa, fb), max(fa, fb), there, at, gradient[i, link])
                     if bodies[body, 0] < max(fa, fb):
                         gradient[i, link] *= -1.0
+        for link in range(distance.shape[1]):
+            if which[i, link] == of_arm + 2:
+                distance[i, link] = np.inf

@@ -1,23 +1,30 @@
 """A last layer for any policy: it lets no link come too near to anything, and leaves dead ends.
 
     env = envs.make("random_boxes_hard", proximity="points")
-    act = LastLayer().around(act, np.random.default_rng(0))      # at the start of an episode
+    act = LastLayer().around(act, env, np.random.default_rng(0))      # at the start of an episode
     action = act(observation)
 
 An action is changed as little as possible (L2) such that, as far as the gradients of the links'
 distances tell, each link slows down towards whatever it comes near to, none comes nearer than
-`keep`, and one that is nearer than that moves away. That alone stands still where it cannot go on;
-so where the arm has hardly moved for some steps, it goes into a random direction for a while.
+`keep`, and one that is nearer than that moves away. Things are what `proximity` tells of, and the
+other links, of which it does not: where they are is known. As a link's nearest point may be another
+one after the step, the layer looks once more, at where the action leads.
+
+That alone stands still where it cannot go on; so where the arm has hardly moved for some steps, it
+goes into a random direction for a while.
 """
 
+import functools
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from envs import panda
-from envs.collision import compiled
+from envs.collision import CollisionChecker, compiled
+from envs.scenes import Scene
 from envs.subgoals import MAX_STEP
+from envs.wrappers import link_proximity
 
 # The numbers below were chosen on validation queries of `random_boxes_hard`: docs/last_layer.md.
 NEAR = 0.15  # m, from where on a link is looked at
@@ -38,45 +45,51 @@ class LastLayer:
     """A last layer.
 
     Attributes:
-        keep: m, the distance that links keep from everything that `proximity` tells of.
+        keep: m, the distance that links keep from everything.
         way_out: whether it leaves dead ends.
-        max_step: longest action (L2, normalised), as of the environment.
     """
 
     keep: float = 0.01
     way_out: bool = True
-    max_step: float = MAX_STEP
 
-    def __call__(self, actions, proximity, keep=None):
+    def __call__(self, actions, proximity, keep=None, max_step=MAX_STEP):
         """Actions (..., 7), changed as little as needed: float32.
 
         Args:
             actions: (..., 7), displacements of the normalised configuration.
-            proximity: (..., links, 8), as `envs.wrappers.ProximityWrapper` has it.
-            keep: m, (..., links), instead of the layer's: see `kept`.
+            proximity: (..., rows, 8), as `envs.wrappers.ProximityWrapper` has it.
+            keep: m, (..., rows), instead of the layer's.
+            max_step: longest action (L2, normalised).
         """
-        actions, rows = np.array(actions, np.float64), np.asarray(proximity, np.float64)
-        links = rows.shape[-2]
-        keep = np.broadcast_to(self.keep if keep is None else keep, rows.shape[:-1])
-        keep = keep.astype(np.float64).reshape(-1, links)
-        _project(actions.reshape(-1, 7), rows.reshape(-1, links, 8), keep, self.max_step)
+        actions, proximity = np.array(actions, np.float64), np.asarray(proximity, np.float64)
+        rows = proximity.shape[-2]
+        keep = np.broadcast_to(self.keep if keep is None else keep, proximity.shape[:-1])
+        keep = keep.astype(np.float64).reshape(-1, rows)
+        _project(actions.reshape(-1, 7), proximity.reshape(-1, rows, 8), keep, max_step)
         return actions.astype(np.float32)
 
-    def around(self, act, rng):
+    def around(self, act, env, rng):
         """`act`, a function from an observation to an action (7,), with this layer: another one.
 
-        For one episode. `rng`, a NumPy Generator, gives the directions out of dead ends.
+        For one episode.
+
+        Args:
+            act: the function.
+            env: the `RoboArmEnv` that the episode is in. See `check_env`.
+            rng: a NumPy Generator, for the directions out of dead ends.
         """
+        proximity_at, max_step = env.get_wrapper_attr("proximity_at"), env.max_step
         before, left, direction = deque(maxlen=PATIENCE + 1), 0, None
+        goal_distances = None
 
         def act_safely(observation):
-            nonlocal left, direction
+            nonlocal left, direction, goal_distances
             state = observation["observation"][: panda.NUM_JOINTS]
             before.append(state)
             moved = np.linalg.norm(state - before[0])
             if left == 0 and self.way_out and len(before) > PATIENCE and moved < PROGRESS:
                 left, direction = DETOUR, rng.standard_normal(panda.NUM_JOINTS)
-                direction *= self.max_step / np.linalg.norm(direction)
+                direction *= max_step / np.linalg.norm(direction)
             if left == 0:
                 action = act(observation)
             else:
@@ -84,17 +97,39 @@ class LastLayer:
                 action = direction
                 if left == 0:
                     before.clear()
-            return self(action, observation["proximity"], self.kept(observation))
+            keep = self.keep
+            if "goal_proximity" in observation:
+                goal = observation["desired_goal"][: panda.NUM_JOINTS]
+                if goal_distances is None:
+                    rows = observation["goal_proximity"], _own_proximity(goal)
+                    goal_distances = np.concatenate(rows)[:, 0]
+                keep = self.kept(goal_distances, np.linalg.norm(state - goal))
+            here = np.concatenate([observation["proximity"], _own_proximity(state)])
+            keep = np.broadcast_to(keep, len(here))
+            move = self(action, here, keep, max_step)
+            there = np.concatenate([proximity_at(state + move), _own_proximity(state + move)])
+            # What it would be here, if its gradient were the same all the way.
+            there[:, 0] -= there[:, 1:] @ move
+            return self(action, np.concatenate([here, there]), np.tile(keep, 2), max_step)
 
         return act_safely
 
-    def kept(self, observation):
-        """The distance that each link keeps, m: (10,). Less near a goal that is nearer itself."""
-        if "goal_proximity" not in observation:
-            return np.full(len(observation["proximity"]), self.keep)
-        state, goal = observation["observation"], observation["desired_goal"]
-        away = np.linalg.norm(state[: panda.NUM_JOINTS] - goal[: panda.NUM_JOINTS])
-        return np.minimum(self.keep, observation["goal_proximity"][:, 0] + GROWTH * away)
+    def kept(self, goal_distances, away):
+        """m that each link keeps, (rows,): less near a goal that is nearer to something itself.
+
+        Args:
+            goal_distances: m, (rows,), at the goal.
+            away: from the goal, L2, normalised.
+        """
+        return np.minimum(self.keep, goal_distances + GROWTH * away)
+
+
+def check_env(env):
+    """Raises ValueError: a last layer cannot act in this environment."""
+    if "proximity" not in env.observation_space.spaces:
+        raise ValueError("a last layer needs proximity in observations: envs.make(proximity=...)")
+    if env.action_mode != "relative":
+        raise ValueError(f"a last layer changes displacements: action_mode {env.action_mode!r}")
 
 
 def layer_of(metadata):
@@ -110,6 +145,16 @@ def layer_of(metadata):
         return LastLayer(float(options["keep"]), bool(options["way_out"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"its last layer makes no sense: {options!r}") from error
+
+
+@functools.cache
+def _arm_alone():
+    return CollisionChecker(Scene(table=None, floor=None))
+
+
+def _own_proximity(state):
+    """How far each link is from the other ones, as `proximity` has it."""
+    return link_proximity(_arm_alone(), state, self_collisions=True, within=NEAR)
 
 
 @compiled

@@ -136,13 +136,17 @@ def make_policy(
         last_layer = own_layer(policy)
     if not last_layer:
         return begin
-    if "proximity" not in env.observation_space.spaces:
-        raise PolicyError("a last layer needs proximity in observations: envs.make(proximity=...)")
+    from envs.last_layer import check_env  # here, because Numba takes a while to import
+
+    try:
+        check_env(env)
+    except ValueError as error:
+        raise PolicyError(str(error)) from error
 
     def begin_safely(number, query):
         act, found = begin(number, query)
         rng = np.random.default_rng([seed, number])
-        return EpisodePolicy(act and last_layer.around(act, rng), found)
+        return EpisodePolicy(act and last_layer.around(act, env, rng), found)
 
     return begin_safely
 

@@ -171,7 +171,7 @@ def evaluate(policy, envs, queries, device, last_layer=None):
             running[env] = env.reset_specific(*queries[i])[0]
             acts[env] = lambda observation: proposed[env]
             if last_layer is not None:
-                acts[env] = last_layer.around(acts[env], np.random.default_rng([0, i]))
+                acts[env] = last_layer.around(acts[env], env, np.random.default_rng([0, i]))
 
     for env in envs:
         start(env)
@@ -206,7 +206,7 @@ def picture_of_rollout(policy, env, query, device, last_layer=None, frames=8):
         return policy(**stack([observation], device))[0].cpu().numpy()
 
     if last_layer is not None:
-        act = last_layer.around(act, np.random.default_rng([0, 0]))
+        act = last_layer.around(act, env, np.random.default_rng([0, 0]))
     observation, _ = env.reset_specific(*query)
     pictures, done = [env.render()], False
     while not done:

@@ -118,19 +118,18 @@ class SceneEncodingWrapper(_ObservingWrapper):
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
 
-def link_proximity(checker, states):
+def link_proximity(checker, states, self_collisions=False, within=PROXIMITY_RANGE):
     """`proximity` as `ProximityWrapper` has it, of normalised configurations: float32 (..., 10, 8).
 
     Args:
         checker: an `envs.collision.CollisionChecker`.
-        states: (..., 7).
+        states: (..., 7); beyond the limits, which an arm may be a little, it is that of the limits.
+        self_collisions: whether other links are things, too.
+        within: m, to which distances are clipped.
     """
-    # float32 may round a limit to just beyond it.
-    nearest = checker.nearest(np.clip(states, -1.0, 1.0), self_collisions=False)
-    near = (nearest.distance < PROXIMITY_RANGE)[..., None]
-    distance = np.minimum(nearest.distance, PROXIMITY_RANGE)[..., None]
-    proximity = np.concatenate([distance, np.where(near, nearest.gradient, 0.0)], axis=-1)
-    return proximity.astype(np.float32)
+    nearest = checker.nearest(np.clip(states, -1.0, 1.0), self_collisions, within)
+    distance = np.minimum(nearest.distance, within)[..., None]
+    return np.concatenate([distance, nearest.gradient], axis=-1).astype(np.float32)
 
 
 class ProximityWrapper(_ObservingWrapper):
@@ -158,13 +157,16 @@ class ProximityWrapper(_ObservingWrapper):
         )
         self._goal, self._of_goal = None, None
 
+    def proximity_at(self, states):
+        """What `proximity` would be in other configurations: (..., 7) -> float32 (..., 10, 8)."""
+        return link_proximity(self._checker_of(self.unwrapped.scene), states)
+
     def _with_more(self, observation):
-        checker = self._checker_of(self.unwrapped.scene)
-        more = {"proximity": link_proximity(checker, observation["observation"][:7])}
+        more = {"proximity": self.proximity_at(observation["observation"][:7])}
         if self.goal_type != "ee":
             goal = observation["desired_goal"][:7]
             key = self.unwrapped.scene, goal.tobytes()
             if self._goal != key:
-                self._goal, self._of_goal = key, link_proximity(checker, goal)
+                self._goal, self._of_goal = key, self.proximity_at(goal)
             more["goal_proximity"] = self._of_goal.copy()
         return {**observation, **more}
