@@ -1,5 +1,7 @@
 """Proximity in observations, and the last layer that keeps away from things by it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -9,6 +11,7 @@ from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
 from envs.last_layer import BRAKE, DETOUR, NEAR, PATIENCE, PUSH, LastLayer
+from envs.policies import PolicyError, make_policy
 from envs.seeing import seen_checker
 from envs.wrappers import PROXIMITY_RANGE
 
@@ -125,10 +128,10 @@ def test_a_point_approaches_a_plane():
 
 
 def test_the_change_is_the_smallest_one():
-    rng, layer = np.random.default_rng(0), LastLayer(keep=0.01, max_step=1.0)
+    rng, layer = np.random.default_rng(0), LastLayer(keep=0.01)
     wanted, gradient = rng.normal(0, 0.01, 7), rng.normal(0, 0.3, 7)
     wanted -= gradient * (gradient @ wanted + 0.008) / (gradient @ gradient)  # 8 mm nearer
-    done = layer(wanted, np.array([[0.025, *gradient]]))
+    done = layer(wanted, np.array([[0.025, *gradient]]), max_step=1.0)
     by = 0.008 - BRAKE * 0.015  # m: it may come 3 mm nearer
     assert done == pytest.approx(wanted + gradient * by / (gradient @ gradient), abs=1e-7)
 
@@ -161,18 +164,9 @@ def test_no_step_becomes_too_long_and_a_batch_is_each_alone():
 
 
 def test_less_is_kept_near_a_goal_that_is_near_to_something():
-    layer = LastLayer(keep=0.01)
-    observation = {
-        "observation": np.zeros(10, np.float32),
-        "desired_goal": np.zeros(10, np.float32),
-        "proximity": np.zeros((3, 8)),
-        "goal_proximity": proximity((0.3,), (0.004,), (-0.001,)),
-    }
-    assert layer.kept(observation) == pytest.approx([0.01, 0.004, -0.001])
-    observation["observation"][0] = 0.1
-    assert layer.kept(observation) == pytest.approx([0.01, 0.007, 0.002])
-    del observation["goal_proximity"]
-    assert layer.kept(observation) == pytest.approx([0.01] * 3)
+    layer, at_goal = LastLayer(keep=0.01), np.array([0.3, 0.004, -0.001])
+    assert layer.kept(at_goal, 0.0) == pytest.approx([0.01, 0.004, -0.001])
+    assert layer.kept(at_goal, 0.1) == pytest.approx([0.01, 0.007, 0.002])
 
 
 # --- In episodes
@@ -186,7 +180,7 @@ def run(env, query, layer, seed=0):
         return target - observation["observation"][:7]
 
     if layer is not None:
-        act = layer.around(act, np.random.default_rng(seed))
+        act = layer.around(act, env, np.random.default_rng(seed))
     observation, info = env.reset_specific(*query)
     states, done = [observation["observation"][:7]], info["is_success"]
     while not done:
@@ -213,6 +207,70 @@ def test_it_keeps_clear_and_gets_further():
     assert touched["layer"] < 0.75 * touched["bare"]
 
 
+def test_links_keep_away_from_each_other():
+    """The forearm folds towards the hand, with nothing else around."""
+    env = envs.make("no_obstacles", goal_type="config", proximity="obstacles")
+    start, goal = np.zeros(7), np.zeros(7)
+    start[[1, 3, 5]], goal[[1, 3, 5]] = (-0.8, -0.5, -0.5), (-0.8, -0.95, -0.95)
+    assert not env.in_collision(panda.denormalise(start))
+    assert env.in_collision(panda.denormalise(goal))
+    alone = CollisionChecker(envs.scenes.Scene(table=None, floor=None))
+    least = {}
+    for layer in (None, LastLayer(way_out=False)):
+        observation, _ = env.reset_specific(panda.denormalise(start), panda.denormalise(start))
+        act = lambda observation: goal - observation["observation"][:7]  # noqa: E731
+        if layer is not None:
+            act = layer.around(act, env, np.random.default_rng(0))
+        states = []
+        for _ in range(60):
+            observation, *_ = env.step(act(observation))
+            states.append(observation["observation"][:7])
+        states = np.clip(states, -1.0, 1.0)
+        least[layer] = alone.nearest(states).distance.min()
+    env.close()
+    bare, kept = least.values()
+    assert bare < 0.001 and 0.007 < kept < 0.013
+
+
+def test_it_looks_where_an_action_leads():
+    """Along a wall that a link only sees once it has moved: slower than the first look allows."""
+    rows = np.zeros((10, 8))
+    rows[:, 0] = NEAR
+
+    def proximity_at(state):
+        there = rows.copy()
+        there[3, :2] = 0.01 - 0.5 * (state[0] - 0.02), -0.5  # 1 cm is kept up to 0.02
+        return there
+
+    env = SimpleNamespace(max_step=0.03, get_wrapper_attr=lambda name: proximity_at)
+    act = LastLayer(way_out=False).around(lambda _: action(0.03), env, None)
+    # (An open pose, with no link near another one.)
+    state = np.concatenate([[0.0, 0.0, 0.0, -0.3, 0.0, 0.3, 0.0], np.zeros(3)])
+    moved = act({"observation": state, "proximity": rows})
+    # Seen from here the wall is 20 mm away, 10 mm more than what is kept: a fifth of those.
+    assert moved == pytest.approx(action(BRAKE * 0.01 / 0.5), abs=1e-6)
+
+
+def test_where_it_cannot_act_it_says_so():
+    for arguments, message in (
+        ({}, "needs proximity"),
+        ({"proximity": "points", "action_mode": "subgoal"}, "action_mode 'subgoal'"),
+    ):
+        env = envs.make("wall", **arguments)
+        with pytest.raises(PolicyError, match=message):
+            make_policy("go-to-goal", env, last_layer=LastLayer())
+        env.close()
+
+
+def test_an_environments_longest_step():
+    env = envs.make("no_obstacles", goal_type="config", proximity="obstacles", max_step=0.05)
+    query = load_queries("no_obstacles", "validation")[0]
+    observation, _ = env.reset_specific(*query)
+    act = make_policy("go-to-goal", env, last_layer=LastLayer())(0, query).act
+    assert 0.04 < np.linalg.norm(act(observation)) < 0.05 + 1e-6
+    env.close()
+
+
 def test_out_of_a_dead_end():
     """It stands for `PATIENCE` steps, is away for `DETOUR`, and a seed gives the same way."""
     layer, asked = LastLayer(), []
@@ -221,11 +279,16 @@ def test_out_of_a_dead_end():
         asked.append(None)
         return np.zeros(7)
 
+    nothing = proximity(*[(NEAR,)] * 10)
+    env = SimpleNamespace(max_step=0.03, get_wrapper_attr=lambda name: lambda state: nothing)
+
     def walk(seed):
-        act, state, moves = layer.around(stay, np.random.default_rng(seed)), np.zeros(10), []
+        state, moves = np.zeros(10), []
+        state[3], state[5] = -0.3, 0.3  # no link is near another one, and will be
+        act = layer.around(stay, env, np.random.default_rng(seed))
         for _ in range(PATIENCE + DETOUR + 1):
-            moves.append(act({"observation": state, "proximity": proximity((1.0,))}))
-            state[:7] += moves[-1]
+            moves.append(act({"observation": state, "proximity": nothing}))
+            state = np.concatenate([state[:7] + moves[-1], state[7:]])
         return np.array(moves)
 
     moves = walk(1)
