@@ -93,26 +93,20 @@ class Validity:
 
         Both are tuples of 7 floats.
         """
-        if self.checks >= self._next:
-            self._relax()
         checks = self._check(start, end)
-        self.checks += abs(checks)
+        self._count(abs(checks))
         return checks > 0
 
     def free(self, states):
         """Which configurations (..., 7) are free: bool (...)."""
-        if self.checks >= self._next:
-            self._relax()
         free = self._checker.is_free(states, **self._rule)
-        self.checks += free.size
+        self._count(free.size)
         return free
 
     def motions_free(self, starts, ends):
         """Which straight motions from `starts` (..., 7) to `ends` (..., 7) are free: bool (...)."""
-        if self.checks >= self._next:
-            self._relax()
         checks = self._checker.motion_checks(starts, ends, **self._rule)
-        self.checks += int(np.abs(checks).sum())
+        self._count(int(np.abs(checks).sum()))
         return checks > 0
 
     def exhausted(self):
@@ -122,6 +116,11 @@ class Validity:
         """From now on, the first rule is kept: for what improves a path that is there."""
         self._later = [self._rules[0]]
         self._relax()
+
+    def _count(self, checks):
+        self.checks += checks
+        if self.checks >= self._next:
+            self._relax()
 
     def _relax(self):
         """Keep the next rule."""

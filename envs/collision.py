@@ -354,7 +354,11 @@ def _cloud(points, radius):
         its points are from it at most, the first of them, and the one after the last. `ball`:
         float64 (1, `_ROW`), a point as a shape.
     """
-    points = np.asarray(points, dtype=np.float64).reshape(len(points), 3)
+    points = np.asarray(points, dtype=np.float64)
+    if not points.size:
+        points = points.reshape(0, 3)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must have shape (n, 3), got {points.shape}")
     if not (np.isfinite(points).all() and 0 <= radius < MAX_MARGIN):
         raise ValueError("points need finite numbers, and a radius from 0 to under half a metre")
     _, cell = np.unique(

@@ -78,7 +78,7 @@ def test_points_are_balls():
 
 
 def test_distances_from_points_are_nearly_those_from_what_was_seen(clutter):
-    """Where the nearest thing is in sight: within 15 mm, and on the safe side of 10 mm mostly."""
+    """Nine of ten are at most 15 mm too long, none is more than 15 mm too short."""
     errors = []
     for scene in clutter:
         states = np.random.default_rng(0).uniform(-1, 1, (3000, 7))
@@ -98,7 +98,7 @@ def test_distances_from_points_are_nearly_those_from_what_was_seen(clutter):
     [([[0.0, np.nan, 0.0]], 0.01), ([[0.0, 0.0, 0.0]], -0.01), ([[0.0, 0.0]], 0.01)],
 )
 def test_bad_points_are_refused(points, radius):
-    with pytest.raises(ValueError, match="points|reshape"):
+    with pytest.raises(ValueError, match="points"):
         CollisionChecker(EMPTY, points, radius)
 
 

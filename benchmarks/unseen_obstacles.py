@@ -1,0 +1,184 @@
+"""Policies in scenes that they never saw, without and with a last layer: docs/unseen_obstacles.md.
+
+    python benchmarks/unseen_obstacles.py --workers 2             # hours; what is done is skipped
+    python benchmarks/unseen_obstacles.py --only random_boxes_hard --num 10000 --workers 2
+    python benchmarks/unseen_obstacles.py --table                 # only writes the tables
+
+Each cell is a call of `clean_rl_scripts/evaluate.py` on the first `--num` test queries, goal
+`combined`. Results go to docs/unseen_obstacles.json at once; the tables in
+docs/unseen_obstacles.md, between its marks, are of what is there. Nothing may be chosen by them:
+for that there is `evaluate.py --split validation`.
+"""
+
+import argparse
+import datetime
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import envs
+from envs.files import write_atomically
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS, PAGE = (ROOT / "docs" / f"unseen_obstacles.{ending}" for ending in ("json", "md"))
+HARD = "random_boxes_hard"
+# What a last layer around any policy keeps: chosen on validation queries (docs/last_layer.md).
+OBSTACLES = ["--keep-distance", "0.01"]
+POINTS = ["--keep-distance", "0.015", "--encoder", "points"]
+STRAIGHT = ["--policy", "go-to-goal", "--goal-type", "combined"]
+PLANNER = ["--policy", "planner", "--goal-type", "combined"]
+CELLS = {
+    "go-to-goal": STRAIGHT,
+    "reactive, points, no way out": [*STRAIGHT, *POINTS, "--no-way-out"],
+    "reactive, points": [*STRAIGHT, *POINTS],
+    "reactive, obstacles, no way out": [*STRAIGHT, *OBSTACLES, "--no-way-out"],
+    "reactive, obstacles": [*STRAIGHT, *OBSTACLES],
+    "look, then plan": [*PLANNER, "--encoder", "points"],
+    "RRT-Connect": PLANNER,
+}
+for _encoder, _layer in (
+    ("vae", POINTS),
+    ("vqvae", POINTS),
+    ("pointnet2", POINTS),
+    ("oracle", OBSTACLES),
+):
+    _flags = ["--policy", f"bc-combined-{_encoder}-{HARD}-s1"]
+    CELLS |= {
+        f"bc, {_encoder}, alone": _flags,
+        f"bc, {_encoder}, no way out": [*_flags, *_layer, "--no-way-out"],
+        f"bc, {_encoder}": [*_flags, *_layer],
+    }
+for _encoder, _layer in (("points", POINTS[:2]), ("oracle", OBSTACLES)):
+    _flags = ["--policy", f"dagger-combined-{_encoder}-{HARD}-s1"]
+    CELLS |= {
+        f"dagger, {_encoder}, alone": [*_flags, "--keep-distance", "0"],
+        f"dagger, {_encoder}, no way out": [*_flags, *_layer, "--no-way-out"],
+        f"dagger, {_encoder}": _flags,  # its own layer
+    }
+# What stands in the first table: policy, what it knows, what its layer knows, and its cells.
+ROWS = (
+    ("`go-to-goal`", "nothing", "points", "go-to-goal", "reactive, points"),
+    ("`go-to-goal`", "nothing", "the obstacles", "go-to-goal", "reactive, obstacles"),
+    ("`bc.py`", "64 numbers (VAE)", "points", "bc, vae, alone", "bc, vae"),
+    ("`bc.py`", "64 numbers (VQ-VAE)", "points", "bc, vqvae, alone", "bc, vqvae"),
+    ("`bc.py`", "64 numbers (PointNet++)", "points", "bc, pointnet2, alone", "bc, pointnet2"),
+    ("`bc.py`", "the obstacles", "the obstacles", "bc, oracle, alone", "bc, oracle"),
+    ("`dagger.py`", "points", "points", "dagger, points, alone", "dagger, points"),
+    ("`dagger.py`", "the obstacles", "the obstacles", "dagger, oracle, alone", "dagger, oracle"),
+)
+# And in the second one, for every task.
+EVERYWHERE = (
+    "go-to-goal",
+    "reactive, points",
+    "dagger, points",
+    "dagger, oracle",
+    "look, then plan",
+)
+# The paper's best learned policy, sections 5.3 and 5.4. It knew 64 numbers of the scene.
+PAPER = {
+    HARD: 0.304,
+    "three_shelves": 0.816,
+    "pole_shelves": 0.741,
+    "narrow_shelves": 0.497,
+}
+KEPT = (
+    *("success_rate", "success_rate_interval", "clean_success_rate", "clean_success_rate_interval"),
+    *("num_queries", "ms_per_action", "planning_seconds", "mean_steps", "path_length"),
+    *("env", "encoder", "last_layer", "seed"),
+)
+BEGIN, END = "<!-- written by benchmarks/unseen_obstacles.py -->\n", "<!-- until here -->\n"
+
+
+def run(results, tasks, names, num, workers):
+    """Fill in the cells that are missing, or had fewer queries."""
+    for task in tasks:
+        for name in names:
+            done = results.get(task, {}).get(name)
+            if done is not None and done["num_queries"] >= num:
+                continue
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "result.json"
+                command = [sys.executable, ROOT / "clean_rl_scripts" / "evaluate.py", *CELLS[name]]
+                command += ["--task", task, "--num-queries", str(num)]
+                command += ["--workers", str(workers), "--json", path]
+                subprocess.run(command, check=True)
+                result = json.loads(path.read_text())
+            result = {key: result[key] for key in KEPT}
+            result |= {"flags": CELLS[name], "date": datetime.date.today().isoformat()}
+            results.setdefault(task, {})[name] = result
+            write_atomically(RESULTS, (json.dumps(results, indent=1) + "\n").encode())
+
+
+def tables(results):
+    """In Markdown."""
+    lines = [
+        "| policy | knows | its layer | alone | with the layer | and the way out | ms per action |",
+        "|---" * 7 + "|",
+    ]
+    hard = results.get(HARD, {})
+    for policy, knows, layer_knows, alone, layered in ROWS:
+        cells = [_cell(hard.get(name)) for name in (alone, f"{layered}, no way out", layered)]
+        taken = f"{hard[layered]['ms_per_action']:.1f}" if layered in hard else "not run"
+        lines.append("| " + " | ".join([policy, knows, layer_knows, *cells, taken]) + " |")
+    for policy, knows, name in (
+        ("look, then plan", "points", "look, then plan"),
+        ("RRT-Connect", "the obstacles", "RRT-Connect"),
+    ):
+        seconds = f"searches {hard[name]['planning_seconds']:.3f} s" if name in hard else "not run"
+        cells = [policy, knows, "none", _cell(hard.get(name)), "", "", seconds]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", "| task | paper's best policy | " + " | ".join(EVERYWHERE) + " |"]
+    lines.append("|---" * (2 + len(EVERYWHERE)) + "|")
+    for task in envs.TASKS:
+        cells = [_cell(results.get(task, {}).get(name)) for name in EVERYWHERE]
+        paper = f"{PAPER[task]:.3f}" if task in PAPER else "none given"
+        lines.append("| " + " | ".join([f"`{task}`", paper, *cells]) + " |")
+    done = [result for cells in results.values() for result in cells.values()]
+    if done:
+        dates = sorted({result["date"] for result in done})
+        counts = sorted({result["num_queries"] for result in done})
+        numbers = " or ".join(f"{n:,}" for n in counts)
+        measured = " to ".join(dict.fromkeys([dates[0], dates[-1]]))
+        lines += [
+            "",
+            f"Test queries of a cell: {numbers}; in brackets, the 95 % interval of success. "
+            f"Measured {measured}.",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(result):
+    if result is None:
+        return "not run"
+    low, high = result["success_rate_interval"]
+    rates = f"{result['success_rate']:.3f}, {result['clean_success_rate']:.3f}"
+    return f"{rates} [{low:.3f}, {high:.3f}]"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--only", nargs="+", choices=list(envs.TASKS), metavar="TASK")
+    parser.add_argument("--cells", nargs="+", choices=list(CELLS), metavar="CELL")
+    parser.add_argument("--num", type=int, default=1000, help="queries of a cell")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    args = parser.parse_args()
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    if not args.table:
+        if args.only is None or HARD in args.only:
+            run(results, [HARD], args.cells or CELLS, args.num, args.workers)
+        others = [task for task in args.only or envs.TASKS if task != HARD]
+        run(results, others, args.cells or EVERYWHERE, args.num, args.workers)
+    before, _, rest = PAGE.read_text().partition(BEGIN)
+    _, _, after = rest.partition(END)
+    write_atomically(PAGE, (before + BEGIN + tables(results) + END + after).encode())
+    print(f"{PAGE} written")
+
+
+if __name__ == "__main__":
+    main()
