@@ -51,7 +51,7 @@ class Args(runs.RunFlags):
     """folder of roadmap paths to learn from (demo_generation.roadmaps), in whatever scenes"""
 
     # The algorithm
-    total_updates: int = 12_000
+    total_updates: int = 24_000
     """batches of the whole run"""
     batch_size: int = 768
     """examples per batch"""
@@ -64,7 +64,7 @@ class Args(runs.RunFlags):
     evaluated and saved (1: no averaging)"""
     pool_size: int = 200_000
     """examples at hand, of which batches are drawn"""
-    examples_per_update: int = 384
+    examples_per_update: int = 256
     """new examples per update, all of one scene; they replace the oldest. With an eighth of a batch
     they are learned by heart (docs/training.md)"""
     noise: float = 0.03
@@ -91,9 +91,9 @@ class Args(runs.RunFlags):
     """whether it leaves dead ends"""
 
     # DAgger
-    round_every: int = 3_000
+    round_every: int = 2_000
     """updates between rounds (0: none)"""
-    round_queries: int = 50
+    round_queries: int = 40
     """queries of a round, each in a scene of the paths"""
     round_labels: int = 16
     """of the states that the policy came to on a query, how many are labelled"""
@@ -101,7 +101,7 @@ class Args(runs.RunFlags):
     """how much likelier such a state is in a batch than an example of the pool"""
 
     # Evaluation and bookkeeping
-    eval_every: int = 3_000
+    eval_every: int = 4_000
     """updates between evaluations on validation queries; the best policy is kept"""
     eval_queries: int = 200
     """validation queries per evaluation"""

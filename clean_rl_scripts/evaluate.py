@@ -402,7 +402,10 @@ def _prepare(
         if last_layer is None:
             last_layer = own_layer(policy)
         if last_layer:
-            env["proximity"] = encoder or env.get("proximity", "obstacles")
+            own = env.get("proximity", encoder or "obstacles")
+            if encoder not in (None, own):
+                raise EvaluationError(f"{policy} is told its distances from {own}, not {encoder}")
+            env["proximity"] = own
         elif encoder is not None and policy not in PLANNING:
             raise EvaluationError(
                 "encoder is for via-points, planner and a last layer: a trained policy has its own"

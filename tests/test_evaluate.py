@@ -265,6 +265,51 @@ def test_the_planner_solves_double_walls_and_follows_its_plan():
     assert result["path_length"] == pytest.approx(lengths)
 
 
+def test_a_last_layer_around_a_policy(tmp_path):
+    """`--keep-distance`: fewer touches, and with the way out of dead ends more is reached."""
+    found = {}
+    for name, flags in {
+        "bare": [],
+        "none": ["--keep-distance", "0"],
+        "layer": ["--keep-distance", "0.01", "--no-way-out"],
+        "way out": ["--keep-distance", "0.01"],
+        "points": ["--keep-distance", "0.015", "--encoder", "points"],
+    }.items():
+        command = ["--policy", "go-to-goal", "--task", "random_boxes_hard", "--num-queries", "25"]
+        command += ["--split", "validation", "--goal-type", "combined"]
+        assert evaluation.main([*command, *flags, "--json", str(tmp_path / "result.json")]) == 0
+        found[name] = json.loads((tmp_path / "result.json").read_text())
+    assert _numbers(found["none"]) == _numbers(found["bare"])
+    layers = {name: result["last_layer"] for name, result in found.items()}
+    assert layers["bare"] is layers["none"] is None
+    assert layers["layer"] == {"keep": 0.01, "way_out": False}
+    assert layers["way out"] == {"keep": 0.01, "way_out": True}
+    assert layers["points"] == {"keep": 0.015, "way_out": True}
+    knows = {name: result["env"].get("proximity") for name, result in found.items()}
+    assert knows == {name: "obstacles" for name in knows} | {
+        "bare": None,
+        "none": None,
+        "points": "points",
+    }
+    assert found["points"]["encoder"] == "points" and found["way out"]["encoder"] is None
+    for name in ("layer", "way out", "points"):
+        assert found[name]["collision_rate"] < 0.6 * found["bare"]["collision_rate"]
+    rates = {name: result["success_rate"] for name, result in found.items()}
+    assert rates["bare"] < rates["layer"] < rates["way out"]
+    assert found["points"]["seed"] == 0 and found["bare"]["seed"] is None
+
+
+def test_a_planner_that_looks():
+    """It knows only what is seen; here that is enough, mostly, and its plans are other ones."""
+    results = [
+        evaluate("planner", "random_boxes_hard", num_queries=8, split="validation", encoder=encoder)
+        for encoder in (None, "points")
+    ]
+    assert [result["encoder"] for result in results] == [None, "points"]
+    assert all(result["success_rate"] >= 0.75 for result in results)
+    assert results[0]["path_length"] != results[1]["path_length"]
+
+
 def test_a_planner_without_time_gives_up():
     both = _queries((LEFT, RIGHT), (RIGHT, LEFT))
     result = evaluate("planner", "wall", queries=both, time_limit=1e-6)
@@ -398,6 +443,10 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
     policy = str(_save(tmp_path / "policy.pt"))
     (tmp_path / "broken.pt").write_bytes(Path(policy).read_bytes()[:500])
     encoder = str(_save(tmp_path / "encoder.pt", kind="encoder"))
+    arguments = {"goal_type": "config", "proximity": "obstacles"}
+    near = str(_save(tmp_path / "near.pt", env=arguments))
+    arguments = {"goal_type": "config", "action_mode": "subgoal"}
+    subgoal = str(_save(tmp_path / "subgoal.pt", env=arguments))
     unsaid = str(_save(tmp_path / "unsaid.pt", env={}))
     unfit = str(_save(tmp_path / "unfit.pt", env={"goal_type": "ee"}))
     (tmp_path / "empty").mkdir()
@@ -406,6 +455,12 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"policy": str(tmp_path / "empty")}, "no such policy"),
         ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
         ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
+        ({"encoder": "points"}, "encoder is for via-points, planner and a last layer"),
+        (
+            {"policy": near, "keep-distance": "0.01", "encoder": "points"},
+            "distances from",
+        ),
+        ({"policy": subgoal, "keep-distance": "0.01"}, "a last layer changes displacements"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
