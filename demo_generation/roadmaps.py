@@ -25,10 +25,8 @@ run that was interrupted or killed goes on when it is started again, and one tha
 continued with more scenes.
 """
 
-import contextlib
 import copy
 import functools
-import importlib.util
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,15 +35,12 @@ import numpy as np
 import tyro
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
-from tqdm import tqdm
 
 import envs
-from envs import roadmap_paths, workers
+from envs import shards
 from envs.collision import CollisionChecker
-from envs.datasets import attribute
-from envs.files import write_atomically
+from envs.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from envs.scenes import Scene
-from envs.shards import shard_path
 
 # Around a configuration that is nearer to something than the margin, the margin grows by this much
 # (m) per unit of normalised distance from it.
@@ -449,25 +444,12 @@ class Collector:
         self.options, self.made_by = options, made_by
 
     def __call__(self, job):
-        """`(number, paths in it, contents of the file)`."""
+        """`(number, contents of the file)`."""
         number, first, end = job
         made = [random_paths_of_scene(index, self.options) for index in range(first, end)]
         scenes, paths = zip(*made, strict=True)
         task, seed = self.options["task"], self.options["seed"]
-        contents = roadmap_paths.shard_bytes(task, seed, first, scenes, paths, self.made_by)
-        return number, sum(map(len, paths)), contents
-
-
-def _is_there(folder, job, made_by):
-    """Whether a shard was made before. Raises ValueError if it is damaged or another one."""
-    number, first, end = job
-    path = shard_path(folder, number)
-    if not path.exists():
-        return False
-    with roadmap_paths.open_shard(path) as file:
-        if attribute(file, "made_by") != made_by:
-            raise ValueError(f"{path} was made by another command: {attribute(file, 'made_by')}")
-        return len(file["path_count"]) >= end - first  # the last one may have had fewer
+        return number, shard_bytes(task, seed, first, scenes, paths, self.made_by)
 
 
 def collect(args, progress=True):
@@ -479,7 +461,7 @@ def collect(args, progress=True):
         ConnectionError: there is no Ray cluster.
         OSError: the folder cannot be written. What was written is safe.
     """
-    for name in ("scenes", "paths_per_scene", "num_neighbours", "shard_size", "workers"):
+    for name in ("scenes", "paths_per_scene", "num_neighbours"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
     if not 0 <= args.seed <= MAX_SEED:
@@ -488,40 +470,18 @@ def collect(args, progress=True):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
     if not args.margin >= NODE_MARGIN:
         raise ValueError(f"--margin must be at least {NODE_MARGIN} m")
-    if not envs.get_task(args.task).trainable:
-        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
     package = Path(envs.__file__).parent.resolve()
     if package in (args.output.resolve(), *args.output.resolve().parents):
         raise ValueError(
             f"{args.output} is in {package}: the repository's own files stay as they are"
         )
-    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
-        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
-    args.output.mkdir(parents=True, exist_ok=True)
+    shards.check_collection(args)
     options = {name: getattr(args, name) for name in OPTIONS}
     flags = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
     made_by = " ".join(["python -m demo_generation.roadmaps", *flags])
-    firsts = range(0, args.scenes, args.shard_size)
-    jobs = [(i, k, min(k + args.shard_size, args.scenes)) for i, k in enumerate(firsts)]
-    missing = [job for job in jobs if not _is_there(args.output, job, made_by)]
-    there = args.scenes - sum(end - first for _, first, end in missing)
-    bar = tqdm(
-        desc=args.task,
-        total=args.scenes * args.paths_per_scene,
-        initial=there * args.paths_per_scene,
-        unit=" paths",
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
-        disable=not progress,
-    )
-    if args.ray_address is None:
-        results = workers.run(Collector, (options, made_by), missing, args.workers, warn=bar.write)
-    else:
-        results = workers.run_on_ray(args.ray_address, Collector, (options, made_by), missing)
-    with bar, contextlib.closing(results):
-        for number, count, contents in results:
-            write_atomically(shard_path(args.output, number), contents)
-            bar.update(count)
-    return roadmap_paths.load_roadmap_paths(args.output)
+    what = made_by, open_shard, "path_count", "paths", args.paths_per_scene
+    shards.collect(args, args.scenes, Collector, (options, made_by), *what, progress)
+    return load_roadmap_paths(args.output)
 
 
 def main(args):

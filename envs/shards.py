@@ -1,15 +1,23 @@
 """Folders of shards: `shard_00012.h5` and so on, HDF5 files of some hundred scenes each.
 
 Every array has checksums, and so has what HDF5 says about them: damage is noticed when it is read.
+`collect` makes a folder's shards, whatever is in them.
 """
 
+import contextlib
+import importlib.util
 import re
+import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
+from tqdm import tqdm
 
+from envs import workers
 from envs.dataset_format import DatasetError, attribute
+from envs.files import write_atomically
+from envs.tasks import get_task
 
 _SHARD = re.compile(r"shard_(\d{5})\.h5")
 
@@ -59,3 +67,72 @@ def read_array(file, path, name):
         return file[name][()]
     except (KeyError, OSError) as error:
         raise DatasetError(f"{path}: {name} is missing or corrupt ({error})") from error
+
+
+def check_collection(args):
+    """Raises ValueError: flags of a collection, as `collect` takes them, that cannot work."""
+    for name in ("shard_size", "workers"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+    if not get_task(args.task).trainable:
+        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
+    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
+        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+
+
+def collect(
+    args, num_scenes, collector, arguments, made_by, open_shard, counted, unit, per_scene, progress
+):
+    """Make the shards of a folder that are missing, each in one piece, in workers.
+
+    Args:
+        args: the flags `task`, `output` (the folder), `shard_size`, `workers`, `ray_address`.
+        num_scenes: in all shards.
+        collector: a class. Of a job, `(number, first scene, scene after the last)`, its instances
+            make `(number, contents of the file)`.
+        arguments: of the class.
+        made_by: the command line, as it stands in the shards: others are not of this collection.
+        open_shard: a function from a path to an `h5py.File`.
+        counted: name of an array in it that has a row per scene.
+        unit, per_scene: what the progress bar counts, and how many of it each scene has.
+        progress: whether there is a bar.
+
+    Raises:
+        ValueError: the folder holds shards of another collection, or damaged ones.
+        RuntimeError: workers keep dying.
+        ConnectionError: there is no Ray cluster.
+        OSError: the folder cannot be written. What was written is safe.
+    """
+    args.output.mkdir(parents=True, exist_ok=True)
+    firsts = range(0, num_scenes, args.shard_size)
+    jobs = [(i, k, min(k + args.shard_size, num_scenes)) for i, k in enumerate(firsts)]
+
+    def is_there(job):
+        number, first, end = job
+        path = shard_path(args.output, number)
+        if not path.exists():
+            return False
+        with open_shard(path) as file:
+            found = attribute(file, "made_by")
+            if found != made_by:
+                raise ValueError(f"{path} was made by another command: {found}")
+            return len(file[counted]) >= end - first  # the last one may have had fewer
+
+    missing = [job for job in jobs if not is_there(job)]
+    there = num_scenes - sum(end - first for _, first, end in missing)
+    bar = tqdm(
+        desc=str(args.task),
+        total=num_scenes * per_scene,
+        initial=there * per_scene,
+        unit=f" {unit}",
+        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+        disable=not progress,
+    )
+    if args.ray_address is None:
+        results = workers.run(collector, arguments, missing, args.workers, warn=bar.write)
+    else:
+        results = workers.run_on_ray(args.ray_address, collector, arguments, missing)
+    with bar, contextlib.closing(results):
+        for number, contents in results:
+            write_atomically(shard_path(args.output, number), contents)
+            bar.update((jobs[number][2] - jobs[number][1]) * per_scene)

@@ -10,8 +10,6 @@ shard at a time, each in one piece; a run that was interrupted or killed goes on
 again, and one that is finished can be continued with a larger `--num`.
 """
 
-import contextlib
-import importlib.util
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,19 +17,10 @@ from typing import Literal
 
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 import envs
-from envs import workers
-from envs.datasets import attribute
-from envs.files import write_atomically
-from envs.observations import (
-    Observations,
-    observe,
-    open_shard,
-    shard_bytes,
-    shard_path,
-)
+from envs import shards
+from envs.observations import Observations, observe, open_shard, shard_bytes
 from envs.sensors import Camera, PointCloud, SensorWorld, cardinal
 
 # Streams 1 to 3 of random numbers are those of the queries and demonstrations.
@@ -95,18 +84,6 @@ class Collector:
         return number, shard_bytes(self.task, self.seed, first, *arguments)
 
 
-def _is_there(folder, job, made_by):
-    """Whether a shard was made before. Raises ValueError if it is damaged or another one."""
-    number, first, end = job
-    path = shard_path(folder, number)
-    if not path.exists():
-        return False
-    with open_shard(path) as file:
-        if attribute(file, "made_by") != made_by:
-            raise ValueError(f"{path} was made by another command: {attribute(file, 'made_by')}")
-        return len(file["configuration"]) >= end - first  # the last one may have had fewer
-
-
 def collect(args, progress=True):
     """Make the shards that are missing.
 
@@ -115,39 +92,16 @@ def collect(args, progress=True):
         ConnectionError: there is no Ray cluster.
         OSError: the folder cannot be written. What was written is safe.
     """
-    for name, lowest in (("num", 1), ("shard_size", 1), ("seed", 0), ("workers", 1)):
+    for name, lowest in (("num", 1), ("seed", 0)):
         if getattr(args, name) < lowest:
             raise ValueError(f"--{name.replace('_', '-')} must be at least {lowest}")
-    if not envs.get_task(args.task).trainable:
-        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
-    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
-        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
-    sensors = sensors_of(args)
-    args.output.mkdir(parents=True, exist_ok=True)
+    shards.check_collection(args)
     names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
     flags = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
     made_by = " ".join(["python -m scene_embedding_train.collect", *flags])
-    firsts = range(0, args.num, args.shard_size)
-    jobs = [(i, k, min(k + args.shard_size, args.num)) for i, k in enumerate(firsts)]
-    missing = [job for job in jobs if not _is_there(args.output, job, made_by)]
-    there = args.num - sum(end - first for _, first, end in missing)
-    bar = tqdm(
-        desc=args.task,
-        total=args.num,
-        initial=there,
-        unit=" scenes",
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
-        disable=not progress,
-    )
-    arguments = (args.task, args.seed, sensors, made_by)
-    if args.ray_address is None:
-        results = workers.run(Collector, arguments, missing, args.workers, warn=bar.write)
-    else:
-        results = workers.run_on_ray(args.ray_address, Collector, arguments, missing)
-    with bar, contextlib.closing(results):
-        for number, contents in results:
-            write_atomically(shard_path(args.output, number), contents)
-            bar.update(jobs[number][2] - jobs[number][1])
+    arguments = (args.task, args.seed, sensors_of(args), made_by)
+    what = made_by, open_shard, "configuration", "scenes", 1
+    shards.collect(args, args.num, Collector, arguments, *what, progress)
     return Observations(args.output)
 
 

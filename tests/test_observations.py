@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs import workers
 from envs.datasets import DatasetError
 from envs.observations import Observations, sensors_from_json, sensors_to_json, shard_path
 from envs.sensors import Camera, PointCloud, SensorWorld, cardinal
@@ -83,13 +84,13 @@ def test_what_is_there_is_not_made_again(whole, tmp_path, monkeypatch):
         (tmp_path / name).write_bytes(contents)
     (tmp_path / "shard_00001.h5").unlink()
     made = []
-    run = collect.workers.run
+    run = workers.run
 
     def record(make, arguments, jobs, *more, **others):
         made.extend(jobs)
         return run(make, arguments, jobs, *more, **others)
 
-    monkeypatch.setattr(collect.workers, "run", record)
+    monkeypatch.setattr(workers, "run", record)
     collect.collect(args(tmp_path), progress=False)
     assert made == [(1, 4, 8)] and shards(tmp_path) == shards(whole)
 

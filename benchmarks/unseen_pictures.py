@@ -1,0 +1,122 @@
+"""The pictures of docs/unseen_obstacles.md: an animation of a policy, and bars of its numbers.
+
+    python benchmarks/unseen_pictures.py
+
+The animation is of validation queries: above `go-to-goal`, below the policy, in the same scenes.
+The bars are of docs/unseen_obstacles.json (benchmarks/unseen_obstacles.py).
+"""
+
+import argparse
+import io
+import json
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from PIL import Image
+
+import envs
+from envs.datasets import load_queries
+from envs.files import write_atomically
+from envs.policies import find_policy, make_policy
+from envs.show import film, rollout
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS, PICTURES = ROOT / "docs" / "unseen_obstacles.json", ROOT / "docs" / "pictures"
+HARD = "random_boxes_hard"
+FRAMES, SECONDS_PER_FRAME, LAST_SECONDS, COLOURS = 36, 0.12, 1.5, 48
+# Of the bars: cell of the results, and its name.
+ALONE = (
+    ("go-to-goal", "go-to-goal", "reactive, points"),
+    ("bc.py, VAE", "bc, vae, alone", "bc, vae"),
+    ("bc.py,\nobstacles", "bc, oracle, alone", "bc, oracle"),
+    ("dagger.py,\npoints", "dagger, points, alone", "dagger, points"),
+    ("dagger.py,\nobstacles", "dagger, oracle, alone", "dagger, oracle"),
+    ("look, then\nplan", None, "look, then plan"),
+)
+
+
+def animation(policy, numbers, size):
+    """A GIF file's bytes: a column per validation query; above `go-to-goal`, below the policy."""
+    queries, rows = load_queries(HARD, "validation"), []
+    for name in ("go-to-goal", policy):
+        found, arguments = find_policy(name)
+        arguments = arguments or {"goal_type": "combined"}
+        env = envs.make(HARD, render_mode="rgb_array", **arguments)
+        begin = make_policy(found, env)
+        columns = []
+        for number in numbers:
+            query = queries[number]
+            configurations, info = rollout(env, query, begin(number, query).act)
+            # All at the same speed: what arrives early stands still for the rest.
+            steps = np.linspace(0, 200, FRAMES).round().astype(int)
+            steps = np.minimum(steps, len(configurations) - 1)
+            columns.append(list(film(env, query, configurations[steps], size)))
+            print(f"{name}, query {number}: {len(configurations) - 1} steps, {info['is_success']=}")
+        env.close()
+        rows.append(np.concatenate(columns, axis=2))
+    frames = [Image.fromarray(frame) for frame in np.concatenate(rows, axis=1)]
+    palette = frames[0].quantize(COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=3)
+    frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    seconds = [SECONDS_PER_FRAME] * (FRAMES - 1) + [LAST_SECONDS]
+    contents = io.BytesIO()
+    durations = [round(1000 * one) for one in seconds]
+    frames[0].save(
+        contents, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0
+    )
+    return contents.getvalue()
+
+
+def bars(results):
+    """A PNG file's bytes."""
+    figure, axes = plt.subplots(figsize=(8, 3.2), layout="constrained")
+    styles = (
+        ("alone", -0.2, 1, "#b8c4d6"),
+        ("with the last layer", 0.2, 2, "#3f6fb5"),
+    )
+    for label, shift, column, colour in styles:
+        for clean in (False, True):
+            name = "clean_success_rate" if clean else "success_rate"
+            heights = [
+                results[row[column]][name] if row[column] in results else np.nan for row in ALONE
+            ]
+            axes.bar(
+                np.arange(len(ALONE)) + shift,
+                heights,
+                0.36,
+                color=colour,
+                edgecolor="black" if clean else colour,
+                linewidth=0.8,
+                alpha=1.0 if clean else 0.55,
+                label=f"{label}, {'clean' if clean else 'success'}",
+            )
+    axes.axhline(0.304, color="#b5533f", linestyle="--", linewidth=1)
+    axes.text(len(ALONE) - 0.55, 0.315, "paper's best policy", color="#b5533f", ha="right")
+    axes.set_xticks(np.arange(len(ALONE)), [row[0] for row in ALONE])
+    axes.set_ylim(0, 1)
+    axes.set_ylabel(f"share of test queries,\n{HARD}")
+    axes.legend(loc="upper left", fontsize=8, ncols=2)
+    contents = io.BytesIO()
+    figure.savefig(contents, format="png", dpi=110)
+    plt.close(figure)
+    return contents.getvalue()
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--policy", default=f"dagger-combined-points-{HARD}-s1")
+    parser.add_argument("--queries", type=int, nargs="+", default=[1, 4, 8])
+    parser.add_argument("--size", type=int, nargs=2, default=(224, 168))
+    args = parser.parse_args()
+    results = json.loads(RESULTS.read_text())
+    write_atomically(PICTURES / "unseen_bars.png", bars(results[HARD]))
+    contents = animation(args.policy, args.queries, tuple(args.size))
+    write_atomically(PICTURES / "unseen_episodes.gif", contents)
+    print(f"{len(contents) / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()
