@@ -111,8 +111,11 @@ def main():
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 4, 8])
     parser.add_argument("--size", type=int, nargs=2, default=(224, 168))
     args = parser.parse_args()
-    results = json.loads(RESULTS.read_text())
-    write_atomically(PICTURES / "unseen_bars.png", bars(results[HARD]))
+    baselines, results = (
+        json.loads(path.read_text())[HARD]
+        for path in (RESULTS.with_name("baselines.json"), RESULTS)
+    )
+    write_atomically(PICTURES / "unseen_bars.png", bars(baselines | results))
     contents = animation(args.policy, args.queries, tuple(args.size))
     write_atomically(PICTURES / "unseen_episodes.gif", contents)
     print(f"{len(contents) / 1e6:.2f} MB")
