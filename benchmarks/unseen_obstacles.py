@@ -120,7 +120,7 @@ def run(tasks, names, num, workers):
             write_atomically(RESULTS, (json.dumps(results, indent=1) + "\n").encode())
 
 
-def tables(load_results(), baselines):
+def tables(results, baselines):
     """In Markdown."""
     names = ("go-to-goal", *EVERYWHERE)
     results = {
