@@ -1,5 +1,6 @@
 """Policies in scenes that they never saw, without and with a last layer: docs/unseen_obstacles.md.
 
+    python benchmarks/unseen_obstacles.py --keep runs/RUN         # a run of dagger.py: its policy
     python benchmarks/unseen_obstacles.py --workers 2             # hours; what is done is skipped
     python benchmarks/unseen_obstacles.py --only random_boxes_hard --num 10000 --workers 2
     python benchmarks/unseen_obstacles.py --table                 # only writes the tables
@@ -22,11 +23,13 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import envs
+from envs.exported_networks import halve_network
 from envs.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, PAGE = (ROOT / "docs" / f"unseen_obstacles.{ending}" for ending in ("json", "md"))
 BASELINES = ROOT / "docs" / "baselines.json"
+POLICIES = ROOT / "bc_script" / "policies"
 HARD = "random_boxes_hard"
 # What a last layer around any policy keeps: chosen on validation queries (docs/last_layer.md).
 OBSTACLES = ["--keep-distance", "0.01"]
@@ -92,6 +95,21 @@ KEPT = (
     *("env", "encoder", "last_layer", "seed"),
 )
 BEGIN, END = "<!-- written by benchmarks/unseen_obstacles.py -->\n", "<!-- until here -->\n"
+
+
+def keep(run):
+    """Put a run's policy where it is found by name, in half precision, with how it was made."""
+    training = json.loads((run / "result.json").read_text())
+    args = training["args"]
+    encoder = args["encoder"].partition(":")[0]
+    name = f"dagger-{args['goal_type']}-{encoder}-{args['task']}-s{args['seed']}"
+    halve_network(run / "policy.pt", POLICIES / f"{name}.pt")
+    made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
+    made |= {key: training[key] for key in ("policy_step", "validation_success_rate")}
+    made |= {"training_seconds": training["seconds"], "date": datetime.date.today().isoformat()}
+    made["args"] = {key: args[key] for key in args if key not in ("runs_dir", "resume")}
+    write_atomically(POLICIES / f"{name}.json", (json.dumps(made, indent=1) + "\n").encode())
+    print(f"{POLICIES / name}.pt")
 
 
 def load_results():
@@ -169,7 +187,10 @@ def main():
     parser.add_argument("--num", type=int, default=1000, help="queries of a cell")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--table", action="store_true", help="run nothing")
+    parser.add_argument("--keep", type=Path, metavar="RUN", help="only keep a run's policy")
     args = parser.parse_args()
+    if args.keep:
+        return keep(args.keep)
     if not args.table:
         if args.only is None or HARD in args.only:
             run([HARD], args.cells or CELLS, args.num, args.workers)

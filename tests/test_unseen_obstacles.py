@@ -1,0 +1,57 @@
+"""The tables of unseen scenes, from results, and a run's policy by name."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import envs
+
+ROOT = Path(__file__).resolve().parent.parent
+spec = importlib.util.spec_from_file_location(
+    "unseen_obstacles", ROOT / "benchmarks" / "unseen_obstacles.py"
+)
+unseen = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(unseen)
+
+
+def result(success, clean, number=200):
+    return {
+        "success_rate": success,
+        "success_rate_interval": [success - 0.03, success + 0.03],
+        "clean_success_rate": clean,
+        "num_queries": number,
+        "ms_per_action": 1.25,
+        "planning_seconds": 0.5,
+        "date": "2026-11-22",
+    }
+
+
+def test_the_tables_between_the_marks_are_of_the_results(tmp_path, monkeypatch):
+    page, results = tmp_path / "page.md", tmp_path / "results.json"
+    page.write_text(f"# Before\n\n{unseen.BEGIN}old\n{unseen.END}\nAfter\n")
+    hard = {"dagger, points": result(0.93, 0.91, 3000), "dagger, points, alone": result(0.7, 0.4)}
+    found = {unseen.HARD: hard, "wall": {"dagger, points": result(0.8, 0.75)}}
+    results.write_text(json.dumps(found))
+    monkeypatch.setattr(unseen, "PAGE", page)
+    monkeypatch.setattr(unseen, "RESULTS", results)
+    monkeypatch.setattr(sys, "argv", ["unseen_obstacles.py", "--table"])
+    unseen.main()
+    text = page.read_text()
+    assert text.startswith("# Before\n\n") and text.endswith("\nAfter\n") and "old" not in text
+    (row,) = [line for line in text.splitlines() if line.startswith("| `dagger.py` | points")]
+    assert "| 0.700, 0.400 [200: 0.670, 0.730] | not run | 0.930, 0.910 [3,000: 0.9" in row
+    assert row.endswith("| 1.2 |")
+    (wall,) = [line for line in text.splitlines() if line.startswith("| `wall` |")]
+    assert "0.800, 0.750 [200" in wall and wall.count("not run") == 3
+    assert all(f"| `{task}` |" in text for task in envs.TASKS)
+    # Again, the same.
+    unseen.main()
+    assert page.read_text() == text
+
+
+def test_the_page_has_the_tables_of_its_results():
+    begin, end = (unseen.PAGE.read_text().index(mark) for mark in (unseen.BEGIN, unseen.END))
+    baselines = json.loads(unseen.BASELINES.read_text())
+    shown = unseen.PAGE.read_text()[begin + len(unseen.BEGIN) : end]
+    assert shown == unseen.tables(unseen.load_results(), baselines)
