@@ -107,8 +107,8 @@ class LastLayer:
             here = np.concatenate([observation["proximity"], _own_proximity(state)])
             keep = np.broadcast_to(keep, len(here))
             move = self(action, here, keep, max_step)
+            # The second look: what is near there, as if its gradient were the same all the way.
             there = np.concatenate([proximity_at(state + move), _own_proximity(state + move)])
-            # What it would be here, if its gradient were the same all the way.
             there[:, 0] -= there[:, 1:] @ move
             return self(action, np.concatenate([here, there]), np.tile(keep, 2), max_step)
 
