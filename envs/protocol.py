@@ -229,7 +229,7 @@ def validate(policy, envs, queries, device, writer, step, progress, last_layer=N
         envs: of `make_eval_envs`.
         writer: TensorBoard's.
         step: of the training.
-        progress: dict with `best_success` and `best_step`, which are set if this is the best.
+        progress: dict with `best_success` and `best_step`, which are set if none was better.
 
     Returns:
         The success rate.
@@ -243,7 +243,7 @@ def validate(policy, envs, queries, device, writer, step, progress, last_layer=N
     picture = picture_of_rollout(policy, envs[0], queries[0], device, last_layer)
     writer.add_image("eval/rollout", picture, step, dataformats="HWC")
     success = result["success_rate"]
-    if success > progress["best_success"]:
+    if success >= progress["best_success"]:
         progress |= {"best_success": success, "best_step": step}
     return success
 

@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 
 import envs
-from envs.policies import PolicyError, find_policy, make_policy, policy_file, shipped_policies
+from envs.last_layer import LastLayer
+from envs.policies import (
+    PolicyError,
+    find_policy,
+    make_policy,
+    own_layer,
+    policy_file,
+    shipped_policies,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -40,6 +48,13 @@ def test_a_policy_in_an_environment_without_what_it_sees():
     with pytest.raises(PolicyError, match="bc-combined-oracle-random_boxes_hard-s1.pt"):
         make_policy(path, env)
     env.close()
+
+
+def test_a_shipped_policy_brings_what_it_sees_and_its_last_layer():
+    path, arguments = find_policy("dagger-combined-points-random_boxes_hard-s1")
+    assert arguments == {"goal_type": "combined", "encoder": "points:32", "proximity": "points"}
+    assert own_layer(path) == LastLayer(keep=0.015, way_out=True)
+    assert own_layer(policy_file("bc-config-double_walls-s1")) is None
 
 
 def test_envs_needs_neither_the_planner_nor_the_trainers():
