@@ -31,7 +31,7 @@ RESULTS, PAGE = (ROOT / "docs" / f"unseen_obstacles.{ending}" for ending in ("js
 BASELINES = ROOT / "docs" / "baselines.json"
 POLICIES = ROOT / "bc_script" / "policies"
 HARD = "random_boxes_hard"
-# What a last layer around any policy keeps: chosen on validation queries (docs/last_layer.md).
+# What a last layer around any policy keeps: see docs/last_layer.md.
 OBSTACLES = ["--keep-distance", "0.01"]
 POINTS = ["--keep-distance", "0.015", "--encoder", "points"]
 STRAIGHT = ["--policy", "go-to-goal", "--goal-type", "combined"]
@@ -107,7 +107,8 @@ def keep(run):
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
     made |= {key: training[key] for key in ("policy_step", "validation_success_rate")}
     made |= {"training_seconds": training["seconds"], "date": datetime.date.today().isoformat()}
-    made["args"] = {key: args[key] for key in args if key not in ("runs_dir", "resume")}
+    folders = ("runs_dir", "resume", "paths")  # on the machine that it was made on
+    made["args"] = {key: args[key] for key in args if key not in folders}
     write_atomically(POLICIES / f"{name}.json", (json.dumps(made, indent=1) + "\n").encode())
     print(f"{POLICIES / name}.pt")
 

@@ -5,7 +5,10 @@ import json
 import sys
 from pathlib import Path
 
+import torch
+
 import envs
+from envs.exported_networks import load_network, save_network
 
 ROOT = Path(__file__).resolve().parent.parent
 spec = importlib.util.spec_from_file_location(
@@ -48,6 +51,25 @@ def test_the_tables_between_the_marks_are_of_the_results(tmp_path, monkeypatch):
     # Again, the same.
     unseen.main()
     assert page.read_text() == text
+
+
+def test_a_runs_policy_is_kept_by_name_and_says_how_it_was_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(unseen, "POLICIES", tmp_path / "policies")
+    (tmp_path / "policies").mkdir()
+    network = torch.nn.Linear(3, 2)
+    save_network(tmp_path / "policy.pt", network, {"input": torch.zeros(1, 3)}, {"kind": "policy"})
+    args = {"goal_type": "combined", "encoder": "points:32", "task": unseen.HARD, "seed": 4}
+    folders = {name: str(tmp_path) for name in ("runs_dir", "paths", "resume")}
+    made = {"steps": 9, "policy_step": 6, "validation_success_rate": 0.5, "seconds": 7}
+    (tmp_path / "result.json").write_text(json.dumps(made | {"args": args | folders}))
+    monkeypatch.setattr(sys, "argv", ["unseen_obstacles.py", "--keep", str(tmp_path)])
+    unseen.main()
+    path = tmp_path / "policies" / "dagger-combined-points-random_boxes_hard-s4.pt"
+    kept = load_network(path)(torch.ones(1, 3))
+    assert torch.allclose(kept, network(torch.ones(1, 3)), atol=1e-2)
+    text = path.with_suffix(".json").read_text()
+    assert str(tmp_path) not in text and json.loads(text)["args"] == args
+    assert json.loads(text)["policy_step"] == 6
 
 
 def test_the_page_has_the_tables_of_its_results():
