@@ -479,8 +479,18 @@ def collect(args, progress=True):
     options = {name: getattr(args, name) for name in OPTIONS}
     flags = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
     made_by = " ".join(["python -m demo_generation.roadmaps", *flags])
-    what = made_by, open_shard, "path_count", "paths", args.paths_per_scene
-    shards.collect(args, args.scenes, Collector, (options, made_by), *what, progress)
+    shards.collect(
+        args,
+        args.scenes,
+        Collector,
+        (options, made_by),
+        made_by,
+        open_shard,
+        counted="path_count",
+        unit="paths",
+        per_scene=args.paths_per_scene,
+        progress=progress,
+    )
     return load_roadmap_paths(args.output)
 
 

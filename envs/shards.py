@@ -81,7 +81,17 @@ def check_collection(args):
 
 
 def collect(
-    args, num_scenes, collector, arguments, made_by, open_shard, counted, unit, per_scene, progress
+    args,
+    num_scenes,
+    collector,
+    arguments,
+    made_by,
+    open_shard,
+    *,
+    counted,
+    unit,
+    per_scene=1,
+    progress=True,
 ):
     """Make the shards of a folder that are missing, each in one piece, in workers.
 

@@ -100,8 +100,17 @@ def collect(args, progress=True):
     flags = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
     made_by = " ".join(["python -m scene_embedding_train.collect", *flags])
     arguments = (args.task, args.seed, sensors_of(args), made_by)
-    what = made_by, open_shard, "configuration", "scenes", 1
-    shards.collect(args, args.num, Collector, arguments, *what, progress)
+    shards.collect(
+        args,
+        args.num,
+        Collector,
+        arguments,
+        made_by,
+        open_shard,
+        counted="configuration",
+        unit="scenes",
+        progress=progress,
+    )
     return Observations(args.output)
 
 
