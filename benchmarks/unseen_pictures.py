@@ -55,7 +55,8 @@ def animation(policy, numbers, size):
             steps = np.linspace(0, 200, FRAMES).round().astype(int)
             steps = np.minimum(steps, len(configurations) - 1)
             columns.append(list(film(env, query, configurations[steps], size)))
-            print(f"{name}, query {number}: {len(configurations) - 1} steps, {info['is_success']=}")
+            ended = "reached" if info["is_success"] else "not reached"
+            print(f"{name}, query {number}: {ended} in {len(configurations) - 1} steps")
         env.close()
         rows.append(np.concatenate(columns, axis=2))
     frames = [Image.fromarray(frame) for frame in np.concatenate(rows, axis=1)]

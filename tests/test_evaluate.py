@@ -456,10 +456,7 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
         ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
         ({"encoder": "points"}, "encoder is for via-points, planner and a last layer"),
-        (
-            {"policy": near, "keep-distance": "0.01", "encoder": "points"},
-            "distances from",
-        ),
+        ({"policy": near, "keep-distance": "0.1", "encoder": "points"}, "from obstacles, not"),
         ({"policy": subgoal, "keep-distance": "0.01"}, "a last layer changes displacements"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),

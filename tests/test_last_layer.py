@@ -92,6 +92,21 @@ def test_proximity_changes_no_episode():
     more.close()
 
 
+def test_nearest_within_a_distance_is_the_same_and_beyond_it_nothing():
+    scene = load_queries("random_boxes_hard")[0].scene
+    states = np.random.default_rng(0).uniform(-1, 1, (300, 7))
+    for checker in (CollisionChecker(scene), seen_checker(scene)):
+        for self_collisions in (False, True):
+            every = checker.nearest(states, self_collisions)
+            near = checker.nearest(states, self_collisions, within=0.1)
+            inside = every.distance < 0.1
+            assert 0.1 < inside.mean() < 0.9
+            for name in ("distance", "gradient", "thing"):
+                one, other = getattr(every, name)[inside], getattr(near, name)[inside]
+                np.testing.assert_allclose(one, other, atol=1e-6)
+            assert np.isinf(near.distance[~inside]).all() and not near.gradient[~inside].any()
+
+
 def test_unknown_proximity_is_refused():
     with pytest.raises(ValueError, match="proximity must be None, 'obstacles' or 'points'"):
         envs.make("wall", proximity="lidar")

@@ -82,6 +82,18 @@ def test_a_last_layer_has_its_own_state_in_every_episode():
     assert found["collision_rate"] < bare["collision_rate"]
 
 
+def test_of_equally_good_policies_the_latest_is_the_best(monkeypatch):
+    rates = iter([0.5, 0.7, 0.6, 0.7, 0.2])
+    monkeypatch.setattr(protocol, "evaluate", lambda *_: {"success_rate": next(rates)})
+    monkeypatch.setattr(protocol, "picture_of_rollout", lambda *_: None)
+    writer = SimpleNamespace(add_scalar=lambda *_: None, add_image=lambda *_, **__: None)
+    progress, best = {"best_success": -1.0, "best_step": 0}, []
+    for step in range(1, 6):
+        protocol.validate(None, [None], [None], "cpu", writer, step, progress)
+        best.append((progress["best_step"], progress["best_success"]))
+    assert best == [(1, 0.5), (2, 0.7), (2, 0.7), (4, 0.7), (4, 0.7)]
+
+
 def result_of(run, capsys, **env_arguments):
     """`result.json` and the printed lines for a policy that needs more than 50 steps."""
     args = SimpleNamespace(task="no_obstacles", goal_type="config", exp_name="x", seed=1)
