@@ -50,6 +50,10 @@ MARGIN_GROWTH = 0.03
 # takes long is likely to go on for long: after so many configurations it keeps this share of them.
 # (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmarks.md.)
 CAUTIONS = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
+# And where RRT-Connect has found nothing after so many configurations, LBKPIECE1 may look at so many,
+# before it goes on: ways out of a shelf that one of them does not find, the other one finds at once.
+# (Chosen together with the original MotionBenchMaker problems: docs/benchmarks.md.)
+OTHER_PLANNER, OTHER_AFTER, OTHER_CHECKS = "LBKPIECE1", 8_000, 4_000
 # Searches that it makes at most for a path that can be followed within an episode.
 SEARCHES = 3
 # Steps by which the arm may come later than its last sub-goal.
@@ -234,22 +238,27 @@ class Planner:
         """
         if not 0 <= caution <= 1:
             raise ValueError(f"caution must be in [0, 1], got {caution!r}")
-        cautions = ((0, caution),)
-        return self._plan(start, goal, scene, seed, cautions, self.time_limit, self.max_checks)
+        turns, cautions = ((self.planner, math.inf),), ((0, caution),)
+        limits = self.time_limit, self.max_checks
+        return self._plan(start, goal, scene, seed, turns, cautions, *limits)
 
     def plan_within(self, seconds, start, goal, scene=None, *, rng):
         """A path found in `seconds`, which are its only limit; it keeps what `CAUTIONS` say.
 
-        The same path comes out on every machine that has the time. If it takes longer to follow
+        RRT-Connect gets help from `OTHER_PLANNER` where that takes long. The same path comes out on every machine that has the time. If it takes longer to follow
         than an episode lasts, there is another search, up to `SEARCHES`, and the shortest is
         returned. `rng`, a NumPy Generator, gives the seeds; the rest is as for `plan`, which may
         be a little late itself.
         """
         deadline, best = time.monotonic() + seconds, None
+        turns = ((self.planner, math.inf),)
+        if self.planner == "RRTConnect":
+            until = OTHER_AFTER, OTHER_AFTER + OTHER_CHECKS, math.inf
+            turns = tuple(zip((self.planner, OTHER_PLANNER, self.planner), until, strict=True))
         for _ in range(SEARCHES):
             seed, left = int(rng.integers(1, 2**32)), deadline - time.monotonic()
             try:
-                path = self._plan(start, goal, scene, seed, CAUTIONS, left, math.inf)
+                path = self._plan(start, goal, scene, seed, turns, CAUTIONS, left, math.inf)
             except PlanningError:
                 break
             if best is None or len(subgoals(path)) < len(subgoals(best)):
@@ -260,7 +269,7 @@ class Planner:
             raise PlanningError(f"no path in {seconds} s")
         return best
 
-    def _plan(self, start, goal, scene, seed, cautions, time_limit, max_checks):
+    def _plan(self, start, goal, scene, seed, turns, cautions, time_limit, max_checks):
         if not seed > 0:
             raise ValueError(f"seed must be positive, got {seed!r}")  # OMPL ignores others
         if np.shape(goal) == (3,):  # a position, with which an episode may begin
@@ -279,8 +288,7 @@ class Planner:
             path = self.planner(is_valid, *states, np.random.default_rng(seed))
             path = None if path is None else _checked(path, *states)
         else:
-            kind = getattr(og, self.planner)
-            path = _solve(kind, self.planner_range, space, is_valid, *states)
+            path = _solve(turns, self.planner_range, space, is_valid, *states)
         if path is not None and self.simplify:
             is_valid.insist()
             path = _simplify(space, path, self.simplify)
@@ -341,17 +349,30 @@ def _state(space, values):
     return state
 
 
-def _solve(kind, planner_range, space, is_valid, start, goal):
-    """Normalised path (n, 7) by one of OMPL's planners; None if there was none in time."""
+def _solve(turns, planner_range, space, is_valid, start, goal):
+    """Normalised path (n, 7) by OMPL's planners; None if there was none in time.
+
+    `turns`: pairs of a planner's name, and the number of checks at which the next one takes over;
+    one that had a turn before goes on from there.
+    """
     problem = ob.ProblemDefinition(space)
     problem.setStartAndGoalStates(_state(space, start), _state(space, goal))
-    planner = kind(space)
-    planner.setProblemDefinition(problem)
-    if hasattr(planner, "setRange"):
-        planner.setRange(planner_range)
-    planner.setup()
-    planner.solve(ob.PlannerTerminationCondition(is_valid.exhausted))
-    return _to_array(problem.getSolutionPath()) if problem.hasExactSolution() else None
+    planners = {}
+    for name, checks in turns:
+        if name not in planners:
+            planners[name] = planner = getattr(og, name)(space)
+            planner.setProblemDefinition(problem)
+            if hasattr(planner, "setRange"):
+                planner.setRange(planner_range)
+            planner.setup()
+
+        def over(checks=checks):
+            return is_valid.checks >= checks or is_valid.exhausted()
+
+        planners[name].solve(ob.PlannerTerminationCondition(over))
+        if problem.hasExactSolution():
+            return _to_array(problem.getSolutionPath())
+    return None
 
 
 def _simplify(space, path, rounds):

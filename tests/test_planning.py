@@ -11,7 +11,14 @@ import pybullet as p
 import pytest
 
 import envs
-from demo_generation.planning import CAUTIONS, MARGIN, PLANNERS, Planner, PlanningError
+from demo_generation.planning import (
+    CAUTIONS,
+    MARGIN,
+    OTHER_AFTER,
+    PLANNERS,
+    Planner,
+    PlanningError,
+)
 from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
@@ -276,6 +283,19 @@ def test_planning_within_a_time(worlds):
     assert paths[0].tobytes() == paths[1].tobytes()
     with pytest.raises(PlanningError, match="no path in 1e-09 s"):
         planner.plan_within(1e-9, *queries[0], rng=np.random.default_rng(4))
+
+
+def test_another_planner_helps_where_rrt_connect_takes_long():
+    """A problem that takes RRT-Connect alone half a million checks or more: docs/benchmarks.md."""
+    env = envs.make("benchmaker_bookshelf_thin")
+    query, planner = load_queries("benchmaker_bookshelf_thin", "original")[88], Planner(env)
+    paths = [planner.plan_within(60.0, *query, rng=np.random.default_rng(4)) for _ in "ab"]
+    assert OTHER_AFTER < planner.checks < 30_000
+    assert is_path_of(paths[0], query.start, query.goal)
+    assert paths[0].tobytes() == paths[1].tobytes()
+    with pytest.raises(PlanningError, match="no path in 1[0-9]{5} collision checks"):
+        Planner(env, max_checks=100_000).plan(*query, seed=4)  # alone
+    env.close()
 
 
 def test_a_path_longer_than_an_episode_is_planned_again(monkeypatch):
