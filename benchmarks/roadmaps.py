@@ -10,8 +10,8 @@ Lengths are L2 in the normalised space: of the straight motion, of the shortest 
 as it is, and of that path after pruning and shortcuts; all three where the roadmap has a path
 without further search. RRT-Connect's paths (`Planner`, with its defaults) are for some of the same
 queries; it keeps 8 mm, not 15. `agreement` is the mean cosine between labels of two roadmaps of a
-scene that differ in their seed, `agreement_detours` that where the way is more than 1 longer than the
-straight motion: two planners that agree can be imitated. The last line is JSON.
+scene that differ in their seed, `agreement_detours` that where the way is more than 1 longer than
+the straight motion: planners that agree can be imitated. The last line is JSON.
 """
 
 import argparse
@@ -82,12 +82,12 @@ def main():
         ends = np.array([(path[0], path[-1]) for path in chosen], np.float64)
         points, _, found = roadmap._search(ends[:, 0], ends[:, 1])
         short = roadmap.paths(ends[:, 0], ends[:, 1], rng)
-        one, other = (
+        labels, others = (
             again.labels(*ends.swapaxes(0, 1), rng)
             for again in (roadmap, Roadmap(scene, rng, **smoothing))
         )
-        excess = np.minimum(one[1], other[1]) - np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-        agreements.append(np.stack([(one[0] * other[0]).sum(1), excess], axis=1))
+        excess = np.minimum(labels[1], others[1]) - np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        agreements.append(np.stack([(labels[0] * others[0]).sum(1), excess], axis=1))
         lengths += [
             (length_of(one), length_of(points[i]), length_of(short[i]))
             for i, one in enumerate(ends)

@@ -50,9 +50,9 @@ MARGIN_GROWTH = 0.03
 # takes long is likely to go on for long: after so many configurations it keeps this share of them.
 # (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmarks.md.)
 CAUTIONS = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
-# And where RRT-Connect has found nothing after so many configurations, LBKPIECE1 may look at so many,
-# before it goes on: ways out of a shelf that one of them does not find, the other one finds at once.
-# (Chosen together with the original MotionBenchMaker problems: docs/benchmarks.md.)
+# Where RRT-Connect has found nothing after so many configurations, another planner may look at so
+# many before it goes on: some ways out of a shelf that it does not find, LBKPIECE1 finds at once.
+# (Chosen on the same queries, and on the original MotionBenchMaker problems: docs/benchmarks.md.)
 OTHER_PLANNER, OTHER_AFTER, OTHER_CHECKS = "LBKPIECE1", 8_000, 4_000
 # Searches that it makes at most for a path that can be followed within an episode.
 SEARCHES = 3
@@ -245,10 +245,10 @@ class Planner:
     def plan_within(self, seconds, start, goal, scene=None, *, rng):
         """A path found in `seconds`, which are its only limit; it keeps what `CAUTIONS` say.
 
-        RRT-Connect gets help from `OTHER_PLANNER` where that takes long. The same path comes out on every machine that has the time. If it takes longer to follow
-        than an episode lasts, there is another search, up to `SEARCHES`, and the shortest is
-        returned. `rng`, a NumPy Generator, gives the seeds; the rest is as for `plan`, which may
-        be a little late itself.
+        RRT-Connect gets help from `OTHER_PLANNER` where it takes long. The same path comes out on
+        every machine that has the time. If it takes longer to follow than an episode lasts, there
+        is another search, up to `SEARCHES`, and the shortest is returned. `rng`, a NumPy Generator,
+        gives the seeds; the rest is as for `plan`, which may be a little late itself.
         """
         deadline, best = time.monotonic() + seconds, None
         turns = ((self.planner, math.inf),)
