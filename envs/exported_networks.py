@@ -2,9 +2,9 @@
 
 A network file is plain data: the network's graph as a list of named PyTorch operations, its
 tensors, and metadata. `load_network` interprets that list; a file from a stranger runs no code,
-because nothing in it is unpickled as an object (`weights_only`) and only pure operations of
-`torch.ops.aten` may be named. (`torch.export.load` promises less: it may unpickle objects, and
-evaluates strings of the file as Python expressions.)
+because nothing in it is unpickled as an object (`weights_only`) and only the operations of
+`envs.network_operations` may be named, with arguments that were checked. (`torch.export.load`
+promises less: it may unpickle objects, and evaluates strings of the file as Python expressions.)
 
     save_network("encoder.pt", encoder, {"points": points}, {"kind": "encoder"})
     code = load_network("encoder.pt")(points=points)
@@ -32,7 +32,9 @@ from pathlib import Path
 import torch
 from torch.utils import _pytree as pytree
 
+from envs import network_operations
 from envs.files import write_atomically
+from envs.network_operations import NetworkError
 
 FORMAT = "roboarm-nmp program"
 VERSION = 1
@@ -50,15 +52,8 @@ _EXTRA = (
 )
 # Numbers of rows on which a network is compared with its module before it is saved.
 _ROWS = (1, 2, 32)
-# Arithmetic on sizes, where a shape depends on the batch, and picking one of several results.
-_PYTHON = {
-    f"operator.{name}": getattr(operator, name)
-    for name in ("add", "sub", "mul", "floordiv", "mod", "neg", "getitem")
-}
-
-
-class NetworkError(ValueError):
-    """A network that cannot be saved, or a network file that cannot be loaded or run."""
+# So many shapes of inputs are remembered as fitting.
+_MAX_KNOWN = 1_000
 
 
 def save_network(path, module, example_inputs, metadata):
@@ -139,8 +134,15 @@ def _read(path):
     """The content of a network file, of which only format and version are checked."""
     try:
         with zipfile.ZipFile(path) as archive:
+            # As torch.save writes it: what comes out is no larger than the file.
+            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.filelist)
+            size = sum(entry.file_size for entry in archive.filelist)
+            if not stored or size > Path(path).stat().st_size:
+                raise NetworkError(f"{path}: not a network file: it is compressed")
             damaged = archive.testzip()  # torch.load does not compare the checksums
         content = None if damaged else torch.load(path, weights_only=True, map_location="cpu")
+    except NetworkError:
+        raise
     except OSError as error:
         raise NetworkError(f"{path}: cannot be read: {error.strerror or error}") from error
     except zipfile.BadZipFile as error:
@@ -189,7 +191,8 @@ class ExportedNetwork:
         return ExportedNetwork(self._content, self._path, device)
 
     def _build(self, content, device):
-        _check_plain(content)
+        network_operations.check_file(content)
+        self._fitting = set()  # shapes of inputs
         self.metadata = dict(copy.deepcopy(content["metadata"]))
         self.inputs = list(content["inputs"])
         # While it runs, its values lie in one list: tensors, inputs, the results of the nodes.
@@ -206,7 +209,7 @@ class ExportedNetwork:
         for name, operation, args, kwargs in content["nodes"]:
             args = tuple(_decode(value, slots, device) for value in args)
             kwargs = {key: _decode(value, slots, device) for key, value in kwargs.items()}
-            self._nodes.append((_function(operation), args, kwargs, operation))
+            self._nodes.append((network_operations.find(operation), args, kwargs, operation))
             slots["node", name] = _Slot(len(slots))
         self._outputs = _decode(content["outputs"], slots, device)
 
@@ -217,11 +220,29 @@ class ExportedNetwork:
                 f"{self._path}: its inputs are {', '.join(self.inputs)}; it got {len(args)} "
                 f"without a name and {', '.join(inputs) or 'none'} by name"
             )
-        values = self._tensors + [given[name] for name in self.inputs]
+        inputs = [given[name] for name in self.inputs]
+        if not all(isinstance(tensor, torch.Tensor) for tensor in inputs):
+            raise NetworkError(f"{self._path}: its inputs are tensors")
+        shapes = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
+        if shapes not in self._fitting:
+            rehearsal = network_operations.Rehearsal()
+            self.to("meta")._run([tensor.to("meta") for tensor in inputs], rehearsal)
+            if len(self._fitting) == _MAX_KNOWN:
+                self._fitting.clear()
+            self._fitting.add(shapes)
+        return self._run(inputs)
+
+    def _run(self, inputs, rehearsal=None):
+        values = self._tensors + inputs
         with torch.no_grad():
             for function, args, kwargs, operation in self._nodes:
                 try:
-                    values.append(function(*_fill(args, values), **_fill(kwargs, values)))
+                    args, kwargs = _fill(args, values), _fill(kwargs, values)
+                    if rehearsal is not None:
+                        rehearsal.before(operation, args)
+                    values.append(function(*args, **kwargs))
+                    if rehearsal is not None:
+                        rehearsal.after(function, values[-1])
                 except Exception as error:  # wrong shapes or types, of many kinds
                     raise NetworkError(f"{self._path}: {operation} failed: {error}") from error
         return _fill(self._outputs, values)
@@ -263,7 +284,7 @@ def _export(module, inputs):
     stored = {**exported.state_dict, **exported.constants}
     targets = {spec.arg.name: spec.target for spec in signature.input_specs}
     names = dict(zip(signature.user_inputs, inputs, strict=True))
-    python_names = {function: name for name, function in _PYTHON.items()}
+    python_names = {getattr(operator, n.partition(".")[2]): n for n in network_operations.PYTHON}
     references, tensors, nodes = {}, {}, []
     for node in exported.graph.nodes:
         if node.op == "output":
@@ -323,41 +344,6 @@ class _Slot(int):
     """Stands for the value at this place in the list of values."""
 
 
-def _check_plain(value):
-    """`weights_only` still makes a few kinds of objects; a network has fewer."""
-    kind = type(value)
-    if kind is dict or kind is list:
-        for one in [*value, *value.values()] if kind is dict else value:
-            _check_plain(one)
-    elif kind is torch.Tensor:
-        if value.layout != torch.strided or value.device.type != "cpu" or value.requires_grad:
-            raise NetworkError("it holds a tensor that is not a plain one")
-    elif value is not None and kind not in (bool, int, float, str):
-        raise NetworkError(f"it holds something that is not plain data: {kind.__name__}")
-
-
-def _function(name):
-    """The function of an operation's name, e.g. `aten.relu.default`, if a network may have it."""
-    if name in _PYTHON:
-        return _PYTHON[name]
-    space, _, rest = str(name).partition(".")
-    packet_name, _, overload = rest.partition(".")
-    packet = getattr(_ATEN, packet_name, None) if space == "aten" else None
-    if isinstance(packet, torch._ops.OpOverloadPacket) and overload in packet.overloads():
-        operation = getattr(packet, overload)
-        if (
-            (operation in _EXTRA or torch.Tag.core in operation.tags)
-            and not operation._schema.is_mutable
-            and torch.Tag.nondeterministic_seeded not in operation.tags
-            # Core, but no network's forward needs them: memory that was never written or is
-            # addressed directly, and backward passes, which trust the indices they are given.
-            and not packet_name.startswith(("as_strided", "empty"))
-            and not packet_name.endswith("_backward")
-        ):
-            return operation
-    raise NetworkError(f"the operation {name!r} is not allowed in a network")
-
-
 def _decode(value, slots, device):
     if isinstance(value, list):
         return [_decode(one, slots, device) for one in value]
@@ -369,10 +355,7 @@ def _decode(value, slots, device):
     if kind == "device":
         return device
     if kind == "torch":
-        constant = getattr(torch, content)
-        if not isinstance(constant, (torch.dtype, torch.layout, torch.memory_format)):
-            raise NetworkError(f"torch.{content} is not allowed in a network")
-        return constant
+        return network_operations.constant(content)
     return slots[kind, content]
 
 
