@@ -23,6 +23,7 @@ import torch.nn.functional as F
 from envs import panda, protocol, runs
 from envs.datasets import MAX_STEP, DatasetError, load_demos
 from envs.demo_episodes import observed
+from envs.flags import PositiveFloat, PositiveInt, Share
 from envs.tasks import task_name
 
 
@@ -38,26 +39,26 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     """what the goal is: end-effector position, configuration, or both"""
     demos: tuple[Path, ...] = ()
     """demonstration files of the task; by default the task's own"""
-    num_demos: int | None = None
+    num_demos: PositiveInt | None = None
     """only the first so many demonstrations of each file"""
 
     # The algorithm
-    total_updates: int = 1_000_000
+    total_updates: PositiveInt = 1_000_000
     """batches of the whole run (paper: 1,000,000)"""
-    batch_size: int = 256
+    batch_size: PositiveInt = 256
     """transitions per batch"""
-    learning_rate: float = 1e-3
+    learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start"""
     anneal: bool = True
     """let the learning rate fall linearly, to zero at the end"""
-    num_modes: int = 1
+    num_modes: PositiveInt = 1
     """Gaussians of the policy's mixture; the most likely one's mean is the action in evaluation"""
-    policy_average: float = 0.001
+    policy_average: Share = 0.001
     """share of the policy that moves into its running average per update; the average is what is
     evaluated and saved (1: no averaging)"""
-    hidden_size: int = 256
+    hidden_size: PositiveInt = 256
     """width of the hidden layers"""
-    num_hidden_layers: int = 2
+    num_hidden_layers: PositiveInt = 2
     """number of hidden layers"""
     relative_goal: bool = True
     """add goal minus end-effector position, times 5, to the network's inputs"""
@@ -72,11 +73,11 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     velocities: ClassVar[bool] = False  # demonstrations have none
 
     # Evaluation and bookkeeping
-    eval_every: int = 50_000
+    eval_every: PositiveInt = 50_000
     """updates between evaluations on validation queries; the best policy is kept"""
-    eval_queries: int = 200
+    eval_queries: PositiveInt = 200
     """validation queries per evaluation"""
-    test_queries: int = 1_000
+    test_queries: PositiveInt = 1_000
     """test queries for the best policy at the end"""
 
 
@@ -213,11 +214,6 @@ if __name__ == "__main__":
     args = runs.parse_args(Args, may_change={"test_queries"})
     device = runs.seed_torch(args)
     validation, test = protocol.load_task(args)
-    for name in ("num_modes", "batch_size", "total_updates", "eval_every"):
-        if getattr(args, name) < 1:
-            sys.exit(f"--{name.replace('_', '-')} must be at least 1")
-    if args.num_demos is not None and args.num_demos < 1:
-        sys.exit("--num-demos must be at least 1")
     try:
         files = [load_demos(file, args.task) for file in args.demos or (args.task,)]
     except DatasetError as error:

@@ -28,6 +28,7 @@ from demo_generation.roadmaps import Roadmap
 from envs import panda, protocol, runs, seeing
 from envs.datasets import MAX_STEP, DatasetError
 from envs.demo_episodes import observed
+from envs.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from envs.last_layer import PATIENCE, PROGRESS, LastLayer
 from envs.queries import Query
 from envs.roadmap_paths import load_roadmap_paths
@@ -51,61 +52,61 @@ class Args(runs.RunFlags):
     """folder of roadmap paths to learn from (demo_generation.roadmaps), in whatever scenes"""
 
     # The algorithm
-    total_updates: int = 24_000
+    total_updates: PositiveInt = 24_000
     """batches of the whole run"""
-    batch_size: int = 768
+    batch_size: PositiveInt = 768
     """examples per batch"""
-    learning_rate: float = 1e-3
+    learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start"""
     anneal: bool = True
     """let the learning rate fall linearly, to zero at the end"""
-    policy_average: float = 0.003
+    policy_average: Share = 0.003
     """share of the policy that moves into its running average per update; the average is what is
     evaluated and saved (1: no averaging)"""
-    pool_size: int = 200_000
+    pool_size: PositiveInt = 200_000
     """examples at hand, of which batches are drawn"""
-    examples_per_update: int = 256
+    examples_per_update: PositiveInt = 256
     """new examples per update, all of one scene; they replace the oldest. With an eighth of a batch
     they are learned by heart (docs/training.md)"""
-    noise: float = 0.03
+    noise: NonNegativeFloat = 0.03
     """standard deviation of the configurations drawn around paths (normalised, each joint)"""
-    length_weight: float = 0.1
+    length_weight: NonNegativeFloat = 0.1
     """of the second loss, that of the remaining length"""
     encoder: str = "oracle"
     """what the policy sees of the scene: `oracle`, the obstacles themselves, or `points` of them
     that four sensors see; proximity is that of the same"""
-    token_size: int = 128
+    token_size: PositiveInt = 128
     """width of the layers that look at one obstacle or point each"""
-    hidden_size: int = 384
+    hidden_size: PositiveInt = 384
     """width of the residual blocks"""
-    num_blocks: int = 3
+    num_blocks: PositiveInt = 3
     """number of residual blocks"""
     bf16: bool | None = None
     """train with hidden products in bfloat16; by default where the hardware has it"""
     velocities: ClassVar[bool] = False  # paths have none
 
     # The last layer
-    keep_distance: float = 0.01
+    keep_distance: NonNegativeFloat = 0.01
     """m, that it keeps"""
     way_out: bool = True
     """whether it leaves dead ends"""
 
     # DAgger
-    round_every: int = 2_000
+    round_every: NonNegativeInt = 2_000
     """updates between rounds (0: none)"""
-    round_queries: int = 80
+    round_queries: NonNegativeInt = 80
     """queries of a round, in scenes of the paths"""
-    round_labels: int = 32
+    round_labels: NonNegativeInt = 32
     """of the states that the policy came to on a query, how many are labelled"""
-    round_weight: float = 5.0
+    round_weight: NonNegativeFloat = 5.0
     """how much likelier such a state is in a batch than an example of the pool"""
 
     # Evaluation and bookkeeping
-    eval_every: int = 4_000
+    eval_every: PositiveInt = 4_000
     """updates between evaluations on validation queries; the best policy is kept"""
-    eval_queries: int = 200
+    eval_queries: PositiveInt = 200
     """validation queries per evaluation"""
-    test_queries: int = 1_000
+    test_queries: PositiveInt = 1_000
     """test queries for the best policy at the end"""
 
 
@@ -358,9 +359,6 @@ if __name__ == "__main__":
     if args.bf16 is None:
         args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
     validation, test = protocol.load_task(args)
-    for name in ("total_updates", "batch_size", "examples_per_update", "eval_every"):
-        if getattr(args, name) < 1:
-            sys.exit(f"--{name.replace('_', '-')} must be at least 1")
     if args.encoder != "oracle" and not args.encoder.startswith("points"):
         sys.exit(f"--encoder must be `oracle` or `points`, got {args.encoder!r}")
     num_draws = args.pool_size // args.examples_per_update

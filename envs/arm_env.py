@@ -17,6 +17,7 @@ from envs.world import (  # some of them only for those who import them from her
     HOLD_DRIFT,  # noqa: F401
     HOLD_STEPS,
     MAX_BODIES_MADE,  # noqa: F401
+    MAX_EDGE,
     POSITION_GAINS,  # noqa: F401
     SUBSTEPS,
     TIME_STEP,
@@ -25,6 +26,8 @@ from envs.world import (  # some of them only for those who import them from her
 
 GOAL_TYPES = ("ee", "config", "combined")
 ACTION_MODES = ("relative", "subgoal")
+# With larger ones hardly any query is farther from its goal than that: m, and L2, normalised.
+MAX_EE_TOLERANCE, MAX_CONFIG_TOLERANCE = 1.0, 2.0
 
 
 class RoboArmEnv(gym.Env):
@@ -102,8 +105,22 @@ class RoboArmEnv(gym.Env):
             ("horizon", horizon),
             ("episodes_per_scene", episodes_per_scene),
         ]:
-            if not (np.isscalar(value) and np.isfinite(value) and value > 0):
+            if not (_is_number(value) and np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be a positive number, got {value!r}")
+        for name, value, most in [
+            ("ee_tolerance", ee_tolerance, MAX_EE_TOLERANCE),
+            ("config_tolerance", config_tolerance, MAX_CONFIG_TOLERANCE),
+        ]:
+            if value > most:
+                raise ValueError(f"{name} must be at most {most}, got {value!r}")
+        for name, value in [("horizon", horizon), ("episodes_per_scene", episodes_per_scene)]:
+            if int(value) != value:
+                raise ValueError(f"{name} must be a whole number, got {value!r}")
+        sides = np.asarray(render_size)
+        if sides.shape != (2,) or sides.dtype.kind not in "iu":
+            raise ValueError(f"render_size must be two numbers of pixels, got {render_size!r}")
+        if not 1 <= sides.min() <= sides.max() <= MAX_EDGE:
+            raise ValueError(f"render_size must be from 1 to {MAX_EDGE}, got {render_size!r}")
         self.scene_distribution = scene if hasattr(scene, "sample") else None
         """The distribution that scenes are drawn from; None if the scene is fixed."""
         self.episodes_per_scene = int(episodes_per_scene)
@@ -278,9 +295,15 @@ class RoboArmEnv(gym.Env):
         """
         if self.start_configuration is None:
             raise RuntimeError("no episode: call reset() or reset_specific() before step()")
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (7,) or not math.isfinite(action @ action):
-            raise ValueError(f"an action is 7 finite numbers in [-1, 1], got {action}")
+        given = action
+        try:
+            action = np.asarray(given)
+            real = action.dtype.kind in "fiub" and not np.ma.isMaskedArray(given)
+            action = action.astype(np.float64) if real else None
+        except (TypeError, ValueError, RuntimeError):  # of lists in lists, other libraries' tensors
+            action = None
+        if action is None or action.shape != (7,) or not math.isfinite(action @ action):
+            raise ValueError(f"an action is 7 finite numbers in [-1, 1], got {given}")
         self._steps += 1
         if self._in_sink:
             info = self._info(False, self._is_success)
@@ -402,6 +425,10 @@ class RoboArmEnv(gym.Env):
     def close(self):
         """Disconnect from PyBullet. Closing twice is allowed."""
         self.world.close()
+
+
+def _is_number(value):
+    return np.isscalar(value) and isinstance(value, (int, float, np.number))
 
 
 def _one_of(name, value, allowed):

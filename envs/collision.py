@@ -325,13 +325,11 @@ def _cells(meshes):
 
 
 def _rows(obstacles):
-    """Obstacles -> float64 (n, `_ROW`). Raises ValueError for what is no obstacle."""
+    """Obstacles -> float64 (n, `_ROW`)."""
     rows = np.zeros((len(obstacles), _ROW))
     for obstacle, numbers, row in zip(obstacles, to_array(obstacles), rows, strict=True):
         (kind,), position, quaternion, size = np.split(numbers, (1, 4, 8))
         norm = math.sqrt(quaternion @ quaternion)
-        if not (np.isfinite(numbers).all() and size.min() > 0 and 0 < norm < math.inf):
-            raise ValueError(f"an obstacle needs finite numbers and positive sizes: {obstacle}")
         half = np.array(size) if isinstance(obstacle, Sphere) else size / 2
         if isinstance(obstacle, Cylinder):
             half[:2] = obstacle.radius

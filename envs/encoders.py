@@ -164,8 +164,8 @@ class SceneEncoder:
         return {name: torch.from_numpy(inputs[name])[None] for name in self._network.inputs}
 
     def encode(self, seen):
-        """z_E, float32 (size,), of what `look` returned."""
-        return self._network(**seen)[0].numpy()
+        """z_E, float32 (size,), of what `look` returned. Raises NetworkError: it is none."""
+        return self._network.row(seen)
 
     def close(self):
         """Close the world it looks into."""

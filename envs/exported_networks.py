@@ -33,7 +33,7 @@ import torch
 from torch.utils import _pytree as pytree
 
 from envs import network_operations
-from envs.files import write_atomically
+from envs.files import check_archive, write_atomically
 from envs.network_operations import NetworkError
 
 FORMAT = "roboarm-nmp program"
@@ -133,16 +133,8 @@ def load_network(path, device="cpu"):
 def _read(path):
     """The content of a network file, of which only format and version are checked."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            # As torch.save writes it: what comes out is no larger than the file.
-            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.filelist)
-            size = sum(entry.file_size for entry in archive.filelist)
-            if not stored or size > Path(path).stat().st_size:
-                raise NetworkError(f"{path}: not a network file: it is compressed")
-            damaged = archive.testzip()  # torch.load does not compare the checksums
-        content = None if damaged else torch.load(path, weights_only=True, map_location="cpu")
-    except NetworkError:
-        raise
+        check_archive(Path(path))
+        content = torch.load(path, weights_only=True, map_location="cpu")
     except OSError as error:
         raise NetworkError(f"{path}: cannot be read: {error.strerror or error}") from error
     except zipfile.BadZipFile as error:
@@ -154,8 +146,6 @@ def _read(path):
         ) from error
     except Exception as error:  # whatever broken bytes lead to
         raise NetworkError(f"{path}: not a network file, or a damaged one: {error}") from error
-    if damaged:
-        raise NetworkError(f"{path}: damaged, a checksum does not match")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise NetworkError(f"{path}: not a network file")
     if content.get("version") != VERSION:
@@ -231,6 +221,24 @@ class ExportedNetwork:
                 self._fitting.clear()
             self._fitting.add(shapes)
         return self._run(inputs)
+
+    def row(self, inputs, size=None):
+        """What it makes of one row of inputs, a dict: NumPy float32 (size,).
+
+        Raises NetworkError: that is not what comes out, or not all of it is finite.
+        """
+        output = self(**inputs)
+        if (
+            not isinstance(output, torch.Tensor)
+            or output.dtype != torch.float32
+            or output.ndim != 2
+            or output.shape != (1, size or output.shape[1])
+        ):
+            wanted = f"(1, {size or 'any'})"
+            raise NetworkError(f"{self._path}: its output is not float32 {wanted} for one row")
+        if not output.isfinite().all():
+            raise NetworkError(f"{self._path}: its output is not finite")
+        return output[0].numpy()
 
     def _run(self, inputs, rehearsal=None):
         values = self._tensors + inputs

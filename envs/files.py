@@ -1,7 +1,8 @@
-"""Writing files whole."""
+"""Writing files whole, and whether they still are."""
 
 import os
 import tempfile
+import zipfile
 from pathlib import Path
 
 
@@ -40,3 +41,17 @@ def replace_atomically(temporary, path):
     with open(temporary, "rb+") as file:
         os.fsync(file.fileno())
     os.replace(temporary, path)
+
+
+def check_archive(path):
+    """Raise an exception if a file that `torch.save` wrote is damaged, which `torch.load` ignores.
+
+    ValueError: one of its checksums does not match. OSError, zipfile.BadZipFile: as `zipfile`.
+    """
+    with zipfile.ZipFile(path) as archive:
+        # As torch writes it. What comes out is no larger than the file.
+        stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.filelist)
+        if not stored or sum(entry.file_size for entry in archive.filelist) > path.stat().st_size:
+            raise ValueError("it is compressed")
+        if archive.testzip() is not None:
+            raise ValueError("a checksum does not match")

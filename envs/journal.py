@@ -3,11 +3,13 @@
 import fcntl
 import json
 import os
+import sys
+import zlib
 
 from envs.scenes import scene_to_json
 from envs.tasks import get_task
 
-VERSION = 2
+VERSION = 3
 
 
 def journal_of(path):
@@ -15,11 +17,24 @@ def journal_of(path):
     return path.with_name(path.name + ".journal")
 
 
-class Journal:
-    """What was made so far: JSON lines, the first one saying of what.
+def line_of(entry):
+    """A line of a journal, bytes: a JSON-ready dict, after its checksum."""
+    content = json.dumps(entry).encode()
+    return b"%08x %s\n" % (zlib.crc32(content), content)
 
-    Lines are appended and flushed one at a time, so whatever happens only the last can be damaged;
-    it is dropped when the journal is opened again. One process at a time holds it.
+
+def _entry_of(line):
+    """The inverse, of a line without its end; None: it is damaged."""
+    checksum, _, content = line.partition(b" ")
+    return json.loads(content) if checksum == b"%08x" % zlib.crc32(content) else None
+
+
+class Journal:
+    """What was made so far: lines of JSON with a checksum, the first one saying of what.
+
+    Lines are appended and flushed one at a time, so a kill can damage the last one only; it is
+    dropped when the journal is opened again. So is any other that does not fit its checksum, which
+    is said on stderr. One process at a time holds the journal.
 
     Args:
         path: file to go on with, or to begin.
@@ -47,22 +62,15 @@ class Journal:
         self._file.seek(0)
         contents = self._file.read()
         lines = contents.split(b"\n")
-        good = 0
-        for number, line in enumerate(lines[:-1]):  # what follows the last line's end is damaged
-            try:
-                entry = json.loads(line)
-            except ValueError:
-                if number == 0:
-                    raise ValueError(_difference(path, None, header)) from None
-                break
-            if number == 0:
-                if entry != header:
-                    raise ValueError(_difference(path, entry, header))
-            else:
-                self.entries[entry["index"]] = entry
-            good += len(line) + 1
-        if good == 0 and not json.dumps(header).encode().startswith(contents):
+        entries = [_entry_of(line) for line in lines[:-1]]  # the rest is torn
+        if entries and entries[0] != header:
+            raise ValueError(_difference(path, entries[0], header))
+        if not entries and not line_of(header).startswith(contents):
             raise ValueError(_difference(path, None, header))  # and not a torn first line either
+        self.entries = {entry["index"]: entry for entry in entries[1:] if entry is not None}
+        if damaged := entries.count(None):
+            print(f"{path}: damaged, {damaged} of its lines are made again", file=sys.stderr)
+        good = len(contents) - len(lines[-1])
         self._file.truncate(good)
         if good == 0:
             self._write(header)
@@ -73,7 +81,7 @@ class Journal:
         self.entries[entry["index"]] = entry
 
     def _write(self, entry):
-        line = json.dumps(entry).encode() + b"\n"
+        line = line_of(entry)
         end = self._file.seek(0, 2)
         try:
             if self._file.write(line) != len(line):  # the disk is full

@@ -269,16 +269,16 @@ def _trained(path, env):
     # gain of a tenth of the time at most.
     def act(observation):
         inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
-        return network(**inputs)[0].numpy()
+        return network.row(inputs, panda.NUM_JOINTS)
 
     space = env.observation_space
     unknown = set(network.inputs) - set(space)
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
     try:
-        action = network(**{name: torch.zeros(1, *space[name].shape) for name in network.inputs})
+        network.row(
+            {name: torch.zeros(1, *space[name].shape) for name in network.inputs}, panda.NUM_JOINTS
+        )
     except NetworkError as error:
         raise PolicyError(str(error)) from error
-    if not isinstance(action, torch.Tensor) or action.shape != (1, panda.NUM_JOINTS):
-        raise PolicyError(f"{path}: its output is not an action for each observation")
     return act

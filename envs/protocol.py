@@ -19,6 +19,7 @@ import envs
 from envs.datasets import load_queries
 from envs.demo_episodes import DemoQueriesWrapper, load_demos_for
 from envs.exported_networks import load_network, save_network
+from envs.flags import PositiveFloat, PositiveInt
 from envs.last_layer import layer_of
 from envs.runs import write_json
 
@@ -35,9 +36,9 @@ class EnvFlags:
     """what the goal is: end-effector position, configuration, or both"""
     action_mode: Literal["relative", "subgoal"] = "relative"
     """action: a displacement of the normalised configuration, or the next one itself"""
-    max_step: float = 0.03
+    max_step: PositiveFloat = 0.03
     """longest displacement per step (L2, normalised configuration)"""
-    horizon: int = 400
+    horizon: PositiveInt = 400
     """steps after which an episode is cut off"""
     stop_on_collision: bool = False
     """end an episode at the first touch"""
@@ -63,10 +64,21 @@ def load_task(args):
     try:
         if not envs.get_task(args.task).trainable:
             sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
-        validation = load_queries(args.task, "validation")[: args.eval_queries]
-        return validation, load_queries(args.task, "test")[: args.test_queries]
+        return tuple(
+            _first(load_queries(args.task, split), f"--{flag}-queries", number)
+            for split, flag, number in (
+                ("validation", "eval", args.eval_queries),
+                ("test", "test", args.test_queries),
+            )
+        )
     except ValueError as error:
         sys.exit(f"--task: {error}")
+
+
+def _first(queries, flag, number):
+    if number > len(queries):
+        print(f"{flag} {number}: there are {len(queries)}, all of them are used", file=sys.stderr)
+    return queries[:number]
 
 
 def make_envs(task, number, **kwargs):

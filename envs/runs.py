@@ -14,7 +14,9 @@ Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `ex
 These functions are for scripts: where the user is wrong, they end the program with a message.
 """
 
+import contextlib
 import importlib.util
+import itertools
 import json
 import os
 import sys
@@ -29,14 +31,16 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from envs.files import replace_atomically, write_atomically
+from envs import flags
+from envs.files import check_archive, replace_atomically, write_atomically
+from envs.flags import Seed, Threads
 
 
 @dataclass
 class RunFlags:
     """The flags of every trainer's run."""
 
-    seed: int = 1
+    seed: Seed = 1
     """seed of everything random; the same seed gives the same run on the same machine and device"""
     runs_dir: Path = Path("runs")
     """the run's folder is made in here: TensorBoard events, checkpoint, the best network
@@ -45,7 +49,7 @@ class RunFlags:
     """continue the run in this folder from its last checkpoint; its own flags are used"""
     device: str = "cpu"
     """`cpu` or `cuda`"""
-    threads: int = 1
+    threads: Threads = 1
     """torch threads; one is fastest for small networks, and leaves the other cores alone"""
     track: bool = False
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
@@ -67,11 +71,27 @@ def parse_args(Args, may_change=()):
     args = tyro.cli(Args)
     if args.resume is not None:
         args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
-    if args.device == "cuda" and not torch.cuda.is_available():
-        sys.exit("--device cuda: PyTorch sees no CUDA device here")
+    flags.check(args)
+    if Path(args.exp_name).name != args.exp_name:
+        sys.exit(f"--exp-name must be part of a folder's name, got {args.exp_name!r}")
+    try:
+        device = torch.device(args.device)
+    except RuntimeError:
+        sys.exit(f"--device must be `cpu` or `cuda`, got {args.device!r}")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        sys.exit(f"--device {args.device}: PyTorch sees no CUDA device here")
+    if args.resume is None:
+        _check_folder(args.runs_dir)
     if args.track and importlib.util.find_spec("wandb") is None:
         sys.exit("--track: wandb is not installed (pip install wandb)")
     return args
+
+
+def _check_folder(folder):
+    """End the program unless folders can be made in this one, which may not be there yet."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        sys.exit(f"--runs-dir {folder}: {there} is no folder that can be written")
 
 
 def _args_of_run(Args, run, may_change):
@@ -121,8 +141,12 @@ def run_folder(args, task):
     """
     if args.resume is not None:
         return args.resume
-    run = args.runs_dir / f"{task}__{args.exp_name}__{args.seed}__{int(time.time())}"
-    run.mkdir(parents=True)
+    name = f"{task}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    for again in itertools.count(1):  # another run may have begun in the same second
+        run = args.runs_dir / (name if again == 1 else f"{name}_{again}")
+        with contextlib.suppress(FileExistsError):
+            run.mkdir(parents=True)
+            break
     write_json(run / "args.json", asdict(args))
     return run
 
@@ -171,6 +195,7 @@ def load_checkpoint(args, parts):
         return
     path = args.resume / "checkpoint.pt"
     try:  # on the CPU first: what is not a network belongs there
+        check_archive(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever a damaged file leads to
         sys.exit(f"--resume: {path} is damaged: {error}")

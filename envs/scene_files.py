@@ -25,7 +25,18 @@ from pathlib import Path
 import yaml
 
 from envs.files import write_atomically
-from envs.scenes import FLOOR, FRICTION, IDENTITY, TABLE, Box, Cylinder, Scene, Sphere
+from envs.scenes import (
+    FLOOR,
+    FRICTION,
+    IDENTITY,
+    MAX_LENGTH,
+    MAX_SCENE_OBSTACLES,
+    TABLE,
+    Box,
+    Cylinder,
+    Scene,
+    Sphere,
+)
 
 _NORM_TOLERANCE = 1e-6
 _MAX_DEPTH = 10  # a scene needs 6
@@ -190,6 +201,8 @@ def _scene(node):
         if not isinstance(node, yaml.SequenceNode):
             reason = f"obstacles must be a list ([] if there are none), got {_describe(node)}"
             raise _mistake(node, reason)
+        if len(node.value) > MAX_SCENE_OBSTACLES:
+            raise _mistake(node, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
         obstacles = tuple(_obstacle(entry) for entry in node.value)
     return Scene(obstacles, table, floor, friction)
 
@@ -299,6 +312,9 @@ def _number(node, what, positive=False):
         number = math.nan
     if not math.isfinite(number):
         raise _mistake(node, f"{what} must be a finite number, got {_describe(node)}")
+    if abs(number) > MAX_LENGTH:
+        limit = f"{MAX_LENGTH:.0f}"
+        raise _mistake(node, f"{what} must be at most {limit}, got {_describe(node)}")
     if positive and number <= 0:
         raise _mistake(node, f"{what} must be positive, got {_describe(node)}")
     return number

@@ -4,11 +4,14 @@ All lengths in metres, in the frame of the robot's base (x forward, y left, z up
 """
 
 import json
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
+MAX_LENGTH, MAX_SCENE_OBSTACLES = 1000.0, 10_000
+"""m, of sizes and coordinates, and obstacles of a scene: more is a mistake."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,10 @@ class Scene:
 
     `floor` is the height of the floor's surface. `friction` is the obstacles' coefficient; PyBullet
     multiplies it by the arm's, 0.5. Values, not code: two equal scenes are equal.
+
+    Raises:
+        TypeError: something is of another type.
+        ValueError: a number that is none, a size that is not positive, or too much of anything.
     """
 
     obstacles: tuple[Obstacle, ...] = ()
@@ -68,6 +75,34 @@ class Scene:
         for obstacle in self.obstacles:
             if not isinstance(obstacle, Obstacle):
                 raise TypeError(f"obstacles must be Box, Cylinder or Sphere, got {obstacle!r}")
+            _check(obstacle)
+        if len(self.obstacles) > MAX_SCENE_OBSTACLES:
+            raise ValueError(f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
+        if self.table is not None:
+            if not isinstance(self.table, Box):
+                raise TypeError(f"table must be a Box or None, got {self.table!r}")
+            _check(self.table)
+        if self.floor is not None and not abs(self.floor) <= MAX_LENGTH:
+            raise ValueError(f"floor must be a height in m or None, got {self.floor!r}")
+        if not 0 <= self.friction < math.inf:
+            raise ValueError(f"friction must be a number from 0 on, got {self.friction!r}")
+
+
+def _check(body):
+    sizes = (body.radius,) if not isinstance(body, Box) else body.size
+    if isinstance(body, Cylinder):
+        sizes = body.radius, body.length
+    turned = getattr(body, "orientation", IDENTITY)
+    if not (
+        (len(body.position), len(turned)) == (3, 4)
+        and (len(sizes) == 3 or not isinstance(body, Box))
+        and all(abs(number) <= MAX_LENGTH for number in (*body.position, *sizes, *turned))
+        and min(sizes) > 0
+        and any(turned)
+    ):
+        raise ValueError(
+            f"an obstacle needs finite numbers and positive sizes, up to {MAX_LENGTH:.0f} m: {body}"
+        )
 
 
 _KINDS = (Box, Cylinder, Sphere)

@@ -13,7 +13,7 @@ import numpy as np
 import pybullet as p
 
 from envs import panda
-from envs.world import World
+from envs.world import MAX_EDGE, World
 
 # Classes (paper, appendix "Training and verifying the encoders").
 ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
@@ -60,8 +60,12 @@ class Camera:
         _check_view(self)
         if not self.outputs or not set(self.outputs) <= set(OUTPUTS):
             raise ValueError(f"outputs must be some of {', '.join(OUTPUTS)}, got {self.outputs!r}")
-        if min(self.size) < 1:
-            raise ValueError(f"size must be two positive numbers of pixels, got {self.size!r}")
+        if (
+            len(self.size) != 2
+            or not all(isinstance(edge, (int, np.integer)) for edge in self.size)
+            or not 1 <= min(self.size) <= max(self.size) <= MAX_EDGE
+        ):
+            raise ValueError(f"size must be two numbers from 1 to {MAX_EDGE}, got {self.size!r}")
 
     @property
     def space(self):
@@ -103,8 +107,13 @@ class PointCloud:
 
     def __post_init__(self):
         _check_view(self)
-        if self.num_samples < 1 or math.isqrt(self.num_samples) ** 2 != self.num_samples:
-            raise ValueError(f"num_samples must be a square number, got {self.num_samples!r}")
+        number = self.num_samples
+        if (
+            not isinstance(number, (int, np.integer))
+            or not 1 <= number <= MAX_EDGE**2
+            or math.isqrt(number) ** 2 != number
+        ):
+            raise ValueError(f"num_samples must be a square number to {MAX_EDGE}², got {number!r}")
 
     @property
     def space(self):

@@ -26,6 +26,7 @@ HOLD_DRIFT = 1e-3
 FLOOR_LOOK, TABLE_LOOK = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
 OBSTACLE_COLOUR = (0.36, 0.50, 0.65, 1)
 MAX_SAMPLING_TRIES = 10_000
+MAX_EDGE = 4096  # pixels of a picture: 20,000 by 20,000 would need all of a machine's memory
 # PyBullet keeps some 4 kB of each body that is removed, so after this many the world is made anew,
 # which takes as long as 100 changes of scene.
 MAX_BODIES_MADE = 5_000

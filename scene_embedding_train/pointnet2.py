@@ -26,6 +26,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from envs.exported_networks import save_network
+from envs.flags import PositiveFloat, PositiveInt, Share
 from envs.observations import sensors_to_json
 from envs.runs import (
     RunFlags,
@@ -65,38 +66,38 @@ class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     # The data
     observations: Path = Path("observations")
     """folder that `scene_embedding_train.collect` wrote"""
-    validation_share: float = 0.05
+    validation_share: Share = 0.05
     """share of the scenes, the last ones, that is not trained on"""
     # END SHARED
 
     # The algorithm
-    total_updates: int = 10_000
+    total_updates: PositiveInt = 10_000
     """batches of the whole run"""
-    batch_size: int = 32
+    batch_size: PositiveInt = 32
     """scenes per batch"""
-    learning_rate: float = 1e-3
+    learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
-    latent_size: int = 16
+    latent_size: PositiveInt = 16
     """numbers per sensor (paper: 16)"""
-    num_points: int = 256
+    num_points: PositiveInt = 256
     """points that the network gets, evenly spaced among those of a cloud above the table"""
-    num_queries: int = 192
+    num_queries: PositiveInt = 192
     """points that it classifies per cloud and batch"""
-    num_centres: tuple[int, int] = (32, 12)
+    num_centres: tuple[PositiveInt, PositiveInt] = (32, 12)
     """points that farthest point sampling leaves, level by level"""
-    radii: tuple[float, float] = (0.15, 0.4)
+    radii: tuple[PositiveFloat, PositiveFloat] = (0.15, 0.4)
     """radius (m) of the ball query around each of them"""
-    num_neighbours: int = 16
+    num_neighbours: PositiveInt = 16
     """points that a ball query finds at most"""
-    num_waves: int = 4
+    num_waves: PositiveInt = 4
     """wavelengths with which places are described: 2 m, 1 m, ..."""
-    width: int = 32
+    width: PositiveInt = 32
     """features at the first level; further ones have more"""
 
     # SHARED: bookkeeping
-    eval_every: int = 2_000
+    eval_every: PositiveInt = 2_000
     """batches between evaluations on validation scenes; the best encoder is kept"""
-    eval_scenes: int = 512
+    eval_scenes: PositiveInt = 512
     """validation scenes per evaluation"""
     # END SHARED
 

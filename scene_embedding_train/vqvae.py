@@ -22,6 +22,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from envs.exported_networks import save_network
+from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Share
 from envs.observations import sensors_to_json
 from envs.runs import (
     RunFlags,
@@ -57,39 +58,39 @@ class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     # The data
     observations: Path = Path("observations")
     """folder that `scene_embedding_train.collect` wrote"""
-    validation_share: float = 0.05
+    validation_share: Share = 0.05
     """share of the scenes, the last ones, that is not trained on"""
     # END SHARED
 
     # The algorithm
-    total_updates: int = 20_000
+    total_updates: PositiveInt = 20_000
     """batches of the whole run"""
-    batch_size: int = 32
+    batch_size: PositiveInt = 32
     """scenes per batch"""
-    picture_size: int = 64
+    picture_size: PositiveInt = 64
     """width and height (pixels) that pictures are averaged down to, as part of the encoder"""
-    learning_rate: float = 1e-3
+    learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
-    latent_size: int = 16
+    latent_size: PositiveInt = 16
     """numbers per camera (paper: 16)"""
-    width: int = 12
+    width: PositiveInt = 12
     """channels of the first convolution; each further one has twice as many"""
-    code_size: int = 2
+    code_size: PositiveInt = 2
     """numbers in a vector of the codebook; a camera's latent is made of latent_size / code_size"""
-    num_codes: int = 256
+    num_codes: PositiveInt = 256
     """vectors in each camera's codebook"""
-    commitment: float = 0.25
+    commitment: NonNegativeFloat = 0.25
     """weight of the encoder's loss for being far from its codes, beside 1 of the codes' own"""
-    restart_every: int = 500
+    restart_every: PositiveInt = 500
     """updates after which codes that were not used since start again as outputs of the encoder"""
-    foreground_weight: float = 10.0
+    foreground_weight: NonNegativeFloat = 10.0
     """weight of pixels that differ from the mean picture, beside 1 for the others: obstacles are
     few pixels (0: all pixels count the same)"""
 
     # SHARED: bookkeeping
-    eval_every: int = 2_000
+    eval_every: PositiveInt = 2_000
     """batches between evaluations on validation scenes; the best encoder is kept"""
-    eval_scenes: int = 512
+    eval_scenes: PositiveInt = 512
     """validation scenes per evaluation"""
     # END SHARED
 

@@ -11,6 +11,7 @@ import psutil
 import pybullet as p
 import pytest
 import stable_baselines3
+import torch
 from gymnasium.utils.env_checker import check_env
 
 import envs
@@ -414,7 +415,22 @@ def test_closing_frees_the_connection():
 
 
 @pytest.mark.parametrize(
-    "action", [np.full(7, np.nan), np.full(7, np.inf), np.zeros(6), np.zeros((1, 7))]
+    "action",
+    [
+        np.full(7, np.nan),
+        np.full(7, np.inf),
+        np.zeros(6),
+        np.zeros((1, 7)),
+        np.zeros(7, complex),
+        np.zeros(7, "datetime64[s]"),
+        np.ma.masked_array(np.zeros(7), mask=[1, 0, 0, 0, 0, 0, 0]),
+        torch.zeros(7, dtype=torch.bfloat16),
+        torch.zeros(7, requires_grad=True),
+        [10**400] * 7,
+        [[0.0], 0.0],
+        "left",
+        None,
+    ],
 )
 def test_bad_actions(env, action):
     observation, _ = env.reset_specific(HOME, NEAR_HOME)
@@ -466,6 +482,15 @@ def test_position_goals_are_for_goal_type_ee():
         ({"max_step": -1}, "max_step must be a positive number"),
         ({"horizon": 0}, "horizon must be a positive number"),
         ({"ee_tolerance": float("nan")}, "ee_tolerance must be a positive number"),
+        ({"ee_tolerance": 3.0}, "ee_tolerance must be at most 1.0"),  # it would never reset
+        ({"config_tolerance": 9.0}, "config_tolerance must be at most 2.0"),
+        ({"max_step": "far"}, "max_step must be a positive number"),
+        ({"horizon": 1e-320}, "horizon must be a whole number"),
+        ({"episodes_per_scene": 1.5}, "episodes_per_scene must be a whole number"),
+        ({"render_size": (-1, 5)}, "render_size must be from 1 to 4096"),
+        ({"render_size": (70_000, 70_000)}, "render_size must be from 1 to 4096"),
+        ({"render_size": 480}, "render_size must be two numbers"),
+        ({"render_size": (480.5, 360)}, "render_size must be two numbers"),
         ({"render_mode": "ansi"}, "render_mode must be one of"),
     ],
 )

@@ -25,7 +25,7 @@ from demo_generation.planning import Planner
 from demo_generation.verify import VERDICTS, Verifier, verify
 from envs import panda, workers
 from envs.datasets import DatasetError, load_demos, scene_to_json, write_demos
-from envs.journal import VERSION
+from envs.journal import VERSION, line_of
 from envs.scenes import from_array
 
 ROOT = Path(__file__).parents[1]
@@ -241,16 +241,20 @@ def test_control_c_and_on_again(whole, output):
 def journal():
     """The journal of a collection that was stopped just before it wrote its file."""
     scene = scene_to_json(envs.TASKS[TASK].scene)
-    lines = [json.dumps({"journal": VERSION, **options(), "scene": scene})]
     collector = collect.Collector(options())
-    lines += [json.dumps(collector(index)) for index in reversed(range(NUM))]
-    return "".join(line + "\n" for line in lines).encode()
+    made = [collector(index) for index in reversed(range(NUM))]
+    lines = [{"journal": VERSION, **options(), "scene": scene}, *made]
+    return b"".join(map(line_of, lines))
+
+
+def entry_of(line):
+    return json.loads(line[9:])
 
 
 def test_what_is_in_the_journal_is_not_made_again(journal, output):
     lines = journal.splitlines(keepends=True)
-    marked = json.loads(lines[5]) | {"digest": 123456789}
-    lines[5] = json.dumps(marked).encode() + b"\n"
+    marked = entry_of(lines[5]) | {"digest": 123456789}
+    lines[5] = line_of(marked)
     collect.journal_of(output).write_bytes(b"".join(lines))
     collect.collect(output, NUM, options(), progress=False)
     digests = load_demos(output).digest
@@ -272,8 +276,20 @@ def test_a_journal_goes_on_after_a_torn_line(journal, output):
     for expected in (3, 4, 5):  # torn, whole, whole
         with contextlib.closing(collect.Journal(path, options())) as opened:
             assert len(opened.entries) == expected
-            opened.append(json.loads(lines[expected + 1]))
+            opened.append(entry_of(lines[expected + 1]))
     assert path.read_bytes() == b"".join(lines[:7])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_flipped_bit_costs_its_entry_and_is_said(seed, whole, journal, output):
+    rng, flipped = np.random.default_rng(seed), bytearray(journal)
+    flipped[rng.integers(journal.index(b"\n") + 1, len(journal) - 1)] ^= 1 << rng.integers(8)
+    collect.journal_of(output).write_bytes(flipped)
+    result = run(output)
+    assert result.returncode == 0 and output.read_bytes() == whole.read_bytes()
+    assert f"{collect.journal_of(output)}: damaged, " in result.stderr
+    begun = int(re.search(rf"(\d+)/{NUM} ", result.stderr).group(1))
+    assert NUM - 2 <= begun < NUM  # two of them, if it was the end of a line
 
 
 def test_a_torn_first_line_is_written_again(whole, journal, output):
@@ -305,8 +321,8 @@ def test_a_full_disk(whole, output):
     assert result.stderr.strip().splitlines()[-1].startswith("what was collected is safe")
     contents = collect.journal_of(output).read_bytes()
     assert contents.endswith(b"\n") and 1000 < len(contents) <= 9000
-    for line in contents.splitlines():
-        json.loads(line)
+    for line in contents.splitlines(keepends=True):
+        assert line == line_of(entry_of(line))
     assert list(output.parent.iterdir()) == [collect.journal_of(output)]
     collected = journal_lines(output)
     assert collected >= 1

@@ -1,5 +1,7 @@
 """envs/runs.py: flags of a run, what a checkpoint brings back. (Whole runs: test_trainers.py.)"""
 
+import contextlib
+import io
 import json
 import sys
 from dataclasses import dataclass
@@ -135,6 +137,17 @@ def test_a_checkpoint_of_a_damaged_file_says_which(parse, tmp_path):
     (run / "checkpoint.pt").write_bytes(content[: len(content) // 2])
     with pytest.raises(SystemExit, match="checkpoint.pt is damaged"):
         runs.load_checkpoint(args, parts())
+    saved = torch.load(io.BytesIO(content), weights_only=True)
+    rng, unnoticed = np.random.default_rng(0), 0
+    for _ in range(100):
+        flipped = bytearray(content)
+        flipped[rng.integers(len(content))] ^= 1 << rng.integers(8)
+        (run / "checkpoint.pt").write_bytes(flipped)
+        with contextlib.suppress(SystemExit):
+            runs.load_checkpoint(args, parts())
+            unnoticed += 1  # nothing but padding or a date was hit:
+            assert str(torch.load(run / "checkpoint.pt", weights_only=True)) == str(saved)
+    assert unnoticed < 50
 
 
 def test_events_of_steps_that_are_done_again_are_hidden(parse, tmp_path):

@@ -39,6 +39,33 @@ def env():
     env.close()
 
 
+# --- What is no scene
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"obstacles": (Sphere((0, 0, 0), 1), Sphere((0, 0, 1), 0))},
+        {"obstacles": (Sphere((0, 0, math.inf), 1),)},
+        {"obstacles": (Box((0, 0, math.nan), (1, 1, 1)),)},
+        {"obstacles": (Box((0, 0, 0), (1, 1)),)},
+        {"obstacles": (Box((0, 0, 0), (1, 1, -1)),)},
+        {"obstacles": (Box((0, 0, 0), (1, 1, 1e300)),)},
+        {"obstacles": (Box((0, 0, 0), (1, 1, 1), (0, 0, 0, 0)),)},
+        {"obstacles": (Cylinder((0, 0, 0), 1, math.nan),)},
+        {"table": Box((0, 0, 0), (1, 1, 0))},
+        {"floor": math.nan},
+        {"floor": -math.inf},
+        {"friction": -1.0},
+        {"friction": math.nan},
+        {"obstacles": (Sphere((0, 0, 0), 1),) * 10_001},
+    ],
+)
+def test_what_is_no_scene_is_refused_with_the_reason(fields):
+    with pytest.raises(ValueError, match=r"obstacle needs finite|at most|floor must|friction must"):
+        Scene(**fields)
+
+
 # --- The distribution
 
 

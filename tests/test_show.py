@@ -386,7 +386,7 @@ def test_errors(tmp_path, capsys, monkeypatch):
         (["wall", *gif, "--policy", tmp_path / "broken.pt"], "broken.pt: not a network file"),
         (["wall", *gif, "--policy", encoder], "encoder.pt: a network, but not a policy"),
         (["wall", *gif, "--policy", unfit], "unfit.pt: aten.sub.Tensor failed"),
-        (["wall", *gif, "--policy", no_action], "no_action.pt: its output is not an action"),
+        (["wall", *gif, "--policy", no_action], "no_action.pt: its output is not float32"),
         (["wall", *gif, "--policy", strange], "goal_type must be one of"),
         (["benchmaker_bookshelf_tall", *gif, "--policy", "demo"], "has no demonstrations"),
     ]

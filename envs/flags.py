@@ -1,0 +1,70 @@
+"""Ranges of a script's flags, as part of their types, and the check of all of them at once.
+
+    @dataclass
+    class Args:
+        num_envs: PositiveInt = 4
+        gamma: Share = 0.95
+
+    check(args)   # or the program ends: "--gamma must be in [0, 1], got 2.0"
+
+`--help` shows the ranges, too.
+"""
+
+import dataclasses
+import math
+import sys
+import typing
+from typing import Annotated
+
+import tyro
+
+
+class Range(typing.NamedTuple):
+    """From `least` to `most`, both included."""
+
+    least: float
+    most: float
+    words: str
+
+
+def _number(kind, least, most, words, symbols):
+    shown = tyro.conf.arg(metavar=f"{kind.__name__.upper()} {symbols}")
+    return Annotated[kind, Range(least, most, words), shown]
+
+
+LARGEST = sys.float_info.max
+PositiveInt = _number(int, 1, 10**12, "at least 1", ">= 1")
+NonNegativeInt = _number(int, 0, 10**12, "at least 0", ">= 0")
+Seed = _number(int, 0, 2**32 - 1, "in [0, 2^32)", "IN [0, 2^32)")
+Threads = _number(int, 1, 256, "in [1, 256]", "IN [1, 256]")
+Share = _number(float, 0.0, 1.0, "in [0, 1]", "IN [0, 1]")
+PositiveFloat = _number(float, sys.float_info.min, LARGEST, "above 0, and finite", "> 0")
+NonNegativeFloat = _number(float, 0.0, LARGEST, "at least 0, and finite", ">= 0")
+FiniteFloat = _number(float, -LARGEST, LARGEST, "finite", "")
+
+
+def check(args):
+    """End the program with a message unless every flag is within its range.
+
+    Args:
+        args: an instance of a dataclass. None, where a flag may be that, is in every range.
+    """
+    hints = typing.get_type_hints(type(args), include_extras=True)
+    for field in dataclasses.fields(args):
+        limits, value = _range_of(hints[field.name]), getattr(args, field.name)
+        values = value if isinstance(value, tuple) else [value]
+        if limits is None or value is None:
+            continue
+        for one in values:
+            if math.isnan(one) or not limits.least <= one <= limits.most:
+                flag = f"--{field.name.replace('_', '-')}"
+                sys.exit(f"{flag} must be {limits.words}, got {one!r}")
+
+
+def _range_of(kind):
+    """The `Range` in a type, in whatever union or tuple it is; None if there is none."""
+    for one in getattr(kind, "__metadata__", ()):
+        if isinstance(one, Range):
+            return one
+    found = (_range_of(one) for one in typing.get_args(kind))
+    return next((one for one in found if one is not None), None)
