@@ -4,7 +4,8 @@ PyTorch's kernels trust whoever calls them: some write where a size or an index 
 a number of groups. A network file (`envs.exported_networks`) may come from a stranger, so
 
 - only the operations in `ALLOWED` are run: those that the trainers, the encoders and the examples
-  in the docs need. `allow` adds one, in your own code and for that process;
+  in the docs need, layers that others are likely to use, and harmless elementwise ones. `allow`
+  adds one, in your own code and for that process;
 - before a network runs on inputs of other shapes than before, it runs without numbers, on PyTorch's
   meta device: what does not fit together is refused there, and so is what is too large;
 - what the meta device lets through is checked here.
@@ -30,10 +31,11 @@ _CONSTANTS = {str(one).removeprefix("torch."): one for one in (*DTYPES, *_FORMAT
 
 _ELEMENTWISE = (
     *("relu", "leaky_relu", "elu", "gelu", "silu", "softplus", "sigmoid", "tanh", "sin", "cos"),
-    *("clamp", "minimum", "logical_not", "bitwise_not", "alias", "clone", "_to_copy"),
+    *("exp", "log", "sqrt", "rsqrt", "abs", "neg", "floor", "clamp", "minimum", "maximum"),
+    *("logical_not", "logical_and", "bitwise_not", "alias", "clone", "_to_copy"),
 )
 _WITH_OTHER = ("add.Tensor", "sub.Tensor", "mul.Tensor", "mul.Scalar", "div.Tensor")
-_COMPARED = ("eq.Scalar", "ne.Scalar", "lt.Scalar", "le.Scalar", "gt.Scalar", "where.self")
+_COMPARED = tuple(f"{name}.Scalar" for name in ("eq", "ne", "lt", "le", "gt", "ge"))
 _REDUCED = ("sum.dim_IntList", "mean.dim", "max.dim", "any.dim")
 _SHAPED = ("squeeze.dims", "slice.Tensor", "select.int", "sym_size.int", "index.Tensor")
 ALLOWED = {
@@ -42,7 +44,7 @@ ALLOWED = {
         *_ELEMENTWISE,
         *_WITH_OTHER,
         *_COMPARED,
-        *_REDUCED,
+        *("where.self", *_REDUCED),
         *_SHAPED,
         *("div.Tensor_mode", "pow.Tensor_Scalar", "bitwise_and.Tensor"),
         *("amax", "argmax", "argmin", "sort", "topk", "linalg_vector_norm", "cdist"),
