@@ -601,10 +601,14 @@ def main(arguments=None):
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
     print(_table(result))
-    if args.json is not None:
-        write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())
-    if args.picture is not None:
-        write_atomically(args.picture, _draw(job))
+    try:
+        if args.json is not None:
+            write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())
+        if args.picture is not None:
+            write_atomically(args.picture, _draw(job))
+    except OSError as error:
+        print(f"evaluate.py: cannot write: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

@@ -9,9 +9,14 @@ from pathlib import Path
 def write_atomically(path, contents):
     """Write bytes: at every moment, whatever happens, `path` is the old file or the whole new one.
 
-    Raises OSError if it cannot be written; an old file is left as it was, and no other.
+    What is no file but a device or a pipe, such as `/dev/stdout`, is written to. Raises OSError if
+    it cannot be written; an old file is left as it was, and no other.
     """
     path = Path(path)
+    if _is_device(path):
+        with open(path, "ab") as file:  # which may be a file all the same: nothing in it is lost
+            file.write(contents)
+        return
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
@@ -22,11 +27,17 @@ def write_atomically(path, contents):
         raise
 
 
+def _is_device(path):
+    return path.exists() and (not path.is_file() or path.absolute().parts[1] in ("dev", "proc"))
+
+
 def check_writable(path):
     """Raise ValueError if no file can be written at `path`. To be called before long work."""
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"{path} is a directory, not a file")
+    if _is_device(path):
+        return
     try:
         tempfile.TemporaryFile(dir=path.absolute().parent).close()
     except OSError as error:

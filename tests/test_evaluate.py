@@ -489,6 +489,21 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
     assert stop.value.code == 2
 
 
+def test_devices_are_written_to_and_never_replaced(query_file, tmp_path):
+    flags = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", str(query_file)]
+    command = [sys.executable, evaluation.__file__, *flags, "--num-queries", "1", "--json"]
+    shown = subprocess.run([*command, "/dev/stdout"], capture_output=True, text=True, check=True)
+    assert json.loads(shown.stdout[shown.stdout.index("{") :])["num_queries"] == 1
+    with open(tmp_path / "out.txt", "w") as file:  # the table, and the JSON after it
+        subprocess.run([*command, "/dev/stdout"], stdout=file, check=True)
+    text = (tmp_path / "out.txt").read_text()
+    assert "success" in text[: text.index("{")] and text.rstrip().endswith("}")
+    full = subprocess.run([*command, "/dev/full"], capture_output=True, text=True)
+    assert full.returncode == 2 and "Traceback" not in full.stderr
+    assert full.stderr.rstrip().endswith("cannot write: [Errno 28] No space left on device")
+    assert not Path("/dev/stdout").is_file() or Path("/dev/stdout").is_symlink()
+
+
 def test_a_query_that_is_refused_is_named(queries):
     goal = queries.goal.copy()
     goal[3] = 7.0
