@@ -43,6 +43,8 @@ SPLITS = ("test", "validation")
 ORIGINAL = "original"  # split of queries that were not sampled; few tasks have it
 QUERY_SCHEMA, DEMO_SCHEMA = "roboarm-nmp queries", "roboarm-nmp demonstrations"
 SCHEMA_VERSION = 1
+MAX_ARRAY_BYTES = 2**30
+"""Of an array in memory: 100,000 demonstrations have a fifth of that."""
 # Of each array: dtype, numbers per row (None: one dimension), and the array of the same length.
 SCENE_ARRAYS = {
     "scene": ("<u4", None, None),
@@ -207,6 +209,8 @@ def read_scenes(path, attributes, arrays, prefix=""):
         raise DatasetError(f"{path}: {prefix}obstacles: {error}") from error
     if not np.isfinite(rows).all():
         raise DatasetError(f"{path}: {prefix}obstacles has numbers that are not finite")
+    if len(rows) and not (rows[:, 8:].min() > 0 and np.abs(rows).max() <= scenes.MAX_LENGTH):
+        raise DatasetError(f"{path}: {prefix}obstacles has sizes that make no sense")
     return QueryScenes(base, index.astype(np.int64), offsets, rows)
 
 
@@ -271,6 +275,27 @@ def read_file(path, schema, task):
         raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
 
 
+def check_plain(path, group):
+    """Raise DatasetError for links, arrays that lie elsewhere or nowhere, and too large ones.
+
+    A file of some kB can name other files, or promise arrays that no memory has room for.
+    """
+    for name in group:
+        where = f"{path}: {group.name.rstrip('/')}/{name}"
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise DatasetError(f"{where} is a link, which is never followed")
+        found = group[name]
+        if isinstance(found, h5py.Group):
+            check_plain(path, found)
+            continue
+        if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+            raise DatasetError(f"{where} is no array of this file")
+        if found.size * found.dtype.itemsize > MAX_ARRAY_BYTES:
+            raise DatasetError(f"{where} has {found.shape} numbers: too many")
+        if found.size and not found.id.get_storage_size():
+            raise DatasetError(f"{where} was never written")
+
+
 def attribute(file, name):
     """An attribute of the file as a Python object; None if there is none."""
     value = file.attrs.get(name)
@@ -293,6 +318,7 @@ def _read_open(path, file, schema, task):
             raise DatasetError(f"{path}: schema version {value}, this code reads {SCHEMA_VERSION}")
         attributes[name] = value
 
+    check_plain(path, file)
     datasets = {name: file.get(name) for name in array_formats(schema, file)}
     for name, dataset in datasets.items():
         if not isinstance(dataset, h5py.Dataset):
@@ -302,6 +328,9 @@ def _read_open(path, file, schema, task):
     if attribute(file, "checksum") != _checksum(attributes, arrays):
         raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
 
+    scene_from_json(attributes["scene"])  # or it is damaged
+    if not isinstance(json.loads(attributes["parameters"]), dict):
+        raise DatasetError(f"{path}: attribute parameters is not a dict")
     made_for = attributes["task"]
     if task is not None and made_for != task_name(task):
         raise DatasetError(

@@ -7,6 +7,7 @@ The format of the files: `envs.dataset_format`.
 """
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -155,6 +156,10 @@ def load_demos(task_or_path, task=None):
     parameters = json.loads(attributes["parameters"])
     before, here, after = schedule(arrays["plan"], plan_offsets, offsets)
     quantum = parameters.get("quantum", QUANTUM)
+    numbers = parameters.get("lag"), [quantum]
+    for name, value, count in zip(("lag", "quantum"), numbers, (7, 1), strict=True):
+        if not isinstance(value, list) or len(value) != count or not all(map(_is_finite, value)):
+            raise DatasetError(f"{path}: parameters: {name} is not {count} finite numbers")
     states = here - parameters["lag"] * (here - before) + arrays["residual"] * quantum
     states = states.astype(np.float32)
     actions = after - states
@@ -178,6 +183,10 @@ def load_demos(task_or_path, task=None):
         made_by=attributes["made_by"],
         parameters=parameters,
     )
+
+
+def _is_finite(value):
+    return isinstance(value, (int, float)) and math.isfinite(value)
 
 
 def write_demos(path, task, seed, plans, executions, columns, made_by, parameters, scenes_of=None):

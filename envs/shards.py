@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from envs import workers
-from envs.dataset_format import DatasetError, attribute
+from envs.dataset_format import DatasetError, attribute, check_plain
 from envs.files import write_atomically
 from envs.tasks import get_task
 
@@ -58,6 +58,11 @@ def open_shard(path, what, schema, version):
     if found != (schema, version):
         file.close()
         raise DatasetError(f"{path}: not {what} of version {version}: {found}")
+    try:
+        check_plain(path, file)
+    except DatasetError:
+        file.close()
+        raise
     return file
 
 

@@ -258,7 +258,44 @@ def wrong_shape(path):
     replace_array(path, np.zeros((29, 7), np.float32))
 
 
+def soft_link(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        file["test/goal"] = h5py.SoftLink("/test/start")
+
+
+def external_link(path):
+    with h5py.File(path, "r+") as file:
+        del file["test"]
+        file["test"] = h5py.ExternalLink("/etc/passwd", "/test")
+
+
+def elsewhere(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        shape, where = (30, 7), [("/dev/zero", 0, h5py.h5f.UNLIMITED)]
+        file.create_dataset("test/goal", shape, np.float32, external=where)
+
+
+def never_written(path):
+    with h5py.File(path, "r+") as file:
+        for name in ("start", "goal"):
+            del file[f"test/{name}"]
+            file.create_dataset(f"test/{name}", (5 * 10**6, 7), np.float32)
+
+
+def promised(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        file.create_dataset("test/goal", (10**12, 7), np.float32, chunks=(1000, 7))
+
+
 BAD = [
+    (soft_link, "/test/goal is a link, which is never followed"),
+    (external_link, "/test is a link, which is never followed"),
+    (elsewhere, "/test/goal is no array of this file"),
+    (never_written, "was never written"),
+    (promised, "too many"),
     (missing, "no such file"),
     (truncate, "truncated"),
     (empty, "not an HDF5 file"),

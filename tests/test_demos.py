@@ -452,7 +452,23 @@ def a_row_too_many(path):
     sign_again(path)
 
 
+def other_parameters(parameters):
+    def damage(path):
+        with h5py.File(path, "r+") as file:
+            file.attrs["parameters"] = np.bytes_(parameters.encode())
+        sign_again(path)
+
+    damage.__name__ = f"parameters {parameters}"
+    return damage
+
+
 BAD = [
+    (other_parameters("{}"), "parameters: lag is not 7 finite numbers"),
+    (other_parameters('{"lag": [0, 0, 0, 0, 0, 0, NaN]}'), "lag is not 7 finite numbers"),
+    (other_parameters('{"lag": "seven"}'), "lag is not 7 finite numbers"),
+    (other_parameters('{"lag": [0, 0, 0, 0, 0, 0, 0], "quantum": NaN}'), "quantum is not 1"),
+    (other_parameters("[]"), "parameters is not a dict"),
+    (other_parameters("{"), "corrupt"),
     (missing, "no such file"),
     (truncate, "truncated"),
     (text, "not an HDF5 file"),
