@@ -50,10 +50,11 @@ MARGIN_GROWTH = 0.03
 # takes long is likely to go on for long: after so many configurations it keeps this share of them.
 # (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmarks.md.)
 CAUTIONS = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
-# Where RRT-Connect has found nothing after so many configurations, another planner may look at so
-# many before it goes on: some ways out of a shelf that it does not find, LBKPIECE1 finds at once.
+# Where RRT-Connect has found nothing after so many configurations, another planner may look at half
+# as many before it goes on, and so in turns, each twice as long as the last one: some ways out of a
+# shelf that RRT-Connect does not find, LBKPIECE1 finds at once.
 # (Chosen on the same queries, and on the original MotionBenchMaker problems: docs/benchmarks.md.)
-OTHER_PLANNER, OTHER_AFTER, OTHER_CHECKS = "LBKPIECE1", 8_000, 4_000
+OTHER_PLANNER, FIRST_TURN = "LBKPIECE1", 8_000
 # Searches that it makes at most for a path that can be followed within an episode.
 SEARCHES = 3
 # Steps by which the arm may come later than its last sub-goal.
@@ -253,8 +254,7 @@ class Planner:
         deadline, best = time.monotonic() + seconds, None
         turns = ((self.planner, math.inf),)
         if self.planner == "RRTConnect":
-            until = OTHER_AFTER, OTHER_AFTER + OTHER_CHECKS, math.inf
-            turns = tuple(zip((self.planner, OTHER_PLANNER, self.planner), until, strict=True))
+            turns = tuple(_turns())
         for _ in range(SEARCHES):
             seed, left = int(rng.integers(1, 2**32)), deadline - time.monotonic()
             try:
@@ -349,6 +349,16 @@ def _state(space, values):
     return state
 
 
+def _turns():
+    """RRT-Connect's turns and the other planner's, for `_solve`: more than there is time for."""
+    checks, length = 0, FIRST_TURN
+    for _ in range(20):
+        for name, share in (("RRTConnect", length), (OTHER_PLANNER, length // 2)):
+            checks += share
+            yield name, checks
+        length *= 2
+
+
 def _solve(turns, planner_range, space, is_valid, start, goal):
     """Normalised path (n, 7) by OMPL's planners; None if there was none in time.
 
@@ -372,6 +382,8 @@ def _solve(turns, planner_range, space, is_valid, start, goal):
         planners[name].solve(ob.PlannerTerminationCondition(over))
         if problem.hasExactSolution():
             return _to_array(problem.getSolutionPath())
+        if is_valid.exhausted():
+            break
     return None
 
 
