@@ -94,9 +94,9 @@ class Args(runs.RunFlags):
     # DAgger
     round_every: NonNegativeInt = 2_000
     """updates between rounds (0: none)"""
-    round_queries: NonNegativeInt = 80
-    """queries of a round, in scenes of the paths"""
-    round_labels: NonNegativeInt = 32
+    round_queries: NonNegativeInt = 40
+    """queries of a round, each in a scene of the paths"""
+    round_labels: NonNegativeInt = 16
     """of the states that the policy came to on a query, how many are labelled"""
     round_weight: NonNegativeFloat = 5.0
     """how much likelier such a state is in a batch than an example of the pool"""
@@ -194,9 +194,6 @@ class Actor(nn.Module):
 # ALGO LOGIC: examples
 AHEAD = 0.1  # normalised: an example's direction is to where its path is after so much
 PER_PATH = 4  # examples of each path that is chosen: its goal's proximity serves all of them
-# Queries of a round in each scene, which share its roadmap; they are those of so many times as many
-# that take the longest detours: others teach little.
-PER_SCENE, CHOICE = 4, 4
 STUCK = 5.0  # states that the policy was stuck in are so much likelier to be labelled
 DRAW, ROUND = 6, 7  # streams of random numbers; those before belong to demo_generation's files
 
@@ -257,32 +254,21 @@ class Examples:
             return actor(**observed)
 
         while len(reached) < self.args.round_queries:
-            number, first, last = self._choose(rng, CHOICE * PER_SCENE)
-            scene, ends = self.paths.scenes[number], self.paths.points[np.stack([first, last], 1)]
-            detours = self.come[last] - self.come[first]
-            detours -= np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-            left = self.args.round_queries - len(reached)
-            longest = np.argsort(-detours, kind="stable")[: min(PER_SCENE, left)]
-            all_states, all_goals = [], []
-            for start, goal in ends[longest]:
-                both = np.stack([start, goal])
-                if not seeing.true_checker(scene).is_free(both, margin=0.001).all():
-                    continue  # rounded, the environment might refuse it
-                query = Query(*panda.denormalise(both).astype(np.float32), scene)
-                visited.clear()
-                result = protocol.evaluate(act, [env], [query], self.device, last_layer)
-                reached.append(result["success_rate"])
-                states = np.array(visited)
-                chances = np.ones(len(states))
-                moved = np.linalg.norm(states[PATIENCE:] - states[:-PATIENCE], axis=1)
-                chances[PATIENCE:][moved < PROGRESS] = STUCK
-                count = min(self.args.round_labels, len(states))
-                chances /= chances.sum()
-                all_states.append(states[rng.choice(len(states), count, False, chances)])
-                all_goals.append(np.repeat(goal[None], count, axis=0))
-            if not all_states:
-                continue
-            states, goals = np.concatenate(all_states), np.concatenate(all_goals)
+            number, first, last = self._choose(rng, 1)
+            scene, ends = self.paths.scenes[number], self.paths.points[np.r_[first, last]]
+            if not seeing.true_checker(scene).is_free(ends, margin=0.001).all():
+                continue  # rounded, the environment might refuse it
+            query = Query(*panda.denormalise(ends).astype(np.float32), scene)
+            visited.clear()
+            result = protocol.evaluate(act, [env], [query], self.device, last_layer)
+            reached.append(result["success_rate"])
+            states = np.array(visited)
+            chances = np.ones(len(states))
+            moved = np.linalg.norm(states[PATIENCE:] - states[:-PATIENCE], axis=1)
+            chances[PATIENCE:][moved < PROGRESS] = STUCK
+            count = min(self.args.round_labels, len(states))
+            states = states[rng.choice(len(states), count, False, chances / chances.sum())]
+            goals = np.repeat(ends[1:], count, axis=0)
             directions, lengths = Roadmap(scene, rng).labels(states, goals, rng)
             kept = lengths > 0.0  # there is a way, and it is not at the goal
             labelled = (x[kept] for x in (states, goals, directions, lengths))

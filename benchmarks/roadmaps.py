@@ -2,7 +2,6 @@
 
     pip install -c constraints.txt -e .
     python benchmarks/roadmaps.py    # random_boxes_hard, 20 scenes, 1,000 paths followed
-    python benchmarks/roadmaps.py --num-nodes 1000 --pulls 0    # faster, and not as good
 
 Making paths includes everything: sampling the scene, the roadmap, pruning and shortcuts. Seconds
 are the process's own and the wall clock's, which are the same where nothing else runs.
@@ -53,14 +52,11 @@ def main():
     parser.add_argument("--scenes", type=int, default=20, help="(20)")
     parser.add_argument("--num", type=int, default=1000, help="paths that are followed (1,000)")
     parser.add_argument("--peer", type=int, default=100, help="of them also planned (100)")
-    parser.add_argument("--num-nodes", type=int, default=Args.num_nodes, help="of a roadmap")
-    parser.add_argument("--pulls", type=int, default=Args.pulls, help="of each path")
     args = parser.parse_args()
     if args.scenes < 1 or args.num < args.scenes or args.peer < 0:
         parser.error("--scenes must be at least 1, --num at least as many, --peer at least 0")
     # Scenes of no other collection, unless somebody chooses the highest seed.
-    smoothing = {"num_nodes": args.num_nodes, "pulls": args.pulls}
-    settings = Args(output=None, task=args.task, seed=MAX_SEED, **smoothing)
+    settings = Args(output=None, task=args.task, seed=MAX_SEED)
     options = {name: getattr(settings, name) for name in OPTIONS}
     random_paths_of_scene(args.scenes, options | {"paths_per_scene": 2})  # compiles
     cpu, wall, made = time.process_time(), time.perf_counter(), []
@@ -78,13 +74,12 @@ def main():
     for index, (scene, paths) in enumerate(tqdm(made, desc="follow", unit=" scenes")):
         rng = np.random.default_rng([MAX_SEED, index])
         chosen = [paths[i] for i in rng.permutation(len(paths))[:each]]
-        roadmap, checker = Roadmap(scene, rng, **smoothing), CollisionChecker(scene)
+        roadmap, checker = Roadmap(scene, rng), CollisionChecker(scene)
         ends = np.array([(path[0], path[-1]) for path in chosen], np.float64)
         points, _, found = roadmap._search(ends[:, 0], ends[:, 1])
         short = roadmap.paths(ends[:, 0], ends[:, 1], rng)
         labels, others = (
-            again.labels(*ends.swapaxes(0, 1), rng)
-            for again in (roadmap, Roadmap(scene, rng, **smoothing))
+            again.labels(*ends.swapaxes(0, 1), rng) for again in (roadmap, Roadmap(scene, rng))
         )
         excess = np.minimum(labels[1], others[1]) - np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         agreements.append(np.stack([(labels[0] * others[0]).sum(1), excess], axis=1))

@@ -13,8 +13,7 @@ collects paths of many scenes (read by `envs.roadmap_paths.load_roadmap_paths`).
 
 A probabilistic roadmap (Kavraki et al., 1996): random free configurations, each joined to its
 nearest neighbours where the straight motion is free, and shortest paths in that graph, which are
-then pruned, cut short and pulled tight. How tight matters to those who learn from their directions:
-docs/demonstrations.md.
+then pruned and cut short.
 
 Paths keep `margin` from everything where there is room. A node, a start or a goal that is nearer
 to something than that is not lost: around it, a path may come as near as it is itself, and has to
@@ -65,10 +64,6 @@ DENSE = 0.15
 GOALS_PER_PATH, SPARE, MAX_ROUNDS = 0.13, 1.1, 10
 # Random chords tried on each path, and the share of its length that each has to save.
 CHORDS, LEAST_GAIN = 40, 0.005
-# Pulling tight: vertices that each path gets for it, and by how much one is moved to the straight
-# line between its neighbours, as shares of its distance from there: that way, and at random in each
-# joint, at most.
-BENDS, PULL, SWAY = 3, (0.3, 1.0), 0.38
 # A label's direction is that of so much (normalised) of its way, a third of a step of the arm.
 AHEAD = 0.01
 _HAIR = 1e-5  # m: what rounding may take from a distance
@@ -86,18 +81,16 @@ class Roadmap:
         num_nodes: random free configurations.
         num_neighbours: of the nearest nodes, how many each node, start and goal is joined to.
         margin: m, at least `NODE_MARGIN`: what paths keep from everything, the arm itself included.
-        pulls: how often a vertex of each path is pulled to the line between its neighbours.
 
     Raises:
         ValueError: the margin is smaller.
         RuntimeError: the scene leaves no room for the arm.
     """
 
-    def __init__(self, scene, rng, num_nodes=2000, num_neighbours=14, margin=0.015, pulls=120):
+    def __init__(self, scene, rng, num_nodes=1000, num_neighbours=14, margin=0.015):
         if not margin >= NODE_MARGIN:
             raise ValueError(f"margin must be at least {NODE_MARGIN} m, got {margin!r}")
         self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
-        self.pulls = pulls
         self._checker = CollisionChecker(scene)
         self._kept = margin  # by the edges
         self.nodes, self._room = np.empty((0, 7)), np.empty(0)
@@ -264,12 +257,7 @@ class Roadmap:
         """Paths (n, k, 7), padded, made shorter, as near as the states (n, m, 7) allow that they
         come by.
         """
-        points = self._cut_short(self._prune(points, states, room), states, room, rng)
-        bent = (points[:, 1] != points[:, -1]).any(1)
-        tight = self._pulled_tight(points[bent], states[bent], room[bent], rng)
-        points = np.concatenate([points, np.repeat(points[:, -1:], BENDS, axis=1)], axis=1)
-        points[bent] = tight
-        return points
+        return self._cut_short(self._prune(points, states, room), states, room, rng)
 
     def _search(self, starts, goals):
         """Shortest paths: points (n, k, 7), padded with the goal, their room (n, k), found (n,)."""
@@ -370,39 +358,6 @@ class Roadmap:
                 points = points[:, :-1]
         return points
 
-    def _pulled_tight(self, points, states, room, rng):
-        """Bent paths (n, k, 7), padded, with `BENDS` vertices more, as tight as it gets; as near as
-        their states allow.
-        """
-        rows = np.arange(len(points))
-        for _ in range(BENDS):  # in the middle of their longest edges
-            edge = np.linalg.norm(np.diff(points, axis=1), axis=-1).argmax(1)
-            middle = (points[rows, edge] + points[rows, edge + 1]) / 2
-            points = np.concatenate([points, points[:, -1:]], axis=1)
-            place = np.arange(points.shape[1])
-            points = points[rows[:, None], np.where(place <= edge[:, None], place, place - 1)]
-            points[rows, edge + 1] = middle
-        for _ in range(self.pulls):
-            i = rng.integers(1, (points != points[:, -1:]).any(-1).sum(1))
-            before, here, after = points[rows, i - 1], points[rows, i], points[rows, i + 1]
-            line = after - before
-            share = ((here - before) * line).sum(1) / np.maximum((line**2).sum(1), 1e-12)
-            pull = before + share.clip(0.05, 0.95)[:, None] * line - here
-            sway = SWAY * rng.random(len(points)) * np.linalg.norm(pull, axis=1)
-            moved = here + rng.uniform(*PULL, (len(points), 1)) * pull
-            moved = moved + sway[:, None] * rng.standard_normal((len(points), 7))
-            moved = moved.clip(-1.0, 1.0)
-
-            def length(vertex, before=before, after=after):
-                ends = vertex - before, after - vertex
-                return sum(np.linalg.norm(move, axis=1) for move in ends)
-
-            tried = np.flatnonzero(length(moved) < length(here) - 1e-4)
-            for start, end in ((before, moved), (moved, after)):
-                tried = tried[self._free(start[tried], end[tried], states[tried], room[tried])]
-            points[tried, i[tried]] = moved[tried]
-        return points
-
     def _moved_out(self, states, room):
         """The states, those with less room (m) moved to `NODE_MARGIN` by the shortest way."""
         states = states.copy()
@@ -444,14 +399,12 @@ class Args:
     """Number of scenes."""
     paths_per_scene: int = 300
     """Paths in each of them."""
-    num_nodes: int = 2000
+    num_nodes: int = 1000
     """Nodes of a roadmap."""
     num_neighbours: int = 14
     """Nearest nodes that each is joined to, where the motion is free."""
     margin: float = 0.015
     """Metres that paths keep from everything, where there is room."""
-    pulls: int = 120
-    """How often a vertex of each path is pulled to the line between its neighbours."""
     shard_size: int = 50
     """Scenes in each file."""
     seed: int = 0
@@ -469,7 +422,6 @@ OPTIONS = (
     "num_nodes",
     "num_neighbours",
     "margin",
-    "pulls",
     "shard_size",
     "seed",
 )
@@ -480,7 +432,7 @@ def random_paths_of_scene(index, options):
     rng = np.random.default_rng([options["seed"], STREAM, index])
     scene = envs.get_task(options["task"]).scene
     scene = scene if isinstance(scene, Scene) else scene.sample(rng)
-    arguments = {name: options[name] for name in ("num_nodes", "num_neighbours", "margin", "pulls")}
+    arguments = {name: options[name] for name in ("num_nodes", "num_neighbours", "margin")}
     roadmap = Roadmap(scene, rng, **arguments)
     return scene, roadmap.random_paths(options["paths_per_scene"], rng)
 
@@ -516,8 +468,6 @@ def collect(args, progress=True):
         raise ValueError(f"--seed must be in [0, {MAX_SEED}]")
     if args.num_nodes <= max(args.num_neighbours, JOINED):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
-    if args.pulls < 0:
-        raise ValueError("--pulls must not be negative")
     if not args.margin >= NODE_MARGIN:
         raise ValueError(f"--margin must be at least {NODE_MARGIN} m")
     package = Path(envs.__file__).parent.resolve()
