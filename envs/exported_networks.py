@@ -186,7 +186,7 @@ class ExportedNetwork:
         self.metadata = dict(copy.deepcopy(content["metadata"]))
         self.inputs = list(content["inputs"])
         # While it runs, its values lie in one list: tensors, inputs, the results of the nodes.
-        halved = content.get("halved", ())  # names of tensors that are stored in float16
+        halved = set(content.get("halved", ()))  # names of tensors that are stored in float16
         self._tensors = [
             tensor.to(device, torch.float32 if name in halved else tensor.dtype)
             for name, tensor in content["tensors"].items()

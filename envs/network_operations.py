@@ -63,7 +63,7 @@ class NetworkError(ValueError):
 
 
 def allow(name):
-    """Let networks have one more operation, such as `aten.exp.default`: for networks of your own.
+    """Let networks have one more operation, such as `aten.erf.default`: for networks of your own.
 
     Raises ValueError: there is none of that name, or it is none of those that only compute (random
     ones, those that change their arguments, or take memory as it is).
@@ -112,7 +112,7 @@ def check_file(content):
     while left:
         value, depth = left.pop()
         kind, count = type(value), count + 1
-        if count > MAX_VALUES or depth > MAX_DEPTH:
+        if count + len(left) > MAX_VALUES or depth > MAX_DEPTH:
             raise NetworkError(
                 f"it has more than {MAX_VALUES:,} values, or more than {MAX_DEPTH} lists in each "
                 f"other"
