@@ -109,8 +109,6 @@ def make_training_envs(args):
         sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
     if args.demo_prob is None and args.demos is not None:
         sys.exit("--demos goes with --demo-prob")
-    if args.demo_prob is not None and not 0 <= args.demo_prob <= 1:
-        sys.exit(f"--demo-prob {args.demo_prob}: a probability is in [0, 1]")
     made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
     if args.demo_prob is None:
         return made

@@ -280,9 +280,8 @@ def test_a_journal_goes_on_after_a_torn_line(journal, output):
     assert path.read_bytes() == b"".join(lines[:7])
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_flipped_bit_costs_its_entry_and_is_said(seed, whole, journal, output):
-    rng, flipped = np.random.default_rng(seed), bytearray(journal)
+def test_a_flipped_bit_costs_its_entry_and_is_said(whole, journal, output):
+    rng, flipped = np.random.default_rng(0), bytearray(journal)
     flipped[rng.integers(journal.index(b"\n") + 1, len(journal) - 1)] ^= 1 << rng.integers(8)
     collect.journal_of(output).write_bytes(flipped)
     result = run(output)

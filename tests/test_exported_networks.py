@@ -536,5 +536,5 @@ def test_the_earlier_names_still_work():
 
 def test_networks_with_something_changed_at_random_are_refused_or_run(tmp_path):
     """More of them: `python tests/attack.py`."""
-    found = attack.attack(60, 1, tmp_path)
-    assert set(found) <= {attack.REFUSED, attack.RAN} and len(found[attack.REFUSED]) > 30
+    found = attack.attack(40, 1, tmp_path)
+    assert set(found) <= {attack.REFUSED, attack.RAN} and len(found[attack.REFUSED]) > 20

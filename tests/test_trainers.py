@@ -180,7 +180,7 @@ def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps
         (["--resume", "nowhere"], "nowhere is no run's folder"),
         (["--goal-type", "pose"], "goal-type"),
         (["--buffer-size", "49"], "--buffer-size 49: an episode has 50 transitions"),
-        (["--demo-prob", "1.5"], "--demo-prob 1.5: a probability is in [0, 1]"),
+        (["--demo-prob", "1.5"], "--demo-prob must be in [0, 1], got 1.5"),
         (["--demo-prob", "1", "--velocities"], "demonstrations have no velocities"),
         (["--demo-prob", "1", "--max-step", "0.02"], "steps up to 0.03"),
         (["--demo-prob", "1", "--demos", "nowhere.h5"], "nowhere.h5: no such file"),
