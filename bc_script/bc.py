@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from envs import panda, protocol, runs
 from envs.datasets import MAX_STEP, DatasetError, load_demos
 from envs.demo_episodes import observed
-from envs.flags import PositiveFloat, PositiveInt, Share
+from envs.flags import Layers, PositiveFloat, PositiveInt, Share, Width
 from envs.tasks import task_name
 
 
@@ -51,14 +51,14 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     """learning rate (Adam) at the start"""
     anneal: bool = True
     """let the learning rate fall linearly, to zero at the end"""
-    num_modes: PositiveInt = 1
+    num_modes: Width = 1
     """Gaussians of the policy's mixture; the most likely one's mean is the action in evaluation"""
     policy_average: Share = 0.001
     """share of the policy that moves into its running average per update; the average is what is
     evaluated and saved (1: no averaging)"""
-    hidden_size: PositiveInt = 256
+    hidden_size: Width = 256
     """width of the hidden layers"""
-    num_hidden_layers: PositiveInt = 2
+    num_hidden_layers: Layers = 2
     """number of hidden layers"""
     relative_goal: bool = True
     """add goal minus end-effector position, times 5, to the network's inputs"""

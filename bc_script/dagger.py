@@ -28,7 +28,15 @@ from demo_generation.roadmaps import Roadmap
 from envs import panda, protocol, runs, seeing
 from envs.datasets import MAX_STEP, DatasetError
 from envs.demo_episodes import observed
-from envs.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
+from envs.flags import (
+    Layers,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Share,
+    Width,
+)
 from envs.last_layer import PATIENCE, PROGRESS, LastLayer
 from envs.queries import Query
 from envs.roadmap_paths import load_roadmap_paths
@@ -75,11 +83,11 @@ class Args(runs.RunFlags):
     encoder: str = "oracle"
     """what the policy sees of the scene: `oracle`, the obstacles themselves, or `points` of them
     that four sensors see; proximity is that of the same"""
-    token_size: PositiveInt = 128
+    token_size: Width = 128
     """width of the layers that look at one obstacle or point each"""
-    hidden_size: PositiveInt = 384
+    hidden_size: Width = 384
     """width of the residual blocks"""
-    num_blocks: PositiveInt = 3
+    num_blocks: Layers = 3
     """number of residual blocks"""
     bf16: bool | None = None
     """train with hidden products in bfloat16; by default where the hardware has it"""

@@ -15,7 +15,6 @@ docs/results.md, and its pictures are made of those results and of the paper's n
 deviations of four seeds).
 """
 
-import argparse
 import csv
 import datetime
 import fnmatch
@@ -34,10 +33,13 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from envs.datasets import load_queries
 from envs.exported_networks import halve_network
-from envs.files import write_atomically
+from envs.files import check_folder, write_atomically
+from envs.flags import PositiveInt, Seed, check
 
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = Path(__file__).with_name("paper_cells.csv")
@@ -362,18 +364,47 @@ def _bar_label(cell):
     return f"{cell.label}, {cell.goal_type}{encoder}" + ", no hindsight" * (cell.hindsight == "no")
 
 
+@dataclass
+class Args:
+    only: tuple[str, ...] = ()
+    """run these cells (names, or patterns of names)"""
+    seeds: tuple[Seed, ...] = (1,)
+    """of the training"""
+    steps: PositiveInt = 1_000_000
+    """environment steps, or batches"""
+    num_queries: PositiveInt = 10_000
+    """test queries"""
+    runs_dir: Path = Path("runs/paper_tables")
+    """where runs are made, and go on"""
+    list: bool = False
+    """list cells and what is done; run none"""
+
+
+def _check(args, cells):
+    """The cells to run. Raises ValueError for arguments that cannot work."""
+    check(args)
+    chosen = []
+    for pattern in args.only:
+        found = [cell for cell in cells if fnmatch.fnmatch(cell.name, pattern)]
+        if not found:
+            raise ValueError(f"no cell is called {pattern}; --list shows them")
+        chosen += found
+    for cell in chosen:
+        available = len(load_queries(cell.task, "test"))
+        if args.num_queries > available:
+            raise ValueError(f"--num-queries: {cell.task} has {available}, not {args.num_queries}")
+    if chosen:
+        check_folder(args.runs_dir)
+    return list(dict.fromkeys(chosen))
+
+
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", nargs="+", metavar="PATTERN", help="run these cells")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1], help="(1)")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="or batches (1,000,000)")
-    parser.add_argument("--num-queries", type=int, default=10_000, help="test queries (10,000)")
-    parser.add_argument("--runs-dir", type=Path, default=Path("runs/paper_tables"))
-    parser.add_argument("--list", action="store_true", help="list cells and what is done; run none")
-    args = parser.parse_args()
+    args = tyro.cli(Args, description=__doc__)
     cells = read_cells()
+    try:
+        chosen = _check(args, cells)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
     folders = sorted({policies_of(algorithm) for algorithm in SCRIPTS})
     if args.list:
         results = load_results(folders)
@@ -381,15 +412,9 @@ def main():
             found = results.get(cell.name)
             print(f"{cell.name:60} {cell.paper}   {ours(found) if found else 'not run'}")
         return
-    chosen = []
-    for pattern in args.only or []:
-        found = [cell for cell in cells if fnmatch.fnmatch(cell.name, pattern)]
-        if not found:
-            sys.exit(f"error: no cell is called {pattern}; --list shows them")
-        chosen += found
     # `kill` ends the trainer too: `subprocess.run` does that for whatever is raised.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("killed; the same command goes on"))
-    for cell in dict.fromkeys(chosen):
+    for cell in chosen:
         for seed in args.seeds:
             try:
                 run(cell, seed, args.steps, args.num_queries, args.runs_dir)

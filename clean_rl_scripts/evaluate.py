@@ -69,9 +69,10 @@ from PIL import Image
 from tqdm import tqdm
 
 import envs
-from envs import panda, workers
+from envs import flags, panda, workers
 from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
 from envs.files import check_writable, write_atomically
+from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Workers
 from envs.last_layer import LastLayer
 from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy, own_layer
 from envs.scenes import Scene
@@ -96,25 +97,25 @@ class Args:
     """which of the task's queries; few tasks have `original` ones"""
     queries: Path | None = None
     """a query file to use instead of the task's own"""
-    num_queries: int | None = None
+    num_queries: PositiveInt | None = None
     """only the first so many queries of the split"""
-    workers: int = 1
+    workers: Workers = 1
     """processes; each uses one core"""
     stop_on_collision: bool = False
     """end an episode at the first touch"""
     encoder: Literal["points"] | None = None
     """what `planner`, `via-points` and the last layer know of the scene: `points` that sensors see;
     by default the true obstacles"""
-    keep_distance: float | None = None
+    keep_distance: NonNegativeFloat | None = None
     """put a last layer around the policy that keeps this distance (m), e.g. 0.01; by default the
     one that is part of the policy, if it has one (0: none at all)"""
     way_out: bool = True
     """the last layer also leaves dead ends, by a detour into a random direction"""
-    seed: int = 0
+    seed: Seed = 0
     """of what is random: `random`, `via-points`, `planner`, ways out"""
-    tries: int = TRIES
+    tries: PositiveInt = TRIES
     """random configurations that `via-points` tries per query"""
-    time_limit: float = TIME_LIMIT
+    time_limit: PositiveFloat = TIME_LIMIT
     """seconds that `planner` may search per query"""
     json: Path | None = None
     """write the results to this file too"""
@@ -577,6 +578,7 @@ def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 for arguments that make no sense."""
     args = tyro.cli(Args, args=arguments, description=__doc__)
     try:
+        flags.check(args)
         for path in (args.json, args.picture):
             if path is not None:
                 check_writable(path)

@@ -23,12 +23,15 @@ from envs import panda, protocol, runs
 from envs.demo_episodes import demo_transitions, transition
 from envs.encoders import LatentTable
 from envs.flags import (
+    Environments,
     FiniteFloat,
+    Layers,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
     Share,
+    Width,
 )
 from envs.tasks import task_name
 
@@ -41,7 +44,7 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     # SHARED: the task
     task: str = "no_obstacles"
     """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
-    num_envs: PositiveInt = 4
+    num_envs: Environments = 4
     """environments stepped together; every one of their steps counts"""
     # END SHARED
 
@@ -82,9 +85,9 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     policy_average: Share = 0.001
     """share of the policy that moves into its running average per update of the policy; the average
     is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
-    hidden_size: PositiveInt = 256
+    hidden_size: Width = 256
     """width of the hidden layers of policy and critics"""
-    num_hidden_layers: PositiveInt = 2
+    num_hidden_layers: Layers = 2
     """number of hidden layers of policy and critics"""
     layer_norm: bool = True
     """LayerNorm in the critics' hidden layers (CleanRL: no)"""

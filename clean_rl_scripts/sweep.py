@@ -17,18 +17,23 @@ worker, and uninterrupted, a search repeats itself; otherwise its samples depend
 and off, and alpha from 1e-5 to 10.)
 """
 
-import argparse
 import csv
 import fcntl
 import importlib.util
+import io
 import json
-import os
+import re
 import subprocess
 import sys
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
+import tyro
 from torch.utils.tensorboard import SummaryWriter
+
+from envs.files import check_folder, write_atomically
+from envs.flags import PositiveInt, Seed, Workers, check
 
 try:
     import optuna
@@ -40,6 +45,24 @@ except ImportError:
     sys.exit('sweep.py needs the extra `sweep`: pip install -c constraints.txt -e ".[sweep]"')
 
 METRIC = "validation_success_rate"
+
+
+@dataclass
+class Args:
+    trainer: tyro.conf.Positional[Path]
+    """A trainer's script."""
+    search: tuple[str, ...]
+    """What is searched over (see above)."""
+    trials: PositiveInt = 20
+    """Number of trials."""
+    folder: Path = Path("sweep")
+    """Where it all is."""
+    seed: Seed = 0
+    """Seed of the search."""
+    workers: Workers = 1
+    """Trials at a time, one core each."""
+    ray_address: str | None = None
+    """Search on the Ray cluster at this address (`auto`, `HOST:PORT`)."""
 
 
 def parse_search(text):
@@ -210,12 +233,11 @@ def write_report(study, search, folder):
 
 def write_csv(path, rows):
     """Rows (dicts with the same keys), written in one piece."""
-    temporary = path.with_name(path.name + ".part")
-    with open(temporary, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0] if rows else [])
-        writer.writeheader()
-        writer.writerows(rows)
-    os.replace(temporary, path)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, rows[0] if rows else [])
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue().encode())
 
 
 def sweep_on_ray(address, trainer, search, trials, folder, flags, seed):
@@ -263,36 +285,36 @@ def sweep_on_ray(address, trainer, search, trials, folder, flags, seed):
     return rows
 
 
+def _check(args, flags):
+    """The search, as `sweep` takes it. Raises ValueError for arguments that cannot work."""
+    check(args)
+    if not args.trainer.is_file():
+        raise ValueError(f"no such trainer: {args.trainer}")
+    search = dict(parse_search(text) for text in args.search)
+    check_folder(args.folder)
+    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
+        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+    command = [sys.executable, args.trainer, "--help"]
+    shown = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    if shown.returncode != 0:
+        end = (shown.stderr or shown.stdout).strip()[-500:]
+        raise ValueError(f"{args.trainer} --help ends with {shown.returncode}: {end}")
+    known = set(re.findall(r"--[\w-]+", shown.stdout))
+    given = [flag.partition("=")[0] for flag in flags if flag.startswith("--")]
+    for flag in (*(f"--{name}" for name in search), *given):
+        if flag.replace("_", "-") not in known:
+            raise ValueError(f"{args.trainer} has no flag {flag}")
+    return search
+
+
 def main(arguments=None):
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("trainer", type=Path, help="a trainer's script")
-    parser.add_argument("--search", nargs="+", required=True, metavar="NAME=", help="see above")
-    parser.add_argument("--trials", type=int, default=20, help="number of trials (20)")
-    parser.add_argument(
-        "--folder", type=Path, default=Path("sweep"), help="where it all is (sweep)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the search (0)")
-    parser.add_argument(
-        "--workers", type=int, default=1, help="trials at a time, one core each (1)"
-    )
-    parser.add_argument(
-        "--ray-address", help="search on the Ray cluster at this address (`auto`, `HOST:PORT`)"
-    )
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     cut = arguments.index("--") if "--" in arguments else len(arguments)
-    args, flags = parser.parse_args(arguments[:cut]), arguments[cut + 1 :]
+    flags = arguments[cut + 1 :]
+    args = tyro.cli(Args, args=arguments[:cut], prog="sweep.py", description=__doc__)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
-        if not args.trainer.is_file():
-            raise ValueError(f"no such trainer: {args.trainer}")
-        for name, lowest in (("trials", 1), ("seed", 0), ("workers", 1)):
-            if getattr(args, name) < lowest:
-                raise ValueError(f"--{name} must be at least {lowest}")
-        search = dict(parse_search(text) for text in args.search)
-        if args.ray_address is not None and importlib.util.find_spec("ray") is None:
-            raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+        search = _check(args, flags)
         if args.ray_address is not None:
             rows = sweep_on_ray(
                 args.ray_address, args.trainer, search, args.trials, args.folder, flags, args.seed

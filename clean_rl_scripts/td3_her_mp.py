@@ -22,7 +22,16 @@ import torch.nn.functional as F
 from envs import panda, protocol, runs
 from envs.demo_episodes import demo_transitions, transition
 from envs.encoders import LatentTable
-from envs.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
+from envs.flags import (
+    Environments,
+    Layers,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Share,
+    Width,
+)
 from envs.tasks import task_name
 
 
@@ -34,7 +43,7 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     # SHARED: the task
     task: str = "no_obstacles"
     """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
-    num_envs: PositiveInt = 4
+    num_envs: Environments = 4
     """environments stepped together; every one of their steps counts"""
     # END SHARED
 
@@ -79,9 +88,9 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     preactivation_penalty: NonNegativeFloat = 0.1
     """weight of the squared inputs of the policy's tanh in its loss, which keeps it from saturating
     (Andrychowicz et al., 2017, appendix A; CleanRL: 0)"""
-    hidden_size: PositiveInt = 256
+    hidden_size: Width = 256
     """width of the hidden layers of policy and critics"""
-    num_hidden_layers: PositiveInt = 2
+    num_hidden_layers: Layers = 2
     """number of hidden layers of policy and critics"""
     layer_norm: bool = True
     """LayerNorm in the critics' hidden layers (CleanRL: no)"""

@@ -25,13 +25,21 @@ from tqdm import tqdm
 import envs
 from demo_generation.following import follow
 from demo_generation.planning import Planner, PlanningError
-from envs import workers
+from envs import flags, workers
 from envs.datasets import (
     check_writable,
     demo_path,
     query_path,
     validate,
     write_demos,
+)
+from envs.flags import (
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Seed,
+    Workers,
 )
 from envs.journal import Journal, journal_of
 from envs.scenes import Scene, from_array, to_array
@@ -46,25 +54,25 @@ REASONS = ("no_plan", "missed", "collided", "too_long")
 class Args:
     task: str
     """Name of a task, or path of a scene file."""
-    num: int = 10_000
+    num: PositiveInt = 10_000
     """Number of demonstrations."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of queries and plans. (The packaged files have 0, and plans of an earlier version.)"""
-    workers: int = 2
+    workers: Workers = 2
     """Number of processes. The file does not depend on it."""
     planner: str = "RRTConnect"
     """One of OMPL's planners, by name."""
-    time_limit: float = 10.0
+    time_limit: PositiveFloat = 10.0
     """Seconds for one plan, a safeguard: where it strikes, the result depends on the machine."""
-    max_checks: int = 30_000
+    max_checks: PositiveInt = 30_000
     """Configurations that one plan may look at (some 3 us each)."""
-    clearance: float = 0.005
+    clearance: NonNegativeFloat = 0.005
     """Metres that plans keep from the scene, where start and goal do."""
-    planner_range: float = 0.4
+    planner_range: NonNegativeFloat = 0.4
     """Longest motion (normalised) that the planner tries at once; 0 for OMPL's choice."""
-    simplify: int = 1
+    simplify: NonNegativeInt = 1
     """Rounds of removing vertices of a plan and cutting its corners."""
-    attempts: int = 3
+    attempts: PositiveInt = 3
     """Plans tried on a query before it is given up for a new one (paper: 3)."""
     allow_collisions: bool = False
     """Keep demonstrations that touched something but reached the goal (the paper's rule)."""
@@ -251,13 +259,11 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
 
 def _check(args):
     """The path to write. Raises ValueError for arguments that cannot work."""
+    flags.check(args)
     path = args.output or demo_path(args.task)
     demo_path(args.task)  # refuses an unknown task, also with --output
     if not envs.get_task(args.task).trainable:
         raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
-    for name, lowest in (("num", 1), ("seed", 0), ("workers", 1), ("attempts", 1)):
-        if getattr(args, name) < lowest:
-            raise ValueError(f"--{name} must be at least {lowest}")
     with contextlib.closing(envs.make(args.task)) as env:
         # Refuses what a planner refuses, before any work is done.
         make_planner(env, vars(args))

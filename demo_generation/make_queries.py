@@ -28,8 +28,9 @@ import envs
 from demo_generation.collect import MAX_QUERIES, demonstrate
 from demo_generation.motionbenchmaker import read_problems
 from demo_generation.planning import Planner
-from envs import workers
+from envs import flags, workers
 from envs.datasets import ORIGINAL, check_writable, query_path, write_queries
+from envs.flags import PositiveInt, Seed, Workers
 from envs.journal import Journal, journal_of
 from envs.scenes import Scene, from_array, to_array
 from envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
@@ -50,15 +51,15 @@ class Args:
     """Names of tasks, paths of scene files, or `all`."""
     solvable: bool = False
     """Keep only queries that a planner solved."""
-    queries_per_scene: int = 1
+    queries_per_scene: PositiveInt = 1
     """Queries in each scene, where scenes vary."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the queries; 0 gives the packaged files."""
-    num_test: int = 10_000
+    num_test: PositiveInt = 10_000
     """Number of test queries."""
-    num_validation: int = 200
+    num_validation: PositiveInt = 200
     """Number of validation queries."""
-    workers: int = 2
+    workers: Workers = 2
     """Number of processes. The file does not depend on it."""
     original: Path | None = None
     """JSON file of MotionBenchMaker problems to add as the split `original`; goes with one task."""
@@ -198,13 +199,10 @@ def make_queries(
 
 def _check(args):
     """The (task, path) pairs to make. Raises ValueError for arguments that cannot work."""
+    flags.check(args)
     tasks = tuple(envs.TASKS) if args.task == ("all",) else tuple(dict.fromkeys(args.task))
     if not tasks:
         raise ValueError(f"--task: one or more of {', '.join(envs.TASKS)}, or all")
-    for name in ("seed", "num_test", "num_validation", "queries_per_scene", "workers"):
-        lowest = 0 if name == "seed" else 1
-        if getattr(args, name) < lowest:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least {lowest}")
     if (args.output or args.original) is not None and len(tasks) > 1:
         raise ValueError("--output and --original are one file: they go with one task")
     if args.original is not None:

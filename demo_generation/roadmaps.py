@@ -39,6 +39,7 @@ from scipy.sparse.csgraph import dijkstra
 import envs
 from envs import shards
 from envs.collision import CollisionChecker
+from envs.flags import PositiveFloat, PositiveInt, Seed, Workers
 from envs.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from envs.scenes import Scene
 
@@ -386,7 +387,7 @@ def _dense(points):
 
 # Streams 1 to 4 of random numbers are those of queries, demonstrations and observations. Seeds are
 # below 2^32, so each is one word of what NumPy seeds with: no scene is one of another stream's.
-STREAM, MAX_SEED = 5, 2**32 - 1
+STREAM = 5
 
 
 @dataclass
@@ -395,21 +396,21 @@ class Args:
     """Folder to write to."""
     task: str = "random_boxes_hard"
     """Name of a task, or path of a scene file. Where scenes do not vary, each has a new roadmap."""
-    scenes: int = 6000
+    scenes: PositiveInt = 6000
     """Number of scenes."""
-    paths_per_scene: int = 300
+    paths_per_scene: PositiveInt = 300
     """Paths in each of them."""
-    num_nodes: int = 1000
+    num_nodes: PositiveInt = 1000
     """Nodes of a roadmap."""
-    num_neighbours: int = 14
+    num_neighbours: PositiveInt = 14
     """Nearest nodes that each is joined to, where the motion is free."""
-    margin: float = 0.015
+    margin: PositiveFloat = 0.015
     """Metres that paths keep from everything, where there is room."""
-    shard_size: int = 50
+    shard_size: PositiveInt = 50
     """Scenes in each file."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of scenes and roadmaps."""
-    workers: int = 2
+    workers: Workers = 2
     """Number of processes. The files do not depend on it."""
     ray_address: str | None = None
     """Work on the Ray cluster at this address (`auto`, `HOST:PORT`) and not in local processes."""
@@ -461,11 +462,6 @@ def collect(args, progress=True):
         ConnectionError: there is no Ray cluster.
         OSError: the folder cannot be written. What was written is safe.
     """
-    for name in ("scenes", "paths_per_scene", "num_neighbours"):
-        if getattr(args, name) < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
-    if not 0 <= args.seed <= MAX_SEED:
-        raise ValueError(f"--seed must be in [0, {MAX_SEED}]")
     if args.num_nodes <= max(args.num_neighbours, JOINED):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
     if not args.margin >= NODE_MARGIN:
@@ -477,8 +473,8 @@ def collect(args, progress=True):
         )
     shards.check_collection(args)
     options = {name: getattr(args, name) for name in OPTIONS}
-    flags = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
-    made_by = " ".join(["python -m demo_generation.roadmaps", *flags])
+    given = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
+    made_by = " ".join(["python -m demo_generation.roadmaps", *given])
     shards.collect(
         args,
         args.scenes,

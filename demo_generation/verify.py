@@ -19,9 +19,10 @@ from tqdm import tqdm
 from demo_generation.collect import make_planner
 from demo_generation.following import follow
 from demo_generation.planning import PlanningError
-from envs import workers
+from envs import flags, workers
 from envs.arm_env import RoboArmEnv
 from envs.datasets import DatasetError, demo_path, load_demos, write_demos
+from envs.flags import Workers
 from envs.tasks import is_task
 
 VERDICTS = ("good", "changed", "missed", "collided", "refused")
@@ -32,7 +33,7 @@ MEND_ATTEMPTS = 10
 class Args:
     files: tyro.conf.Positional[tuple[str, ...]]
     """Demonstration files, or tasks (names or scene files)."""
-    workers: int = 2
+    workers: Workers = 2
     """Number of processes."""
     mend: bool = False
     """Plan anew what does not verify, on the same query, and replace the file."""
@@ -163,6 +164,10 @@ def verify(task_or_path, num_workers=1, mend=False, progress=True):
 
 
 def main(args):
+    try:
+        flags.check(args)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
     failed = False
     for name in args.files:
         try:

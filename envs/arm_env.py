@@ -4,8 +4,6 @@ Paper: sections 2 and 4, appendix "Extended NMP goal-conditioned MDP description
 """
 
 import math
-import os
-import sys
 import time
 
 import gymnasium as gym
@@ -22,6 +20,7 @@ from envs.world import (  # some of them only for those who import them from her
     SUBSTEPS,
     TIME_STEP,
     World,
+    why_no_window,
 )
 
 GOAL_TYPES = ("ee", "config", "combined")
@@ -154,9 +153,8 @@ class RoboArmEnv(gym.Env):
         self.action_space = gym.spaces.Box(-1.0, 1.0, (panda.NUM_JOINTS,), np.float32)
 
         self._window = render_mode == "human"
-        if self._window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-            # PyBullet would end the whole process.
-            gym.logger.warn("render_mode='human' needs a display (DISPLAY is not set): no window")
+        if self._window and (problem := why_no_window()):
+            gym.logger.warn(f"render_mode='human' needs a display ({problem}): no window")
             self._window = False
         self.world = World(scene, self._window)
         """The simulated `World`. Change its scene by `set_scene` of the environment."""

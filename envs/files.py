@@ -1,7 +1,11 @@
 """Writing files whole, and whether they still are."""
 
+import contextlib
+import fcntl
+import glob
 import os
 import tempfile
+import uuid
 import zipfile
 from pathlib import Path
 
@@ -17,14 +21,46 @@ def write_atomically(path, contents):
         with open(path, "ab") as file:  # which may be a file all the same: nothing in it is lost
             file.write(contents)
         return
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with new_contents(path) as temporary:
+        temporary.write_bytes(contents)
+
+
+@contextlib.contextmanager
+def new_contents(path):
+    """A context whose value is the path of an empty file; at its end that replaces `path`.
+
+    What was written is brought to the disk first: after a power cut too, `path` is the old file or
+    the whole new one. After an exception it is the old one. What processes that were killed have
+    left is cleared away.
+    """
+    path = Path(path)
+    clear_leftovers(path.parent, path.name)
+    while True:
+        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+        lock = open(temporary, "wb")  # noqa: SIM115 (closed below)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if temporary.exists():  # or it looked like a leftover, before it was locked
+            break
+        lock.close()
     try:
-        with open(temporary, "wb") as file:
-            file.write(contents)
-        replace_atomically(temporary, path)
+        with lock:
+            yield temporary
+            os.fsync(lock)
+            os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def clear_leftovers(folder, name="*"):
+    """Delete what killed processes left of new contents of the file `name`, or of all, in a folder.
+
+    Who is still writing holds a lock.
+    """
+    for temporary in Path(folder).glob(f".{name if name == '*' else glob.escape(name)}.*.tmp"):
+        with contextlib.suppress(OSError), open(temporary, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            temporary.unlink()
 
 
 def _is_device(path):
@@ -40,18 +76,17 @@ def check_writable(path):
         return
     try:
         tempfile.TemporaryFile(dir=path.absolute().parent).close()
+        clear_leftovers(path.parent, path.name)
     except OSError as error:
         raise ValueError(f"cannot write {path}: {error.strerror}") from error
 
 
-def replace_atomically(temporary, path):
-    """Rename a file that is whole, in `path`'s folder, to `path`, which it replaces.
-
-    What was written is brought to the disk first: after a power cut too, `path` is whole.
-    """
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+def check_folder(path):
+    """Raise ValueError unless files can be written in a folder, which may not be there yet."""
+    path = Path(path)
+    there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise ValueError(f"{path}: {there} is no folder that can be written")
 
 
 def check_archive(path):

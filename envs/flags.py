@@ -5,7 +5,7 @@
         num_envs: PositiveInt = 4
         gamma: Share = 0.95
 
-    check(args)   # or the program ends: "--gamma must be in [0, 1], got 2.0"
+    check(args)   # or ValueError: "--gamma must be in [0, 1], got 2.0"
 
 `--help` shows the ranges, too.
 """
@@ -37,6 +37,11 @@ PositiveInt = _number(int, 1, 10**12, "at least 1", ">= 1")
 NonNegativeInt = _number(int, 0, 10**12, "at least 0", ">= 0")
 Seed = _number(int, 0, 2**32 - 1, "in [0, 2^32)", "IN [0, 2^32)")
 Threads = _number(int, 1, 256, "in [1, 256]", "IN [1, 256]")
+Workers = Threads
+Layers = _number(int, 1, 100, "in [1, 100]", "IN [1, 100]")
+Width = _number(int, 1, 2**16, "in [1, 65536]", "IN [1, 65536]")
+Pixels = _number(int, 1, 4096, "in [1, 4096]", "IN [1, 4096]")  # PyBullet gets slow long before
+Environments = _number(int, 1, 1000, "in [1, 1000]", "IN [1, 1000]")  # PyBullet has room for 1,024
 Share = _number(float, 0.0, 1.0, "in [0, 1]", "IN [0, 1]")
 PositiveFloat = _number(float, sys.float_info.min, LARGEST, "above 0, and finite", "> 0")
 NonNegativeFloat = _number(float, 0.0, LARGEST, "at least 0, and finite", ">= 0")
@@ -44,7 +49,7 @@ FiniteFloat = _number(float, -LARGEST, LARGEST, "finite", "")
 
 
 def check(args):
-    """End the program with a message unless every flag is within its range.
+    """Raise ValueError, in one line, unless every flag is within its range.
 
     Args:
         args: an instance of a dataclass. None, where a flag may be that, is in every range.
@@ -58,7 +63,7 @@ def check(args):
         for one in values:
             if math.isnan(one) or not limits.least <= one <= limits.most:
                 flag = f"--{field.name.replace('_', '-')}"
-                sys.exit(f"{flag} must be {limits.words}, got {one!r}")
+                raise ValueError(f"{flag} must be {limits.words}, got {one!r}")
 
 
 def _range_of(kind):

@@ -15,6 +15,8 @@ These functions are for scripts: where the user is wrong, they end the program w
 """
 
 import contextlib
+import errno
+import functools
 import importlib.util
 import itertools
 import json
@@ -32,8 +34,15 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from envs import flags
-from envs.files import check_archive, replace_atomically, write_atomically
+from envs.files import (
+    check_archive,
+    check_folder,
+    clear_leftovers,
+    new_contents,
+    write_atomically,
+)
 from envs.flags import Seed, Threads
+from envs.tasks import SCENE_FILES
 
 
 @dataclass
@@ -56,6 +65,7 @@ class RunFlags:
 
 
 MAY_CHANGE = {"resume", "runs_dir", "threads", "track"}  # they do not change what is computed
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 def parse_args(Args, may_change=()):
@@ -71,7 +81,12 @@ def parse_args(Args, may_change=()):
     args = tyro.cli(Args)
     if args.resume is not None:
         args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
-    flags.check(args)
+    try:
+        flags.check(args)
+        if args.resume is None:
+            check_folder(args.runs_dir)
+    except ValueError as error:
+        sys.exit(str(error))
     if Path(args.exp_name).name != args.exp_name:
         sys.exit(f"--exp-name must be part of a folder's name, got {args.exp_name!r}")
     try:
@@ -80,18 +95,9 @@ def parse_args(Args, may_change=()):
         sys.exit(f"--device must be `cpu` or `cuda`, got {args.device!r}")
     if device.type == "cuda" and not torch.cuda.is_available():
         sys.exit(f"--device {args.device}: PyTorch sees no CUDA device here")
-    if args.resume is None:
-        _check_folder(args.runs_dir)
     if args.track and importlib.util.find_spec("wandb") is None:
         sys.exit("--track: wandb is not installed (pip install wandb)")
     return args
-
-
-def _check_folder(folder):
-    """End the program unless folders can be made in this one, which may not be there yet."""
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        sys.exit(f"--runs-dir {folder}: {there} is no folder that can be written")
 
 
 def _args_of_run(Args, run, may_change):
@@ -100,7 +106,8 @@ def _args_of_run(Args, run, may_change):
     saved = json.loads((run / "args.json").read_text())
     kinds = typing.get_type_hints(Args)
     known = [field.name for field in fields(Args) if field.name in saved]
-    defaults = Args(**{name: _from_json(saved[name], kinds[name]) for name in known})
+    begun_in = Path(saved.get("begun_in", "."))
+    defaults = Args(**{name: _from_json(saved[name], kinds[name], begun_in) for name in known})
     defaults.resume = run
     args = tyro.cli(Args, default=defaults)
     had, given = (json.loads(_to_json(asdict(one))) for one in (defaults, args))
@@ -114,13 +121,19 @@ def _args_of_run(Args, run, may_change):
     return args
 
 
-def _from_json(value, kind):
-    """A flag's value as the dataclass has it: JSON knows neither tuples nor paths."""
+def _from_json(value, kind, begun_in):
+    """A flag's value as the dataclass has it: JSON knows neither tuples nor paths.
+
+    A file that is not to be found from here is that from the folder where the run was begun.
+    """
     if isinstance(value, list):
-        return tuple(_from_json(one, kind) for one in value)
-    if isinstance(value, str) and Path in (kind, *typing.get_args(kind)):
-        return Path(value)
-    return value
+        return tuple(_from_json(one, kind, begun_in) for one in value)
+    is_path = Path in (kind, *typing.get_args(kind))
+    if not isinstance(value, str) or not (is_path or value.endswith(SCENE_FILES)):
+        return value
+    there = begun_in / value
+    value = there if there.exists() and not Path(value).exists() else value
+    return Path(value) if is_path else str(value)
 
 
 def _to_json(content):
@@ -140,6 +153,8 @@ def run_folder(args, task):
         task: the name of what is learned, the first part of the folder's name.
     """
     if args.resume is not None:
+        clear_leftovers(args.resume)
+        sys.excepthook = functools.partial(_say_plainly, args.resume)
         return args.resume
     name = f"{task}__{args.exp_name}__{args.seed}__{int(time.time())}"
     for again in itertools.count(1):  # another run may have begun in the same second
@@ -147,8 +162,24 @@ def run_folder(args, task):
         with contextlib.suppress(FileExistsError):
             run.mkdir(parents=True)
             break
-    write_json(run / "args.json", asdict(args))
+    write_json(run / "args.json", asdict(args) | {"begun_in": Path.cwd()})
+    sys.excepthook = functools.partial(_say_plainly, run)
     return run
+
+
+def _say_plainly(run, kind, error, trace):
+    """Python's `excepthook`: what is no mistake of the program's is said in a line or two."""
+    if isinstance(error, KeyboardInterrupt):
+        text = "interrupted"
+    elif isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
+        text = f"error: out of memory ({str(error).splitlines()[0]})"
+    elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
+        text = f"error: {error}"
+    else:
+        return sys.__excepthook__(kind, error, trace)
+    if (run / "checkpoint.pt").exists():
+        text += f"\nwhat the last checkpoint has is safe: --resume {run} goes on from there"
+    print(f"\n{text}", file=sys.stderr)
 
 
 def seed_torch(args):
@@ -175,10 +206,11 @@ def save_checkpoint(run, parts):
     state["torch_rng"] = torch.get_rng_state()
     if torch.cuda.is_initialized():
         state["cuda_rng"] = torch.cuda.get_rng_state()
-    # Always the same temporary name: a run that is killed often leaves one half checkpoint at most.
-    temporary = run / "checkpoint.pt.part"
-    torch.save(state, temporary)
-    replace_atomically(temporary, run / "checkpoint.pt")
+    try:
+        with new_contents(run / "checkpoint.pt") as temporary:
+            torch.save(state, temporary)
+    except RuntimeError as error:  # PyTorch's words for a disk that is full
+        raise OSError(errno.ENOSPC, str(error).splitlines()[0], "checkpoint.pt") from error
 
 
 def load_checkpoint(args, parts):

@@ -14,9 +14,9 @@ import h5py
 import numpy as np
 from tqdm import tqdm
 
-from envs import workers
+from envs import flags, workers
 from envs.dataset_format import DatasetError, attribute, check_plain
-from envs.files import write_atomically
+from envs.files import check_folder, write_atomically
 from envs.tasks import get_task
 
 _SHARD = re.compile(r"shard_(\d{5})\.h5")
@@ -76,9 +76,8 @@ def read_array(file, path, name):
 
 def check_collection(args):
     """Raises ValueError: flags of a collection, as `collect` takes them, that cannot work."""
-    for name in ("shard_size", "workers"):
-        if getattr(args, name) < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1")
+    flags.check(args)
+    check_folder(args.output)
     if not get_task(args.task).trainable:
         raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
     if args.ray_address is not None and importlib.util.find_spec("ray") is None:

@@ -14,7 +14,6 @@ after another, in real time, until it is closed, or Escape or Ctrl-C is pressed.
 import io
 import itertools
 import math
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from PIL import Image
 from tqdm import tqdm
 
 import envs
-from envs import panda, scenes
+from envs import flags, panda, scenes
 from envs.datasets import (
     Demos,
     Query,
@@ -40,10 +39,11 @@ from envs.datasets import (
     query_path,
 )
 from envs.files import write_atomically
+from envs.flags import NonNegativeInt, Pixels, PositiveInt, Seed
 from envs.policies import find_policy, make_policy
+from envs.world import why_no_window
 
 SIZE = (640, 480)
-LARGEST_SIZE = 4096  # PyBullet gets slow long before
 OVERSAMPLING = 2  # the software renderer has jagged edges
 FIELD_OF_VIEW, PITCH, MARGIN = 40.0, -28.0, 0.05  # degrees, degrees, share of the picture
 # From the front right, as long as the obstacles do not hide more of the arm's surroundings from
@@ -72,16 +72,16 @@ class Args:
     configuration), `random`, `via-points`, `planner` (as in clean_rl_scripts/evaluate.py), a policy
     network, a run's folder with a `policy.pt` in it, or the name of a policy of docs/results.md.
     `demo` replays the task's demonstrations; --query is the number of one of these then."""
-    query: int = 0
+    query: NonNegativeInt = 0
     """Number of the (first) query to show, from 0."""
     split: Literal["test", "validation", "original"] = "test"
     """Which of the task's queries. If it has no query file, random ones are shown."""
-    draws: int = 1
+    draws: PositiveInt = 1
     """Pictures in a .png: so many queries, from --query on, side by side. Where scenes vary, each
     query has its own."""
-    size: tuple[int, int] = SIZE
+    size: tuple[Pixels, Pixels] = SIZE
     """Width and height of one picture in pixels."""
-    seed: int = 0
+    seed: Seed = 0
     """Of random queries, and of `random`, `via-points` and `planner`."""
 
 
@@ -317,6 +317,7 @@ def _find_queries(args):
 
 def _check(args):
     """Raises ValueError for arguments that cannot work, without any work."""
+    flags.check(args)
     envs.get_task(args.task)
     if args.output is not None:
         if args.output.suffix.lower() not in (".png", ".gif"):
@@ -324,16 +325,10 @@ def _check(args):
         check_writable(args.output)
     if args.draws > 1 and (args.output is None or args.output.suffix.lower() != ".png"):
         raise ShowError("--draws goes with --output FILE.png")
-    for name, lowest in (("query", 0), ("draws", 1), ("seed", 0)):
-        if getattr(args, name) < lowest:
-            raise ShowError(f"--{name} must be at least {lowest}, got {getattr(args, name)}")
-    if not all(1 <= pixels <= LARGEST_SIZE for pixels in args.size):
-        raise ShowError(f"--size must be two numbers from 1 to {LARGEST_SIZE}")
-    no_display = sys.platform.startswith("linux") and not os.environ.get("DISPLAY")
-    if args.output is None and no_display:
+    if args.output is None and (problem := why_no_window()):
         raise ShowError(
-            "a window needs a display (DISPLAY is not set); "
-            "--output FILE.png or --output FILE.gif writes a file instead"
+            f"a window needs a display ({problem}); "
+            f"--output FILE.png or --output FILE.gif writes a file instead"
         )
 
 

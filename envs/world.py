@@ -6,6 +6,9 @@ goal-conditioned MDP of it, `envs.sensors.SensorWorld` something to be looked at
 
 import contextlib
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pybullet as p
@@ -33,6 +36,33 @@ MAX_BODIES_MADE = 5_000
 # Where and how the arm touches nothing (m, rad). PyBullet places a body by its centre of mass.
 FAR_AWAY, IN_PLACE, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0)
 CONTACT_FREE = ((panda.LOWER + panda.UPPER) / 2).tolist()
+# What asks an X server, and how long (s) it may take.
+OPEN_DISPLAY = """
+import ctypes, sys
+open_display = ctypes.CDLL("libX11.so.6").XOpenDisplay
+open_display.restype = ctypes.c_void_p
+sys.exit(not open_display(None))
+"""
+DISPLAY_SECONDS = 10
+
+
+def why_no_window():
+    """Why PyBullet's window cannot be opened here, in words; None if it can.
+
+    To be asked before: without a display PyBullet ends the process, and it waits for ever for one
+    that does not answer.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    display = os.environ.get("DISPLAY")
+    if not display:
+        return "DISPLAY is not set"
+    command = [sys.executable, "-c", OPEN_DISPLAY]
+    try:
+        answer = subprocess.run(command, capture_output=True, timeout=DISPLAY_SECONDS)
+    except subprocess.TimeoutExpired:
+        return f"DISPLAY is {display}, which does not answer"
+    return None if answer.returncode == 0 else f"DISPLAY is {display}, which cannot be opened"
 
 
 class World:

@@ -20,6 +20,7 @@ import tyro
 
 import envs
 from envs import shards
+from envs.flags import PositiveInt, Seed, Workers
 from envs.observations import Observations, observe, open_shard, shard_bytes
 from envs.sensors import Camera, PointCloud, SensorWorld, cardinal
 
@@ -31,19 +32,19 @@ STREAM = 4
 class Args:
     task: str = "random_boxes_hard"
     """Name of a task, or path of a scene file."""
-    num: int = 20_000
+    num: PositiveInt = 20_000
     """Number of scenes."""
     sensors: Literal["images", "clouds", "both"] = "both"
     """Cameras, point clouds, or both in the same places."""
-    image_size: int = 224
+    image_size: PositiveInt = 224
     """Width and height of the images in pixels."""
-    num_samples: int = 10_000
+    num_samples: PositiveInt = 10_000
     """Rays of a point cloud, a square number."""
-    shard_size: int = 500
+    shard_size: PositiveInt = 500
     """Scenes in each file."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of scenes and configurations."""
-    workers: int = 2
+    workers: Workers = 2
     """Number of processes. The files do not depend on it."""
     output: Path = Path("observations")
     """Folder to write to."""
@@ -92,13 +93,10 @@ def collect(args, progress=True):
         ConnectionError: there is no Ray cluster.
         OSError: the folder cannot be written. What was written is safe.
     """
-    for name, lowest in (("num", 1), ("seed", 0)):
-        if getattr(args, name) < lowest:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least {lowest}")
     shards.check_collection(args)
     names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
-    flags = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
-    made_by = " ".join(["python -m scene_embedding_train.collect", *flags])
+    given = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
+    made_by = " ".join(["python -m scene_embedding_train.collect", *given])
     arguments = (args.task, args.seed, sensors_of(args), made_by)
     shards.collect(
         args,

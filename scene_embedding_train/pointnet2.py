@@ -26,7 +26,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from envs.exported_networks import save_network
-from envs.flags import PositiveFloat, PositiveInt, Share
+from envs.flags import PositiveFloat, PositiveInt, Share, Width
 from envs.observations import sensors_to_json
 from envs.runs import (
     RunFlags,
@@ -77,7 +77,7 @@ class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     """scenes per batch"""
     learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
-    latent_size: PositiveInt = 16
+    latent_size: Width = 16
     """numbers per sensor (paper: 16)"""
     num_points: PositiveInt = 256
     """points that the network gets, evenly spaced among those of a cloud above the table"""
@@ -91,7 +91,7 @@ class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     """points that a ball query finds at most"""
     num_waves: PositiveInt = 4
     """wavelengths with which places are described: 2 m, 1 m, ..."""
-    width: PositiveInt = 32
+    width: Width = 32
     """features at the first level; further ones have more"""
 
     # SHARED: bookkeeping

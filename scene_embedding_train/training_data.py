@@ -3,15 +3,15 @@
 Its functions are for the trainers: where the user is wrong, they end the program with a message.
 """
 
+import contextlib
 import hashlib
 import sys
-import uuid
 
 import numpy as np
 from tqdm import tqdm
 
 from envs.datasets import DatasetError
-from envs.files import replace_atomically
+from envs.files import new_contents
 from envs.observations import Observations, shard_path
 
 
@@ -56,13 +56,14 @@ def unpacked(observations, name, arrays, shards):
     key = contents_key(observations)
     paths = {one: observations.folder / f"{name}_{one}_{key}.npy" for one in arrays}
     if not all(path.exists() for path in paths.values()):
-        # Names of its own: several trainers may be at this at once. Who is last replaces the same.
-        own = uuid.uuid4().hex
-        temporary = {one: path.with_name(f".{path.name}.{own}.tmp") for one, path in paths.items()}
-        try:
+        # Several trainers may be at this at once. Who is last replaces the same.
+        with contextlib.ExitStack() as stack:
             whole = {
                 one: np.lib.format.open_memmap(
-                    temporary[one], "w+", dtype, (len(observations), *shape)
+                    stack.enter_context(new_contents(paths[one])),
+                    "w+",
+                    dtype,
+                    (len(observations), *shape),
                 )
                 for one, (dtype, shape) in arrays.items()
             }
@@ -72,12 +73,8 @@ def unpacked(observations, name, arrays, shards):
             for (begin, end), rows in bar:
                 for one, array in whole.items():
                     array[begin:end] = rows[one]
-            for one, array in whole.items():
+            for array in whole.values():
                 array.flush()
-                replace_atomically(temporary[one], paths[one])
-        finally:
-            for path in temporary.values():
-                path.unlink(missing_ok=True)
     return {one: np.load(path, mmap_mode="r") for one, path in paths.items()}
 
 

@@ -20,7 +20,7 @@ import torch
 import torch.nn as nn
 
 from envs.exported_networks import save_network
-from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Share
+from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Share, Width
 from envs.observations import sensors_to_json
 from envs.runs import (
     RunFlags,
@@ -65,13 +65,13 @@ class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     """batches of the whole run"""
     batch_size: PositiveInt = 32
     """scenes per batch"""
-    picture_size: PositiveInt = 64
+    picture_size: Width = 64
     """width and height (pixels) that pictures are averaged down to, as part of the encoder"""
     learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
-    latent_size: PositiveInt = 16
+    latent_size: Width = 16
     """numbers per camera (paper: 16)"""
-    width: PositiveInt = 12
+    width: Width = 12
     """channels of the first convolution; each further one has twice as many"""
     kl_weight: NonNegativeFloat = 0.001
     """weight of the KL divergence, per latent number, beside the squared error of a picture (with

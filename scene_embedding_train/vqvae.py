@@ -22,7 +22,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from envs.exported_networks import save_network
-from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Share
+from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Share, Width
 from envs.observations import sensors_to_json
 from envs.runs import (
     RunFlags,
@@ -67,13 +67,13 @@ class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     """batches of the whole run"""
     batch_size: PositiveInt = 32
     """scenes per batch"""
-    picture_size: PositiveInt = 64
+    picture_size: Width = 64
     """width and height (pixels) that pictures are averaged down to, as part of the encoder"""
     learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
-    latent_size: PositiveInt = 16
+    latent_size: Width = 16
     """numbers per camera (paper: 16)"""
-    width: PositiveInt = 12
+    width: Width = 12
     """channels of the first convolution; each further one has twice as many"""
     code_size: PositiveInt = 2
     """numbers in a vector of the codebook; a camera's latent is made of latent_size / code_size"""

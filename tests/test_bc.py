@@ -108,7 +108,7 @@ def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path):
             ["--demos", str(demo_path("wall"))],
             "this file is for the task 'wall', not 'no_obstacles'",
         ),
-        (["--num-modes", "0"], "--num-modes must be at least 1"),
+        (["--num-modes", "0"], "--num-modes must be in [1, 65536]"),
         (["--num-demos", "0"], "--num-demos must be at least 1"),
         (["--resume", "nowhere"], "nowhere is no run's folder"),
     ],

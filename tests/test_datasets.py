@@ -521,8 +521,8 @@ def test_make_queries_command_repeats_itself(tmp_path):
         (["--task", "wall", "--output", "no/such/folder/wall.h5"], "cannot write no/such/folder"),
         (["--task", "wall", "--output", "envs"], "envs is a directory"),
         (["--task", "all", "--output", "some.h5"], "one task"),
-        (["--task", "wall", "--workers", "0"], "--workers must be at least 1"),
-        (["--task", "wall", "--seed", "-1"], "--seed must be at least 0"),
+        (["--task", "wall", "--workers", "0"], "--workers must be in [1, 256]"),
+        (["--task", "wall", "--seed", "-1"], "--seed must be in [0, 2^32)"),
     ],
 )
 def test_make_queries_refuses_before_it_works(arguments, complaint):

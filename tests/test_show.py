@@ -316,7 +316,7 @@ def window(monkeypatch):
     def camera(physicsClientId):
         return [640, 480, None, np.eye(4).ravel().tolist()]
 
-    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(show, "why_no_window", lambda: None)
     monkeypatch.setattr(show.envs, "make", without_window)
     monkeypatch.setattr(show.p, "getDebugVisualizerCamera", camera)
     return sleeps
@@ -376,10 +376,10 @@ def test_errors(tmp_path, capsys, monkeypatch):
         (["wall", *png, "--query", many], f"no test query {many}: the numbers are 0 to {many - 1}"),
         (["wall", *png, "--query", many - 1, "--draws", 2], f"no test query {many}"),
         (["wall", *png, "--query", -1], "--query must be at least 0, got -1"),
-        (["wall", *png, "--draws", 0], "--draws must be at least 1"),
+        (["wall", *png, "--draws", 0], "--draws must be at least 1, got 0"),
         (["wall", *gif, "--draws", 2], "--draws goes with --output FILE.png"),
-        (["wall", *png, "--seed", -1], "--seed must be at least 0"),
-        (["wall", *png, "--size", 0, 10], "--size must be two numbers from 1 to"),
+        (["wall", *png, "--seed", -1], "--seed must be in [0, 2^32)"),
+        (["wall", *png, "--size", 0, 10], "--size must be in [1, 4096], got 0"),
         (["wall", *png, "--split", "original"], "has no original queries"),
         (["wall", *gif, "--policy", "go-to-gaol"], "no such policy: go-to-gaol"),
         (["wall", *gif, "--policy", tmp_path / "empty"], "no such policy"),
