@@ -26,7 +26,7 @@ from envs.exported_networks import NetworkError, load_network
 from envs.files import write_atomically
 from envs.observations import sensors_from_json
 from envs.scenes import ROW, to_array
-from envs.seeing import farthest_points, seen_points
+from envs.seeing import farthest_points, keep_points, seen_points
 from envs.sensors import POSE, PointCloud, SensorWorld
 
 ORACLE, POINTS = "oracle", "points"
@@ -36,7 +36,7 @@ NUM_POINTS = 64
 PACKAGED = Path(importlib.resources.files("scene_embedding_train") / "encoders")
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
-CACHED_SCENES = 20_000
+CACHED_SCENES = 500
 
 
 def oracle(scene):
@@ -128,18 +128,27 @@ class SceneEncoder:
     def encode_demos(self, demos):
         """z_E of the scenes of `envs.datasets.Demos`: float32 (n, size). Later calls know them.
 
+        So do those who ask for their points (`envs.seeing`), with `points`.
+
         A trained encoder looks at them once, with a progress bar: z_E is kept in a file beside it,
         `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others.
         """
         seen = [demos.scenes[i] for i in range(len(demos))]
+        quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
 
         def encode():
-            quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
             bar = tqdm(seen, desc=f"encoding {demos.task}", unit="scene", mininterval=quiet)
             return np.stack([self(scene) for scene in bar])
 
         if self.path is None:
-            return encode()
+            if self.name.startswith(POINTS):
+                for scene in tqdm(
+                    seen, f"looking at {demos.task}", unit="scene", mininterval=quiet
+                ):
+                    keep_points(scene)
+            latents = np.stack([self._encode(scene) for scene in seen])
+            self._of_demos |= zip(seen, latents, strict=True)
+            return latents
         path = self.path.with_suffix(f".{demos.task}.npz")
         key = hashlib.sha256(self.path.read_bytes() + repr(seen).encode()).hexdigest()
         latents = _read_latents(path, key)

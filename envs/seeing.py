@@ -20,7 +20,8 @@ CELL = 0.025
 """m. Of the points in a cube of this size, one is kept: some 1,500 on `random_boxes_hard`."""
 POINT_RADIUS = 0.01
 """m. A point stands for what is around it: with this radius there is hardly a hole in a surface."""
-_CACHED_SCENES, _CACHED_CHECKERS = 20_000, 256  # some 20 and 60 kB each
+_CACHED_SCENES, _CACHED_CHECKERS = 500, 64  # some 20 and 60 kB each
+_kept = {}
 
 
 @functools.cache
@@ -28,12 +29,22 @@ def _world():
     return SensorWorld()
 
 
-@functools.lru_cache(_CACHED_SCENES)
 def seen_points(scene):
     """Points of a `Scene`'s obstacles: float32 (n, 3), m, in the base's frame; not to be changed.
 
-    There are none where no obstacle is seen.
+    There are none where no obstacle is seen. The last scenes are remembered.
     """
+    points = _kept.get(scene)
+    return _look(scene) if points is None else points
+
+
+def keep_points(scene):
+    """Remember what is seen of a `Scene`, some 20 kB, for good: it is seen again and again."""
+    _kept[scene] = seen_points(scene)
+
+
+@functools.lru_cache(_CACHED_SCENES)
+def _look(scene):
     world = _world()
     world.show(scene, POSE)
     seen = [sensor.observe(world) for sensor in cardinal(PointCloud).values()]

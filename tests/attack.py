@@ -1,206 +1,90 @@
-"""Hostile network files: does any of them crash, hang or get large?
+"""Hostile inputs: does anything crash, hang, lose or change data, or leave something behind?
 
-    python tests/attack.py --programs 10000 --seed 0
+    python tests/attack.py                    # everything, hours
+    python tests/attack.py --only files --number 1000
+    python tests/attack.py --only networks --repeat 1234
 
-Networks with one to three things changed at random (operations, arguments, references, stored
-tensors) are loaded and run, each in a process of its own. The last lines are a table: how many ran,
-how many were refused (`NetworkError`), and for all else a number that repeats it (`--only NUMBER`).
+Attacks: `networks` (network files with one to three things changed at random, each in a process of
+its own), `files` (bits flipped and files cut off, of every kind that is written), `flags` (of every
+command), `environments` (arguments of environments, scenes and sensors, and actions), `kills`
+(`kill -9` at random moments of training, collecting, drawing and sweeping).
+
+Each attempt depends on the seed and its number only. The last lines are a table: how many attempts
+had which outcome, and for bad ones the numbers that repeat them.
 """
 
-import argparse
 import collections
-import copy
 import os
-import pickle
-import resource
-import signal
 import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+os.environ["OMP_NUM_THREADS"] = "1"
 
 import torch
-from torch import nn
+import tyro
+from attacks import children, environments, files, flags, kills, networks
 from tqdm import tqdm
 
-from envs import network_operations
-from envs.exported_networks import ExportedNetwork, NetworkError, save_network
-
-SECONDS, MEGABYTES = 20, 1500
-NUMBERS = (0, 1, -1, 2, 3, 7, -7, 255, 2**15, 2**31, -(2**31), 2**40, 2**62, -(2**63), 2**63, 2**70)
-ODD = (
-    *NUMBERS,
-    0.5,
-    -1.0,
-    float("nan"),
-    float("inf"),
-    1e300,
-    True,
-    False,
-    None,
-    "mean",
-    "floor",
-    [],
-)
-REFUSED, RAN = "refused", "ran"
+# How many attempts, and how many of them share a process.
+SIZES = {"networks": 10_000, "files": 20_000, "flags": 2_000, "environments": 20_000, "kills": 200}
+PER_CHILD = {"networks": 1, "files": 200, "flags": 1, "environments": 100, "kills": 1}
+MODULES = {
+    "networks": networks,
+    "files": files,
+    "flags": flags,
+    "environments": environments,
+    "kills": kills,
+}
+GOOD = (children.REFUSED, children.RAN, files.UNCHANGED)
 
 
-class Mixed(nn.Module):
-    """Most kinds of operations that a network may have."""
-
-    def __init__(self):
-        super().__init__()
-        self.pictures = nn.Sequential(
-            nn.Conv2d(3, 6, 3, 2, 1), nn.GroupNorm(2, 6), nn.ELU(), nn.MaxPool2d(2), nn.AvgPool2d(2)
-        )
-        self.grow = nn.Sequential(nn.ConvTranspose2d(6, 3, 2, 2), nn.BatchNorm2d(3), nn.Sigmoid())
-        self.book = nn.Embedding(9, 5)
-        self.layer = nn.Sequential(nn.Linear(12, 5), nn.LayerNorm(5), nn.GELU(), nn.Softplus())
-
-    def forward(self, picture, points, numbers):
-        seen = self.pictures(picture.float() / 255)
-        x = self.layer(torch.cat([seen.mean((2, 3)), self.grow(seen).amax((2, 3)), numbers], 1))
-        nearest = torch.cdist(x, self.book.weight).argmin(1)
-        x = x + self.book(nearest) + self.book((nearest + 9) // 2)
-        near = torch.cdist(points, points[:, :2]).topk(3, dim=1, largest=False)
-        group = points.gather(1, near.indices[:, :, :1].expand(-1, -1, 3)) - points[:, :1]
-        group = torch.where(group.norm(dim=-1, keepdim=True) < 0.5, group, 0)
-        order = numbers.sort(1).values.clamp(-1, 1).pow(2).unsqueeze(1) @ points[:, :3]
-        weights = torch.softmax(x, 1) * torch.log_softmax(x, 1).relu()
-        index = torch.arange(x.shape[0], device=x.device)
-        picked = points[index[:, None], nearest[:, None].clamp(0, 7)]
-        return torch.cat([weights, group.flatten(1), order[:, 0], picked[:, 0].tanh()], 1)
+@dataclass
+class Args:
+    only: tuple[Literal["networks", "files", "flags", "environments", "kills"], ...] = tuple(SIZES)
+    """these attacks"""
+    number: int | None = None
+    """attempts of each; by default 10,000, 20,000, 2,000, 20,000, 200"""
+    seed: int = 0
+    """of everything random"""
+    repeat: int | None = None
+    """only the attempt with this number"""
 
 
-def inputs(rows=2):
-    generator = torch.Generator().manual_seed(0)
-    return {
-        "picture": torch.randint(0, 255, (rows, 3, 16, 16), generator=generator).byte(),
-        "points": torch.rand(rows, 8, 3, generator=generator),
-        "numbers": torch.rand(rows, 3, generator=generator),
-    }
+def attack(name, numbers, seed, folder, progress=False):
+    """Make an attack's attempts; dict from an outcome to the numbers of its attempts.
 
-
-def hostile(content, rng):
-    """A copy with one to three things changed; `rng` is a `random.Random`."""
-    content = copy.deepcopy(content)
-    for _ in range(rng.randint(1, 3)):
-        nodes = content["nodes"]
-        node, kind = rng.choice(nodes), rng.random()
-        if kind < 0.25:
-            known = [*network_operations.ALLOWED, *network_operations.PYTHON]
-            node[1] = rng.choice(sorted(known) if rng.random() < 0.9 else ["aten._fft_c2r.default"])
-        elif kind < 0.7:
-            _change(rng.choice([node[2], node[3]]), rng, nodes, content)
-        elif kind < 0.8:
-            nodes.insert(rng.randrange(len(nodes)), copy.deepcopy(node))
-        elif kind < 0.9:
-            name = rng.choice(sorted(content["tensors"]))
-            content["tensors"][name] = _tensor(content["tensors"][name], rng)
-        else:
-            node[2], other = copy.deepcopy(rng.choice(nodes)[2]), node[2]
-            node[2] = node[2] if rng.random() < 0.5 else other[: rng.randint(0, len(other))]
-    return content
-
-
-def _change(arguments, rng, nodes, content):
-    """Change one of the arguments, in place, or of those inside of it."""
-    keys = list(arguments) if isinstance(arguments, dict) else list(range(len(arguments)))
-    if not keys or rng.random() < 0.05:
-        if isinstance(arguments, list):
-            arguments.append(rng.choice(ODD))
-        else:
-            arguments[rng.choice(["dtype", "dim", "keepdim", "rounding_mode"])] = rng.choice(ODD)
-        return
-    key = rng.choice(keys)
-    inside = arguments[key]
-    if isinstance(inside, list) and inside and rng.random() < 0.7:
-        return _change(inside, rng, nodes, content)
-    if isinstance(inside, dict) or rng.random() < 0.2:
-        references = [{"node": node[0]} for node in nodes]
-        references += [{"tensor": name} for name in content["tensors"]]
-        references += [{"torch": name} for name in ("int64", "bool", "uint8", "float32", "float64")]
-        arguments[key] = rng.choice(references)
-    elif isinstance(inside, list) and rng.random() < 0.3:
-        arguments[key] = inside * rng.choice([0, 2, 1000])
-    else:
-        arguments[key] = rng.choice(ODD)
-
-
-def _tensor(tensor, rng):
-    kind = rng.randrange(5)
-    if kind == 0:
-        return (
-            torch.full_like(tensor, float("nan")) if tensor.is_floating_point() else tensor + 2**40
-        )
-    if kind == 1:
-        return tensor.flatten()[: rng.randint(0, tensor.numel())].clone()
-    if kind == 2:
-        return torch.tensor(rng.choice([0, -1, 2**62, -(2**63)])).expand(tensor.shape).clone()
-    if kind == 3:
-        return tensor.expand(1000, *tensor.shape)
-    return tensor.reshape(1, *tensor.shape, 1).clone()
-
-
-def outcome(content):
-    """What comes of loading and running it, in a process of its own: a word or two."""
-    reader, writer = os.pipe()
-    child = os.fork()
-    if child == 0:
-        signal.alarm(SECONDS)
-        size = 2**20 * MEGABYTES + _pages()
-        resource.setrlimit(resource.RLIMIT_AS, (size, size))
-        try:
-            # As a reader gets it; what cannot be unpickled is for other tests.
-            ExportedNetwork(pickle.loads(pickle.dumps(content)))(**inputs())
-            answer = RAN
-        except NetworkError as error:
-            answer = "out of memory" if "allocate" in str(error) else REFUSED
-        except BaseException as error:
-            answer = f"traceback: {type(error).__name__}"
-        os.write(writer, answer.encode())
-        os._exit(0)
-    os.close(writer)
-    with os.fdopen(reader) as file:
-        answer = file.read()
-    _, status = os.waitpid(child, 0)
-    if os.WIFSIGNALED(status):
-        number = os.WTERMSIG(status)
-        return "hang" if number == signal.SIGALRM else f"crash: {signal.Signals(number).name}"
-    return answer or "crash: no answer"
-
-
-def _pages():
-    """Bytes of address space that this process has."""
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[0]) * resource.getpagesize()
-
-
-def attack(programs, seed, folder, only=None, progress=False):
-    """Counter of outcomes, and dict from an outcome to the numbers of those programs."""
-    import random
-
+    Args:
+        name: one of `SIZES`.
+        numbers: of the attempts.
+        seed: int.
+        folder: an empty one to work in.
+        progress: show a progress bar.
+    """
     torch.set_num_threads(1)
-    path = folder / "mixed.pt"
-    torch.manual_seed(seed)
-    save_network(path, Mixed(), inputs(), {"kind": "encoder"})
-    content = torch.load(path, weights_only=True)
+    attempt = MODULES[name].attempts(seed, folder)
+    seconds = getattr(MODULES[name], "SECONDS", children.SECONDS)
     found = collections.defaultdict(list)
-    numbers = range(programs) if only is None else [only]
-    for number in tqdm(numbers, disable=not progress, unit="program"):
-        found[outcome(hostile(content, random.Random(f"{seed} {number}")))].append(number)
+    results = children.outcomes(attempt, numbers, PER_CHILD[name], seconds)
+    for number, word in tqdm(results, name, len(numbers), disable=not progress, mininterval=5):
+        found[word].append(number)
     return found
 
 
-if __name__ == "__main__":
-    import tempfile
-    from pathlib import Path
+def main(args):
+    bad = False
+    for name in args.only:
+        numbers = range(args.number or SIZES[name]) if args.repeat is None else [args.repeat]
+        with tempfile.TemporaryDirectory() as folder:
+            found = attack(name, numbers, args.seed, Path(folder), progress=True)
+        print(f"\n{name}, seed {args.seed}: {len(numbers)} attempts")
+        for word, those in sorted(found.items(), key=lambda item: -len(item[1])):
+            print(f"  {len(those):8} {word}" + f": {those[:20]}" * (word not in GOOD), flush=True)
+            bad = bad or word not in GOOD
+    return int(bad)
 
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--programs", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", type=int, metavar="NUMBER")
-    args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        found = attack(args.programs, args.seed, Path(folder), args.only, progress=True)
-    for name, numbers in sorted(found.items(), key=lambda item: -len(item[1])):
-        rest = "" if name in (REFUSED, RAN) else f"  {numbers[:20]}"
-        print(f"{name:24}{len(numbers):8}{rest}")
-    sys.exit(any(name not in (REFUSED, RAN) for name in found))
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Args, description=__doc__)))

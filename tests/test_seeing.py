@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs import seeing
 from envs.collision import POINT, CollisionChecker
 from envs.encoders import SceneEncoder
 from envs.exported_networks import NetworkError
@@ -42,7 +43,7 @@ def test_a_scene_is_seen_the_same_way_again():
     scene = Scene((BOX, Sphere((-0.4, 0.4, 0.3), 0.1)))
     before = seen_points(scene).tobytes()
     seen_points(Scene((Sphere((0.4, 0.4, 0.4), 0.05),)))
-    seen_points.cache_clear()
+    seeing._look.cache_clear()
     assert seen_points(scene).tobytes() == before
 
 

@@ -1,0 +1,1 @@
+"""Attacks: hostile inputs by the thousand, each made of a seed and a number that repeat it."""
