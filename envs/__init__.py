@@ -1,5 +1,7 @@
 """RoboArm-NMP's environments. `make(task)` builds one; importing registers the Gymnasium ids."""
 
+from pathlib import Path
+
 import gymnasium
 
 from envs.arm_env import RoboArmEnv
@@ -24,6 +26,9 @@ def make(task, encoder=None, proximity=None, **kwargs):
         ValueError: unknown task, malformed scene file, an argument out of its range, or a file
             that is no encoder.
     """
+    for name, value in (("task", task), ("encoder", encoder), ("proximity", proximity)):
+        if not isinstance(value, (str, Path)) and (value is not None or name == "task"):
+            raise ValueError(f"{name} must be a name or a path, got {value!r}")
     if proximity not in (None, "obstacles", "points"):
         raise ValueError(f"proximity must be None, 'obstacles' or 'points', got {proximity!r}")
     env = RoboArmEnv(get_task(task).scene, **kwargs)

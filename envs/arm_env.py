@@ -11,6 +11,7 @@ import numpy as np
 import pybullet as p
 
 from envs import panda
+from envs.scenes import is_number
 from envs.world import (  # some of them only for those who import them from here
     HOLD_DRIFT,  # noqa: F401
     HOLD_STEPS,
@@ -98,13 +99,20 @@ class RoboArmEnv(gym.Env):
         _one_of("reward", reward, ("sparse", "dense"))
         _one_of("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         for name, value in [
+            ("stop_on_collision", stop_on_collision),
+            ("sink_state", sink_state),
+            ("velocities", velocities),
+        ]:
+            if not isinstance(value, (bool, np.bool_)):
+                raise ValueError(f"{name} must be a bool, got {value!r}")
+        for name, value in [
             ("ee_tolerance", ee_tolerance),
             ("config_tolerance", config_tolerance),
             ("max_step", max_step),
             ("horizon", horizon),
             ("episodes_per_scene", episodes_per_scene),
         ]:
-            if not (_is_number(value) and np.isfinite(value) and value > 0):
+            if not (is_number(value) and value > 0):
                 raise ValueError(f"{name} must be a positive number, got {value!r}")
         for name, value, most in [
             ("ee_tolerance", ee_tolerance, MAX_EE_TOLERANCE),
@@ -425,19 +433,15 @@ class RoboArmEnv(gym.Env):
         self.world.close()
 
 
-def _is_number(value):
-    return np.isscalar(value) and isinstance(value, (int, float, np.number))
-
-
 def _one_of(name, value, allowed):
-    if value not in allowed:
+    if not isinstance(value, (str, type(None))) or value not in allowed:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
 
 
 def _vector(name, value, sizes):
     try:
         vector = np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"{name} must be numbers, got {value!r}") from error
     if vector.ndim != 1 or vector.size not in sizes:
         expected = " or ".join(str(size) for size in sizes)

@@ -22,7 +22,7 @@ import numpy as np
 
 from envs import panda
 from envs.collision import CollisionChecker, compiled
-from envs.scenes import Scene
+from envs.scenes import Scene, is_number
 from envs.subgoals import MAX_STEP
 from envs.wrappers import link_proximity
 
@@ -47,10 +47,19 @@ class LastLayer:
     Attributes:
         keep: m, the distance that links keep from everything.
         way_out: whether it leaves dead ends.
+
+    Raises:
+        ValueError: `keep` is no distance, or `way_out` not a bool.
     """
 
     keep: float = 0.01
     way_out: bool = True
+
+    def __post_init__(self):
+        if not (is_number(self.keep) and self.keep >= 0):
+            raise ValueError(f"keep must be a distance in m, got {self.keep!r}")
+        if not isinstance(self.way_out, bool):
+            raise ValueError(f"way_out must be a bool, got {self.way_out!r}")
 
     def __call__(self, actions, proximity, keep=None, max_step=MAX_STEP):
         """Actions (..., 7), changed as little as needed: float32.

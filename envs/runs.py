@@ -83,10 +83,13 @@ def parse_args(Args, may_change=()):
         args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
     try:
         flags.check(args)
+    except ValueError as error:
+        sys.exit(str(error))
+    try:
         if args.resume is None:
             check_folder(args.runs_dir)
     except ValueError as error:
-        sys.exit(str(error))
+        sys.exit(f"--runs-dir {error}")
     if Path(args.exp_name).name != args.exp_name:
         sys.exit(f"--exp-name must be part of a folder's name, got {args.exp_name!r}")
     try:

@@ -82,10 +82,23 @@ class Scene:
             if not isinstance(self.table, Box):
                 raise TypeError(f"table must be a Box or None, got {self.table!r}")
             _check(self.table)
-        if self.floor is not None and not abs(self.floor) <= MAX_LENGTH:
+        if self.floor is not None and not _is_length(self.floor):
             raise ValueError(f"floor must be a height in m or None, got {self.floor!r}")
-        if not 0 <= self.friction < math.inf:
+        if not (is_number(self.friction) and self.friction >= 0):
             raise ValueError(f"friction must be a number from 0 on, got {self.friction!r}")
+
+
+def is_number(value):
+    """Whether a value is a finite real number, Python's or NumPy's: no text, date or tensor."""
+    try:
+        kinds = (int, float, np.integer, np.floating)
+        return isinstance(value, kinds) and math.isfinite(value)
+    except (OverflowError, TypeError):  # 10**400; a time span, which NumPy counts as an integer
+        return False
+
+
+def _is_length(value):
+    return is_number(value) and abs(value) <= MAX_LENGTH
 
 
 def _check(body):
@@ -96,7 +109,7 @@ def _check(body):
     if not (
         (len(body.position), len(turned)) == (3, 4)
         and (len(sizes) == 3 or not isinstance(body, Box))
-        and all(abs(number) <= MAX_LENGTH for number in (*body.position, *sizes, *turned))
+        and all(map(_is_length, (*body.position, *sizes, *turned)))
         and min(sizes) > 0
         and any(turned)
     ):

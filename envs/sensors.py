@@ -13,6 +13,7 @@ import numpy as np
 import pybullet as p
 
 from envs import panda
+from envs.scenes import MAX_LENGTH, is_number
 from envs.world import MAX_EDGE, World
 
 # Classes (paper, appendix "Training and verifying the encoders").
@@ -109,7 +110,7 @@ class PointCloud:
         _check_view(self)
         number = self.num_samples
         if (
-            not isinstance(number, (int, np.integer))
+            not (isinstance(number, (int, np.integer)) and is_number(number))
             or not 1 <= number <= MAX_EDGE**2
             or math.isqrt(number) ** 2 != number
         ):
@@ -193,15 +194,23 @@ def _axes(sensor):
 def _check_view(sensor):
     for name in ("eye", "target", "up"):
         vector = getattr(sensor, name)
-        if len(vector) != 3 or not np.isfinite(vector).all():
-            raise ValueError(f"{name} must be three finite numbers, got {vector!r}")
+        if len(vector) != 3 or not all(is_number(x) and abs(x) <= MAX_LENGTH for x in vector):
+            raise ValueError(
+                f"{name} must be three numbers, up to {MAX_LENGTH:.0f} m, got {vector!r}"
+            )
     looks = np.subtract(sensor.target, sensor.eye)
     if np.linalg.norm(np.cross(looks, sensor.up)) < 1e-9:
         raise ValueError("a sensor cannot look along its own up direction, or from its target")
+    for name in ("field_of_view", "near", "far"):
+        if not is_number(getattr(sensor, name)):
+            raise ValueError(f"{name} must be a number, got {getattr(sensor, name)!r}")
     if not 0 < sensor.field_of_view < 180:
         raise ValueError(f"field_of_view must be between 0 and 180, got {sensor.field_of_view!r}")
-    if not 0 < sensor.near < sensor.far:
-        raise ValueError(f"near and far must be 0 < near < far, got {sensor.near}, {sensor.far}")
+    if not 0 < sensor.near < sensor.far <= MAX_LENGTH:
+        raise ValueError(
+            f"near and far must be 0 < near < far <= {MAX_LENGTH:.0f} m, got {sensor.near!r}, "
+            f"{sensor.far!r}"
+        )
 
 
 class SensorWorld(World):

@@ -48,22 +48,21 @@ def write_attributes(file, attributes):
         file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
 
 
+@contextlib.contextmanager
 def open_shard(path, what, schema, version):
-    """An `h5py.File` of a shard. Raises DatasetError: damaged, or something else than `what`."""
+    """A context with the `h5py.File` of a shard.
+
+    Raises DatasetError: it is something else than `what`, or damaged, which may come out later.
+    """
     try:
-        file = h5py.File(path, "r")
-    except OSError as error:
+        with h5py.File(path, "r") as file:
+            found = attribute(file, "schema"), attribute(file, "schema_version")
+            if found != (schema, version):
+                raise DatasetError(f"{path}: not {what} of version {version}: {found}")
+            check_plain(path, file)
+            yield file
+    except (KeyError, OSError, RuntimeError) as error:  # as damaged HDF5 raises
         raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
-    found = attribute(file, "schema"), attribute(file, "schema_version")
-    if found != (schema, version):
-        file.close()
-        raise DatasetError(f"{path}: not {what} of version {version}: {found}")
-    try:
-        check_plain(path, file)
-    except DatasetError:
-        file.close()
-        raise
-    return file
 
 
 def read_array(file, path, name):

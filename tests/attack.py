@@ -29,7 +29,7 @@ from attacks import children, environments, files, flags, kills, networks
 from tqdm import tqdm
 
 # How many attempts, and how many of them share a process.
-SIZES = {"networks": 10_000, "files": 20_000, "flags": 2_000, "environments": 20_000, "kills": 200}
+SIZES = {"networks": 10_000, "files": 20_000, "flags": 2_000, "environments": 20_000, "kills": 50}
 PER_CHILD = {"networks": 1, "files": 200, "flags": 1, "environments": 100, "kills": 1}
 MODULES = {
     "networks": networks,
@@ -46,7 +46,7 @@ class Args:
     only: tuple[Literal["networks", "files", "flags", "environments", "kills"], ...] = tuple(SIZES)
     """these attacks"""
     number: int | None = None
-    """attempts of each; by default 10,000, 20,000, 2,000, 20,000, 200"""
+    """attempts of each; by default 10,000, 20,000, 2,000, 20,000, 50 (of four kills)"""
     seed: int = 0
     """of everything random"""
     repeat: int | None = None
@@ -76,7 +76,11 @@ def attack(name, numbers, seed, folder, progress=False):
 def main(args):
     bad = False
     for name in args.only:
-        numbers = range(args.number or SIZES[name]) if args.repeat is None else [args.repeat]
+        if args.repeat is not None:  # in this process, for debuggers
+            with tempfile.TemporaryDirectory() as folder:
+                print(MODULES[name].attempts(args.seed, Path(folder))(args.repeat))
+            continue
+        numbers = range(args.number or SIZES[name])
         with tempfile.TemporaryDirectory() as folder:
             found = attack(name, numbers, args.seed, Path(folder), progress=True)
         print(f"\n{name}, seed {args.seed}: {len(numbers)} attempts")

@@ -129,8 +129,8 @@ def _run(module, arguments, folder):
     """The exit code and what was said, of a command run in this process, in a folder."""
     os.chdir(folder)
     sys.argv = [module, *arguments]
-    with open("said", "w+") as said, contextlib.redirect_stderr(said):
-        with contextlib.redirect_stdout(said):
+    with open("said", "w+") as said:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
             os.dup2(said.fileno(), 1)
             os.dup2(said.fileno(), 2)
             try:

@@ -1,4 +1,4 @@
-"""Networks with one to three things changed at random: operations, arguments, references, tensors."""
+"""Networks with one to three random changes: of operations, arguments, references, tensors."""
 
 import copy
 import pickle
