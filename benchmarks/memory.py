@@ -7,7 +7,7 @@
 
 With --soak, all tasks in turn for so many minutes, each time in a new environment with cameras,
 point clouds and distances: how much it grows after the first turns of all tasks, in which it fills
-what it may remember of scenes (some 40 MB). The target is below 30 MB in an hour.
+what it may remember of scenes and makes worlds anew. The target is below 30 MB in an hour.
 
 The last line is JSON.
 """
@@ -26,7 +26,7 @@ from envs.sensors import Camera, PointCloud, cardinal
 from envs.world import MAX_BODIES_MADE
 from envs.wrappers import SensorWrapper
 
-EPISODES_PER_TURN, FIRST_TURNS = 20, 8
+EPISODES_PER_TURN, FIRST_TURNS = 20, 20
 
 
 def megabytes():

@@ -19,7 +19,6 @@ and off, and alpha from 1e-5 to 10.)
 
 import csv
 import fcntl
-import importlib.util
 import io
 import json
 import re
@@ -34,6 +33,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from envs.files import check_folder, write_atomically
 from envs.flags import PositiveInt, Seed, Workers, check
+from envs.workers import check_ray
 
 try:
     import optuna
@@ -292,8 +292,7 @@ def _check(args, flags):
         raise ValueError(f"no such trainer: {args.trainer}")
     search = dict(parse_search(text) for text in args.search)
     check_folder(args.folder)
-    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
-        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+    check_ray(args.ray_address)
     command = [sys.executable, args.trainer, "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, errors="replace")
     if shown.returncode != 0:

@@ -11,9 +11,6 @@ goes on from there when it is started again.
 import base64
 import collections
 import contextlib
-import importlib.util
-import re
-import socket
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -272,14 +269,7 @@ def _check(args):
         validate(query_path(args.task), args.task)  # demonstrations must not be of its queries
     if path.exists() and not args.overwrite:
         raise ValueError(f"{path} exists; --overwrite replaces it")
-    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
-        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
-    if re.fullmatch(r"[^/]+:\d+", args.ray_address or ""):  # where nobody answers, Ray would wait
-        host, port = args.ray_address.rsplit(":", 1)
-        try:
-            socket.create_connection((host, int(port)), timeout=5).close()
-        except OSError as error:
-            raise ValueError(f"no Ray cluster at {args.ray_address}: {error}") from error
+    workers.check_ray(args.ray_address)
     return path
 
 

@@ -16,7 +16,10 @@ Minari makes the environment again from its Gymnasium id alone, so this works fo
 """
 
 import contextlib
+import fcntl
 import importlib.util
+import os
+import shutil
 import sys
 import tempfile
 from dataclasses import dataclass, replace
@@ -32,6 +35,8 @@ import envs
 from demo_generation.following import follow
 from envs.datasets import MAX_STEP, demo_path, load_demos, subgoals
 from envs.demo_episodes import demo_episode
+
+PREFIX = ".exporting-"  # of folders that are not whole yet; Minari does not look into hidden ones
 
 
 @dataclass
@@ -111,6 +116,25 @@ def _check_recoverable(demos):
         )
 
 
+@contextlib.contextmanager
+def _locked(folder):
+    """A context in which this process holds a folder. Raises BlockingIOError: another one does."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _clear_leftovers(root):
+    """Delete what exports that were killed have left, unless a dataset was about to be replaced."""
+    for folder in root.glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError), _locked(folder):
+            if not (folder / "old").exists():
+                shutil.rmtree(folder)
+
+
 def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False, progress=True):
     """Write `Demos` into Minari's local storage; returns the dataset's id and number of steps.
 
@@ -157,10 +181,12 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
         mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
         disable=not progress,
     )
-    # Minari does not look into hidden folders.
+    root = get_dataset_path().resolve()
+    _clear_leftovers(root)
     with (
         contextlib.closing(env),
-        tempfile.TemporaryDirectory(prefix=".exporting-", dir=get_dataset_path()) as folder,
+        tempfile.TemporaryDirectory(prefix=PREFIX, dir=root) as folder,
+        _locked(folder),
     ):
         new, old = Path(folder, "new"), Path(folder, "old")
         new.mkdir()

@@ -91,6 +91,9 @@ class Journal:
             raise
 
     def close(self):
+        """Let others have it. If nothing was made, there is no journal."""
+        if not self.entries:
+            self.path.unlink(missing_ok=True)
         self._file.close()
 
 

@@ -59,7 +59,11 @@ class Camera:
 
     def __post_init__(self):
         _check_view(self)
-        if not self.outputs or not set(self.outputs) <= set(OUTPUTS):
+        if not (
+            isinstance(self.outputs, (tuple, list))
+            and self.outputs
+            and all(isinstance(one, str) and one in OUTPUTS for one in self.outputs)
+        ):
             raise ValueError(f"outputs must be some of {', '.join(OUTPUTS)}, got {self.outputs!r}")
         if (
             len(self.size) != 2
@@ -110,7 +114,7 @@ class PointCloud:
         _check_view(self)
         number = self.num_samples
         if (
-            not (isinstance(number, (int, np.integer)) and is_number(number))
+            not (isinstance(number, (int, np.integer)) and not isinstance(number, bool))
             or not 1 <= number <= MAX_EDGE**2
             or math.isqrt(number) ** 2 != number
         ):

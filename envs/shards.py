@@ -5,7 +5,6 @@ Every array has checksums, and so has what HDF5 says about them: damage is notic
 """
 
 import contextlib
-import importlib.util
 import re
 import sys
 from pathlib import Path
@@ -79,8 +78,7 @@ def check_collection(args):
     check_folder(args.output)
     if not get_task(args.task).trainable:
         raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
-    if args.ray_address is not None and importlib.util.find_spec("ray") is None:
-        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+    workers.check_ray(args.ray_address)
 
 
 def collect(
@@ -116,7 +114,6 @@ def collect(
         ConnectionError: there is no Ray cluster.
         OSError: the folder cannot be written. What was written is safe.
     """
-    args.output.mkdir(parents=True, exist_ok=True)
     firsts = range(0, num_scenes, args.shard_size)
     jobs = [(i, k, min(k + args.shard_size, num_scenes)) for i, k in enumerate(firsts)]
 
@@ -147,5 +144,6 @@ def collect(
         results = workers.run_on_ray(args.ray_address, collector, arguments, missing)
     with bar, contextlib.closing(results):
         for number, contents in results:
+            args.output.mkdir(parents=True, exist_ok=True)
             write_atomically(shard_path(args.output, number), contents)
             bar.update((jobs[number][2] - jobs[number][1]) * per_scene)

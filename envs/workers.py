@@ -6,9 +6,12 @@ returns the function that does jobs; it has an importable, top-level name.
 
 import collections
 import concurrent.futures
+import importlib.util
 import multiprocessing
 import os
+import re
 import signal
+import socket
 import threading
 from concurrent.futures.process import BrokenProcessPool
 
@@ -68,6 +71,23 @@ def _follow_parent():
 
 def _work(job):
     return _worker(job)
+
+
+def check_ray(address):
+    """Raise ValueError unless there can be a Ray cluster at an address; None is none."""
+    if address is None:
+        return
+    if importlib.util.find_spec("ray") is None:
+        raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
+    if address == "auto":
+        return
+    match = re.fullmatch(r"([^/\s:]+):(\d{1,5})", address)
+    if not match or int(match[2]) > 65_535:
+        raise ValueError(f"--ray-address must be `auto` or HOST:PORT, got {address!r}")
+    try:  # where nobody answers, Ray would wait
+        socket.create_connection((match[1], int(match[2])), timeout=5).close()
+    except OSError as error:
+        raise ValueError(f"no Ray cluster at {address}: {error}") from error
 
 
 def run_on_ray(address, make_worker, arguments, jobs):

@@ -17,6 +17,7 @@ of your own, copy this file and change the parts under `# MODEL`. Parts between 
 """
 
 import math
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -123,12 +124,15 @@ def ball_query(points, centres, radius, number):
     return torch.where(distances <= radius, indices, indices[:, :, :1])
 
 
+NEAREST = 3  # centres that a point's features are interpolated from
+
+
 def interpolate(values, centres, points):
     """Values (n, c, f) at centres (n, c, 3) -> at points (n, p, 3): of the three nearest centres.
 
     Weighted by the inverse of the distance: (n, p, f).
     """
-    distances, indices = torch.cdist(points, centres).topk(3, dim=2, largest=False)
+    distances, indices = torch.cdist(points, centres).topk(NEAREST, dim=2, largest=False)
     weights = 1.0 / (distances + 1e-6)
     weights = weights / weights.sum(2, keepdim=True)
     return (gather(values, indices) * weights.unsqueeze(-1)).sum(2)
@@ -328,6 +332,11 @@ def evaluate(model, clouds, rows, batch_size, device):
 
 if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
+    many, few = args.num_centres
+    if not args.num_points >= many >= max(few, args.num_neighbours):
+        sys.exit("--num-points must be at least --num-centres, and these --num-neighbours")
+    if few < NEAREST:
+        sys.exit(f"--num-centres must be at least {NEAREST}")
     observations = open_observations(args.observations)
     clouds = load_clouds(observations, args.num_points)
     num_training, validation = split(observations, args)

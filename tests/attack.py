@@ -65,9 +65,12 @@ def attack(name, numbers, seed, folder, progress=False):
     """
     torch.set_num_threads(1)
     attempt = MODULES[name].attempts(seed, folder)
-    seconds = getattr(MODULES[name], "SECONDS", children.SECONDS)
+    limits = [
+        getattr(MODULES[name], limit, getattr(children, limit))
+        for limit in ("SECONDS", "MEGABYTES")
+    ]
     found = collections.defaultdict(list)
-    results = children.outcomes(attempt, numbers, PER_CHILD[name], seconds)
+    results = children.outcomes(attempt, numbers, PER_CHILD[name], *limits)
     for number, word in tqdm(results, name, len(numbers), disable=not progress, mininterval=5):
         found[word].append(number)
     return found

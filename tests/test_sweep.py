@@ -125,6 +125,8 @@ def test_a_search_repeats_itself_and_goes_on(trainer, tmp_path, capsys):
     with pytest.raises(SystemExit, match="holds another search"):
         sweep.main(arguments(trainer, "--trials", "8", "--seed", "3"))
     with pytest.raises(SystemExit, match="holds another search"):
+        sweep.main(arguments(trainer, "--trials", "8", "--", "--other", "1"))
+    with pytest.raises(SystemExit, match="has no flag --seconds"):
         sweep.main(arguments(trainer, "--trials", "8", "--", "--seconds", "1"))
 
 

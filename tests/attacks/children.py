@@ -13,8 +13,10 @@ REFUSED, RAN = "refused", "ran"
 SECONDS, MEGABYTES = 20, 1500
 
 
-def outcomes(attempt, numbers, per_child=500, seconds=SECONDS):
+def outcomes(attempt, numbers, per_child, seconds=SECONDS, megabytes=MEGABYTES):
     """Yield `(number, word)` for each number, in order; `per_child` attempts share a process.
+
+    A process may have so many megabytes more than this one.
 
     Words besides those of `attempt`: `crash: SIGNAL`, `hang` (more than `seconds`), `traceback:
     ERROR` for an exception that `attempt` raised.
@@ -26,7 +28,7 @@ def outcomes(attempt, numbers, per_child=500, seconds=SECONDS):
         child = os.fork()
         if child == 0:
             os.close(reader)
-            _attempts(attempt, batch, writer)
+            _attempts(attempt, batch, writer, megabytes)
         os.close(writer)
         done, hangs = 0, False
         for word in _lines(reader, seconds):
@@ -58,11 +60,11 @@ def _lines(reader, seconds):
         yield from (line.decode() for line in whole)
 
 
-def _attempts(attempt, numbers, writer):
+def _attempts(attempt, numbers, writer, megabytes):
     try:
         with open("/proc/self/statm") as file:
             has = int(file.read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, 2 * (has + 2**20 * MEGABYTES,))
+        resource.setrlimit(resource.RLIMIT_AS, 2 * (has + 2**20 * megabytes,))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for number in numbers:
             try:

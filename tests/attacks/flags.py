@@ -10,8 +10,12 @@ import shutil
 import sys
 from pathlib import Path
 
+from trainers import ROOT
+
 from attacks.children import RAN, REFUSED
 
+sys.path.append(str(ROOT))  # where `benchmarks` is
+MEGABYTES = 8000
 SECONDS = 60  # what is not refused is a whole run, and trials of a sweep are processes of their own
 NUMBERS = (0, -1, -5, 1, 2, 3.5, 2**31, 2**63, 2**70, 10**30, 1e-300, 1e-320, 1e300, 0.5)
 WORDS = ("nan", "inf", "-inf", "", " ", "x", "None", "../../x", "/", "/dev/null", "/dev/null/x")
@@ -19,7 +23,15 @@ WORDS += ("no/such/folder", "a" * 300, "ü\n", "1,5", "1e3", "0x10", "--", "-", 
 # Where large numbers are only long work.
 LONG = ("total_timesteps", "total_updates", "num", "num_test", "num_validation", "scenes", "trials")
 LONG += ("paths_per_scene", "steps", "horizon", "tries", "num_nodes", "round_queries", "draws")
-LONG += ("round_labels", "attempts", "max_checks", "simplify", "time_limit", "updates_per_step")
+LONG += (
+    "num_queries",
+    "round_labels",
+    "attempts",
+    "max_checks",
+    "simplify",
+    "time_limit",
+    "updates_per_step",
+)
 
 RUN = "--eval-queries 1 --test-queries 1 --runs-dir runs"
 RL = f"--task wall --num-envs 1 --hidden-size 8 --batch-size 4 --learning-starts 20 {RUN}"
@@ -37,7 +49,8 @@ TINY = {
     "scene_embedding_train.vqvae": "--observations observations --total-updates 2 --eval-every 2"
     " --batch-size 1 --picture-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
     "scene_embedding_train.pointnet2": "--observations observations --total-updates 2"
-    " --eval-every 2 --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs",
+    " --eval-every 2 --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs"
+    " --num-points 16 --num-centres 8 4 --num-neighbours 4",
     "clean_rl_scripts.evaluate": "--policy go-to-goal --task wall --num-queries 1 --json a.json",
     "demo_generation.collect": "--task wall --num 1 --workers 1 --output demos.h5",
     "demo_generation.make_queries": "--task mine.yaml --num-test 2 --num-validation 1 --workers 1"
@@ -82,6 +95,7 @@ def attempts(seed, folder):
         rng = random.Random(f"{seed} {number}")
         module = list(TINY)[number % len(TINY)]
         here = folder / str(number)
+        shutil.rmtree(here, ignore_errors=True)
         shutil.copytree(given, here, symlinks=True)
         before = _everything(here)
         try:
@@ -89,9 +103,10 @@ def attempts(seed, folder):
             made = _everything(here) - before
         finally:
             shutil.rmtree(here)
+        print(said)  # unless this is repeated, nobody reads it
         if "Traceback" in said:
             return f"traceback of {module}: {said.strip().splitlines()[-1][:120]}"
-        if _everything(folder) != {given, *given.rglob("*")}:
+        if any(not path.name.isdigit() for path in folder.iterdir() if path != given):
             return f"{module} left something elsewhere"
         if code == 0:
             return RAN
@@ -120,7 +135,9 @@ def _flags(fields, rng):
             flags.append(rng.choice([flag, f"--no-{flag[2:]}"]))
             continue
         values = [one for one in NUMBERS if name not in LONG or not 5 < one < 2**62]
-        value = rng.choice([*values, *WORDS])
+        value = rng.choice(
+            [*values, *(word for word in WORDS if word != "None" or name not in LONG)]
+        )
         flags += [flag, str(value)] + [str(rng.choice(values))] * (name in ("size", "radii"))
     return flags
 
@@ -129,23 +146,25 @@ def _run(module, arguments, folder):
     """The exit code and what was said, of a command run in this process, in a folder."""
     os.chdir(folder)
     sys.argv = [module, *arguments]
-    with open("said", "w+") as said:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
-            try:
-                runpy.run_module(module, run_name="__main__", alter_sys=True)
-                code = 0
-            except SystemExit as end:
-                code = end.code or 0
-                if isinstance(code, str):
-                    print(code, file=said)
-            except BaseException as error:
-                sys.excepthook(type(error), error, error.__traceback__)
-                code = 1
-            said.flush()
-            said.seek(0)
-            text = said.read()
+    said, streams = open("said", "w+"), (os.dup(1), os.dup(2))  # noqa: SIM115 (closed below)
+    with said, contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        os.dup2(said.fileno(), 1)
+        os.dup2(said.fileno(), 2)
+        try:
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+            code = 0
+        except SystemExit as end:
+            code = end.code or 0
+            if isinstance(code, str):
+                print(code, file=said)
+        except BaseException as error:
+            sys.excepthook(type(error), error, error.__traceback__)
+            code = 1
+        said.flush()
+        said.seek(0)
+        text = said.read()
+    for number, stream in enumerate(streams, start=1):
+        os.dup2(stream, number)
     Path("said").unlink()
     return code, text
 

@@ -16,7 +16,7 @@ from trainers import ROOT, command
 from attacks.children import RAN
 from attacks.flags import TRAINER
 
-SECONDS = 900
+SECONDS, MEGABYTES = 900, 20_000
 KILLS = 4  # of an attempt
 SLOW_TRAINER = TRAINER.replace("run.mkdir", "import time\ntime.sleep(1.0)\nrun.mkdir").replace(
     "parents=True", "parents=True, exist_ok=True"
