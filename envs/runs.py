@@ -175,7 +175,7 @@ def _say_plainly(run, kind, error, trace):
     if isinstance(error, KeyboardInterrupt):
         text = "interrupted"
     elif isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
-        text = f"error: out of memory ({str(error).splitlines()[0]})"
+        text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()
     elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
         text = f"error: {error}"
     else:

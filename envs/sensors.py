@@ -21,6 +21,7 @@ ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
 CLASSES = ("robot", "table and floor", "obstacle", "nothing")
 ROBOT_COLOUR = (0.90, 0.45, 0.15, 1)
 OUTPUTS = ("rgb", "depth", "segmentation")
+LEAST_NEAR = 0.001  # m, of `near`; with far less, no number is left for the other distances
 # Cardinal directions as seen by the robot: x is forward, y left.
 CARDINAL = {"front": (1, 0), "left": (0, 1), "back": (-1, 0), "right": (0, -1)}
 DISTANCE, HEIGHT = 1.6, 0.8  # of the default sensors' places, m
@@ -210,10 +211,10 @@ def _check_view(sensor):
             raise ValueError(f"{name} must be a number, got {getattr(sensor, name)!r}")
     if not 0 < sensor.field_of_view < 180:
         raise ValueError(f"field_of_view must be between 0 and 180, got {sensor.field_of_view!r}")
-    if not 0 < sensor.near < sensor.far <= MAX_LENGTH:
+    if not LEAST_NEAR <= sensor.near < sensor.far <= MAX_LENGTH:
         raise ValueError(
-            f"near and far must be 0 < near < far <= {MAX_LENGTH:.0f} m, got {sensor.near!r}, "
-            f"{sensor.far!r}"
+            f"near and far must be {LEAST_NEAR} <= near < far <= {MAX_LENGTH:.0f} m, "
+            f"got {sensor.near!r}, {sensor.far!r}"
         )
 
 

@@ -80,6 +80,7 @@ def main(args):
     bad = False
     for name in args.only:
         if args.repeat is not None:  # in this process, for debuggers
+            children.repeating = True
             with tempfile.TemporaryDirectory() as folder:
                 print(MODULES[name].attempts(args.seed, Path(folder))(args.repeat))
             continue

@@ -3,6 +3,8 @@
 import contextlib
 import io
 import json
+import re
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from envs import runs
+from envs.files import new_contents
 
 
 @dataclass
@@ -25,6 +28,11 @@ class Args(runs.RunFlags):
     name: str | None = None
     steps: int = 10
     size: ClassVar[int] = 0
+
+
+@pytest.fixture(autouse=True)
+def own_excepthook(monkeypatch):
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
 
 
 @pytest.fixture
@@ -126,6 +134,84 @@ def test_a_checkpoint_brings_every_part_back(parse, tmp_path):
     assert [learn(after) for _ in range(3)] == expected
     with pytest.raises(SystemExit, match="of another version: it has no critic"):
         runs.load_checkpoint(args, after | {"critic": torch.nn.Linear(1, 1)})
+
+
+def test_files_are_found_from_another_folder(parse, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for name in ("a.h5", "mine.yaml"):
+        Path(name).touch()
+    flags = ["--data", "a.h5", "--name", "mine.yaml", "--files", "missing.h5", "--runs-dir", "runs"]
+    run = runs.run_folder(parse(*flags), "mine").absolute()
+    assert parse("--resume", run).name == "mine.yaml"
+    monkeypatch.chdir(tmp_path / "there")
+    args = parse("--resume", run)
+    assert args.data == tmp_path / "here" / "a.h5"
+    assert args.name == str(tmp_path / "here" / "mine.yaml")
+    assert args.files == (Path("missing.h5"),)  # whoever reads it says that it is missing
+
+
+def test_what_a_kill_has_left_is_cleared_away(parse, tmp_path):
+    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    left = run / ".checkpoint.pt.0123abcd.tmp"
+    left.write_text("half of one")
+    with new_contents(run / "policy.pt") as being_written:
+        runs.run_folder(parse("--resume", run), "wall")
+        assert not left.exists() and being_written.exists()
+        being_written.write_text("whole")
+    assert {path.name for path in run.iterdir()} == {"args.json", "policy.pt"}
+    left.touch()
+    runs.save_checkpoint(run, parts())
+    assert not left.exists()
+
+
+SCRIPT = """
+import resource, signal, sys
+from dataclasses import dataclass
+import torch
+from envs import runs
+
+@dataclass
+class Args(runs.RunFlags):
+    exp_name: str = "test"
+
+args = runs.parse_args(Args)
+run = runs.run_folder(args, "wall")
+numbers = torch.zeros(1000)
+runs.save_checkpoint(run, {"numbers": numbers})
+"""
+
+
+@pytest.mark.parametrize(
+    ("happening", "said"),
+    [
+        (
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900))\nsave()",
+            "error: .*: 'checkpoint.pt'",
+        ),
+        ("torch.zeros(10**15)", "error: out of memory .+"),
+        ("bytearray(10**15)", "error: out of memory"),
+        ("raise KeyboardInterrupt", "interrupted"),
+    ],
+)
+def test_what_is_no_mistake_of_the_program_is_said_plainly(tmp_path, happening, said):
+    save = "def save():\n    runs.save_checkpoint(run, {'numbers': numbers + 1})\n"
+    command = [sys.executable, "-c", SCRIPT + save + happening, "--runs-dir", tmp_path]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    run = next(tmp_path.iterdir())
+    lines = ended.stderr.strip().splitlines()
+    assert ended.returncode != 0 and "Traceback" not in ended.stderr
+    assert re.fullmatch(said, lines[-2])
+    assert lines[-1] == f"what the last checkpoint has is safe: --resume {run} goes on from there"
+    assert {path.name for path in run.iterdir()} == {"args.json", "checkpoint.pt"}
+    assert not torch.load(run / "checkpoint.pt", weights_only=True)["numbers"].any()
+
+
+def test_other_mistakes_keep_their_traceback(tmp_path):
+    command = [sys.executable, "-c", SCRIPT + "1 / 0", "--runs-dir", tmp_path]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert "Traceback" in ended.stderr and "ZeroDivisionError" in ended.stderr
 
 
 def test_a_checkpoint_of_a_damaged_file_says_which(parse, tmp_path):

@@ -1,8 +1,10 @@
 """envs.show: what is in its pictures and animations, who moves the arm, and its errors."""
 
 import os
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -336,6 +338,21 @@ def test_the_window_goes_on_until_ctrl_c(window, tmp_path, capsys, monkeypatch):
     assert lines[0].startswith("Ctrl-C ends")
     assert [line.split(",")[0] for line in lines[1:]] == [f"test query {i}" for i in (1, 0, 1)]
     assert window[1:] == [show.PAUSE] * 3
+
+
+def test_a_display_that_does_not_answer(monkeypatch, capsys):
+    monkeypatch.setattr("envs.world.DISPLAY_SECONDS", 2)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert port > 6000  # a display's number is that of its port, less 6000
+        monkeypatch.setenv("DISPLAY", f"127.0.0.1:{port - 6000}")
+        began = time.monotonic()
+        assert run("wall") == 2
+        assert time.monotonic() - began < 10
+    assert f"DISPLAY is 127.0.0.1:{port - 6000}, which " in capsys.readouterr().err
+    env = envs.make("wall", render_mode="human")  # warns
+    env.reset(seed=0)
+    env.close()
 
 
 def test_the_window_ends_with_escape(window, monkeypatch):

@@ -11,6 +11,7 @@ import traceback
 
 REFUSED, RAN = "refused", "ran"
 SECONDS, MEGABYTES = 20, 1500
+repeating = False  # one attempt, in this process: what is said is wanted
 
 
 def outcomes(attempt, numbers, per_child, seconds=SECONDS, megabytes=MEGABYTES):

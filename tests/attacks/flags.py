@@ -12,6 +12,7 @@ from pathlib import Path
 
 from trainers import ROOT
 
+from attacks import children
 from attacks.children import RAN, REFUSED
 
 sys.path.append(str(ROOT))  # where `benchmarks` is
@@ -103,7 +104,8 @@ def attempts(seed, folder):
             made = _everything(here) - before
         finally:
             shutil.rmtree(here)
-        print(said)  # unless this is repeated, nobody reads it
+        if children.repeating:
+            print(said)
         if "Traceback" in said:
             return f"traceback of {module}: {said.strip().splitlines()[-1][:120]}"
         if any(not path.name.isdigit() for path in folder.iterdir() if path != given):
