@@ -103,10 +103,10 @@ def test_trained_resumed_and_evaluated(trainer, tmp_path):
         subprocess.run(show, check=True, capture_output=True, cwd=ROOT)
         assert (tmp_path / "rollout.gif").stat().st_size > 0
         return
-    part = [*flags(trainer), "--goal-type", "combined", "--total-timesteps", "1200"]
+    part = [*flags(trainer), "--goal-type", "combined", "--total-timesteps", "600"]
     again = run_script(trainer, tmp_path / "part", *part)
     resume = [sys.executable, str(PATHS[trainer]), "--resume", str(again)]
-    subprocess.run([*resume, "--total-timesteps", "1800"], check=True, capture_output=True)
+    subprocess.run([*resume, "--total-timesteps", "1200"], check=True, capture_output=True)
     one, other = (
         torch.load(path / "checkpoint.pt", weights_only=True)["actor"] for path in (run, again)
     )

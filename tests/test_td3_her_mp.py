@@ -34,7 +34,7 @@ def test_policy_and_targets_are_updated_with_delay(tmp_path):
     once = run_script("td3_her_mp", tmp_path / "once", *common, "--policy-frequency", "1000")
     for run, same in ((often, True), (once, False)):
         state = torch.load(run / "checkpoint.pt", weights_only=True)
-        assert state["progress"]["updates"] == 80
+        assert state["progress"]["updates"] == 50
         for key, value in state["actor"].items():
             torch.testing.assert_close(state["actor_target"][key], value, rtol=0, atol=0)
         # With tau 1 the targets are what the critics were at the last update of the policy.

@@ -16,9 +16,9 @@ PATHS = {
 # Those that need nothing but a task; dagger.py needs roadmap paths.
 TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
 TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
-TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1800"
+TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1200"
 TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --eval-queries 3"
-TINY_BC += " --test-queries 4 --total-updates 1800"
+TINY_BC += " --test-queries 4 --total-updates 1200"
 TINY_DAGGER = "--hidden-size 16 --token-size 16 --num-blocks 1 --batch-size 16 --pool-size 100"
 TINY_DAGGER += " --examples-per-update 10 --total-updates 40 --round-every 15 --round-queries 1"
 TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1"
