@@ -77,13 +77,13 @@ def check_ray(address):
     """Raise ValueError unless there can be a Ray cluster at an address; None is none."""
     if address is None:
         return
+    match = re.fullmatch(r"([^/\s:]+):(\d{1,5})", address)
+    if address != "auto" and (not match or int(match[2]) > 65_535):
+        raise ValueError(f"--ray-address must be `auto` or HOST:PORT, got {address!r}")
     if importlib.util.find_spec("ray") is None:
         raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
     if address == "auto":
         return
-    match = re.fullmatch(r"([^/\s:]+):(\d{1,5})", address)
-    if not match or int(match[2]) > 65_535:
-        raise ValueError(f"--ray-address must be `auto` or HOST:PORT, got {address!r}")
     try:  # where nobody answers, Ray would wait
         socket.create_connection((match[1], int(match[2])), timeout=5).close()
     except OSError as error:

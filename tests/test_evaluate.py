@@ -465,7 +465,7 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),
         ({"queries": str(tmp_path / "no.h5")}, "no.h5"),
         ({"num-queries": "31"}, "num_queries must be 1 to 30, got 31"),
-        ({"num-queries": "0"}, "num_queries must be 1 to 30"),
+        ({"num-queries": "0"}, "--num-queries must be at least 1, got 0"),
         ({"split": "validation", "num-queries": "11"}, "num_queries must be 1 to 10"),
         ({"split": "original"}, "has no original queries"),
         ({"workers": "0"}, "--workers must be in [1, 256]"),

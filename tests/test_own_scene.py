@@ -293,9 +293,10 @@ def test_training_refuses_demonstrations_of_another_scene_of_this_name(other):
 def test_a_collection_does_not_go_on_in_a_changed_scene(inside):
     options = {name: getattr(collect.Args("my_scene.yaml"), name) for name in collect.OPTIONS}
     journal = collect.journal_of(Path("new.h5"))
-    collect.Journal(journal, options).close()
-    with contextlib.closing(collect.Journal(journal, options)):
-        pass  # the same collection
+    with contextlib.closing(collect.Journal(journal, options)) as opened:
+        opened.append({"index": 0})
+    with contextlib.closing(collect.Journal(journal, options)) as opened:
+        assert opened.entries  # the same collection
     Path("my_scene.yaml").write_text(YAML.replace("radius: 0.1}", "radius: 0.11}"))
     with pytest.raises(ValueError, match="the journal of something else"):
         collect.Journal(journal, options)
