@@ -478,6 +478,7 @@ if __name__ == "__main__":
             actions = agent.explore(protocol.stack(observations, device))
 
         # SHARED: a step in every environment
+        runs.check_finite("the policy's actions", actions)
         for i, env in enumerate(envs):
             before = observations[i]
             observations[i], reward, terminated, truncated, info = env.step(actions[i])

@@ -123,10 +123,14 @@ class RoboArmEnv(gym.Env):
         for name, value in [("horizon", horizon), ("episodes_per_scene", episodes_per_scene)]:
             if int(value) != value:
                 raise ValueError(f"{name} must be a whole number, got {value!r}")
-        sides = np.asarray(render_size)
-        if sides.shape != (2,) or sides.dtype.kind not in "iu":
+        if not (
+            isinstance(render_size, (tuple, list, np.ndarray))
+            and np.ndim(render_size) == 1
+            and len(render_size) == 2
+            and all(isinstance(side, (int, np.integer)) for side in render_size)
+        ):
             raise ValueError(f"render_size must be two numbers of pixels, got {render_size!r}")
-        if not 1 <= sides.min() <= sides.max() <= MAX_EDGE:
+        if not all(1 <= side <= MAX_EDGE for side in render_size):
             raise ValueError(f"render_size must be from 1 to {MAX_EDGE}, got {render_size!r}")
         self.scene_distribution = scene if hasattr(scene, "sample") else None
         """The distribution that scenes are drawn from; None if the scene is fixed."""

@@ -92,7 +92,8 @@ def check_folder(path):
 def check_archive(path):
     """Raise an exception if a file that `torch.save` wrote is damaged, which `torch.load` ignores.
 
-    ValueError: one of its checksums does not match. OSError, zipfile.BadZipFile: as `zipfile`.
+    ValueError: one of its checksums does not match, or what is said of an entry is not what
+    `torch.save` says. OSError, zipfile.BadZipFile: as `zipfile`.
     """
     with zipfile.ZipFile(path) as archive:
         # As torch writes it. What comes out is no larger than the file.
@@ -101,3 +102,6 @@ def check_archive(path):
             raise ValueError("it is compressed")
         if archive.testzip() is not None:
             raise ValueError("a checksum does not match")
+        # Of an entry marked as a folder `torch.load` reads nothing: the tensor is what memory had.
+        if any(entry.external_attr for entry in archive.filelist):
+            raise ValueError("an entry is no plain file")

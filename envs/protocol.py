@@ -21,7 +21,7 @@ from envs.demo_episodes import DemoQueriesWrapper, load_demos_for
 from envs.exported_networks import load_network, save_network
 from envs.flags import PositiveFloat, PositiveInt
 from envs.last_layer import layer_of
-from envs.runs import write_json
+from envs.runs import check_finite, write_json
 
 NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
 PICTURE_SIZE = (240, 180)
@@ -170,6 +170,9 @@ def evaluate(policy, envs, queries, device, last_layer=None):
     Returns:
         A dict of floats: `success_rate`, `clean_success_rate` (without a touch), `collision_rate`
         and `episode_length` in steps.
+
+    Raises:
+        FloatingPointError: the policy's actions are not finite.
     """
     waiting = iter(range(len(queries)))
     running, proposed, acts, results = {}, {}, {}, []  # env -> observation, action, function
@@ -187,6 +190,7 @@ def evaluate(policy, envs, queries, device, last_layer=None):
         start(env)
     while running:
         actions = policy(**stack(list(running.values()), device)).cpu().numpy()
+        check_finite("the policy's actions", actions)
         for env, action in zip(list(running), actions, strict=True):
             proposed[env] = action
             action = acts[env](running[env])

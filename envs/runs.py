@@ -178,9 +178,11 @@ def _say_plainly(run, kind, error, trace):
         text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()
     elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
         text = f"error: {error}"
+    elif isinstance(error, FloatingPointError):
+        text = f"error: training has diverged: {error}; what was made before is in {run}"
     else:
         return sys.__excepthook__(kind, error, trace)
-    if (run / "checkpoint.pt").exists():
+    if (run / "checkpoint.pt").exists() and not isinstance(error, FloatingPointError):
         text += f"\nwhat the last checkpoint has is safe: --resume {run} goes on from there"
     print(f"\n{text}", file=sys.stderr)
 
@@ -196,6 +198,15 @@ def seed_torch(args):
     return torch.device(args.device)
 
 
+def check_finite(name, values):
+    """Raise FloatingPointError, which ends a run with a line, where training has diverged.
+
+    `values`: tensor or array of numbers, which the line calls `name`.
+    """
+    if not torch.as_tensor(values).isfinite().all():
+        raise FloatingPointError(f"{name} are no longer finite")
+
+
 def save_checkpoint(run, parts):
     """Write `checkpoint.pt`: the states of the run's parts, and of torch's random numbers.
 
@@ -204,7 +215,14 @@ def save_checkpoint(run, parts):
         parts: dict from a name to what changes in the run: anything with `state_dict` and
             `load_state_dict` (modules, optimisers), a tensor, a dict of plain values, or a NumPy
             generator.
+
+    Raises:
+        FloatingPointError: a module's parameters are not finite. The checkpoint stays what it was.
     """
+    for name, part in parts.items():
+        if isinstance(part, torch.nn.Module):
+            for parameter in part.parameters():
+                check_finite(f"the parameters of `{name}`", parameter)
     state = {name: _state_of(part) for name, part in parts.items()}
     state["torch_rng"] = torch.get_rng_state()
     if torch.cuda.is_initialized():

@@ -31,6 +31,7 @@ from envs.flags import PositiveFloat, PositiveInt, Share, Width
 from envs.observations import sensors_to_json
 from envs.runs import (
     RunFlags,
+    check_finite,
     elapsed,
     load_checkpoint,
     parse_args,
@@ -338,8 +339,8 @@ if __name__ == "__main__":
     if few < NEAREST:
         sys.exit(f"--num-centres must be at least {NEAREST}")
     observations = open_observations(args.observations)
-    clouds = load_clouds(observations, args.num_points)
     num_training, validation = split(observations, args)
+    clouds = load_clouds(observations, args.num_points)
     run, device = run_folder(args, observations.task), seed_torch(args)
     rng = np.random.default_rng(args.seed)
 
@@ -376,6 +377,7 @@ if __name__ == "__main__":
 
         # Evaluate, keep the best encoder
         if step % args.eval_every == 0 or step == args.total_updates:
+            check_finite("the losses", loss)
             result = evaluate(model, clouds, validation, args.batch_size, device)
             for name, value in result.items():
                 writer.add_scalar(f"eval/{name}", value, step)

@@ -197,14 +197,15 @@ def update(model, optimizer, batch, mean_image, args):
 
 
 if __name__ == "__main__":
-    # SHARED: pictures to train on
     args = parse_args(Args, may_change={"observations"})
+
+    # SHARED: pictures to train on
     observations = open_observations(args.observations)
     size = args.picture_size
     if num_halvings(size) == 0:
         sys.exit(f"--picture-size {size}: 8, 16, 32, 64, 128, ... pixels")
-    images, cameras = load_pictures(observations, size)
     num_training, validation = split(observations, args)
+    images, cameras = load_pictures(observations, size)
     run, device = run_folder(args, observations.task), seed_torch(args)
     rng = np.random.default_rng(args.seed)
     mean_image = mean_picture(images, num_training, device)

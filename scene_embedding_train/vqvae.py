@@ -246,14 +246,17 @@ def update(model, optimizer, batch, mean_image, args):
 
 
 if __name__ == "__main__":
-    # SHARED: pictures to train on
     args = parse_args(Args, may_change={"observations"})
+    if args.latent_size % args.code_size:
+        sys.exit(f"--latent-size {args.latent_size} is no multiple of --code-size {args.code_size}")
+
+    # SHARED: pictures to train on
     observations = open_observations(args.observations)
     size = args.picture_size
     if num_halvings(size) == 0:
         sys.exit(f"--picture-size {size}: 8, 16, 32, 64, 128, ... pixels")
-    images, cameras = load_pictures(observations, size)
     num_training, validation = split(observations, args)
+    images, cameras = load_pictures(observations, size)
     run, device = run_folder(args, observations.task), seed_torch(args)
     rng = np.random.default_rng(args.seed)
     mean_image = mean_picture(images, num_training, device)
@@ -265,8 +268,6 @@ if __name__ == "__main__":
     # END SHARED
 
     # MODEL: network and optimiser
-    if args.latent_size % args.code_size:
-        sys.exit(f"--latent-size {args.latent_size} is no multiple of --code-size {args.code_size}")
     model = VQVAE(len(cameras), size, args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
 

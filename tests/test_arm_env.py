@@ -491,6 +491,7 @@ def test_position_goals_are_for_goal_type_ee():
         ({"render_size": (70_000, 70_000)}, "render_size must be from 1 to 4096"),
         ({"render_size": 480}, "render_size must be two numbers"),
         ({"render_size": (480.5, 360)}, "render_size must be two numbers"),
+        ({"render_size": torch.zeros(2, dtype=torch.bfloat16)}, "render_size must be two numbers"),
         ({"render_mode": "ansi"}, "render_mode must be one of"),
     ],
 )

@@ -636,6 +636,16 @@ def test_nothing_of_a_run_needs_the_cpu(name, observations, tmp_path, monkeypatc
     assert all(tensor.is_meta for tensor in weights)
 
 
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_diverged_run_ends(name, observations, tmp_path, monkeypatch, torch_as_it_was):
+    flags = ("--learning-rate", "1e30", "--total-updates", "3", "--eval-every", "3")
+    _, script, *flags = command(name, observations, tmp_path, *flags)
+    monkeypatch.setattr("sys.argv", [script, *flags])
+    with pytest.raises(FloatingPointError, match="are no longer finite"):
+        runpy.run_path(script, run_name="__main__")
+    assert not list(tmp_path.glob("*/encoder.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
+
+
 # --- In an environment
 
 

@@ -506,11 +506,16 @@ def test_damaged_and_foreign_files_are_refused(saved, tmp_path):
         weights = max(archive.infolist(), key=lambda entry: entry.file_size)
     flipped = bytearray(whole)
     flipped[weights.header_offset + 200] ^= 1
+    folder = bytearray(whole)  # its entry in the directory at the end says that it is one
+    entry = whole.rindex(weights.filename.encode())
+    assert whole[entry - 46 : entry - 42] == b"PK\x01\x02"
+    folder[entry - 8] ^= 16
     cases = {
         "empty": b"",
         "text": b"hello",
         "truncated": whole[: len(whole) // 2],
         "flipped": bytes(flipped),
+        "folder": bytes(folder),
         "pickle": pickle.dumps({"format": "roboarm-nmp program"}),
     }
     for name, content in cases.items():

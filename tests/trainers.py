@@ -6,6 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+import torch
+
 ROOT = Path(__file__).parents[1]
 PATHS = {
     "sac_her_mp": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
@@ -49,4 +52,16 @@ def run_script(trainer, folder, *flags):
 def run_here(trainer, monkeypatch, *flags):
     """The same in this process, so that what the script imports can be changed first."""
     monkeypatch.setattr(sys, "argv", list(map(str, flags)))
-    runpy.run_path(str(PATHS[trainer]), run_name="__main__")
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    try:
+        runpy.run_path(str(PATHS[trainer]), run_name="__main__")
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+def refusal(trainer, monkeypatch, capsys, folder, *flags):
+    """What such a run says of flags with which it ends before it has made anything."""
+    with pytest.raises(SystemExit) as end:
+        run_here(trainer, monkeypatch, *command(trainer, folder, *flags)[1:])
+    assert end.value.code not in (None, 0) and not list(folder.iterdir())
+    return f"{capsys.readouterr().err}{end.value.code}"

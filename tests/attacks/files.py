@@ -149,11 +149,8 @@ def attempts(seed, folder):
             return UNCHANGED
         if kind == "journal":  # damaged lines are left out, and that is said
             fits = found.items() <= contents[kind].items()
-            return (
-                REFUSED
-                if fits and (said.getvalue() or len(damaged) < len(originals[kind]))
-                else CHANGED
-            )
+            torn = not damaged.endswith(b"\n")
+            return REFUSED if fits and (said.getvalue() or torn) else CHANGED
         return RAN if kind in TEXTS else CHANGED
 
     return attempt
