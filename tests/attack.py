@@ -10,7 +10,8 @@ command), `environments` (arguments of environments, scenes and sensors, and act
 (`kill -9` at random moments of training, collecting, drawing and sweeping).
 
 Each attempt depends on the seed and its number only. The last lines are a table: how many attempts
-had which outcome, and for bad ones the numbers that repeat them.
+were refused clearly, ran, or read what was there before; then, of whatever else came of attempts,
+the numbers that repeat them.
 """
 
 import collections
@@ -77,21 +78,27 @@ def attack(name, numbers, seed, folder, progress=False):
 
 
 def main(args):
-    bad = False
-    for name in args.only:
-        if args.repeat is not None:  # in this process, for debuggers
-            children.repeating = True
+    if args.repeat is not None:  # in this process, for debuggers
+        children.repeating = True
+        for name in args.only:
             with tempfile.TemporaryDirectory() as folder:
                 print(MODULES[name].attempts(args.seed, Path(folder))(args.repeat))
-            continue
+        return 0
+    rows = []
+    for name in args.only:
         numbers = range(args.number or SIZES[name])
         with tempfile.TemporaryDirectory() as folder:
             found = attack(name, numbers, args.seed, Path(folder), progress=True)
-        print(f"\n{name}, seed {args.seed}: {len(numbers)} attempts")
-        for word, those in sorted(found.items(), key=lambda item: -len(item[1])):
-            print(f"  {len(those):8} {word}" + f": {those[:20]}" * (word not in GOOD), flush=True)
-            bad = bad or word not in GOOD
-    return int(bad)
+        rows.append((name, len(numbers), found))
+    print(f"\n{'seed ' + str(args.seed):13}{'attempts':>9}" + "".join(f"{one:>17}" for one in GOOD))
+    for name, tried, found in rows:
+        print(f"{name:13}{tried:9}" + "".join(f"{len(found.get(one, ())):17}" for one in GOOD))
+    bad = [(name, *one) for name, _, found in rows for one in found.items() if one[0] not in GOOD]
+    for name, word, numbers in bad:
+        print(f"{name}: {len(numbers)} {word}, numbers {numbers[:20]}")
+    if not bad:
+        print("nothing else")
+    return int(bool(bad))
 
 
 if __name__ == "__main__":
