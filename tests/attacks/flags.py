@@ -19,7 +19,7 @@ sys.path.append(str(ROOT))  # where `benchmarks` is
 MEGABYTES = 8000
 SECONDS = 60  # what is not refused is a whole run, and trials of a sweep are processes of their own
 NUMBERS = (0, -1, -5, 1, 2, 3.5, 2**31, 2**63, 2**70, 10**30, 1e-300, 1e-320, 1e300, 0.5)
-WORDS = ("nan", "inf", "-inf", "", " ", "x", "None", "../../x", "/", "/dev/null", "/dev/null/x")
+WORDS = ("nan", "inf", "-inf", "", " ", "x", "None", "../../x", "/proc", "/dev/null", "/dev/null/x")
 WORDS += ("no/such/folder", "a" * 300, "ü\n", "1,5", "1e3", "0x10", "--", "-", "wall", "empty.h5")
 # Where large numbers are only long work.
 LONG = ("total_timesteps", "total_updates", "num", "num_test", "num_validation", "scenes", "trials")
