@@ -113,5 +113,5 @@ def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path):
         (["--resume", "nowhere"], "nowhere is no run's folder"),
     ],
 )
-def test_bad_flags(tmp_path, flags, message, monkeypatch, capsys):
-    assert message in refusal("bc", monkeypatch, capsys, tmp_path, *flags)
+def test_bad_flags(tmp_path, flags, message, capsys):
+    assert message in refusal("bc", capsys, tmp_path, *flags)

@@ -267,5 +267,5 @@ def test_a_run_killed_and_resumed_its_policy_by_name(tmp_path, folder):
         (["--pool-size", "5"], "--pool-size must be at least --examples-per-update"),
     ],
 )
-def test_bad_flags(tmp_path, flags, message, monkeypatch, capsys):
-    assert message in refusal("dagger", monkeypatch, capsys, tmp_path, *flags)
+def test_bad_flags(tmp_path, flags, message, capsys):
+    assert message in refusal("dagger", capsys, tmp_path, *flags)

@@ -13,7 +13,7 @@ from trainers import PATHS, TRAINERS, command, run_here
 import envs.protocol
 
 ONCE = "--total-timesteps 60 --horizon 30 --eval-every 30 --learning-starts 15 --num-envs 3"
-ONCE_BC = "--total-updates 4 --eval-every 2"
+ONCE_BC = "--total-updates 2 --eval-every 2"
 SEEING = ["--task", "random_boxes_hard", "--encoder", "oracle", "--goal-type", "combined"]
 
 
@@ -37,28 +37,26 @@ def flags(trainer):
 
 @pytest.mark.parametrize("seeing", [False, True])
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_update_evaluation_and_resume_on_another_device(
-    trainer, seeing, tmp_path, meta, monkeypatch
-):
+def test_update_evaluation_and_resume_on_another_device(trainer, seeing, tmp_path, meta):
     more = SEEING if seeing else ["--goal-type", "ee"]
     if seeing and trainer != "bc":
         more = [*more, "--demo-prob", "1"]
-    run_here(trainer, monkeypatch, *command(trainer, tmp_path, *flags(trainer), *more)[1:])
+    run_here(trainer, *command(trainer, tmp_path, *flags(trainer), *more)[1:])
     (run,) = tmp_path.iterdir()
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     assert state["progress"]["updates"] > 0
     assert all(tensor.is_meta for tensor in state["actor"].values())
     (run / "result.json").unlink()
     longer = [] if trainer == "bc" else ["--total-timesteps", "120"]
-    run_here(trainer, monkeypatch, PATHS[trainer], "--resume", run, *longer)
-    assert json.loads((run / "result.json").read_text())["steps"] == (4 if trainer == "bc" else 120)
+    run_here(trainer, PATHS[trainer], "--resume", run, *longer)
+    assert json.loads((run / "result.json").read_text())["steps"] == (2 if trainer == "bc" else 120)
 
 
 def test_a_tensor_left_on_the_cpu_is_noticed(tmp_path, meta, monkeypatch):
     stack = envs.protocol.stack
     monkeypatch.setattr(envs.protocol, "stack", lambda observations, _: stack(observations, "cpu"))
     with pytest.raises(RuntimeError, match="device"):
-        run_here("bc", monkeypatch, *command("bc", tmp_path, *flags("bc"))[1:])
+        run_here("bc", *command("bc", tmp_path, *flags("bc"))[1:])
 
 
 class OneType(torch.overrides.TorchFunctionMode):
@@ -80,8 +78,8 @@ class OneType(torch.overrides.TorchFunctionMode):
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_no_kernel_gets_two_types(trainer, tmp_path, monkeypatch):
+def test_no_kernel_gets_two_types(trainer, tmp_path):
     few = [flag for flag in flags(trainer) if flag not in ("--device", "meta")]
     given = command(trainer, tmp_path, *few, "--bf16", *(["True"] if trainer != "bc" else []))[1:]
     with OneType():
-        run_here(trainer, monkeypatch, *given)
+        run_here(trainer, *given)

@@ -7,9 +7,10 @@ import sys
 import numpy as np
 import pytest
 import torch
-from trainers import PATHS, ROOT, TRAINERS, command, load, run_script
+from trainers import PATHS, ROOT, TRAINERS, load, refusal, run_here, run_script
 
 import envs
+from clean_rl_scripts import evaluate
 from envs.datasets import load_demos
 from envs.demo_episodes import demo_transitions
 from envs.encoders import oracle, scene_encoder
@@ -86,16 +87,9 @@ def test_trained_resumed_and_evaluated(trainer, tmp_path):
     run = run_script(trainer, tmp_path / "whole", *flags(trainer), "--goal-type", "combined")
     program = torch.load(run / "policy.pt", weights_only=True)
     assert program["metadata"]["env"]["encoder"] == "oracle"
-    evaluate = [sys.executable, str(ROOT / "clean_rl_scripts" / "evaluate.py"), "--task", HARD]
-    evaluate += [
-        "--policy",
-        str(run),
-        "--num-queries",
-        "3",
-        "--json",
-        str(tmp_path / "result.json"),
-    ]
-    subprocess.run(evaluate, check=True, capture_output=True)
+    arguments = ["--policy", run, "--num-queries", "3", "--task", HARD]
+    arguments += ["--json", tmp_path / "result.json"]
+    assert evaluate.main(list(map(str, arguments))) == 0
     assert json.loads((tmp_path / "result.json").read_text())["goal_type"] == "combined"
     if trainer == "bc":
         show = [sys.executable, "-m", "envs.show", HARD, "--policy", str(run)]
@@ -105,8 +99,7 @@ def test_trained_resumed_and_evaluated(trainer, tmp_path):
         return
     part = [*flags(trainer), "--goal-type", "combined", "--total-timesteps", "600"]
     again = run_script(trainer, tmp_path / "part", *part)
-    resume = [sys.executable, str(PATHS[trainer]), "--resume", str(again)]
-    subprocess.run([*resume, "--total-timesteps", "1200"], check=True, capture_output=True)
+    run_here(trainer, PATHS[trainer], "--resume", again, "--total-timesteps", "1200")
     one, other = (
         torch.load(path / "checkpoint.pt", weights_only=True)["actor"] for path in (run, again)
     )
@@ -114,12 +107,12 @@ def test_trained_resumed_and_evaluated(trainer, tmp_path):
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_what_is_no_encoder_is_refused(trainer, tmp_path):
+def test_what_is_no_encoder_is_refused(trainer, tmp_path, capsys):
+    (tmp_path / "runs").mkdir()
     (tmp_path / "encoder.pt").write_text("nothing")
-    given = command(trainer, tmp_path / "runs", "--encoder", str(tmp_path / "encoder.pt"))
-    done = subprocess.run(given, capture_output=True, text=True)
-    assert done.returncode == 1 and "Traceback" not in done.stderr
-    assert "--encoder: " in done.stderr and "not a network file" in done.stderr
+    given = ("--encoder", str(tmp_path / "encoder.pt"))
+    said = refusal(trainer, capsys, tmp_path / "runs", *given)
+    assert "--encoder: " in said and "not a network file" in said
 
 
 def test_one_encoder_serves_all_environments_of_a_process(env):

@@ -166,7 +166,7 @@ def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps
     flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
     if stop is not None:
         flags += ["--stop-at-success", stop]
-    run_here("sac_her_mp", monkeypatch, *flags)
+    run_here("sac_her_mp", *flags)
     (result,) = tmp_path.glob("*/result.json")
     assert json.loads(result.read_text())["steps"] == steps
 
@@ -193,8 +193,8 @@ def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps
         (["--demos", "some.h5"], "--demos goes with --demo-prob"),
     ],
 )
-def test_bad_flags(tmp_path, flags, message, monkeypatch, capsys):  # refused in a shared block
-    assert message in refusal("sac_her_mp", monkeypatch, capsys, tmp_path, *flags)
+def test_bad_flags(tmp_path, flags, message, capsys):  # refused in a shared block
+    assert message in refusal("sac_her_mp", capsys, tmp_path, *flags)
 
 
 @pytest.mark.parametrize(
@@ -205,9 +205,9 @@ def test_bad_flags(tmp_path, flags, message, monkeypatch, capsys):  # refused in
         ("bc", ["--learning-rate", "1e30"]),
     ],
 )
-def test_a_diverged_run_ends(name, flags, tmp_path, monkeypatch):
+def test_a_diverged_run_ends(name, flags, tmp_path):
     with pytest.raises(FloatingPointError, match="the policy's actions are no longer finite"):
-        run_here(name, monkeypatch, *command(name, tmp_path, *flags)[1:])
+        run_here(name, *command(name, tmp_path, *flags)[1:])
     assert not list(tmp_path.glob("*/policy.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
 
 

@@ -2,9 +2,9 @@
 
 import importlib.util
 import runpy
-import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -43,25 +43,27 @@ def command(trainer, folder, *flags):
 
 
 def run_script(trainer, folder, *flags):
-    """The folder of such a run."""
-    done = subprocess.run(command(trainer, folder, *flags), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    """The folder of such a run, which is made in this process: without seconds of imports."""
+    run_here(trainer, *command(trainer, folder, *flags)[1:])
     return next(folder.iterdir())
 
 
-def run_here(trainer, monkeypatch, *flags):
-    """The same in this process, so that what the script imports can be changed first."""
-    monkeypatch.setattr(sys, "argv", list(map(str, flags)))
-    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-    try:
-        runpy.run_path(str(PATHS[trainer]), run_name="__main__")
-    finally:
-        torch.use_deterministic_algorithms(False)
+def run_here(trainer, *arguments):
+    """A trainer in this process, so that what it imports can be changed first.
+
+    `arguments` are those of the command line; the first is the script.
+    """
+    argv = patch.object(sys, "argv", list(map(str, arguments)))
+    with argv, patch.object(sys, "excepthook", sys.excepthook):
+        try:
+            runpy.run_path(str(PATHS[trainer]), run_name="__main__")
+        finally:
+            torch.use_deterministic_algorithms(False)
 
 
-def refusal(trainer, monkeypatch, capsys, folder, *flags):
+def refusal(trainer, capsys, folder, *flags):
     """What such a run says of flags with which it ends before it has made anything."""
     with pytest.raises(SystemExit) as end:
-        run_here(trainer, monkeypatch, *command(trainer, folder, *flags)[1:])
+        run_here(trainer, *command(trainer, folder, *flags)[1:])
     assert end.value.code not in (None, 0) and not list(folder.iterdir())
     return f"{capsys.readouterr().err}{end.value.code}"
