@@ -168,7 +168,7 @@ class RoboArmEnv(gym.Env):
         if self._window and (problem := why_no_window()):
             gym.logger.warn(f"render_mode='human' needs a display ({problem}): no window")
             self._window = False
-        self.world = World(scene, self._window)
+        self.world = World(scene, self._window, drawn=render_mode is not None)
         """The simulated `World`. Change its scene by `set_scene` of the environment."""
         self.start_configuration = None
         """Start of this episode, float32 (7,), rad; None before the first reset."""

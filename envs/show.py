@@ -139,6 +139,7 @@ def film(env, query, configurations, size=SIZE, points=()):
     Yields:
         n pictures, uint8 (height, width, 3).
     """
+    env.world.draw()
     env.reset_specific(*query)
     has_ghost = len(query.goal) == panda.NUM_JOINTS
     poses = [*configurations, *[query.goal] * has_ghost]

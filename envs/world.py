@@ -71,6 +71,8 @@ class World:
     Args:
         scene: a `Scene`; by default an empty one.
         window: open PyBullet's window.
+        drawn: give bodies the looks that pictures show. PyBullet takes up to six times as long to
+            add a cylinder or a sphere that has them; else pictures show specks, until `draw`.
 
     Attributes:
         client: PyBullet's number of the engine; None once it is closed.
@@ -81,8 +83,9 @@ class World:
         TypeError: `scene` is not a `Scene`.
     """
 
-    def __init__(self, scene=None, window=False):
+    def __init__(self, scene=None, window=False, drawn=True):
         self.client = None
+        self._drawn = drawn
         scene = Scene() if scene is None else scene
         _check_scene(scene)
         self.client = p.connect(p.GUI if window else p.DIRECT)
@@ -101,6 +104,18 @@ class World:
         self.robot = self._load_robot()
         self._parts, self._bodies, self._bodies_made = [], [], 0
         self._goal_marker = None
+        self._speck = p.createVisualShape(
+            p.GEOM_BOX, halfExtents=[0.001] * 3, physicsClientId=self.client
+        )
+
+    def draw(self):
+        """Give the bodies of the scene their looks, now and from now on; not during an episode."""
+        if not self._drawn:
+            for body in self._bodies:
+                p.removeBody(body, physicsClientId=self.client)
+            self._drawn, self._parts, self._bodies = True, [], []
+            scene, self.scene = self.scene, None
+            self.set_scene(scene)
 
     def _load_robot(self):
         return panda.load(self.client)
@@ -143,11 +158,13 @@ class World:
         else:
             kind, collision = p.GEOM_SPHERE, {"radius": obstacle.radius}
             visual = collision
-        client = self.client
+        client, look = self.client, self._speck
+        if self._drawn:
+            look = p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client)
         body = p.createMultiBody(
             0.0,  # kg: it never moves
             p.createCollisionShape(kind, **collision, physicsClientId=client),
-            p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client),
+            look,
             basePosition=obstacle.position,
             baseOrientation=orientation,
             physicsClientId=client,

@@ -326,6 +326,27 @@ def test_replay_is_bit_identical_in_any_order_and_any_process():
     assert output.split()[-3:] == [first[29], first[3], first[11]]
 
 
+@pytest.mark.parametrize("task", ["random_boxes_hard", "benchmaker_bookshelf_thin"])
+def test_an_episode_is_the_same_with_and_without_pictures(task):
+    query = load_queries(task)[5]
+    hashes = set()
+    for arguments in ({}, {"render_mode": "rgb_array", "render_size": (32, 24)}, {"draw": True}):
+        late = arguments.pop("draw", False)
+        env = envs.make(task, **arguments)
+        if late:
+            env.world.draw()
+        rng, moved = np.random.default_rng(0), hashlib.sha256()
+        env.reset_specific(query.start, query.goal, query.scene)
+        for _ in range(60):
+            observation = env.step(rng.uniform(-0.03, 0.03, 7))[0]
+            moved.update(observation["observation"].tobytes())
+            if env.render_mode is not None:
+                env.render()
+        hashes.add(moved.hexdigest())
+        env.close()
+    assert len(hashes) == 1
+
+
 def test_a_seed_fixes_the_episode():
     a, b = envs.make("boxes"), envs.make("boxes")
     for name, value in a.reset(seed=7)[0].items():

@@ -18,7 +18,7 @@ import envs
 from envs import panda, show
 from envs.datasets import Query, load_demos, load_queries, write_queries
 from envs.exported_networks import save_network
-from envs.scenes import Box, Scene, Sphere
+from envs.scenes import Box, Cylinder, Scene, Sphere
 from envs.tasks import TASKS, Task
 
 SMALL = (96, 72)
@@ -60,6 +60,21 @@ def frames_of(path):
 
 
 # --- Pictures
+
+
+def test_an_environment_that_does_not_render_is_drawn_for_pictures():
+    scene = Scene((Sphere((0.5, 0.3, 0.4), 0.1), Cylinder((0.5, -0.3, 0.3), 0.05, 0.3)))
+    query, task = Query(BENT, BENT + 0.1, scene), "random_boxes_hard"
+    plain, drawn = envs.make(task), env_of(task)
+    expected = show.picture(drawn, query, SMALL)
+    assert not np.array_equal(expected, show.picture(drawn, Query(BENT, BENT, Scene()), SMALL))
+    plain.reset_specific(*query)
+    found = [show.picture(plain, query, SMALL) for _ in range(2)]
+    for one in found:
+        different = (one != expected).any(-1) & ~green(expected)  # which is the goal's ball
+        assert different.sum() < 20
+    plain.close()
+    drawn.close()
 
 
 def test_a_picture_has_the_goal_as_a_ball_and_as_a_ghost(env):
