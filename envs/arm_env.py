@@ -65,7 +65,8 @@ class RoboArmEnv(gym.Env):
         sink_state: instead of terminating, stay where the episode ended, at reward 0 whatever the
             action, until the horizon.
         velocities: add joint velocities to `observation`.
-        render_mode: None, `rgb_array`, or `human` (opens PyBullet's window).
+        render_mode: None, `rgb_array`, or `human` (opens PyBullet's window). With None, bodies have
+            no looks: call `env.world.draw()` before a picture of `env.client` of your own.
         render_size: (width, height) of `rgb_array` pictures in pixels.
 
     Raises:
