@@ -203,7 +203,7 @@ def check_finite(name, values):
 
     `values`: tensor or array of numbers, which the line calls `name`.
     """
-    if (~torch.as_tensor(values).isfinite()).any().item():
+    if not torch.as_tensor(values).isfinite().all():
         raise FloatingPointError(f"{name} are no longer finite")
 
 

@@ -1,5 +1,16 @@
-"""Ctrl-C can be tested also where it is ignored, as in the background of a shell."""
-
 import signal
 
+import pytest
+
+from envs import protocol
+
+# Ctrl-C can be tested also where it is ignored, as in the background of a shell.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def short_episodes(monkeypatch):
+    """Evaluations are over sooner, also of trainers that have no --horizon."""
+    make_envs = protocol.make_envs
+    short = {"horizon": 30}
+    monkeypatch.setattr(protocol, "make_envs", lambda *args, **kw: make_envs(*args, **kw | short))

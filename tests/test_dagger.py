@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import meta_device
 import numpy as np
 import pytest
 import torch
@@ -255,6 +256,18 @@ def test_a_run_killed_and_resumed_its_policy_by_name(tmp_path, folder):
     bare = evaluate(whole, HARD, split="validation", num_queries=2, last_layer=False)
     assert bare["last_layer"] is None and bare["mean_steps"] != result["mean_steps"]
     assert bare["collision_rate"] >= result["collision_rate"]
+
+
+def test_nothing_of_a_run_needs_the_cpu(tmp_path, folder, short_episodes):
+    """Updates, a round, and an evaluation, with the `meta` device in CUDA's place."""
+    few = ["--total-updates", "4", "--eval-every", "4", "--round-every", "2", "--eval-queries", "1"]
+    flags = ["--paths", str(folder), "--encoder", "oracle", "--device", "meta", *few]
+    with meta_device.in_cudas_place():
+        run = run_script("dagger", tmp_path, *flags)
+    assert load_network(run / "policy.pt").metadata["step"] == 4
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    assert state["progress"]["updates"] == 4
+    assert all(tensor.is_meta for tensor in state["actor"].values())
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ kernel, so tensors of two types in one are looked for separately.
 
 import json
 
+import meta_device
 import pytest
 import torch
 from trainers import PATHS, TRAINERS, command, run_here
@@ -18,16 +19,9 @@ SEEING = ["--task", "random_boxes_hard", "--encoder", "oracle", "--goal-type", "
 
 
 @pytest.fixture
-def meta(monkeypatch):
-    """What CUDA can do and `meta` cannot: bring numbers to the CPU, fused Adam."""
-    cpu, adam = torch.Tensor.cpu, torch.optim.Adam
-
-    def to_cpu(tensor):
-        return torch.zeros(tensor.shape, dtype=tensor.dtype) if tensor.is_meta else cpu(tensor)
-
-    monkeypatch.setattr(torch.Tensor, "cpu", to_cpu)
-    monkeypatch.setattr(torch.Tensor, "item", lambda tensor: to_cpu(tensor).tolist())
-    monkeypatch.setattr(torch.optim, "Adam", lambda *args, fused, **kw: adam(*args, **kw))
+def meta():
+    with meta_device.in_cudas_place():
+        yield
 
 
 def flags(trainer):
@@ -37,7 +31,9 @@ def flags(trainer):
 
 @pytest.mark.parametrize("seeing", [False, True])
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_update_evaluation_and_resume_on_another_device(trainer, seeing, tmp_path, meta):
+def test_update_evaluation_and_resume_on_another_device(
+    trainer, seeing, tmp_path, meta, short_episodes
+):
     more = SEEING if seeing else ["--goal-type", "ee"]
     if seeing and trainer != "bc":
         more = [*more, "--demo-prob", "1"]

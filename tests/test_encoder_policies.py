@@ -83,7 +83,7 @@ def flags(trainer):
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_trained_resumed_and_evaluated(trainer, tmp_path):
+def test_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
     run = run_script(trainer, tmp_path / "whole", *flags(trainer), "--goal-type", "combined")
     program = torch.load(run / "policy.pt", weights_only=True)
     assert program["metadata"]["env"]["encoder"] == "oracle"

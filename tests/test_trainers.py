@@ -102,7 +102,7 @@ def test_the_saved_policy_acts_without_the_script(finished_run, trainer):
     env.step(action)
 
 
-def test_the_running_average_of_the_policy_is_what_is_saved(tmp_path, trainer):
+def test_the_running_average_of_the_policy_is_what_is_saved(tmp_path, trainer, short_episodes):
     module = load(trainer)
     length = "--total-updates" if trainer == "bc" else "--total-timesteps"
     flags = [length, "600", "--policy-average", "0.01", "--goal-type", "ee"]
