@@ -84,7 +84,10 @@ def check_writable(path):
 def check_folder(path):
     """Raise ValueError unless files can be written in a folder, which may not be there yet."""
     path = Path(path)
-    there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+    try:
+        there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+    except OSError as error:
+        raise ValueError(f"cannot write {path}: {error.strerror}") from error
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
         raise ValueError(f"{path}: {there} is no folder that can be written")
 

@@ -113,7 +113,7 @@ def attempts(seed, folder):
             return f"traceback of {module}: {said.strip().splitlines()[-1][:120]}"
         if any(not path.name.isdigit() for path in folder.iterdir() if path != given):
             return f"{module} left something elsewhere"
-        if code == 0:
+        if code == 0 or "training has diverged" in said:
             return RAN
         if plain:
             return f"{module} does not run"

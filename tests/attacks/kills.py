@@ -89,7 +89,8 @@ def attempts(seed, folder):
                     process.kill()
                     said, _ = process.communicate()
                     continue
-                if process.returncode != 0:
+                # What was killed may have been done already, and on its way out.
+                if process.returncode != 0 and "exists; --overwrite" not in said:
                     return f"{name}: exit code {process.returncode}: {said[-300:]}"
                 break
             if _made(here, pattern) != expected[name]:
