@@ -14,3 +14,16 @@ def short_episodes(monkeypatch):
     make_envs = protocol.make_envs
     short = {"horizon": 30}
     monkeypatch.setattr(protocol, "make_envs", lambda *args, **kw: make_envs(*args, **kw | short))
+
+
+@pytest.fixture
+def cluster():
+    """A Ray cluster of two nodes on this machine, a core each."""
+    cluster = pytest.importorskip("ray.cluster_utils").Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 0}
+    )
+    for _ in range(2):
+        cluster.add_node(num_cpus=1)
+    cluster.wait_for_nodes()
+    yield cluster
+    cluster.shutdown()

@@ -665,22 +665,15 @@ def test_verify_goes_on_after_a_bad_file(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_a_node_collects_the_same_bytes(output, tmp_path):
-    cluster_utils = pytest.importorskip("ray.cluster_utils")
+def test_a_cluster_that_loses_a_node_collects_the_same_bytes(output, tmp_path, cluster):
     num = 150
     local = tmp_path / "local.h5"
     assert run(local, "--workers", "2", num=num).returncode == 0
-    cluster = cluster_utils.Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
-    try:
-        nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
-        cluster.wait_for_nodes()
-        with running(output, "--ray-address", cluster.address, demos=40, num=num) as process:
-            cluster.remove_node(nodes[0], allow_graceful=False)
-            assert journal_lines(output) < num - 40
-            _, stderr = process.communicate(timeout=300)
-        assert process.returncode == 0, stderr
-    finally:
-        cluster.shutdown()
+    with running(output, "--ray-address", cluster.address, demos=40, num=num) as process:
+        cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+        assert journal_lines(output) < num - 40
+        _, stderr = process.communicate(timeout=300)
+    assert process.returncode == 0, stderr
     assert output.read_bytes() == local.read_bytes()
 
 

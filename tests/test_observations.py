@@ -158,14 +158,6 @@ def test_damaged_folders_are_refused_by_name(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_cluster_makes_the_same_files(whole, tmp_path):
-    cluster_utils = pytest.importorskip("ray.cluster_utils")
-    cluster = cluster_utils.Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
-    try:
-        for _ in range(2):
-            cluster.add_node(num_cpus=1)
-        cluster.wait_for_nodes()
-        collect.collect(args(tmp_path, ray_address=cluster.address), progress=False)
-    finally:
-        cluster.shutdown()
+def test_a_cluster_makes_the_same_files(whole, tmp_path, cluster):
+    collect.collect(args(tmp_path, ray_address=cluster.address), progress=False)
     assert shards(tmp_path) == shards(whole)

@@ -220,6 +220,12 @@ def test_the_files_do_not_depend_on_the_workers(collected, tmp_path):
     assert files(tmp_path) == files(collected)
 
 
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_files(collected, tmp_path, cluster):
+    collect(Args(tmp_path, **SMALL, ray_address=cluster.address), progress=False)
+    assert files(tmp_path) == files(collected)
+
+
 def test_killed_and_resumed_is_the_same(collected, tmp_path):
     flags = [f"--{k.replace('_', '-')}={v}" for k, v in SMALL.items()]
     command = [sys.executable, "-m", "demo_generation.roadmaps", "--output", str(tmp_path), *flags]
