@@ -84,7 +84,7 @@ def table(results):
         "`python benchmarks/baselines.py` measures this and writes it (goal `ee`). What the",
         "policies do: [tasks.md](tasks.md). In each cell: success, clean success [95 % interval of",
         "success]. Who plans has LBKPIECE1's help where RRT-Connect takes long",
-        "([demonstrations.md](demonstrations.md)). What can be done in 0.05 s depends on the machine,",
+        "([demonstrations.md](demonstrations.md)). What 0.05 s are enough for depends on the",",
         "and here on the day.",
         "",
         "| task | paper, `go-to-goal` | " + " | ".join(CELLS) + " |",
