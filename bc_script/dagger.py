@@ -223,7 +223,7 @@ class Examples:
         self.paths, self.args, self.device = paths, args, device
         seen = args.encoder != "oracle"
         self.checker_of = seeing.seen_checker if seen else seeing.true_checker
-        self.scenes = np.flatnonzero(np.diff(paths.path_offsets))  # that have paths
+        self.with_paths = np.flatnonzero(np.diff(paths.path_offsets))  # numbers of scenes
         steps = np.linalg.norm(np.diff(paths.points, axis=0), axis=1)
         steps[paths.offsets[1:-1] - 1] = 1.0  # from the end of a path to the next one: anything
         self.come = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
@@ -285,7 +285,7 @@ class Examples:
 
     def _choose(self, rng, number):
         """A scene, and the first and the last point of some of its paths (number,)."""
-        scene = int(rng.choice(self.scenes))
+        scene = int(rng.choice(self.with_paths))
         path = rng.integers(*self.paths.path_offsets[scene : scene + 2], number)
         return scene, self.paths.offsets[path], self.paths.offsets[path + 1] - 1
 

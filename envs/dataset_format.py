@@ -34,9 +34,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from envs import panda, scenes
+from envs import panda
 from envs.files import write_atomically
-from envs.scenes import scene_from_json, scene_to_json
+from envs.scenes import (
+    MAX_LENGTH,
+    ROW,
+    from_array,
+    scene_from_json,
+    scene_to_json,
+    to_array,
+)
 from envs.tasks import TASKS, get_task, is_task, task_name
 
 SPLITS = ("test", "validation")
@@ -49,7 +56,7 @@ MAX_ARRAY_BYTES = 2**30
 SCENE_ARRAYS = {
     "scene": ("<u4", None, None),
     "obstacle_count": ("<u4", None, "obstacle_count"),
-    "obstacles": ("<f8", scenes.ROW, "obstacles"),
+    "obstacles": ("<f8", ROW, "obstacles"),
 }
 QUERY_ARRAYS = {
     "start": ("<f4", 7, "start"),
@@ -120,7 +127,7 @@ class QueryScenes:
         if self.index is None:
             return self.base
         first, last = self.offsets[self.index[i] :][:2]
-        return replace(self.base, obstacles=scenes.from_array(self.rows[first:last]))
+        return replace(self.base, obstacles=from_array(self.rows[first:last]))
 
     def take(self, which):
         """The scenes of fewer queries, by slice or index array."""
@@ -190,7 +197,7 @@ def scene_arrays(path, scenes_of, base, prefix=""):
     return {
         f"{prefix}scene": np.array(index, np.uint32),
         f"{prefix}obstacle_count": np.array([len(s.obstacles) for s in numbers], np.uint32),
-        f"{prefix}obstacles": scenes.to_array([o for s in numbers for o in s.obstacles]),
+        f"{prefix}obstacles": to_array([o for s in numbers for o in s.obstacles]),
     }
 
 
@@ -204,12 +211,12 @@ def read_scenes(path, attributes, arrays, prefix=""):
     if offsets[-1] != len(rows) or index.max() >= len(counts):
         raise DatasetError(f"{path}: {prefix}scene does not fit the number of scenes or obstacles")
     try:
-        scenes.from_array(rows)
+        from_array(rows)
     except ValueError as error:
         raise DatasetError(f"{path}: {prefix}obstacles: {error}") from error
     if not np.isfinite(rows).all():
         raise DatasetError(f"{path}: {prefix}obstacles has numbers that are not finite")
-    if len(rows) and not (rows[:, 8:].min() > 0 and np.abs(rows).max() <= scenes.MAX_LENGTH):
+    if len(rows) and not (rows[:, 8:].min() > 0 and np.abs(rows).max() <= MAX_LENGTH):
         raise DatasetError(f"{path}: {prefix}obstacles has sizes that make no sense")
     return QueryScenes(base, index.astype(np.int64), offsets, rows)
 

@@ -22,8 +22,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from envs import scenes, shards
+from envs import shards
 from envs.datasets import DatasetError, attribute, scene_from_json, scene_to_json
+from envs.scenes import from_array, to_array
 from envs.sensors import Camera, PointCloud
 from envs.shards import read_array, shard_path, shard_paths, write_attributes
 from envs.tasks import get_task, task_name
@@ -80,7 +81,7 @@ def shard_bytes(task, seed, first, sensors, scenes_seen, configurations, observa
         observations: list of n dicts, those of `observe`.
         made_by: the command line that makes the shards.
     """
-    rows = scenes.to_array([o for scene in scenes_seen for o in scene.obstacles])
+    rows = to_array([o for scene in scenes_seen for o in scene.obstacles])
     arrays = {
         "obstacle_count": np.array([len(scene.obstacles) for scene in scenes_seen], np.uint32),
         "obstacles": rows,
@@ -166,6 +167,6 @@ class Observations:
         counts, rows = self.read(number, "obstacle_count"), self.read(number, "obstacles")
         ends = np.cumsum(counts.astype(np.int64))
         return [
-            replace(self.base_scene, obstacles=scenes.from_array(rows[end - count : end]))
+            replace(self.base_scene, obstacles=from_array(rows[end - count : end]))
             for end, count in zip(ends, counts, strict=True)
         ]

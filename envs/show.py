@@ -28,7 +28,7 @@ from PIL import Image
 from tqdm import tqdm
 
 import envs
-from envs import flags, panda, scenes
+from envs import flags, panda
 from envs.datasets import (
     Demos,
     Query,
@@ -41,6 +41,7 @@ from envs.datasets import (
 from envs.files import write_atomically
 from envs.flags import NonNegativeInt, Pixels, PositiveInt, Seed
 from envs.policies import find_policy, make_policy
+from envs.scenes import to_array
 from envs.world import why_no_window
 
 SIZE = (640, 480)
@@ -164,7 +165,7 @@ def film(env, query, configurations, size=SIZE, points=()):
 def _extent(env, configurations):
     """Corners (n, 3), m, of boxes around the obstacles, the table, and the arm in all its poses."""
     solids = [*env.scene.obstacles, *[env.scene.table] * (env.scene.table is not None)]
-    rows = scenes.to_array(solids)
+    rows = to_array(solids)
     # From the sizes in a row to half edges, for each kind: box, cylinder, sphere.
     scale = np.array([[0.5, 0.5, 0.5], [1, 1, 0.5], [1, 1, 1]])[rows[:, 0].astype(int)]
     turns = np.array([p.getMatrixFromQuaternion(row[4:8]) for row in rows]).reshape(-1, 3, 3)
