@@ -395,7 +395,8 @@ class Args:
     output: Path
     """Folder to write to."""
     task: str = "random_boxes_hard"
-    """Name of a task, or path of a scene file. Where scenes do not vary, each has a new roadmap."""
+    """Name of a task, `mixed_scenes`, or path of a scene file. Where scenes do not vary, each has a
+    new roadmap."""
     scenes: PositiveInt = 6000
     """Number of scenes."""
     paths_per_scene: PositiveInt = 300

@@ -71,13 +71,14 @@ def _sample_box(rng, azimuth):
     yaw = azimuth + rng.uniform(-math.pi / 2, math.pi / 2)
     half = round(yaw / TURN) * TURN / 2
     return Box(
-        _rounded(distance * math.cos(azimuth), distance * math.sin(azimuth), height),
-        _rounded(*size),
+        rounded(distance * math.cos(azimuth), distance * math.sin(azimuth), height),
+        rounded(*size),
         (0.0, 0.0, math.sin(half), math.cos(half)),
     )
 
 
-def _rounded(*lengths):
+def rounded(*lengths):
+    """Lengths (m), as multiples of `GRID`."""
     return tuple(round(length / GRID) * GRID for length in lengths)
 
 

@@ -8,6 +8,7 @@ say, then calibrated so that the go-to-goal policy succeeds as often as in the p
 from dataclasses import dataclass
 from pathlib import Path
 
+from envs.mixed_scenes import MixedScenes
 from envs.random_boxes import RandomBoxes
 from envs.scene_files import load_scene
 from envs.scenes import TABLE, Box, Cylinder, Scene
@@ -20,12 +21,12 @@ class Task:
     """A scene, or a distribution of scenes, under a name.
 
     Attributes:
-        scene: a `Scene` or a `RandomBoxes`.
+        scene: a `Scene`, or a distribution of them with `base` and `sample(rng)`.
         summary: one line for listings.
         trainable: False for the tasks that are there to test generalisation (paper: "OOD").
     """
 
-    scene: Scene | RandomBoxes
+    scene: Scene | RandomBoxes | MixedScenes
     summary: str
     trainable: bool = True
 
@@ -36,23 +37,23 @@ class Task:
 
 
 def get_task(task):
-    """The `Task` of a name in `TASKS`, or of the path of a scene file (`envs.scene_files`).
+    """The `Task` of a name in `TASKS` or `TRAINING_SCENES`, or of the path of a scene file.
 
     Raises:
         ValueError: neither; or the scene file is malformed.
     """
-    if task in TASKS:
-        return TASKS[task]
+    if task in NAMED:
+        return NAMED[task]
     if is_task(task):
-        if task_name(task) in TASKS:
+        if task_name(task) in NAMED:
             raise ValueError(f"{task}: a scene file may not have the name of a task")
         return Task(load_scene(task), f"the scene in {task}")
     raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}, or a scene file (.yaml)")
 
 
 def is_task(task):
-    """Whether `task` is a name in `TASKS` or looks like the path of a scene file."""
-    return task in TASKS or Path(task).suffix in SCENE_FILES
+    """Whether `task` is a name or looks like the path of a scene file."""
+    return task in NAMED or Path(task).suffix in SCENE_FILES
 
 
 def task_name(task):
@@ -178,3 +179,8 @@ TASKS = {
         trainable=False,
     ),
 }
+# Not a task of the benchmark: it has no queries. Paths in such scenes are to learn from.
+TRAINING_SCENES = {
+    "mixed_scenes": Task(MixedScenes(), "random boxes, walls with gaps, or racks of shelves")
+}
+NAMED = TASKS | TRAINING_SCENES

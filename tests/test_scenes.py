@@ -39,6 +39,15 @@ def env():
     env.close()
 
 
+def distance_to_robot(box):
+    """m, of points on the robot's axis below its shoulder; by PyBullet, an independent way."""
+    to_box = p.invertTransform(box.position, box.orientation)
+    points = [(0.0, 0.0, height) for height in np.linspace(0.0, SHOULDER, 10)]
+    local = np.array([p.multiplyTransforms(*to_box, x, (0, 0, 0, 1))[0] for x in points])
+    beyond = np.maximum(np.abs(local) - np.array(box.size) / 2, 0.0)
+    return np.linalg.norm(beyond, axis=1).min()
+
+
 # --- What is no scene
 
 
@@ -89,12 +98,7 @@ def test_obstacles_are_shelves_poles_and_walls_that_leave_the_robot_its_place():
     assert 0.1 < boards < 0.9 and 0.1 < slender.mean() < 0.9
     for box in boxes:
         assert np.array_equal(np.divide([*box.position, *box.size], GRID) % 1, np.zeros(6))
-        # Points on the robot's axis, in the box's frame by PyBullet, an independent way.
-        for height in np.linspace(0.0, SHOULDER, 10):
-            to_box = p.invertTransform(box.position, box.orientation)
-            local, _ = p.multiplyTransforms(*to_box, (0.0, 0.0, height), (0, 0, 0, 1))
-            beyond = np.maximum(np.abs(local) - np.array(box.size) / 2, 0.0)
-            assert np.linalg.norm(beyond) > KEEP_CLEAR - 0.01
+        assert distance_to_robot(box) > KEEP_CLEAR - 0.01
 
 
 def test_scenes_differ_and_a_seed_fixes_them():
@@ -102,6 +106,36 @@ def test_scenes_differ_and_a_seed_fixes_them():
     assert boxes.sample(np.random.default_rng(3)) == boxes.sample(np.random.default_rng(3))
     rng = np.random.default_rng(3)
     assert len({boxes.sample(rng) for _ in range(20)}) == 20
+
+
+def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
+    mixed = envs.get_task("mixed_scenes").scene
+    assert mixed.sample(np.random.default_rng(3)) == mixed.sample(np.random.default_rng(3))
+    drawn = [mixed.sample(np.random.default_rng([0, i])) for i in range(300)]
+    assert len(set(drawn)) == 300 and not {task.scene for task in TASKS.values()} & set(drawn)
+    assert max(len(scene.obstacles) for scene in drawn) <= 32
+    walls = racks = 0
+    for scene in drawn:
+        assert scene == replace(mixed.base, obstacles=scene.obstacles)
+        assert min(map(distance_to_robot, scene.obstacles)) > KEEP_CLEAR - 0.02
+        sizes = np.array([box.size for box in scene.obstacles])
+        places = np.array([box.position for box in scene.obstacles])
+        walls += (sizes[:, 0] > 0.39).all() and np.allclose(
+            places[:, 2], sizes[:, 2] / 2, atol=GRID
+        )
+        racks += len(np.unique(places[:, :2], axis=0)) < len(places)  # boards above each other
+    assert 70 < walls < 130 and 70 < racks < 130
+
+
+def test_there_are_no_queries_in_mixed_scenes():
+    with pytest.raises(DatasetError, match="mixed_scenes.h5: no such file"):
+        load_queries("mixed_scenes")
+    env = envs.make("mixed_scenes")
+    env.reset(seed=0)
+    first = env.world.scene
+    env.reset()
+    assert env.world.scene != first
+    env.close()
 
 
 # --- In the environment
