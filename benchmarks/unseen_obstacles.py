@@ -25,6 +25,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import envs
 from envs.exported_networks import halve_network
 from envs.files import write_atomically
+from envs.roadmap_paths import load_roadmap_paths
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, PAGE = (ROOT / "docs" / f"unseen_obstacles.{ending}" for ending in ("json", "md"))
@@ -56,12 +57,16 @@ for _encoder, _layer in (
         f"bc, {_encoder}, no way out": [*_flags, *_layer, "--no-way-out"],
         f"bc, {_encoder}": [*_flags, *_layer],
     }
-for _encoder, _layer in (("points", POINTS[:2]), ("oracle", OBSTACLES)):
-    _flags = ["--policy", f"dagger-combined-{_encoder}-{HARD}-s1"]
+for _name, _policy, _layer in (
+    ("dagger, points", f"points-{HARD}", POINTS[:2]),
+    ("dagger, points, mixed scenes", "points-mixed_scenes", POINTS[:2]),
+    ("dagger, oracle", f"oracle-{HARD}", OBSTACLES),
+):
+    _flags = ["--policy", f"dagger-combined-{_policy}-s1"]
     CELLS |= {
-        f"dagger, {_encoder}, alone": [*_flags, "--keep-distance", "0"],
-        f"dagger, {_encoder}, no way out": [*_flags, *_layer, "--no-way-out"],
-        f"dagger, {_encoder}": _flags,  # its own layer
+        f"{_name}, alone": [*_flags, "--keep-distance", "0"],
+        f"{_name}, no way out": [*_flags, *_layer, "--no-way-out"],
+        _name: _flags,  # its own layer
     }
 # What stands in the first table: policy, what it knows, what its layer knows, and its cells.
 ROWS = (
@@ -72,6 +77,10 @@ ROWS = (
     ("`bc.py`", "64 numbers (PointNet++)", "points", "bc, pointnet2, alone", "bc, pointnet2"),
     ("`bc.py`", "the obstacles", "the obstacles", "bc, oracle, alone", "bc, oracle"),
     ("`dagger.py`", "points", "points", "dagger, points, alone", "dagger, points"),
+    (
+        *("`dagger.py`, mixed scenes", "points", "points"),
+        *("dagger, points, mixed scenes, alone", "dagger, points, mixed scenes"),
+    ),
     ("`dagger.py`", "the obstacles", "the obstacles", "dagger, oracle, alone", "dagger, oracle"),
 )
 # And in the second one, for every task. (`go-to-goal` is in docs/baselines.json: whatever the goal
@@ -79,6 +88,7 @@ ROWS = (
 EVERYWHERE = (
     "reactive, points",
     "dagger, points",
+    "dagger, points, mixed scenes",
     "dagger, oracle",
     "look, then plan",
 )
@@ -102,7 +112,8 @@ def keep(run):
     training = json.loads((run / "result.json").read_text())
     args = training["args"]
     encoder = args["encoder"].partition(":")[0]
-    name = f"dagger-{args['goal_type']}-{encoder}-{args['task']}-s{args['seed']}"
+    scenes = load_roadmap_paths(Path(args["paths"])).task  # that it learned from
+    name = f"dagger-{args['goal_type']}-{encoder}-{scenes}-s{args['seed']}"
     halve_network(run / "policy.pt", POLICIES / f"{name}.pt")
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
     made |= {key: training[key] for key in ("policy_step", "validation_success_rate")}

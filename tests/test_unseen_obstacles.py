@@ -5,10 +5,13 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import torch
 
 import envs
 from envs.exported_networks import load_network, save_network
+from envs.roadmap_paths import shard_bytes
+from envs.shards import shard_path
 
 ROOT = Path(__file__).resolve().parent.parent
 spec = importlib.util.spec_from_file_location(
@@ -46,7 +49,7 @@ def test_the_tables_between_the_marks_are_of_the_results(tmp_path, monkeypatch):
     assert "| 0.700, 0.400 [200: 0.670, 0.730] | not run | 0.930, 0.910 [3,000: 0.9" in row
     assert row.endswith("| 1.2 |")
     (wall,) = [line for line in text.splitlines() if line.startswith("| `wall` |")]
-    assert "0.800, 0.750 [200" in wall and wall.count("not run") == 3
+    assert "0.800, 0.750 [200" in wall and wall.count("not run") == 4
     assert all(f"| `{task}` |" in text for task in envs.TASKS)
     # Again, the same.
     unseen.main()
@@ -60,11 +63,15 @@ def test_a_runs_policy_is_kept_by_name_and_says_how_it_was_made(tmp_path, monkey
     save_network(tmp_path / "policy.pt", network, {"input": torch.zeros(1, 3)}, {"kind": "policy"})
     args = {"goal_type": "combined", "encoder": "points:32", "task": unseen.HARD, "seed": 4}
     folders = {name: str(tmp_path) for name in ("runs_dir", "paths", "resume")}
+    scene = envs.get_task("mixed_scenes").scene.sample(np.random.default_rng(0))
+    path = np.zeros((2, 7), np.float32)
+    shard = shard_bytes("mixed_scenes", 0, 0, [scene], [[path]], "a test")
+    shard_path(tmp_path, 0).write_bytes(shard)
     made = {"steps": 9, "policy_step": 6, "validation_success_rate": 0.5, "seconds": 7}
     (tmp_path / "result.json").write_text(json.dumps(made | {"args": args | folders}))
     monkeypatch.setattr(sys, "argv", ["unseen_obstacles.py", "--keep", str(tmp_path)])
     unseen.main()
-    path = tmp_path / "policies" / "dagger-combined-points-random_boxes_hard-s4.pt"
+    path = tmp_path / "policies" / "dagger-combined-points-mixed_scenes-s4.pt"
     kept = load_network(path)(torch.ones(1, 3))
     assert torch.allclose(kept, network(torch.ones(1, 3)), atol=1e-2)
     text = path.with_suffix(".json").read_text()
