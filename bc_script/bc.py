@@ -20,10 +20,9 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from envs import panda, protocol, runs
+from envs import flags, panda, protocol, runs
 from envs.datasets import MAX_STEP, DatasetError, load_demos
 from envs.demo_episodes import observed
-from envs.flags import Layers, PositiveFloat, PositiveInt, Share, Width
 from envs.tasks import task_name
 
 
@@ -39,26 +38,26 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     """what the goal is: end-effector position, configuration, or both"""
     demos: tuple[Path, ...] = ()
     """demonstration files of the task; by default the task's own"""
-    num_demos: PositiveInt | None = None
+    num_demos: flags.PositiveInt | None = None
     """only the first so many demonstrations of each file"""
 
     # The algorithm
-    total_updates: PositiveInt = 1_000_000
+    total_updates: flags.PositiveInt = 1_000_000
     """batches of the whole run (paper: 1,000,000)"""
-    batch_size: PositiveInt = 256
+    batch_size: flags.PositiveInt = 256
     """transitions per batch"""
-    learning_rate: PositiveFloat = 1e-3
+    learning_rate: flags.PositiveFloat = 1e-3
     """learning rate (Adam) at the start"""
     anneal: bool = True
     """let the learning rate fall linearly, to zero at the end"""
-    num_modes: Width = 1
+    num_modes: flags.Width = 1
     """Gaussians of the policy's mixture; the most likely one's mean is the action in evaluation"""
-    policy_average: Share = 0.001
+    policy_average: flags.Share = 0.001
     """share of the policy that moves into its running average per update; the average is what is
     evaluated and saved (1: no averaging)"""
-    hidden_size: Width = 256
+    hidden_size: flags.Width = 256
     """width of the hidden layers"""
-    num_hidden_layers: Layers = 2
+    num_hidden_layers: flags.Layers = 2
     """number of hidden layers"""
     relative_goal: bool = True
     """add goal minus end-effector position, times 5, to the network's inputs"""
@@ -73,11 +72,11 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     velocities: ClassVar[bool] = False  # demonstrations have none
 
     # Evaluation and bookkeeping
-    eval_every: PositiveInt = 50_000
+    eval_every: flags.PositiveInt = 50_000
     """updates between evaluations on validation queries; the best policy is kept"""
-    eval_queries: PositiveInt = 200
+    eval_queries: flags.PositiveInt = 200
     """validation queries per evaluation"""
-    test_queries: PositiveInt = 1_000
+    test_queries: flags.PositiveInt = 1_000
     """test queries for the best policy at the end"""
 
 

@@ -25,18 +25,9 @@ import torch.nn.functional as F
 from tqdm import tqdm
 
 from demo_generation.roadmaps import Roadmap
-from envs import panda, protocol, runs, seeing
+from envs import flags, panda, protocol, runs, seeing
 from envs.datasets import MAX_STEP, DatasetError
 from envs.demo_episodes import observed
-from envs.flags import (
-    Layers,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    Share,
-    Width,
-)
 from envs.last_layer import PATIENCE, PROGRESS, LastLayer
 from envs.queries import Query
 from envs.roadmap_paths import load_roadmap_paths
@@ -60,61 +51,61 @@ class Args(runs.RunFlags):
     """folder of roadmap paths to learn from (demo_generation.roadmaps), in whatever scenes"""
 
     # The algorithm
-    total_updates: PositiveInt = 24_000
+    total_updates: flags.PositiveInt = 24_000
     """batches of the whole run"""
-    batch_size: PositiveInt = 768
+    batch_size: flags.PositiveInt = 768
     """examples per batch"""
-    learning_rate: PositiveFloat = 1e-3
+    learning_rate: flags.PositiveFloat = 1e-3
     """learning rate (Adam) at the start"""
     anneal: bool = True
     """let the learning rate fall linearly, to zero at the end"""
-    policy_average: Share = 0.003
+    policy_average: flags.Share = 0.003
     """share of the policy that moves into its running average per update; the average is what is
     evaluated and saved (1: no averaging)"""
-    pool_size: PositiveInt = 200_000
+    pool_size: flags.PositiveInt = 200_000
     """examples at hand, of which batches are drawn"""
-    examples_per_update: PositiveInt = 256
+    examples_per_update: flags.PositiveInt = 256
     """new examples per update, all of one scene; they replace the oldest. With an eighth of a batch
     they are learned by heart (docs/training.md)"""
-    noise: NonNegativeFloat = 0.03
+    noise: flags.NonNegativeFloat = 0.03
     """standard deviation of the configurations drawn around paths (normalised, each joint)"""
-    length_weight: NonNegativeFloat = 0.1
+    length_weight: flags.NonNegativeFloat = 0.1
     """of the second loss, that of the remaining length"""
     encoder: str = "oracle"
     """what the policy sees of the scene: `oracle`, the obstacles themselves, or `points` of them
     that four sensors see; proximity is that of the same"""
-    token_size: Width = 128
+    token_size: flags.Width = 128
     """width of the layers that look at one obstacle or point each"""
-    hidden_size: Width = 384
+    hidden_size: flags.Width = 384
     """width of the residual blocks"""
-    num_blocks: Layers = 3
+    num_blocks: flags.Layers = 3
     """number of residual blocks"""
     bf16: bool | None = None
     """train with hidden products in bfloat16; by default where the hardware has it"""
     velocities: ClassVar[bool] = False  # paths have none
 
     # The last layer
-    keep_distance: NonNegativeFloat = 0.01
+    keep_distance: flags.NonNegativeFloat = 0.01
     """m, that it keeps"""
     way_out: bool = True
     """whether it leaves dead ends"""
 
     # DAgger
-    round_every: NonNegativeInt = 2_000
+    round_every: flags.NonNegativeInt = 2_000
     """updates between rounds (0: none)"""
-    round_queries: NonNegativeInt = 40
+    round_queries: flags.NonNegativeInt = 40
     """queries of a round, each in a scene of the paths"""
-    round_labels: NonNegativeInt = 16
+    round_labels: flags.NonNegativeInt = 16
     """of the states that the policy came to on a query, how many are labelled"""
-    round_weight: NonNegativeFloat = 5.0
+    round_weight: flags.NonNegativeFloat = 5.0
     """how much likelier such a state is in a batch than an example of the pool"""
 
     # Evaluation and bookkeeping
-    eval_every: PositiveInt = 4_000
+    eval_every: flags.PositiveInt = 4_000
     """updates between evaluations on validation queries; the best policy is kept"""
-    eval_queries: PositiveInt = 200
+    eval_queries: flags.PositiveInt = 200
     """validation queries per evaluation"""
-    test_queries: PositiveInt = 1_000
+    test_queries: flags.PositiveInt = 1_000
     """test queries for the best policy at the end"""
 
 

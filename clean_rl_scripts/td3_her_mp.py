@@ -19,19 +19,9 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from envs import panda, protocol, runs
+from envs import flags, panda, protocol, runs
 from envs.demo_episodes import demo_transitions, transition
 from envs.encoders import LatentTable
-from envs.flags import (
-    Environments,
-    Layers,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    Share,
-    Width,
-)
 from envs.tasks import task_name
 
 
@@ -43,58 +33,58 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     # SHARED: the task
     task: str = "no_obstacles"
     """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
-    num_envs: Environments = 4
+    num_envs: flags.Environments = 4
     """environments stepped together; every one of their steps counts"""
     # END SHARED
 
     # The algorithm
-    total_timesteps: PositiveInt = 1_000_000
+    total_timesteps: flags.PositiveInt = 1_000_000
     """environment steps of the whole run"""
-    learning_starts: NonNegativeInt = 2_000
+    learning_starts: flags.NonNegativeInt = 2_000
     """environment steps with random actions before the first update"""
-    updates_per_step: NonNegativeFloat = 0.5
+    updates_per_step: flags.NonNegativeFloat = 0.5
     """updates of the critics per environment step (CleanRL: 1)"""
-    buffer_size: PositiveInt = 1_000_000
+    buffer_size: flags.PositiveInt = 1_000_000
     """transitions in the replay buffer"""
-    batch_size: PositiveInt = 256
+    batch_size: flags.PositiveInt = 256
     """transitions per update"""
-    her_probability: Share = 0.8
+    her_probability: flags.Share = 0.8
     """share of sampled transitions whose goal is replaced by one reached later in their episode"""
-    demo_prob: Share | None = None
+    demo_prob: flags.Share | None = None
     """train on the queries of the task's demonstrations; when an episode fails, its demonstration
     enters the replay buffer with this probability (the paper's p). Without it: random queries"""
     demos: Path | None = None
     """demonstration file to use with --demo-prob; by default the task's own"""
-    gamma: Share = 0.95
+    gamma: flags.Share = 0.95
     """discount factor (CleanRL: 0.99)"""
-    tau: Share = 0.005
+    tau: flags.Share = 0.005
     """share of policy and critics that moves into the target networks, per update of the policy"""
-    policy_lr: PositiveFloat = 1e-3
+    policy_lr: flags.PositiveFloat = 1e-3
     """learning rate of the policy (Adam; CleanRL: 3e-4)"""
-    q_lr: PositiveFloat = 1e-3
+    q_lr: flags.PositiveFloat = 1e-3
     """learning rate of the critics (Adam)"""
-    exploration_noise: NonNegativeFloat = 0.35
+    exploration_noise: flags.NonNegativeFloat = 0.35
     """standard deviation of the noise on the actions in training, in units of action_scale
     (CleanRL: 0.1)"""
-    policy_noise: NonNegativeFloat = 0.2
+    policy_noise: flags.NonNegativeFloat = 0.2
     """standard deviation of the noise that smooths the critics' target, in units of action_scale"""
-    noise_clip: NonNegativeFloat = 0.5
+    noise_clip: flags.NonNegativeFloat = 0.5
     """bound of the noise that smooths the critics' target, in units of action_scale"""
-    policy_frequency: PositiveInt = 2
+    policy_frequency: flags.PositiveInt = 2
     """updates of the critics per update of the policy and of all target networks"""
-    policy_average: Share = 0.001
+    policy_average: flags.Share = 0.001
     """share of the policy that moves into its running average per update of the policy; the average
     is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
-    preactivation_penalty: NonNegativeFloat = 0.1
+    preactivation_penalty: flags.NonNegativeFloat = 0.1
     """weight of the squared inputs of the policy's tanh in its loss, which keeps it from saturating
     (Andrychowicz et al., 2017, appendix A; CleanRL: 0)"""
-    hidden_size: Width = 256
+    hidden_size: flags.Width = 256
     """width of the hidden layers of policy and critics"""
-    num_hidden_layers: Layers = 2
+    num_hidden_layers: flags.Layers = 2
     """number of hidden layers of policy and critics"""
     layer_norm: bool = True
     """LayerNorm in the critics' hidden layers (CleanRL: no)"""
-    action_scale: PositiveFloat = 0.06
+    action_scale: flags.PositiveFloat = 0.06
     """the policy's outputs are in [-action_scale, action_scale]; the MDP clips a step at max_step,
     so with the full range of 1 every step is a longest step, which overshoots the goal"""
     relative_goal: bool = True
@@ -107,13 +97,13 @@ class Args(runs.RunFlags, protocol.EnvFlags):
 
     # SHARED: flags of the evaluation
     # Evaluation and bookkeeping
-    eval_every: PositiveInt = 25_000
+    eval_every: flags.PositiveInt = 25_000
     """environment steps between evaluations on validation queries; the best policy is kept"""
-    eval_queries: PositiveInt = 200
+    eval_queries: flags.PositiveInt = 200
     """validation queries per evaluation"""
-    test_queries: PositiveInt = 1_000
+    test_queries: flags.PositiveInt = 1_000
     """test queries for the best policy at the end"""
-    stop_at_success: Share | None = None
+    stop_at_success: flags.Share | None = None
     """stop as soon as a validation success rate is this high, e.g. 0.9; by default never"""
     # END SHARED
 
@@ -330,7 +320,7 @@ def polyak_update(target_parameters, parameters, tau):
 
 # SHARED: batches
 def updates_due(step, buffer, args):
-    """NonNegativeInt of updates that fall due in the environment steps that led to `step`.
+    """Number of updates that fall due in the environment steps that led to `step`.
 
     None before `learning_starts`, and none for steps in which nothing was there to learn from:
     episodes enter the buffer when they end.
