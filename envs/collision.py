@@ -402,7 +402,7 @@ def _memory():
         np.zeros((8, 12)),
         np.empty((11, 3)),
         np.zeros(12),
-        np.empty(31),
+        np.empty(32),
         np.zeros((1, _ROW)),
     )
 
@@ -457,6 +457,21 @@ def _box_gap(bodies, k, frames, centres, points, j, pose):
     v = max(abs(pose[10]) - bodies[k, 6], 0.0)
     w = max(abs(pose[11]) - bodies[k, 7], 0.0)
     return math.sqrt(u * u + v * v + w * w)
+
+
+@compiled
+def _box_gaps(bodies, k, frames, centres, points, begin, end, gaps):
+    """Write distances (m) of points from the box around a body."""
+    f = frames[int(bodies[k, 0])]
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    cx, cy, cz = centres[k, 0], centres[k, 1], centres[k, 2]
+    half_x, half_y, half_z = bodies[k, 5], bodies[k, 6], bodies[k, 7]
+    for j in range(begin, end):
+        x, y, z = points[j, 0] - cx, points[j, 1] - cy, points[j, 2] - cz
+        u = max(abs(xx * x + yx * y + zx * z) - half_x, 0.0)
+        v = max(abs(xy * x + yy * y + zy * z) - half_y, 0.0)
+        w = max(abs(xz * x + yz * y + zz * z) - half_z, 0.0)
+        gaps[j] = math.sqrt(u * u + v * v + w * w)
 
 
 @compiled
@@ -672,14 +687,13 @@ def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
     Returns the distance and the number of points in the simplex.
     """
     x, y, z = s[28], s[29], s[30]
-    distance, bound, n = math.sqrt(x * x + y * y + z * z), _FAR, 0
+    distance, bound, n, s[31] = math.sqrt(x * x + y * y + z * z), _FAR, 0, -_FAR
     for _ in range(_MAX_ITERATIONS):
         px, py, pz, ax, ay, az = _support(vertices, cells, k, rows, j, pose, -x, -y, -z)
         lower = (px * x + py * y + pz * z) / distance
-        if lower >= far:
-            return lower, n
-        if bound - lower <= _TOLERANCE:
-            break
+        if lower >= far or bound - lower <= _TOLERANCE:
+            s[31] = lower
+            return max(lower, bound) if lower < far else lower, n
         i = 3 * n
         s[i], s[i + 1], s[i + 2], s[12 + i], s[13 + i], s[14 + i] = px, py, pz, ax, ay, az
         n = _reduce(s, n + 1)
@@ -975,6 +989,69 @@ def _write(frames, f, centres, k, s, sign, back, direction, point):
 
 
 @compiled
+def _cloud_distance(
+    bodies, vertices, cells, k, world, frames, centres, pose, s, far, polytope, gaps
+):
+    """`_signed_distance` from the nearest point of the cloud.
+
+    `gaps`: two arrays to write to, for all groups and for all points: how far (m) they are from the
+    box around the body; so they are at least that far from its hull.
+    """
+    _, points, groups, ball = world
+    of_groups, of_points = gaps
+    _box_gaps(bodies, k, frames, centres, groups, 0, groups.shape[0], of_groups)
+    middle = -1
+    for g in range(groups.shape[0]):
+        of_groups[g] -= groups[g, 3]
+        if middle < 0 or of_groups[g] < of_groups[middle]:
+            middle = g
+    # What is probably nearest goes first: it rules out the others.
+    first, least = -1, far
+    for n in range(groups.shape[0]):
+        g = middle if n == 0 else n - 1 if n <= middle else n
+        begin, end = int(groups[g, 4]), int(groups[g, 5])
+        of_points[begin] = -1.0  # not known
+        if of_groups[g] < least:
+            _box_gaps(bodies, k, frames, centres, points, begin, end, of_points)
+            for j in range(begin, end):
+                if of_points[j] < least:
+                    first, least = j, of_points[j]
+    nearest = _FAR
+    # Planes that all of the hull is behind, seen from points that were looked at: through the
+    # hull's point that is nearest to the nearest one, and of the last one that is farther away.
+    ax = ay = az = bx = by = bz = 0.0
+    a = b = -_FAR
+    x = y = z = 0.0  # the hull's point
+    for g in range(-1 if first >= 0 else groups.shape[0], groups.shape[0]):
+        begin, end = first, first + 1
+        if g >= 0:
+            begin, end = int(groups[g, 4]), int(groups[g, 5])
+            # (From inside of the box, no length is known to be a way out.)
+            if of_groups[g] + groups[g, 3] > 0.0 and of_groups[g] >= far:
+                continue
+            if of_points[begin] < 0.0:
+                _box_gaps(bodies, k, frames, centres, points, begin, end, of_points)
+        for j in range(begin, end):
+            if (g >= 0 and j == first) or (of_points[j] > 0.0 and of_points[j] >= far):
+                continue
+            _box_gap(bodies, k, frames, centres, points, j, pose)
+            u, v, w = pose[9], pose[10], pose[11]
+            if max(a - (ax * u + ay * v + az * w), b - (bx * u + by * v + bz * w)) >= far:
+                continue
+            core = _core_distance(vertices, cells, k, ball, 0, pose, s, far, polytope)
+            if core < far:
+                nearest = far = core
+                x, y, z, ax, ay, az = s[24], s[25], s[26], s[28], s[29], s[30]
+                a = ax * x + ay * y + az * z + _TOLERANCE if core > 0.0 else -_FAR
+            else:
+                norm = math.sqrt(s[28] * s[28] + s[29] * s[29] + s[30] * s[30])
+                bx, by, bz = s[28] / norm, s[29] / norm, s[30] / norm
+                b = s[31] + bx * u + by * v + bz * w
+    s[24], s[25], s[26], s[28], s[29], s[30] = x, y, z, ax, ay, az
+    return nearest
+
+
+@compiled
 def _nearest_batch(
     states,
     self_collisions,
@@ -995,6 +1072,7 @@ def _nearest_batch(
         np.empty((_EPA_FACES, 7)),
         np.empty((_EPA_FACES, 2), np.int64),
     )
+    gaps = np.empty(groups.shape[0]), np.empty(points.shape[0])
     of_arm = rows.shape[0]
     distance[:], direction[:], point[:], which[:] = within, 0.0, 0.0, of_arm + 2
     for i in range(states.shape[0]):
@@ -1016,33 +1094,14 @@ def _nearest_batch(
                 if core < far:
                     distance[i, link], which[i, link] = core - rounding, j
                     _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
-            # The points, again the one that is probably nearest first.
             rounding = ball[0, 16] + BULLET_MARGIN
-            first, least = -1, min(distance[i, link] + rounding, _FAR)
-            for g in range(groups.shape[0]):
-                if _box_gap(bodies, k, frames, centres, groups, g, pose) - groups[g, 3] < least:
-                    for j in range(int(groups[g, 4]), int(groups[g, 5])):
-                        gap = _box_gap(bodies, k, frames, centres, points, j, pose)
-                        if gap < least:
-                            first, least = j, gap
-            for g in range(-1 if first >= 0 else groups.shape[0], groups.shape[0]):
-                begin, end = first, first + 1
-                if g >= 0:
-                    begin, end = int(groups[g, 4]), int(groups[g, 5])
-                    gap = _box_gap(bodies, k, frames, centres, groups, g, pose)
-                    # (From inside of the box, no length is known to be a way out.)
-                    if gap > 0.0 and gap - groups[g, 3] >= distance[i, link] + rounding:
-                        continue
-                for j in range(begin, end):
-                    far = min(distance[i, link] + rounding, _FAR)
-                    gap = _box_gap(bodies, k, frames, centres, points, j, pose)
-                    if (g >= 0 and j == first) or (gap > 0.0 and gap >= far):
-                        continue
-                    core = _core_distance(vertices, cells, k, ball, 0, pose, s, far, polytope)
-                    if core < far:
-                        distance[i, link], which[i, link] = core - rounding, of_arm + 1
-                        there, at = direction[i, link], point[i, link]
-                        _write(frames, f, centres, k, s, 1.0, 0.0, there, at)
+            far = min(distance[i, link] + rounding, _FAR)
+            core = _cloud_distance(
+                bodies, vertices, cells, k, world, frames, centres, pose, s, far, polytope, gaps
+            )
+            if core < far:
+                distance[i, link], which[i, link] = core - rounding, of_arm + 1
+                _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
             _gradient(frames, 0, f, direction[i, link], point[i, link], gradient[i, link])
         rounding = 2 * BULLET_MARGIN
         for j in range(pairs.shape[0] if self_collisions else 0):

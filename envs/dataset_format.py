@@ -44,7 +44,7 @@ from envs.scenes import (
     scene_to_json,
     to_array,
 )
-from envs.tasks import NAMED, TASKS, get_task, is_task, task_name
+from envs.tasks import TASKS, get_task, has_name, is_task, task_name
 
 SPLITS = ("test", "validation")
 ORIGINAL = "original"  # split of queries that were not sampled; few tasks have it
@@ -138,7 +138,7 @@ class QueryScenes:
 def task_file(task, folder, suffix):
     """The path of a task's file in a folder of `envs`, or beside a scene file."""
     get_task(task)  # refuses an unknown task
-    if task in NAMED:
+    if has_name(task):
         return Path(__file__).parent / folder / f"{task}.h5"
     return Path(task).with_name(task_name(task) + suffix)
 

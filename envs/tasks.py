@@ -42,10 +42,10 @@ def get_task(task):
     Raises:
         ValueError: neither; or the scene file is malformed.
     """
-    if task in NAMED:
-        return NAMED[task]
+    if has_name(task):
+        return TASKS[task] if task in TASKS else TRAINING_SCENES[task]
     if is_task(task):
-        if task_name(task) in NAMED:
+        if has_name(task_name(task)):
             raise ValueError(f"{task}: a scene file may not have the name of a task")
         return Task(load_scene(task), f"the scene in {task}")
     raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}, or a scene file (.yaml)")
@@ -53,7 +53,12 @@ def get_task(task):
 
 def is_task(task):
     """Whether `task` is a name or looks like the path of a scene file."""
-    return task in NAMED or Path(task).suffix in SCENE_FILES
+    return has_name(task) or Path(task).suffix in SCENE_FILES
+
+
+def has_name(task):
+    """Whether `task` is one of `TASKS` or `TRAINING_SCENES`, and no scene file."""
+    return task in TASKS or task in TRAINING_SCENES
 
 
 def task_name(task):
@@ -183,4 +188,3 @@ TASKS = {
 TRAINING_SCENES = {
     "mixed_scenes": Task(MixedScenes(), "random boxes, walls with gaps, or racks of shelves")
 }
-NAMED = TASKS | TRAINING_SCENES
