@@ -15,8 +15,10 @@ between two of those until something is within 1 cm, inside or outside, uniforml
 - deepest_mm: of these, the largest distance from contact, by whichever of the two says more.
 
 Speed: uniform configurations in 40 scenes of `random_boxes_hard`, processor time of one core, in
-turns, the median of `--rounds`. PyBullet's check is what planners used before: set the joints,
-detect collisions, read the contacts; `in_collision` also clears old contacts first.
+turns, the median of `--rounds`. `proximity` is asked about one configuration, as a policy does at
+every step: of the true obstacles, and of the points that sensors see. PyBullet's check is what
+planners used before: set the joints, detect collisions, read the contacts; `in_collision` also
+clears old contacts first.
 
 The last line is JSON.
 """
@@ -38,6 +40,8 @@ import envs
 from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
+from envs.seeing import seen_checker
+from envs.wrappers import link_proximity
 
 NEAR = 0.01  # m
 SCENES = 40  # of each distribution
@@ -122,13 +126,18 @@ def speed(rounds, rng):
     checkers = [CollisionChecker(scene) for scene in scenes]
     checkers[0].is_free(np.zeros(7))  # compiles
     checkers[0].nearest(np.zeros(7))
-    seconds = {name: [] for name in ("is_free", "nearest", "pybullet", "in_collision")}
+    seeing_checkers = [seen_checker(scene) for scene in scenes]
+    link_proximity(seeing_checkers[0], np.zeros(7))
+    names = "is_free", "nearest", "proximity", "proximity, points", "pybullet", "in_collision"
+    seconds = {name: [] for name in names}
     for _ in range(rounds):
         total = dict.fromkeys(seconds, 0.0)
-        for scene, checker in zip(scenes, checkers, strict=True):
+        for scene, checker, seeing in zip(scenes, checkers, seeing_checkers, strict=True):
             states = rng.uniform(-1.0, 1.0, (ours, 7))
             total["is_free"] += timed(checker.is_free, states) / ours
             total["nearest"] += timed(checker.nearest, states[:500]) / 500
+            for name, one in (("proximity", checker), ("proximity, points", seeing)):
+                total[name] += timed(ask, partial(link_proximity, one), states[:100]) / 100
             env.set_scene(scene)
             configurations = panda.denormalise(states[:100]).tolist()
             total["pybullet"] += timed(ask, partial(pybullet_check, env), configurations) / 100
@@ -167,7 +176,7 @@ def main():
     micros = speed(args.rounds, rng)
     print()
     for name, value in micros.items():
-        print(f"{name:14}{value:10.2f} us")
+        print(f"{name:18}{value:10.2f} us")
     print()
     result = {
         "configurations": asked,
@@ -177,6 +186,8 @@ def main():
         "ratio_to_pybullet": micros["pybullet"] / micros["is_free"],
         "ratio_to_in_collision": micros["in_collision"] / micros["is_free"],
         "nearest_per_second": 1e6 / micros["nearest"],
+        "proximity_us": micros["proximity"],
+        "proximity_points_us": micros["proximity, points"],
         "python": platform.python_version(),
     }
     print(json.dumps(result))
