@@ -682,7 +682,8 @@ def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
     It may stop early: at a lower bound of the distance that is at least `far`, or at an upper bound
     that is below `near`, which it then returns. Writes to `s`: the simplex's points (3 x 4) of body
     minus core, the body's vertices they come from (3 x 4), weights (4), and at the end the vector
-    from the core to the hull (3). On entry, that is any vector to begin with. `pose` is the core's.
+    from the core to the hull (3) and how far away the hull is at least along it (or -`_FAR`). On
+    entry, the vector is any one to begin with. `pose` is the core's.
 
     Returns the distance and the number of points in the simplex.
     """
@@ -693,7 +694,7 @@ def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
         lower = (px * x + py * y + pz * z) / distance
         if lower >= far or bound - lower <= _TOLERANCE:
             s[31] = lower
-            return max(lower, bound) if lower < far else lower, n
+            return lower if lower >= far else bound, n
         i = 3 * n
         s[i], s[i + 1], s[i + 2], s[12 + i], s[13 + i], s[14 + i] = px, py, pz, ax, ay, az
         n = _reduce(s, n + 1)

@@ -13,6 +13,7 @@ from demo_generation.planning import Planner, PlanningError
 from envs import dataset_format, panda
 from envs.arm_env import RoboArmEnv
 from envs.datasets import DatasetError, load_demos, load_queries, write_queries
+from envs.encoders import MAX_OBSTACLES
 from envs.random_boxes import GRID, KEEP_CLEAR, SHOULDER
 from envs.scenes import Box, Cylinder, Scene, Sphere, from_array, to_array
 from envs.tasks import TASKS
@@ -113,7 +114,7 @@ def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
     assert mixed.sample(np.random.default_rng(3)) == mixed.sample(np.random.default_rng(3))
     drawn = [mixed.sample(np.random.default_rng([0, i])) for i in range(300)]
     assert len(set(drawn)) == 300 and not {task.scene for task in TASKS.values()} & set(drawn)
-    assert max(len(scene.obstacles) for scene in drawn) <= 32
+    assert max(len(scene.obstacles) for scene in drawn) <= MAX_OBSTACLES
     walls = racks = 0
     for scene in drawn:
         assert scene == replace(mixed.base, obstacles=scene.obstacles)

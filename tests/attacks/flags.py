@@ -113,10 +113,10 @@ def attempts(seed, folder):
             return f"traceback of {module}: {said.strip().splitlines()[-1][:120]}"
         if any(not path.name.isdigit() for path in folder.iterdir() if path != given):
             return f"{module} left something elsewhere"
+        if plain and code != 0:
+            return f"{module} does not run"
         if code == 0 or "training has diverged" in said:
             return RAN
-        if plain:
-            return f"{module} does not run"
         if any(path.name.endswith((".tmp", ".part", ".journal")) for path in made):
             return f"{module} left {sorted(path.name for path in made)}"
         return REFUSED if not made else f"{module}: late, after {sorted(p.name for p in made)[:3]}"
