@@ -94,7 +94,7 @@ def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path, short_episode
     assert len(losses) == 1 and np.isfinite(losses).all()
     assert json.loads((run / "args.json").read_text())["demos"] == [path, path]
     (run / "result.json").unlink()
-    run_here("bc", PATHS["bc"], "--resume", run)
+    run_here(PATHS["bc"], "--resume", run)
     assert (run / "result.json").exists()
 
 

@@ -37,14 +37,14 @@ def test_update_evaluation_and_resume_on_another_device(
     more = SEEING if seeing else ["--goal-type", "ee"]
     if seeing and trainer != "bc":
         more = [*more, "--demo-prob", "1"]
-    run_here(trainer, *command(trainer, tmp_path, *flags(trainer), *more)[1:])
+    run_here(*command(trainer, tmp_path, *flags(trainer), *more)[1:])
     (run,) = tmp_path.iterdir()
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     assert state["progress"]["updates"] > 0
     assert all(tensor.is_meta for tensor in state["actor"].values())
     (run / "result.json").unlink()
     longer = [] if trainer == "bc" else ["--total-timesteps", "120"]
-    run_here(trainer, PATHS[trainer], "--resume", run, *longer)
+    run_here(PATHS[trainer], "--resume", run, *longer)
     assert json.loads((run / "result.json").read_text())["steps"] == (2 if trainer == "bc" else 120)
 
 
@@ -52,7 +52,7 @@ def test_a_tensor_left_on_the_cpu_is_noticed(tmp_path, meta, monkeypatch):
     stack = envs.protocol.stack
     monkeypatch.setattr(envs.protocol, "stack", lambda observations, _: stack(observations, "cpu"))
     with pytest.raises(RuntimeError, match="device"):
-        run_here("bc", *command("bc", tmp_path, *flags("bc"))[1:])
+        run_here(*command("bc", tmp_path, *flags("bc"))[1:])
 
 
 class OneType(torch.overrides.TorchFunctionMode):
@@ -78,4 +78,4 @@ def test_no_kernel_gets_two_types(trainer, tmp_path):
     few = [flag for flag in flags(trainer) if flag not in ("--device", "meta")]
     given = command(trainer, tmp_path, *few, "--bf16", *(["True"] if trainer != "bc" else []))[1:]
     with OneType():
-        run_here(trainer, *given)
+        run_here(*given)

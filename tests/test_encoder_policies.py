@@ -99,7 +99,7 @@ def test_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
         return
     part = [*flags(trainer), "--goal-type", "combined", "--total-timesteps", "600"]
     again = run_script(trainer, tmp_path / "part", *part)
-    run_here(trainer, PATHS[trainer], "--resume", again, "--total-timesteps", "1200")
+    run_here(PATHS[trainer], "--resume", again, "--total-timesteps", "1200")
     one, other = (
         torch.load(path / "checkpoint.pt", weights_only=True)["actor"] for path in (run, again)
     )

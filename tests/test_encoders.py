@@ -4,14 +4,12 @@ import copy
 import importlib.util
 import json
 import os
-import runpy
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
 
 import h5py
 import meta_device
@@ -21,6 +19,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainers import run_here
 
 import envs
 from envs.datasets import load_demos, load_queries
@@ -63,19 +62,6 @@ def command(name, observations, folder, *flags):
     script = [sys.executable, str(FOLDER / f"{name}.py"), "--observations", str(observations)]
     tiny = [*TINY, *(TINY_CLOUDS if name == "pointnet2" else ["--picture-size", "16"])]
     return [*script, "--runs-dir", str(folder), *tiny, *flags]
-
-
-def run_here(script, *arguments):
-    """In this process: without seconds of imports. It leaves torch's settings as they were."""
-    state, threads = torch.get_rng_state(), torch.get_num_threads()
-    argv = patch.object(sys, "argv", [script, *arguments])
-    with argv, patch.object(sys, "excepthook", sys.excepthook):
-        try:
-            runpy.run_path(script, run_name="__main__")
-        finally:
-            torch.use_deterministic_algorithms(False)
-            torch.set_num_threads(threads)
-            torch.set_rng_state(state)
 
 
 @pytest.fixture(scope="module", params=SCRIPTS)

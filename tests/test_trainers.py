@@ -166,7 +166,7 @@ def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps
     flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
     if stop is not None:
         flags += ["--stop-at-success", stop]
-    run_here("sac_her_mp", *flags)
+    run_here(*flags)
     (result,) = tmp_path.glob("*/result.json")
     assert json.loads(result.read_text())["steps"] == steps
 
@@ -207,7 +207,7 @@ def test_bad_flags(tmp_path, flags, message, capsys):  # refused in a shared blo
 )
 def test_a_diverged_run_ends(name, flags, tmp_path):
     with pytest.raises(FloatingPointError, match="the policy's actions are no longer finite"):
-        run_here(name, *command(name, tmp_path, *flags)[1:])
+        run_here(*command(name, tmp_path, *flags)[1:])
     assert not list(tmp_path.glob("*/policy.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
 
 

@@ -44,26 +44,29 @@ def command(trainer, folder, *flags):
 
 def run_script(trainer, folder, *flags):
     """The folder of such a run, which is made in this process: without seconds of imports."""
-    run_here(trainer, *command(trainer, folder, *flags)[1:])
+    run_here(*command(trainer, folder, *flags)[1:])
     return next(folder.iterdir())
 
 
-def run_here(trainer, *arguments):
-    """A trainer in this process, so that what it imports can be changed first.
+def run_here(script, *arguments):
+    """A script in this process, so that what it imports can be changed first.
 
-    `arguments` are those of the command line; the first is the script.
+    It leaves torch's settings as they were.
     """
-    argv = patch.object(sys, "argv", list(map(str, arguments)))
+    state, threads = torch.get_rng_state(), torch.get_num_threads()
+    argv = patch.object(sys, "argv", [str(script), *map(str, arguments)])
     with argv, patch.object(sys, "excepthook", sys.excepthook):
         try:
-            runpy.run_path(str(PATHS[trainer]), run_name="__main__")
+            runpy.run_path(str(script), run_name="__main__")
         finally:
             torch.use_deterministic_algorithms(False)
+            torch.set_num_threads(threads)
+            torch.set_rng_state(state)
 
 
 def refusal(trainer, capsys, folder, *flags):
     """What such a run says of flags with which it ends before it has made anything."""
     with pytest.raises(SystemExit) as end:
-        run_here(trainer, *command(trainer, folder, *flags)[1:])
+        run_here(*command(trainer, folder, *flags)[1:])
     assert end.value.code not in (None, 0) and not list(folder.iterdir())
     return f"{capsys.readouterr().err}{end.value.code}"
