@@ -173,12 +173,7 @@ class CollisionChecker:
         looked at again; and it does not look at its arguments.
         """
         rule, relaxed = _rule(margin, clearance, relaxed, resolution)
-        rest = (rule, relaxed[0], _arm(), self._world)
-
-        def check(start, end):
-            return _motion(start, end, *rest)
-
-        return check
+        return functools.partial(_motion, rule, relaxed[0], _arm(), self._world)
 
     def nearest(self, states, self_collisions=True, within=math.inf):
         """How far each of `LINKS` is from the nearest thing, and which way is out: a `Nearest`.
@@ -789,7 +784,7 @@ def _free_batch(states, rule, relaxed, arm, world, free):
 
 
 @compiled
-def _motion(start, end, rule, relaxed, arm, world):
+def _motion(rule, relaxed, arm, world, start, end):
     """How many states of a motion were looked at, not counting its start; negative: not free."""
     memory, q = _memory(), np.empty(7)
     squared = 0.0
@@ -823,7 +818,7 @@ def _motion_batch(starts, stops, rule, relaxed, arm, world, checks):
         if not _is_free(starts[i], rule, near, arm, world, memory):
             checks[i] = -1
             continue
-        more = _motion(starts[i], stops[i], rule, near, arm, world)
+        more = _motion(rule, near, arm, world, starts[i], stops[i])
         checks[i] = more + 1 if more > 0 else more - 1
 
 
