@@ -28,10 +28,11 @@ from demo_generation.roadmaps import Roadmap
 from envs import flags, panda, protocol, runs, seeing
 from envs.datasets import MAX_STEP, DatasetError
 from envs.demo_episodes import observed
+from envs.encoders import scene_encoder
+from envs.exported_networks import NetworkError
 from envs.last_layer import PATIENCE, PROGRESS, LastLayer
 from envs.queries import Query
 from envs.roadmap_paths import load_roadmap_paths
-from envs.scenes import ROW
 from envs.tasks import task_name
 from envs.wrappers import link_proximity
 
@@ -72,8 +73,9 @@ class Args(runs.RunFlags):
     length_weight: flags.NonNegativeFloat = 0.1
     """of the second loss, that of the remaining length"""
     encoder: str = "oracle"
-    """what the policy sees of the scene: `oracle`, the obstacles themselves, or `points` of them
-    that four sensors see; proximity is that of the same"""
+    """what the policy sees of the scene: `oracle`, the obstacles themselves, `points` of them that
+    four sensors see, or an encoder's z_E (a name or path); proximity is that of the same, or of the
+    seen points if z_E cannot tell it"""
     token_size: flags.Width = 128
     """width of the layers that look at one obstacle or point each"""
     hidden_size: flags.Width = 384
@@ -138,14 +140,14 @@ class Block(nn.Module):
 class Actor(nn.Module):
     """Straight to the goal, and a learned direction added to that.
 
-    What is seen of the scene are tokens, obstacles or points, zeros where there is none. Each is
-    looked at together with all that is known of the arm; of what comes out, the maximum counts
-    (PointNet: Qi et al., 2017).
+    What is seen of the scene are tokens, obstacles or points, zeros where there is none, or a
+    single one, z_E. Each is looked at together with all that is known of the arm; of what comes
+    out, the maximum counts (PointNet: Qi et al., 2017).
     """
 
     def __init__(self, args):
         super().__init__()
-        self.num_numbers = 3 if args.encoder.startswith("points") else 1 + ROW  # of a token
+        self.num_numbers = scene_encoder(args.encoder).row_size  # of a token
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
@@ -212,8 +214,7 @@ class Examples:
 
     def __init__(self, paths, args, device):
         self.paths, self.args, self.device = paths, args, device
-        seen = args.encoder != "oracle"
-        self.checker_of = seeing.seen_checker if seen else seeing.true_checker
+        self.checker_of = seeing.checker_of(scene_encoder(args.encoder).proximity)
         self.with_paths = np.flatnonzero(np.diff(paths.path_offsets))  # numbers of scenes
         steps = np.linalg.norm(np.diff(paths.points, axis=0), axis=1)
         steps[paths.offsets[1:-1] - 1] = 1.0  # from the end of a path to the next one: anything
@@ -344,8 +345,10 @@ if __name__ == "__main__":
     if args.bf16 is None:
         args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
     validation, test = protocol.load_task(args)
-    if args.encoder != "oracle" and not args.encoder.startswith("points"):
-        sys.exit(f"--encoder must be `oracle` or `points`, got {args.encoder!r}")
+    try:
+        proximity = scene_encoder(args.encoder).proximity
+    except NetworkError as error:
+        sys.exit(f"--encoder: {error}")
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:
         sys.exit("--pool-size must be at least --examples-per-update")
@@ -353,7 +356,6 @@ if __name__ == "__main__":
         paths = load_roadmap_paths(args.paths)
     except DatasetError as error:
         sys.exit(f"--paths: {error}")
-    proximity = "obstacles" if args.encoder == "oracle" else "points"
     env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder, "proximity": proximity}
     eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
     last_layer = LastLayer(args.keep_distance, args.way_out)

@@ -1,4 +1,4 @@
-"""What z_E knows of a scene: how well a small network predicts from it which cells are occupied.
+"""What z_E knows of a scene: which cells are occupied, and how far links are from obstacles.
 
     python benchmarks/scene_knowledge.py                       # the packaged encoders, oracle, mean
     python benchmarks/scene_knowledge.py runs/.../encoder.pt --json knowledge.json
@@ -12,10 +12,18 @@ neither it nor an encoder has seen. Two figures, over all cells that are not alw
 - information: the share of the uncertainty that z_E removes, 1 - (cross-entropy of the
   prediction) / (cross-entropy of each cell's mean); the mean has 0, perfect knowledge 1;
 - IoU: of the cells predicted as occupied (probability over one half) and those that are.
+
+What a policy needs is how far its links are from obstacles (m, clipped to 0.4). A second network,
+as large, learns that from z_E and where the links are, at `POSES` random configurations per scene:
+
+- links: mean error in cm for links that are within 10 cm of an obstacle;
+- decoded: the same for an encoder that has a decoder, without any network: distances from the
+  points that it tells of (`envs.encoders.told_checker`).
 """
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +32,24 @@ import torch.nn as nn
 import torch.nn.functional as F
 from tqdm import tqdm
 
+from envs import panda
+from envs.collision import CollisionChecker
 from envs.datasets import load_demos, load_queries
-from envs.encoders import MAX_OBSTACLES, ORACLE, PACKAGED, scene_encoder
+from envs.encoders import (
+    MAX_OBSTACLES,
+    ORACLE,
+    TOLD_RADIUS,
+    packaged_encoders,
+    scene_encoder,
+    told_points,
+)
 from envs.scenes import ROW, to_array
+from envs.wrappers import link_proximity
 
 TASK = "random_boxes_hard"
 CELL = 0.2  # m
 LOW, HIGH = np.array([-0.8, -0.8, 0.0]), np.array([0.8, 0.8, 1.6])
+POSES, NEAR, FAR = 16, 0.1, 0.4
 SHAPE = tuple(np.round((HIGH - LOW) / CELL).astype(int))
 
 
@@ -51,6 +70,37 @@ def occupied(obstacles):
         along_box = np.abs(offset @ axes) < half + CELL / 2 * np.abs(axes).sum(0)
         cells |= along_cell.all(-1) & along_box.all(-1)
     return cells
+
+
+def link_distances(scenes, seed):
+    """At random configurations, where the links are and how far from obstacles.
+
+    Returns:
+        float32 (scenes, POSES, 63), place and two axes of each joint's frame; (scenes, POSES, 10),
+        m; and the normalised configurations (scenes, POSES, 7).
+    """
+    states = np.random.default_rng(seed).uniform(-1.0, 1.0, (len(scenes), POSES, 7))
+    distances = [
+        link_proximity(CollisionChecker(replace(scene, table=None, floor=None)), some, within=FAR)
+        for scene, some in zip(tqdm(scenes, desc="distances"), states, strict=True)
+    ]
+    return _frames(panda.denormalise(states)), np.stack(distances)[..., 0], states
+
+
+def _frames(configurations):
+    position, rotation = np.zeros((*configurations.shape[:-1], 3)), np.eye(3)
+    parts = []
+    for joint, (x, y, z, roll) in enumerate(panda.JOINT_FRAMES):
+        position = position + rotation @ np.array([x, y, z])
+        turn = np.zeros((*configurations.shape[:-1], 3, 3))
+        c, s = np.cos(configurations[..., joint]), np.sin(configurations[..., joint])
+        cr, sr = np.cos(roll), np.sin(roll)
+        turn[..., 0, 0], turn[..., 0, 1] = c, -s
+        turn[..., 1, 0], turn[..., 1, 1], turn[..., 1, 2] = cr * s, cr * c, -sr
+        turn[..., 2, 0], turn[..., 2, 1], turn[..., 2, 2] = sr * s, sr * c, cr
+        rotation = rotation @ turn
+        parts += [position, rotation[..., :, 0], rotation[..., :, 2]]
+    return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
 def _rotation(quaternion):
@@ -112,6 +162,71 @@ def probe(codes, cells, test_codes, is_set=False, seed=0, epochs=60):
     return probabilities.numpy()
 
 
+class NearestObstacle(nn.Module):
+    """The oracle's numbers and links' places -> distances, the least of those to each obstacle."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def forward(self, inputs):
+        codes, places = inputs.split((MAX_OBSTACLES * (1 + ROW), inputs.shape[1] - 384), dim=1)
+        rows = codes.unflatten(1, (MAX_OBSTACLES, 1 + ROW))
+        rows = rows[:, : int(rows[..., 0].sum(1).max())]
+        places = places.unsqueeze(1).expand(-1, rows.shape[1], -1)
+        found = self.network(torch.cat([rows, places], dim=2))
+        return (found + FAR * (1.0 - rows[..., :1])).amin(1)
+
+
+def distance_probe(codes, data, test_codes, test_data, is_set=False, seed=0, epochs=10):
+    """Train the second network; its mean error (m) on the test scenes' links within `NEAR`."""
+    torch.manual_seed(seed)
+    if not is_set:
+        mean, std = codes.mean(0), codes.std(0) + 1e-3
+        codes, test_codes = (codes - mean) / std, (test_codes - mean) / std
+    codes, test_codes, places, distances, test_places, test_distances = (
+        torch.as_tensor(x) for x in (codes, test_codes, *data[:2], *test_data[:2])
+    )
+    size = (1 + ROW if is_set else codes.shape[1]) + places.shape[2]
+    network = nn.Sequential(
+        nn.Linear(size, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(),
+        nn.Linear(256, distances.shape[2]),
+    )  # fmt: skip
+    if is_set:
+        network = NearestObstacle(network)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    updates, done = epochs * -(-len(codes) * POSES // 512), 0
+    for _ in range(epochs):
+        for rows in torch.randperm(len(codes) * POSES).split(512):
+            scene, pose = rows // POSES, rows % POSES
+            truth = distances[scene, pose]
+            predicted = network(torch.cat([codes[scene], places[scene, pose]], dim=1))
+            weights = 1.0 + 4.0 * (truth < NEAR)
+            loss = (weights * (predicted - truth).abs()).sum() / weights.sum()
+            optimizer.param_groups[0]["lr"] = 1e-3 * (1.0 - done / updates)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            done += 1
+    with torch.no_grad():
+        spread = test_codes.unsqueeze(1).expand(-1, POSES, -1)
+        inputs = torch.cat([spread, test_places], dim=2).flatten(0, 1)
+        predicted = torch.cat([network(some) for some in inputs.split(4096)])
+    error = (predicted - test_distances.flatten(0, 1)).abs()
+    return error[test_distances.flatten(0, 1) < NEAR].mean().item()
+
+
+def decoded_error(name, scenes, distances, states):
+    """Mean error (m) of distances from the points that an encoder tells of."""
+    errors = []
+    for scene, truth, some in zip(tqdm(scenes, desc="decoded"), distances, states, strict=True):
+        bare = replace(scene, table=None, floor=None)
+        told = CollisionChecker(replace(bare, obstacles=()), told_points(scene, name), TOLD_RADIUS)
+        error = np.abs(link_proximity(told, some, within=FAR)[..., 0] - truth)
+        errors.append(error[truth < NEAR])
+    return float(np.concatenate(errors).mean())
+
+
 def cross_entropy(probabilities, cells):
     """Mean over scenes and cells, in nats."""
     p = np.clip(probabilities, 1e-6, 1 - 1e-6)
@@ -145,17 +260,29 @@ def main():
     sometimes = grids[0].any(0)
     cells, test_cells = (grid[:, sometimes] for grid in grids)
     means = cells.mean(0)
+    data, test_data = link_distances(training, 0), link_distances(testing, 1)
     results = {"mean": figures(means[None].repeat(len(test_cells), 0), means, test_cells)}
-    packaged = sorted(path.stem for path in PACKAGED.glob("*.pt"))
-    for name in [ORACLE, *(args.encoders or packaged)]:
+    nothing = np.zeros((len(training), 1), np.float32), np.zeros((len(testing), 1), np.float32)
+    error = distance_probe(nothing[0], data, nothing[1], test_data)
+    results["mean"]["links_cm"] = 100 * error
+    for name in [ORACLE, *(args.encoders or packaged_encoders())]:
         encoder = scene_encoder(name)
         codes = encoder.encode_demos(demos)[: len(training)]
         test_codes = np.stack([encoder(scene) for scene in tqdm(testing, desc=name)])
-        results[name] = figures(probe(codes, cells, test_codes, name == ORACLE), means, test_cells)
+        is_set = name == ORACLE
+        results[name] = figures(probe(codes, cells, test_codes, is_set), means, test_cells)
+        error = distance_probe(codes, data, test_codes, test_data, is_set)
+        results[name]["links_cm"] = 100 * error
+        if encoder.has_decoder:
+            error = decoded_error(name, testing, *test_data[1:])
+            results[name]["decoded_cm"] = 100 * error
     print(f"{len(training)} scenes to learn from, {len(testing)} to test, {cells.shape[1]} cells,")
     print(f"{test_cells.mean():.3f} of them occupied")
     for name, result in results.items():
-        print(f"{name:40} information {result['information']:.3f}  IoU {result['iou']:.3f}")
+        line = f"{name:40} information {result['information']:.3f}  IoU {result['iou']:.3f}"
+        line += f"  links {result['links_cm']:.2f} cm"
+        decoded = result.get("decoded_cm")
+        print(line if decoded is None else f"{line}, decoded {decoded:.2f} cm")
     if args.json is not None:
         args.json.write_text(json.dumps(results, indent=1) + "\n")
 

@@ -25,11 +25,13 @@ Policies to compare a trained one with:
   is doing.
 
 The last two check collisions with the true obstacles (`envs.collision`), which a trained policy
-does not see; with `--encoder points`, with what four point clouds see of them: look, then plan.
+does not see; with `--encoder points`, with what four point clouds see of them: look, then plan;
+with the name of an encoder that has a decoder (`--encoder field`), with what its 64 numbers tell.
 
 Around any policy, `--keep-distance` puts a last layer (`envs.last_layer`): no link comes nearer to
 anything than so many metres, and the arm leaves dead ends. It knows the true obstacles, too, or
-with `--encoder points` what is seen.
+with `--encoder points` what is seen. A policy that was trained with points and distances from them
+may get those that an encoder tells of: `--encoder field`.
 
 What comes out:
 
@@ -71,6 +73,7 @@ from tqdm import tqdm
 import envs
 from envs import flags, panda, workers
 from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
+from envs.encoders import told_by
 from envs.files import check_writable, write_atomically
 from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Workers
 from envs.last_layer import LastLayer
@@ -103,9 +106,10 @@ class Args:
     """processes; each uses one core"""
     stop_on_collision: bool = False
     """end an episode at the first touch"""
-    encoder: Literal["points"] | None = None
-    """what `planner`, `via-points` and the last layer know of the scene: `points` that sensors see;
-    by default the true obstacles"""
+    encoder: str | None = None
+    """what `planner`, `via-points` and the last layer know of the scene: `points` that sensors see,
+    or an encoder with a decoder (a name or path), which then also tells a policy of points what it
+    knows; by default the true obstacles"""
     keep_distance: NonNegativeFloat | None = None
     """put a last layer around the policy that keeps this distance (m), e.g. 0.01; by default the
     one that is part of the policy, if it has one (0: none at all)"""
@@ -325,8 +329,9 @@ def evaluate(
         seed: of what is random; each query has its own generator.
         tries: random configurations that `via-points` tries per query, >= 1.
         time_limit: seconds that `planner` may search per query, > 0.
-        encoder: `points`: `planner`, `via-points` and the last layer know only what sensors see;
-            None: the true obstacles.
+        encoder: what `planner`, `via-points` and the last layer know (`envs.seeing.checker_of`):
+            `points`, or an encoder's name, which tells a policy of points what it knows, too; None:
+            the true obstacles.
         last_layer: an `envs.last_layer.LastLayer` around the policy; None: the one that is part of
             it, if it has one; False: none.
         workers: processes. More than one needs the caller's script to be importable
@@ -399,6 +404,8 @@ def _prepare(
                         f"cannot be evaluated with {goal_type!r}"
                     )
                 env, goal_type = trained, trained["goal_type"]
+                if encoder not in (None, "points") and env.get("proximity") == "points":
+                    env |= {"encoder": told_by(encoder, env["encoder"]), "proximity": encoder}
         env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
         if last_layer is None:
             last_layer = own_layer(policy)

@@ -15,11 +15,11 @@ def make(task, encoder=None, proximity=None, **kwargs):
 
     Args:
         task: name of a task (`TASKS`), or path of a scene file (docs/your_own_scene.md).
-        encoder: what is appended to `observation` about the scene: path of an encoder's network,
-            `oracle` or `points` (`envs.encoders`); None for nothing.
+        encoder: what is appended to `observation` about the scene: name or path of an encoder's
+            network, `oracle` or `points` (`envs.encoders`); None for nothing.
         proximity: add `proximity` to observations, how far each link is from the nearest thing
-            (`envs.wrappers.ProximityWrapper`): of the true `obstacles`, or of the `points` that
-            four sensors saw of them; None for nothing.
+            (`envs.wrappers.ProximityWrapper`): of the true `obstacles`, of the `points` that four
+            sensors saw of them, or what z_E of an encoder tells; None for nothing.
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:
@@ -29,8 +29,6 @@ def make(task, encoder=None, proximity=None, **kwargs):
     for name, value in (("task", task), ("encoder", encoder), ("proximity", proximity)):
         if not isinstance(value, (str, Path)) and (value is not None or name == "task"):
             raise ValueError(f"{name} must be a name or a path, got {value!r}")
-    if proximity not in (None, "obstacles", "points"):
-        raise ValueError(f"proximity must be None, 'obstacles' or 'points', got {proximity!r}")
     env = RoboArmEnv(get_task(task).scene, **kwargs)
     # What takes long to import is imported only where it is needed.
     if encoder is not None:
@@ -39,11 +37,10 @@ def make(task, encoder=None, proximity=None, **kwargs):
 
         env = SceneEncodingWrapper(env, scene_encoder(encoder))
     if proximity is not None:
-        from envs import seeing
+        from envs.seeing import checker_of
         from envs.wrappers import ProximityWrapper
 
-        checker_of = seeing.seen_checker if proximity == "points" else seeing.true_checker
-        env = ProximityWrapper(env, checker_of)
+        env = ProximityWrapper(env, checker_of(proximity))
     return env
 
 

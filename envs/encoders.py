@@ -4,6 +4,7 @@
     encoder = SceneEncoder("runs/.../encoder.pt")     # trained by a script of scene_embedding_train
     encoder = SceneEncoder("oracle")                  # the obstacles themselves
     encoder = SceneEncoder("points")                  # points of them that four sensors see
+    encoder = SceneEncoder("points:32:field")         # points that z_E of the encoder `field` tells
     env = SceneEncodingWrapper(envs.make("random_boxes_hard"), encoder)
 
 Paper: sections 5.1 and 5.3. `SceneEncodingWrapper` is in `envs.wrappers`.
@@ -16,12 +17,14 @@ import io
 import re
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
+from envs.collision import CollisionChecker
 from envs.exported_networks import NetworkError, load_network
 from envs.files import write_atomically
 from envs.observations import sensors_from_json
@@ -34,9 +37,14 @@ NUM_POINTS = 64
 """Of `points`; `points:32` has 32."""
 # Only data are found there: `envs` imports no trainer.
 PACKAGED = Path(importlib.resources.files("scene_embedding_train") / "encoders")
+# The end of a decoder's name, beside its encoder's.
+DECODER = ".decoder.pt"
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
-CACHED_SCENES = 500
+CACHED_SCENES, CACHED_CHECKERS = 500, 64
+TOLD_CELL, TOLD_REACH, TOLD_RADIUS = 0.025, 0.015, 0.0  # m
+# The grid: wherever the arm can be, above the table.
+TOLD_LOW, TOLD_HIGH = (-0.9, -0.9, 0.0), (0.9, 0.9, 1.5)
 
 
 def oracle(scene):
@@ -54,12 +62,34 @@ def oracle(scene):
     return rows.ravel()
 
 
-def points(scene, number=NUM_POINTS):
+def points(scene, number=NUM_POINTS, encoder=None):
     """Points of a scene's obstacles that four sensors see, as far apart as can be: (number * 3,).
 
-    float32, m, in the base's frame, see `envs.seeing.farthest_points`.
+    float32, m, in the base's frame, see `envs.seeing.farthest_points`. With the name of an encoder,
+    those that it tells of.
     """
-    return farthest_points(seen_points(scene), number).ravel()
+    there = seen_points(scene) if encoder is None else told_points(scene, encoder)
+    return farthest_points(there, number).ravel()
+
+
+def told_by(encoder, name):
+    """The name of the points that an encoder tells of, as many as in `points` or `points:N`."""
+    return f"{POINTS}:{name.partition(':')[2] or NUM_POINTS}:{encoder}"
+
+
+def told_points(scene, name):
+    """Points of a scene's obstacles as an encoder with a decoder tells them: float32 (n, 3), m.
+
+    Of a grid of `TOLD_CELL` those that the decoder says are nearer than `TOLD_REACH` to an
+    obstacle. They come from z_E alone, and are remembered with it.
+    """
+    return scene_encoder(name).told_points(scene)
+
+
+@functools.lru_cache(CACHED_CHECKERS)
+def told_checker(scene, name):
+    """A `CollisionChecker` of table, floor, and what z_E tells of a `Scene`'s obstacles."""
+    return CollisionChecker(replace(scene, obstacles=()), told_points(scene, name), TOLD_RADIUS)
 
 
 def _read_latents(path, key):
@@ -69,6 +99,11 @@ def _read_latents(path, key):
             return file["codes"] if file["key"] == key else None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
+
+
+def packaged_encoders():
+    """Names of the encoders in `PACKAGED`."""
+    return sorted(path.stem for path in PACKAGED.glob("*.pt") if not path.match(f"*{DECODER}"))
 
 
 @functools.lru_cache
@@ -88,6 +123,7 @@ class SceneEncoder:
         name: as given, a string.
         path: of the network; None for `oracle` and `points`.
         size: of z_E.
+        row_size: numbers of it that belong together: those of one obstacle or point, or all.
 
     Raises:
         NetworkError: the file cannot be used.
@@ -95,13 +131,16 @@ class SceneEncoder:
 
     def __init__(self, name):
         self.name = str(name)
-        self.path = self._world = None
+        self.path = self._world = self._told_by = None
         self._of_demos = {}  # scene -> z_E
         if self.name == ORACLE:
-            self._encode, self.size = oracle, MAX_OBSTACLES * (1 + ROW)
-        elif match := re.fullmatch(rf"{POINTS}(:[1-9]\d{{0,3}})?", self.name):
-            number = int(match[1][1:]) if match[1] else NUM_POINTS
-            self._encode, self.size = functools.partial(points, number=number), 3 * number
+            self._encode, self.size, self.row_size = oracle, MAX_OBSTACLES * (1 + ROW), 1 + ROW
+        elif match := re.fullmatch(rf"{POINTS}(?::([1-9]\d{{0,3}})(?::(.+))?)?", self.name):
+            number, self._told_by = int(match[1] or NUM_POINTS), match[2]
+            if self._told_by is not None:
+                scene_encoder(self._told_by).decoder  # noqa: B018 (or it raises)
+            self._encode = functools.partial(points, number=number, encoder=self._told_by)
+            self.size, self.row_size = 3 * number, 3
         else:
             packaged = PACKAGED / f"{name}.pt"
             self.path = packaged if packaged.exists() else Path(name)
@@ -114,7 +153,7 @@ class SceneEncoder:
                 raise NetworkError(f"{name}: its sensors make no sense: {error!r}") from error
             self._world = SensorWorld()
             self._encode = lambda scene: self.encode(self.look(scene))
-            self.size = len(self(self._world.scene))
+            self.size = self.row_size = len(self(self._world.scene))
 
     @functools.cached_property
     def _cached(self):
@@ -141,7 +180,7 @@ class SceneEncoder:
             return np.stack([self(scene) for scene in bar])
 
         if self.path is None:
-            if self.name.startswith(POINTS):
+            if self.name.startswith(POINTS) and self._told_by is None:
                 for scene in tqdm(
                     seen, f"looking at {demos.task}", unit="scene", mininterval=quiet
                 ):
@@ -176,6 +215,50 @@ class SceneEncoder:
         """z_E, float32 (size,), of what `look` returned. Raises NetworkError: it is none."""
         return self._network.row(seen)
 
+    @property
+    def proximity(self):
+        """Distances for `envs.make(proximity=...)` that know what z_E knows.
+
+        Where z_E cannot tell of distances, those from the `points` that four sensors see.
+        """
+        if self.name == ORACLE:
+            return "obstacles"
+        return self.name if self.has_decoder else self._told_by or "points"
+
+    @property
+    def has_decoder(self):
+        """Whether it can tell how far obstacles are."""
+        return self.path is not None and self.path.with_suffix(DECODER).exists()
+
+    @functools.cached_property
+    def decoder(self):
+        """The network from z_E and points to distances from obstacles (m), beside the encoder's.
+
+        Raises NetworkError: there is none.
+        """
+        if not self.has_decoder:
+            raise NetworkError(f"{self.name} has no decoder: it cannot tell how far obstacles are")
+        return load_network(self.path.with_suffix(DECODER))
+
+    @functools.cached_property
+    def _told(self):
+        return functools.lru_cache(CACHED_SCENES)(self._tell)
+
+    def told_points(self, scene):
+        """See `told_points`."""
+        return self._told(scene)
+
+    def _tell(self, scene):
+        z = torch.from_numpy(self(scene))[None]
+        coarse = 3 * TOLD_CELL
+        at = _grid(coarse)
+        # What is nearer than half a coarse cell's diagonal may have something in it.
+        near = self.decoder(z, at)[0] < TOLD_REACH + coarse * 3**0.5 / 2
+        steps = torch.arange(-1, 2) * TOLD_CELL
+        around = torch.cartesian_prod(steps, steps, steps)
+        fine = (at[0, near].unsqueeze(1) + around).flatten(0, 1)
+        return fine[self.decoder(z, fine[None])[0] < TOLD_REACH].numpy()
+
     def close(self):
         """Close the world it looks into."""
         if self._world is not None:
@@ -201,3 +284,10 @@ class LatentTable:
             self._latents = np.concatenate([self._latents, np.zeros_like(self._latents)])
         self._latents[row] = latent
         return row
+
+
+@functools.cache
+def _grid(cell):
+    """The middles of cells between `TOLD_LOW` and `TOLD_HIGH`: float32 (1, n, 3), m."""
+    axes = [torch.arange(a + cell / 2, b, cell) for a, b in zip(TOLD_LOW, TOLD_HIGH, strict=True)]
+    return torch.cartesian_prod(*axes)[None]

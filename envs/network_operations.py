@@ -31,6 +31,7 @@ _CONSTANTS = {str(one).removeprefix("torch."): one for one in (*DTYPES, *_FORMAT
 
 _ELEMENTWISE = (
     *("relu", "leaky_relu", "elu", "gelu", "silu", "softplus", "sigmoid", "tanh", "sin", "cos"),
+    "atan2",
     *("exp", "log", "sqrt", "rsqrt", "abs", "neg", "floor", "clamp", "minimum", "maximum"),
     *("logical_not", "logical_and", "bitwise_not", "alias", "clone", "_to_copy"),
 )

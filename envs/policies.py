@@ -122,8 +122,8 @@ def make_policy(
         seed: of what is random; each query has its own generator.
         tries: random configurations that `via-points` tries per query.
         time_limit: seconds that `planner` may search per query.
-        encoder: `points`: `via-points` and `planner` know only what sensors see
-            (`envs.seeing`); None: the true obstacles.
+        encoder: what `via-points` and `planner` know (`envs.seeing.checker_of`): `points` that
+            sensors see, or an encoder's name; None: the true obstacles.
         last_layer: an `envs.last_layer.LastLayer` around the policy; None: the one that is part of
             a trained policy, if it has one; False: none. With one, the environment must have
             `proximity`.
@@ -177,11 +177,12 @@ def _random(rng):
 
 
 def _checker_of(encoder):
-    from envs import seeing  # here, because Numba takes a while to import
+    from envs.seeing import checker_of  # here, because Numba takes a while to import
 
-    if encoder not in (None, "points"):
-        raise PolicyError(f"a planner knows the true obstacles or `points`, not {encoder!r}")
-    return seeing.seen_checker if encoder == "points" else seeing.true_checker
+    try:
+        return checker_of(encoder or "obstacles")
+    except ValueError as error:
+        raise PolicyError(f"what a planner knows: {error}") from error
 
 
 def _via_points(seed, tries, checker_of):

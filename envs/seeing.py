@@ -79,3 +79,23 @@ def farthest_points(points, number):
         distance = np.minimum(distance, np.linalg.norm(points - row, axis=1))
         nearest = distance
     return chosen
+
+
+def checker_of(source):
+    """What is known of scenes: a function from a `Scene` to a `CollisionChecker`.
+
+    Args:
+        source: `obstacles`, the true ones; `points`, what four sensors see of them; or the name or
+            path of an encoder with a decoder, which tells of them in z_E (`envs.encoders`).
+
+    Raises:
+        ValueError: it is none of these.
+    """
+    if source == "obstacles":
+        return true_checker
+    if source == "points":
+        return seen_checker
+    from envs import encoders  # here, because PyTorch takes a while to import
+
+    encoders.scene_encoder(source).decoder  # noqa: B018 (or it raises)
+    return functools.partial(encoders.told_checker, name=source)

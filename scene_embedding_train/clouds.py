@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from envs.sensors import NOTHING, PointCloud, deproject
+from envs.sensors import NOTHING, OBSTACLE, PointCloud, deproject
 from scene_embedding_train.training_data import unpacked
 
 TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
@@ -52,6 +52,46 @@ def load_clouds(observations, num_points):
     arrays = {"points": (np.float32, (*shape, 3)), "labels": (np.uint8, shape)}
     arrays["depths"] = (np.uint16, (len(sensors), samples.pop()))
     return Clouds(sensors, **unpacked(observations, f"clouds_{num_points}", arrays, shards))
+
+
+def load_obstacle_points(observations, num_points):
+    """What the sensors saw of obstacles: `points` and `there`, arrays that are mapped into memory.
+
+    `points`: float32 (scenes, sensors * num_points, 3), m, evenly spaced among a sensor's points on
+    obstacles; `there`: bool (scenes, sensors * num_points), false where a sensor saw none.
+    """
+    sensors = [k for k, one in observations.sensors.items() if isinstance(one, PointCloud)]
+    if not sensors:
+        sys.exit(f"--observations: {observations.folder}: no clouds (collect with --sensors)")
+
+    def rows(shard):
+        seen = [whole_clouds(observations, shard, name) for name in sensors]
+        points, there = on_obstacles(seen, num_points)
+        return {"points": points.numpy(), "there": there.numpy()}
+
+    count = len(sensors) * num_points
+    arrays = {"points": (np.float32, (count, 3)), "there": (np.bool_, (count,))}
+    shards = (rows(shard) for shard in range(len(observations.offsets) - 1))
+    found = unpacked(observations, f"obstacle_points_{num_points}", arrays, shards)
+    return sensors, found["points"], found["there"]
+
+
+def on_obstacles(clouds, num_points):
+    """Of each cloud `num_points` points on obstacles, evenly spaced among those that there are.
+
+    Args:
+        clouds: list of a sensor's points (n, p, 3), m, and labels (n, p).
+
+    Returns:
+        Points (n, sensors * num_points, 3), and where there are any: bool (n, sensors *
+        num_points).
+    """
+    all_points, all_there = [], []
+    for points, labels in clouds:
+        chosen = thin_out(labels == OBSTACLE, num_points)
+        all_points.append(gather(points, chosen))
+        all_there.append(gather(labels.unsqueeze(2), chosen).squeeze(2) == OBSTACLE)
+    return torch.cat(all_points, dim=1), torch.cat(all_there, dim=1)
 
 
 def thinned_clouds(observations, shard, names, num_points):

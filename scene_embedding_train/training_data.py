@@ -13,6 +13,7 @@ from tqdm import tqdm
 from envs.datasets import DatasetError
 from envs.files import new_contents
 from envs.observations import Observations, shard_path
+from envs.scenes import ROW, to_array
 
 
 def open_observations(folder):
@@ -76,6 +77,17 @@ def unpacked(observations, name, arrays, shards):
             for array in whole.values():
                 array.flush()
     return {one: np.load(path, mmap_mode="r") for one, path in paths.items()}
+
+
+def load_obstacles(observations):
+    """The true obstacles: float32 (scenes, most, 12), 1 and a row of `to_array`, zeros for none."""
+    shards = range(len(observations.offsets) - 1)
+    scenes = [scene for shard in shards for scene in observations.scenes(shard)]
+    obstacles = np.zeros((len(scenes), max(len(s.obstacles) for s in scenes), 1 + ROW), np.float32)
+    for rows, scene in zip(obstacles, scenes, strict=True):
+        rows[: len(scene.obstacles), 0] = 1.0
+        rows[: len(scene.obstacles), 1:] = to_array(scene.obstacles)
+    return obstacles
 
 
 def contents_key(observations):
