@@ -1,10 +1,11 @@
 """Put trained scene encoders into the repository: program, how it was made, and a picture.
 
     pip install -c constraints.txt -e ".[bench]"
-    python benchmarks/keep_encoders.py runs/RUN ...    # of vae.py, vqvae.py, pointnet2.py
+    python benchmarks/keep_encoders.py runs/RUN ...    # of vae.py, vqvae.py, pointnet2.py, field.py
 
-Of each finished run, `encoder.pt` becomes `scene_embedding_train/encoders/<exp_name>.pt`, which is
-what `--encoder <exp_name>` finds; the JSON beside it has data, updates, figures on validation
+Of each finished run, `encoder.pt` becomes `scene_embedding_train/encoders/<exp_name>.pt`, in half
+precision, which is what `--encoder <exp_name>` finds, and its decoder, if there is one,
+`<exp_name>.decoder.pt`; the JSON beside it has data, updates, figures on validation
 scenes and flags; `docs/pictures/encoder_<exp_name>.png` is TensorBoard's picture of a validation
 scene at the update whose encoder was kept.
 """
@@ -13,7 +14,6 @@ import argparse
 import datetime
 import io
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -21,7 +21,8 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from envs.datasets import attribute
-from envs.encoders import PACKAGED
+from envs.encoders import DECODER, PACKAGED
+from envs.exported_networks import halve_network
 from envs.files import write_atomically
 from envs.observations import open_shard, shard_path
 
@@ -51,7 +52,9 @@ def keep(run, encoders, pictures):
         result["observations"] = attribute(shard, "made_by")
     result["args"] = {key: value for key, value in trained["args"].items() if key not in PATHS}
     encoders.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(run / "encoder.pt", encoders / f"{name}.pt")
+    halve_network(run / "encoder.pt", encoders / f"{name}.pt")
+    if (run / f"encoder{DECODER}").exists():
+        halve_network(run / f"encoder{DECODER}", encoders / f"{name}{DECODER}")
     write_atomically(encoders / f"{name}.json", (json.dumps(result, indent=1) + "\n").encode())
     picture(run, trained["best_update"]).save(pictures / f"encoder_{name}.png", optimize=True)
     return result

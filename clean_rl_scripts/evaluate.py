@@ -414,7 +414,7 @@ def _prepare(
             if encoder not in (None, own):
                 raise EvaluationError(f"{policy} is told its distances from {own}, not {encoder}")
             env["proximity"] = own
-        elif encoder is not None and policy not in PLANNING:
+        elif encoder not in (None, env.get("proximity")) and policy not in PLANNING:
             raise EvaluationError(
                 "encoder is for via-points, planner and a last layer: a trained policy has its own"
             )

@@ -265,14 +265,14 @@ def distances(obstacles, points):
 def queries(obstacles, number, spread):
     """Points to ask about (n, number, 3), m: the first half around obstacles, the others anywhere.
 
-    Those around obstacles are somewhere in one of them (in the box around a cylinder or sphere),
-    whichever, and a random way of standard deviation `spread` from there.
+    Those around obstacles are somewhere in one of them (in the box around a cylinder, or around the
+    middle half of a sphere), and a random way of standard deviation `spread` from there.
     """
     n, half, device = len(obstacles), number // 2, obstacles.device
     which = (torch.rand(n, half, device=device) * obstacles[..., 0].sum(1, keepdim=True)).long()
     chosen = obstacles.gather(1, which.unsqueeze(2).expand(-1, -1, obstacles.shape[2]))
     _, kind, place, turn, size = chosen.split((1, 1, 3, 4, 3), dim=2)
-    size = torch.where(kind == 0.0, size, 2.0 * size)
+    size = torch.where(kind == 0.0, size, size * size.new_tensor([2.0, 2.0, 1.0]))  # radii
     near = place + rotated(size * (torch.rand_like(size) - 0.5), turn)
     near = near + spread * torch.randn_like(near)
     low, high = obstacles.new_tensor([[-REACH, -REACH, 0.0], [REACH, REACH, HEIGHT]])
@@ -336,22 +336,22 @@ def evaluate(model, data, asked, rows, args, device):
 
     Returns:
         A dict: `error_near` of what is within `NEAR` of an obstacle, and `error_5cm`, `error_10cm`,
-        `error_20cm`, `error_40cm` by distance, up to there; NaN where there is no such point.
+        `error_20cm`, `error_40cm` by distance, up to there (0 where there is none).
     """
-    errors, truths = [], []
+    spans = {"near": (-1.0, NEAR), "5cm": (-1.0, 0.05), "10cm": (0.05, 0.1)}
+    spans |= {"20cm": (0.1, 0.2), "40cm": (0.2, 0.4)}
+    sums, counts = dict.fromkeys(spans, 0.0), dict.fromkeys(spans, 0)
     for first in range(0, len(rows), args.batch_size):
         some = slice(first, first + args.batch_size)
         *seen, obstacles = batch_of(data, rows[some], args, device)
         points = asked[some].to(device)
-        truths.append(distances(obstacles, points).cpu())
+        truth = distances(obstacles, points)
         predicted = model.decoder(model.encode(*seen), points).clamp(DEEPEST, FARTHEST)
-        errors.append((predicted.cpu() - truths[-1]).abs())
-    error, truth = torch.cat(errors), torch.cat(truths)
-    result = {"error_near": error[truth < NEAR].mean().item()}
-    for low, high in ((-1.0, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.4)):
-        of_these = error[(truth > low) & (truth <= high)]
-        result[f"error_{100 * high:.0f}cm"] = of_these.mean().item()
-    return result
+        for name, (low, high) in spans.items():
+            these = (truth > low) & (truth <= high)
+            sums[name] += ((predicted - truth).abs() * these).sum().item()
+            counts[name] += these.sum().item()
+    return {f"error_{name}": sums[name] / max(1, counts[name]) for name in spans}
 
 
 def batch_of(data, rows, args, device):
@@ -475,9 +475,9 @@ if __name__ == "__main__":
     result["seconds"] = round(progress["seconds"])
     write_json(run / "result.json", result | {"args": asdict(args)})
     # END SHARED
-    shown = "mean error {error_near:.4f} m within 10 cm of an obstacle; by distance, up to 5 cm "
-    shown += (
-        "{error_5cm:.4f}, 10 cm {error_10cm:.4f}, 20 cm {error_20cm:.4f}, 40 cm {error_40cm:.4f}"
+    shown = (
+        "mean error {error_near:.4f} m within 10 cm of an obstacle; up to 5 cm {error_5cm:.4f}, "
     )
+    shown += "10 cm {error_10cm:.4f}, 20 cm {error_20cm:.4f}, 40 cm {error_40cm:.4f}"
     print(f"{shown.format(**result)}. {run / 'result.json'}")
     writer.close()

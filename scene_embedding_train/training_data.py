@@ -80,13 +80,18 @@ def unpacked(observations, name, arrays, shards):
 
 
 def load_obstacles(observations):
-    """The true obstacles: float32 (scenes, most, 12), 1 and a row of `to_array`, zeros for none."""
+    """The true obstacles: float32 (scenes, most, 12), 1 and a row of `to_array`, zeros for none.
+
+    Quaternions have length 1.
+    """
     shards = range(len(observations.offsets) - 1)
     scenes = [scene for shard in shards for scene in observations.scenes(shard)]
     obstacles = np.zeros((len(scenes), max(len(s.obstacles) for s in scenes), 1 + ROW), np.float32)
     for rows, scene in zip(obstacles, scenes, strict=True):
         rows[: len(scene.obstacles), 0] = 1.0
         rows[: len(scene.obstacles), 1:] = to_array(scene.obstacles)
+    turns = obstacles[..., 5:9]
+    turns /= np.maximum(np.linalg.norm(turns, axis=-1, keepdims=True), 1e-9)
     return obstacles
 
 

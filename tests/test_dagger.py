@@ -51,7 +51,7 @@ def folder(tmp_path_factory):
     return write_paths(tmp_path_factory.mktemp("paths"), scenes, [paths[0], [], paths[2]])
 
 
-@pytest.fixture(scope="module", params=["oracle", "points"])
+@pytest.fixture(scope="module", params=["oracle", "points", "vqvae"])
 def some(request, folder):
     """An untrained policy, its environment, and a batch of examples in two scenes."""
     env = envs.make(HARD, goal_type="combined", encoder=request.param, proximity="obstacles")
@@ -149,7 +149,7 @@ def test_an_update(some):
 
 def test_the_action_before_it_has_learned_is_straight_to_the_goal(some):
     _, _, batch = some
-    args = dagger.Args(encoder="oracle" if some[0].num_numbers == 12 else "points")
+    args = dagger.Args(encoder={12: "oracle", 3: "points", 64: "vqvae"}[some[0].num_numbers])
     inputs = inputs_of(batch)
     to_goal = inputs["desired_goal"][:, :7] - inputs["observation"][:, :7]
     near = to_goal / to_goal.norm(dim=1, keepdim=True).clamp(min=0.03) * 0.03
@@ -275,7 +275,7 @@ def test_nothing_of_a_run_needs_the_cpu(tmp_path, folder, short_episodes):
     [
         (["--paths", "nowhere"], "--paths: nowhere"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
-        (["--encoder", "vae"], "--encoder must be `oracle` or `points`, got 'vae'"),
+        (["--encoder", "lidar"], "--encoder: lidar: cannot be read"),
         (["--batch-size", "0"], "--batch-size must be at least 1"),
         (["--pool-size", "5"], "--pool-size must be at least --examples-per-update"),
     ],

@@ -14,6 +14,7 @@ from pathlib import Path
 import h5py
 import meta_device
 import numpy as np
+import pybullet as p
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
@@ -23,20 +24,22 @@ from trainers import run_here
 
 import envs
 from envs.datasets import load_demos, load_queries
-from envs.encoders import MAX_OBSTACLES, PACKAGED, SceneEncoder, oracle
+from envs.encoders import MAX_OBSTACLES, PACKAGED, SceneEncoder, oracle, packaged_encoders
 from envs.exported_networks import NetworkError, load_network, save_network
 from envs.observations import Observations
-from envs.scenes import Scene, Sphere, from_array
+from envs.scenes import Box, Cylinder, Scene, Sphere, from_array
 from envs.sensors import OBSTACLE, PointCloud
 from envs.wrappers import SceneEncodingWrapper
 from scene_embedding_train import clouds, collect, pictures
+from scene_embedding_train.training_data import load_obstacles
 
 FOLDER = Path(__file__).parents[1] / "scene_embedding_train"
-SCRIPTS = ("vae", "vqvae", "pointnet2")
+SCRIPTS = ("vae", "vqvae", "pointnet2", "field")
+OF_CLOUDS = ("pointnet2", "field")
 TINY = ["--total-updates", "8", "--eval-every", "4", "--eval-scenes", "6", "--batch-size", "8"]
 TINY += ["--width", "4", "--validation-share", "0.3"]
-TINY_CLOUDS = ["--num-points", "64", "--num-centres", "8", "4", "--num-neighbours", "4"]
-TINY_CLOUDS += ["--num-queries", "50"]
+TINY_CLOUDS = ["--num-points", "64", "--num-queries", "50"]
+TINY_POINTNET = ["--num-centres", "8", "4", "--num-neighbours", "4"]
 
 
 def load(name):
@@ -47,7 +50,7 @@ def load(name):
     return module
 
 
-vae, vqvae, pointnet2 = (load(name) for name in SCRIPTS)
+vae, vqvae, pointnet2, field = (load(name) for name in SCRIPTS)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +63,8 @@ def observations(tmp_path_factory):
 
 def command(name, observations, folder, *flags):
     script = [sys.executable, str(FOLDER / f"{name}.py"), "--observations", str(observations)]
-    tiny = [*TINY, *(TINY_CLOUDS if name == "pointnet2" else ["--picture-size", "16"])]
+    tiny = [*TINY, *(TINY_CLOUDS if name in OF_CLOUDS else ["--picture-size", "16"])]
+    tiny += TINY_POINTNET if name == "pointnet2" else []
     return [*script, "--runs-dir", str(folder), *tiny, *flags]
 
 
@@ -215,6 +219,134 @@ def test_one_update_of_pointnet2():
     check_step(model, before, expected, args.learning_rate)
 
 
+OBSTACLES = (
+    Box((0.3, 0.2, 0.5), (0.2, 0.1, 0.3), (0.5, 0.5, -0.1, 0.7)),
+    Cylinder((-0.3, 0.2, 0.6), 0.1, 0.3, (0.1, -0.7, 0.1, 0.7)),
+    Sphere((0.0, -0.4, 0.3), 0.12),
+)
+
+
+def test_distances_are_pybullets():
+    client = p.connect(p.DIRECT)
+    tip = p.createCollisionShape(p.GEOM_SPHERE, radius=1e-4, physicsClientId=client)
+    tip = p.createMultiBody(0, tip, physicsClientId=client)
+    box, cylinder, sphere = OBSTACLES
+    half = [edge / 2 for edge in box.size]
+    size = {"radius": cylinder.radius, "height": cylinder.length}
+    shapes = [
+        p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client),
+        p.createCollisionShape(p.GEOM_CYLINDER, **size, physicsClientId=client),
+        p.createCollisionShape(p.GEOM_SPHERE, radius=sphere.radius, physicsClientId=client),
+    ]
+    turns = [box.orientation, cylinder.orientation, (0.0, 0.0, 0.0, 1.0)]
+    bodies = [
+        p.createMultiBody(0, shape, -1, obstacle.position, turn, physicsClientId=client)
+        for obstacle, shape, turn in zip(OBSTACLES, shapes, turns, strict=True)
+    ]
+    points = np.random.default_rng(0).uniform([-0.6, -0.6, 0.0], [0.6, 0.6, 1.0], (2_000, 3))
+    expected = []
+    for point in points:
+        p.resetBasePositionAndOrientation(tip, point, (0, 0, 0, 1), physicsClientId=client)
+        found = (p.getClosestPoints(tip, body, 0.5, physicsClientId=client) for body in bodies)
+        expected.append(min((one[8] + 1e-4 for some in found for one in some), default=0.5))
+    p.disconnect(client)
+    rows = oracle(Scene(OBSTACLES)).reshape(1, MAX_OBSTACLES, 12)
+    points = torch.tensor(points[None], dtype=torch.float32)
+    found = field.distances(torch.from_numpy(rows), points)[0].numpy()
+    assert (found < 0.0).sum() > 20 and (found == field.FARTHEST).sum() > 20
+    # (Bullet's boxes and cylinders have rounded edges, and its depths are those of GJK and EPA.)
+    np.testing.assert_allclose(found, np.clip(expected, -0.05, 0.4), atol=1.5e-3)
+
+
+def test_points_are_asked_about_around_all_obstacles_alike():
+    torch.manual_seed(0)
+    rows = torch.zeros(2, MAX_OBSTACLES, 12)
+    rows[0] = torch.from_numpy(oracle(Scene(OBSTACLES)).reshape(MAX_OBSTACLES, 12))
+    asked = field.queries(rows, 6_000, 1e-3)  # (the second scene is empty)
+    assert asked.shape == (2, 6_000, 3) and asked.isfinite().all()
+    anywhere = asked[:, 3_000:]
+    low, high = torch.tensor([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.5]])
+    assert ((anywhere >= low) & (anywhere <= high)).all()
+    assert (anywhere.mean((0, 1)) - (low + high) / 2).abs().max() < 0.05
+    alone = [rows[:1, i : i + 1] for i in range(3)]
+    near = torch.stack([field.distances(one, asked[:1, :3_000]) for one in alone])
+    # That much of the box around the cylinder, or around half of the sphere, is inside of them.
+    shares = (near < 0.003).float().mean((1, 2)) * 3
+    np.testing.assert_allclose(shares, [1.0, np.pi / 4, np.pi / 4 * 11 / 12], atol=0.06)
+
+
+def test_turned_scenes_keep_their_distances_from_points():
+    torch.manual_seed(0)
+    places, others = torch.randn(5, 7, 3), torch.randn(5, 9, 3)
+    turned, turned_others = field.turned(places, others)
+    torch.testing.assert_close(torch.cdist(turned, turned_others), torch.cdist(places, others))
+    torch.testing.assert_close(turned[..., 2], places[..., 2])
+    assert (turned - places).abs().amax((1, 2)).min() > 0.01
+    edges = turned[:, 1:4, :2] - turned[:, :1, :2]
+    before = places[:, 1:4, :2] - places[:, :1, :2]
+    signs = torch.linalg.det(edges[:, :2]) / torch.linalg.det(before[:, :2])
+    assert set(signs.round().tolist()) == {-1.0, 1.0}  # some are mirrored
+
+
+def test_cells_around_the_axis():
+    """A point is in the cells whose middles it is between, all around the circle."""
+    angle = torch.tensor([0.0, 1.0, 3.14, -3.14, -2.0])
+    points = torch.stack([0.4 * angle.cos(), 0.4 * angle.sin(), torch.full((5,), 0.3)], dim=1)
+    angles, radii, heights = field.cylindrical(points)
+    for cells in (angles, radii, heights):
+        torch.testing.assert_close(cells.sum(1), torch.ones(5))
+    middles = (np.arange(field.ANGLES) + 0.5) / field.ANGLES * 2 * np.pi - np.pi
+    found = (angles.numpy() * np.exp(1j * middles)).sum(1)
+    np.testing.assert_allclose(np.angle(found * np.exp(-1j * angle.numpy())), 0.0, atol=1e-3)
+    radius = (radii @ ((torch.arange(field.RADII) + 0.5) / field.RADII * field.REACH)).numpy()
+    np.testing.assert_allclose(radius, 0.4, atol=1e-6)
+
+
+def test_sectors_that_turn_give_parts_of_the_latent_that_turn():
+    torch.manual_seed(0)
+    args = field.Args(width=8, latent_size=16)
+    model, eighth = field.Field(4, args).eval(), 2 * np.pi / field.SECTORS
+    points, there = torch.rand(3, 20, 3) - 0.5, torch.rand(3, 20) < 0.8
+    c, s = np.cos(eighth), np.sin(eighth)
+    turn = torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32)
+    z, turned = model.encode(points, there), model.encode(points @ turn, there)
+    expected = z.unflatten(1, (field.SECTORS, -1)).roll(1, 1).flatten(1)
+    torch.testing.assert_close(turned, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        model.decoder(turned, points @ turn), model.decoder(z, points), rtol=1e-4, atol=1e-5
+    )
+    nowhere = model.encode(points + ~there.unsqueeze(2) * 0.3, there)
+    torch.testing.assert_close(nowhere, z)  # what is not there is not seen
+
+
+def test_one_update_of_the_field():
+    torch.manual_seed(0)
+    args = field.Args(width=8, learning_rate=0.01, num_queries=30, latent_noise=0.1)
+    model = field.Field(4, args)
+    before, rows = copy.deepcopy(model), oracle(Scene(OBSTACLES)).reshape(1, MAX_OBSTACLES, 12)
+    obstacles = torch.from_numpy(rows).expand(3, -1, -1)
+    points, there = torch.rand(3, 20, 3) - 0.5, torch.rand(3, 20) < 0.8
+    torch.manual_seed(1)
+    losses = one_update(field, model, (points, there), args, obstacles)
+    torch.manual_seed(1)
+    asked = field.queries(obstacles, 30, args.spread)
+    truth = field.distances(obstacles, asked)
+    turned, turned_asked = field.turned(points, asked)
+    z = before.encode(turned, there)
+    errors = (before.decoder(z + 0.1 * torch.randn_like(z), turned_asked) - truth).abs()
+    total = weight = near = count = 0.0
+    for error, distance in zip(errors.flatten(), truth.flatten().tolist(), strict=True):
+        is_near = distance < 0.1
+        total, weight = (
+            total + (5.0 if is_near else 1.0) * error,
+            weight + (5.0 if is_near else 1.0),
+        )
+        near, count = near + is_near * error, count + is_near
+    torch.testing.assert_close(losses["loss"], total / weight)
+    torch.testing.assert_close(losses["near"], near / count)
+    check_step(model, before, total / weight, args.learning_rate)
+
+
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_an_encoder_learns_something_tiny(name, observations):
     """On the scenes that it is trained on, its error falls to a part of what it was."""
@@ -229,6 +361,16 @@ def test_an_encoder_learns_something_tiny(name, observations):
         def error():
             found = pointnet2.evaluate(model, data, rows, 20, "cpu")
             return 1 - (found["iou_obstacle"] + found["absent"]) / 2
+
+    elif name == "field":
+        module, args = field, field.Args(width=64, num_points=32)
+        model = field.Field(4, args)
+        data = [*clouds.load_obstacle_points(read, 32)[1:], load_obstacles(read)]
+        *batch, obstacles = field.batch_of(data, rows, args, "cpu")
+        inputs, asked = (obstacles,), field.queries(obstacles, 400, 0.05)
+
+        def error():
+            return field.evaluate(model, data, asked, rows, args, "cpu")["error_20cm"]
 
     else:
         module, kind = (vae, vae.VAE) if name == "vae" else (vqvae, vqvae.VQVAE)
@@ -245,7 +387,7 @@ def test_an_encoder_learns_something_tiny(name, observations):
     before = error()
     for _ in range(150):
         module.update(model, optimizer, batch, *inputs, args)
-    assert error() < 0.4 * before
+    assert error() < 0.5 * before
 
 
 @pytest.mark.parametrize(("size", "halvings"), [(224, 5), (64, 4), (112, 4), (16, 2), (8, 1)])
@@ -430,7 +572,7 @@ def test_farthest_point_sampling_against_a_loop():
     for row, cloud in zip(found.tolist(), points, strict=True):
         expected = [0]
         while len(expected) < 12:
-            nearest = [min(float((p - cloud[i]).norm()) for i in expected) for p in cloud]
+            nearest = [min(float((point - cloud[i]).norm()) for i in expected) for point in cloud]
             expected.append(int(np.argmax(nearest)))
         assert row == expected
 
@@ -441,7 +583,7 @@ def test_ball_query_against_a_loop():
     found = pointnet2.ball_query(points, centres, 0.3, 6)
     for cloud, middles, rows in zip(points, centres, found.tolist(), strict=True):
         for middle, row in zip(middles, rows, strict=True):
-            distances = [float((p - middle).norm()) for p in cloud]
+            distances = [float((point - middle).norm()) for point in cloud]
             order = np.argsort(distances)
             inside = [int(i) for i in order if distances[i] <= 0.3][:6]
             assert row == inside + [int(order[0])] * (6 - len(inside))
@@ -515,6 +657,7 @@ def test_shared_blocks_have_not_drifted_apart():
     assert shared_blocks("vqvae") == blocks and len(blocks) == 7
     of_clouds = shared_blocks("pointnet2")
     assert len(of_clouds) == 4 and all(blocks[name] == of_clouds[name] for name in of_clouds)
+    assert shared_blocks("field") == of_clouds
 
 
 def test_a_run_leaves_an_encoder_a_result_and_events(run):
@@ -529,6 +672,9 @@ def test_a_run_leaves_an_encoder_a_result_and_events(run):
     if name == "pointnet2":
         figures = {"accuracy", "iou_robot", "iou_static", "iou_obstacle", "absent"}
         assert (image.width, image.height) == (2 * 160, 160)
+    elif name == "field":
+        figures = {"error_near", "error_5cm", "error_10cm", "error_20cm", "error_40cm"}
+        assert (image.width, image.height) == (3 * 96, 2 * 96)
     else:
         figures = {"error", "error_foreground", "mean_image_error", "mean_image_error_foreground"}
         assert (image.width, image.height) == (4 * 16, 2 * 16)
@@ -544,8 +690,10 @@ def test_a_run_is_kept_with_its_figures_and_picture(run, tmp_path):
     command = [sys.executable, str(script), str(folder), *where]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    kept = (tmp_path / f"{name}.pt").read_bytes()
-    assert kept == (folder / "encoder.pt").read_bytes()
+    for ending in ("", ".decoder") if name == "field" else ("",):
+        kept, whole = tmp_path / f"{name}{ending}.pt", folder / f"encoder{ending}.pt"
+        assert kept.stat().st_size < whole.stat().st_size
+        assert load_network(kept).metadata == load_network(whole).metadata
     assert Image.open(tmp_path / f"encoder_{name}.png").height > 0
     text = (tmp_path / f"{name}.json").read_text()
     result = json.loads(text)
@@ -560,7 +708,7 @@ def test_the_saved_encoder_needs_no_script(run, observations):
     encoder = load_network(folder / "encoder.pt")
     assert encoder.metadata["kind"] == "encoder"
     read = Observations(observations)
-    if name == "pointnet2":
+    if name in OF_CLOUDS:
         inputs = {}
         for sensor in read.sensors:
             if isinstance(read.sensors[sensor], PointCloud):
@@ -626,7 +774,7 @@ def test_a_diverged_run_ends(name, observations, tmp_path):
     flags = ("--learning-rate", "1e30", "--total-updates", "3", "--eval-every", "3")
     with pytest.raises(FloatingPointError, match="are no longer finite"):
         run_here(*command(name, observations, tmp_path, *flags)[1:])
-    assert not list(tmp_path.glob("*/encoder.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
+    assert not list(tmp_path.glob("*/encoder*.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
 
 
 # --- In an environment
@@ -697,12 +845,11 @@ def test_a_trained_encoder_in_an_environment(run, observations):
 
 
 def test_packaged_encoders_are_found_by_name():
-    networks = sorted(PACKAGED.glob("*.pt"))
-    assert [path.stem for path in networks] == sorted(SCRIPTS)
-    assert sum(path.stat().st_size for path in PACKAGED.glob("*.[pj]*")) < 6e6
+    assert packaged_encoders() == sorted(SCRIPTS)
+    assert sum(path.stat().st_size for path in PACKAGED.glob("*.[pj]*")) < 7e6
     queries = load_queries("random_boxes_hard")
-    for path in networks:
-        encoder = SceneEncoder(path.stem)
+    for name in SCRIPTS:
+        encoder, path = SceneEncoder(name), PACKAGED / f"{name}.pt"
         codes = np.stack([encoder(queries.scenes[i]) for i in (0, 9_999)])
         assert codes.shape == (2, 64) and np.isfinite(codes).all()
         assert np.abs(codes[0] - codes[1]).max() > 0.1  # it sees the difference
@@ -710,6 +857,8 @@ def test_packaged_encoders_are_found_by_name():
         assert result["scenes"] >= 19_000
         if path.stem == "pointnet2":
             assert result["iou_obstacle"] >= 0.8
+        elif path.stem == "field":
+            assert result["error_near"] <= 0.01
         else:
             assert result["error_foreground"] < result["mean_image_error_foreground"] / 3
         encoder.close()

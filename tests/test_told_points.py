@@ -1,0 +1,131 @@
+"""What an encoder with a decoder tells of obstacles: points, distances, policies that use them."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import envs
+from clean_rl_scripts.evaluate import EvaluationError, evaluate
+from envs.collision import CollisionChecker
+from envs.encoders import (
+    TOLD_CELL,
+    TOLD_HIGH,
+    TOLD_LOW,
+    TOLD_RADIUS,
+    TOLD_REACH,
+    SceneEncoder,
+    told_by,
+    told_checker,
+    told_points,
+)
+from envs.exported_networks import NetworkError, save_network
+from envs.observations import sensors_to_json
+from envs.scenes import Box, Scene
+from envs.seeing import checker_of, seen_checker, true_checker
+from envs.sensors import PointCloud, cardinal
+
+BALL = (0.45, 0.1, 0.6, 0.15)  # what the encoder tells of, whatever the scene: place and radius, m
+POLICY = "dagger-combined-points-random_boxes_hard-s1"
+
+
+class AlwaysTheSame(torch.nn.Module):
+    def forward(self, front_points):
+        return torch.tensor(BALL) + 0.0 * front_points[:, 0, :1]
+
+
+class DistanceFromTheBall(torch.nn.Module):
+    def forward(self, latent, points):
+        offset = points - latent[:, None, :3]
+        return offset.square().sum(2).sqrt() - latent[:, 3:]
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory):
+    """An encoder's path, with a decoder beside it."""
+    path = tmp_path_factory.mktemp("told") / "encoder.pt"
+    sensors = {"front": cardinal(PointCloud, num_samples=100)["front"]}
+    metadata = {"kind": "encoder", "sensors": sensors_to_json(sensors)}
+    save_network(path, AlwaysTheSame(), {"front_points": torch.zeros(2, 100, 3)}, metadata)
+    inputs = {"latent": torch.rand(2, 4), "points": torch.rand(2, 5, 3)}
+    save_network(path.with_suffix(".decoder.pt"), DistanceFromTheBall(), inputs, {"kind": "field"})
+    return str(path)
+
+
+def test_points_are_those_of_the_grid_where_something_is_said_to_be(encoder):
+    points = told_points(Scene(), encoder)
+    axes = [
+        np.arange(low + TOLD_CELL / 2, high, TOLD_CELL)
+        for low, high in zip(TOLD_LOW, TOLD_HIGH, strict=True)
+    ]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    there = np.linalg.norm(grid - BALL[:3], axis=1) - BALL[3] < TOLD_REACH
+    assert points.dtype == np.float32 and there.sum() > 500
+    expected = {tuple(row) for row in np.round(grid[there], 4).tolist()}
+    assert {tuple(row) for row in np.round(points.astype(float), 4).tolist()} == expected
+    assert len(points) == len(expected)
+
+
+def test_distances_are_those_of_what_is_told(encoder):
+    told = checker_of(encoder)(Scene())
+    states = np.random.default_rng(0).uniform(-1, 1, (200, 7))
+    points = told_points(Scene(), encoder)
+    expected = CollisionChecker(Scene(), points, TOLD_RADIUS).nearest(states).distance
+    np.testing.assert_array_equal(told.nearest(states).distance, expected)
+    assert checker_of(encoder)(Scene()) is told  # made once
+    assert checker_of("obstacles") is true_checker and checker_of("points") is seen_checker
+    # The true obstacles count for nothing.
+    boxed = Scene((Box((0.0, 0.5, 0.4), (0.3, 0.3, 0.3)),))
+    np.testing.assert_array_equal(told_checker(boxed, encoder).nearest(states).distance, expected)
+
+
+def test_in_an_environment(encoder):
+    env = envs.make(
+        "random_boxes_hard", goal_type="combined", encoder=f"points:8:{encoder}", proximity=encoder
+    )
+    observation, _ = env.reset(seed=1)
+    assert env.encoder.size == 24 and env.encoder.row_size == 3
+    assert env.encoder.proximity == encoder
+    told = observation["observation"][10:].reshape(8, 3)
+    away = np.linalg.norm(told - BALL[:3], axis=1)
+    assert (away < BALL[3] + TOLD_REACH + 1e-4).all() and away.max() > BALL[3] - TOLD_CELL
+    distances = told_checker(env.scene, encoder).nearest(
+        observation["observation"][:7], self_collisions=False
+    )
+    np.testing.assert_allclose(
+        observation["proximity"][:, 0], distances.distance.clip(max=0.3), atol=1e-5
+    )
+    env.close()
+
+
+def test_what_encoders_can_tell():
+    assert SceneEncoder("oracle").proximity == "obstacles"
+    assert SceneEncoder("points:5").proximity == SceneEncoder("vae").proximity == "points"
+    assert told_by("field", "points") == "points:64:field"
+    assert told_by("field", "points:32") == "points:32:field"
+    for name in ("points:8:vae", "points:8:oracle"):
+        with pytest.raises(NetworkError, match="has no decoder: it cannot tell how far"):
+            SceneEncoder(name)
+    with pytest.raises(ValueError, match="vae has no decoder"):
+        envs.make("wall", proximity="vae")
+    with pytest.raises(ValueError, match="nowhere: cannot be read"):
+        checker_of("nowhere")
+
+
+def test_a_policy_of_points_knows_only_what_is_told(encoder, tmp_path):
+    options = dict(split="validation", num_queries=2)
+    seen = evaluate(POLICY, "random_boxes_hard", **options)
+    told = evaluate(POLICY, "random_boxes_hard", encoder=encoder, **options)
+    assert told["env"]["encoder"] == f"points:32:{encoder}" and told["env"]["proximity"] == encoder
+    assert told["last_layer"] == seen["last_layer"] and told["encoder"] == encoder
+    assert told["mean_steps"] != seen["mean_steps"]
+    alone = evaluate(POLICY, "wall", encoder=encoder, last_layer=False, **options)
+    assert alone["env"]["proximity"] == encoder and alone["last_layer"] is None
+    planned = evaluate("planner", "random_boxes_hard", encoder=encoder, **options)
+    assert json.loads(json.dumps(planned))["encoder"] == encoder
+    for policy in ("bc-ee-double_walls-s1", "go-to-goal"):
+        with pytest.raises(EvaluationError, match="encoder is for via-points, planner"):
+            evaluate(policy, "double_walls", encoder=encoder, **options)
+    with pytest.raises(EvaluationError, match="vae has no decoder"):
+        evaluate(POLICY, "random_boxes_hard", encoder="vae", **options)
