@@ -67,8 +67,9 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     """train with hidden layers in bfloat16 (first layer, head and weights stay in float32)"""
     encoder: str | None = None
     """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
-    `vqvae`, `pointnet2`, or the path of your own `encoder.pt`, docs/sensors.md), `points` of what
-    sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default nothing"""
+    `vqvae`, `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `points`
+    of what sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default
+    nothing"""
     velocities: ClassVar[bool] = False  # demonstrations have none
 
     # Evaluation and bookkeeping

@@ -43,6 +43,7 @@ CELLS = {
     "reactive, obstacles, no way out": [*STRAIGHT, *OBSTACLES, "--no-way-out"],
     "reactive, obstacles": [*STRAIGHT, *OBSTACLES],
     "look, then plan": [*PLANNER, "--encoder", "points"],
+    "look, then plan, field": [*PLANNER, "--encoder", "field"],
     "RRT-Connect": PLANNER,
 }
 for _encoder, _layer in (
@@ -57,12 +58,13 @@ for _encoder, _layer in (
         f"bc, {_encoder}, no way out": [*_flags, *_layer, "--no-way-out"],
         f"bc, {_encoder}": [*_flags, *_layer],
     }
-for _name, _policy, _layer in (
-    ("dagger, points", f"points-{HARD}", POINTS[:2]),
-    ("dagger, points, mixed scenes", "points-mixed_scenes", POINTS[:2]),
-    ("dagger, oracle", f"oracle-{HARD}", OBSTACLES),
+for _name, _policy, _layer, _encoder in (
+    ("dagger, points", f"points-{HARD}", POINTS[:2], []),
+    ("dagger, field", f"points-{HARD}", POINTS[:2], ["--encoder", "field"]),
+    ("dagger, points, mixed scenes", "points-mixed_scenes", POINTS[:2], []),
+    ("dagger, oracle", f"oracle-{HARD}", OBSTACLES, []),
 ):
-    _flags = ["--policy", f"dagger-combined-{_policy}-s1"]
+    _flags = ["--policy", f"dagger-combined-{_policy}-s1", *_encoder]
     CELLS |= {
         f"{_name}, alone": [*_flags, "--keep-distance", "0"],
         f"{_name}, no way out": [*_flags, *_layer, "--no-way-out"],
@@ -76,6 +78,10 @@ ROWS = (
     ("`bc.py`", "64 numbers (VQ-VAE)", "points", "bc, vqvae, alone", "bc, vqvae"),
     ("`bc.py`", "64 numbers (PointNet++)", "points", "bc, pointnet2, alone", "bc, pointnet2"),
     ("`bc.py`", "the obstacles", "the obstacles", "bc, oracle, alone", "bc, oracle"),
+    (
+        *("`dagger.py`", "64 numbers (field)", "64 numbers (field)"),
+        *("dagger, field, alone", "dagger, field"),
+    ),
     ("`dagger.py`", "points", "points", "dagger, points, alone", "dagger, points"),
     (
         *("`dagger.py`, mixed scenes", "points", "points"),
@@ -86,6 +92,7 @@ ROWS = (
 # And in the second one, for every task.
 EVERYWHERE = (
     "reactive, points",
+    "dagger, field",
     "dagger, points",
     "dagger, points, mixed scenes",
     "dagger, oracle",
@@ -174,6 +181,7 @@ def tables(results, baselines):
         taken = f"{hard[layered]['ms_per_action']:.1f}" if layered in hard else "not run"
         lines.append("| " + " | ".join([policy, knows, layer_knows, *cells, taken]) + " |")
     for policy, knows, name in (
+        ("look, then plan", "64 numbers (field)", "look, then plan, field"),
         ("look, then plan", "points", "look, then plan"),
         ("RRT-Connect", "the obstacles", "RRT-Connect"),
     ):

@@ -46,8 +46,9 @@ class EnvFlags:
     """joint velocities in the observation"""
     encoder: str | None = None
     """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
-    `vqvae`, `pointnet2`, or the path of your own `encoder.pt`, docs/sensors.md), `points` of what
-    sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default nothing"""
+    `vqvae`, `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `points`
+    of what sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default
+    nothing"""
 
 
 def env_arguments_of(args):

@@ -725,6 +725,20 @@ def test_the_saved_encoder_needs_no_script(run, observations):
     assert together.std(0).max() > 0
 
 
+def test_a_field_of_pictures(observations, tmp_path):
+    flags = ["--sees", "images", "--picture-size", "16", "--latent-size", "16"]
+    run_here(*command("field", observations, tmp_path, *flags)[1:])
+    (folder,) = tmp_path.iterdir()
+    encoder = SceneEncoder(folder / "encoder.pt")
+    assert set(encoder.sensors) == {"front", "left", "back", "right"} and encoder.size == 16
+    scene = Observations(observations).scenes(0)[0]
+    at = torch.rand(1, 7, 3)
+    assert encoder.decoder(torch.from_numpy(encoder(scene))[None], at).shape == (1, 7)
+    encoder.close()
+    with pytest.raises(SystemExit, match="--latent-size must be a multiple of 8, got 12"):
+        run_here(*command("field", observations, tmp_path, "--latent-size", "12")[1:])
+
+
 def test_killed_and_resumed_is_bit_identical_to_uninterrupted(run, observations, tmp_path):
     name, finished = run
     process = subprocess.Popen(

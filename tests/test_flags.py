@@ -8,7 +8,7 @@ from trainers import PATHS, ROOT, load
 
 from envs import runs
 
-ENCODERS = ("vae", "vqvae", "pointnet2")
+ENCODERS = ("vae", "vqvae", "pointnet2", "field")
 PATHS |= {name: ROOT / "scene_embedding_train" / f"{name}.py" for name in ENCODERS}
 REINFORCEMENT = ("sac_her_mp", "td3_her_mp")
 POLICIES = (*REINFORCEMENT, "bc", "dagger")
@@ -50,6 +50,8 @@ CASES = [
     ("vae", "--kl-weight", "-1"),
     ("pointnet2", "--num-centres", "32 0"),
     ("pointnet2", "--radii", "nan 0.4"),
+    ("field", "--spread", "0"),
+    ("field", "--latent-noise", "-1"),
 ]
 
 

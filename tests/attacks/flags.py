@@ -53,6 +53,8 @@ TINY = {
     "scene_embedding_train.pointnet2": "--observations observations --total-updates 2"
     " --eval-every 2 --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs"
     " --num-points 16 --num-centres 8 4 --num-neighbours 4",
+    "scene_embedding_train.field": "--observations observations --total-updates 2 --eval-every 2"
+    " --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs --num-points 16",
     "clean_rl_scripts.evaluate": "--policy go-to-goal --task wall --num-queries 1 --json a.json",
     "demo_generation.collect": "--task wall --num 1 --workers 1 --output demos.h5",
     "demo_generation.make_queries": "--task mine.yaml --num-test 2 --num-validation 1 --workers 1"
