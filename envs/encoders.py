@@ -41,7 +41,7 @@ PACKAGED = Path(importlib.resources.files("scene_embedding_train") / "encoders")
 DECODER = ".decoder.pt"
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
-CACHED_SCENES, CACHED_CHECKERS = 500, 64
+CACHED_SCENES, CACHED_TOLD, CACHED_CHECKERS = 500, 1_000, 64
 TOLD_CELL, TOLD_REACH, TOLD_RADIUS = 0.025, 0.015, 0.0  # m
 # The grid: wherever the arm can be, above the table.
 TOLD_LOW, TOLD_HIGH = (-0.9, -0.9, 0.0), (0.9, 0.9, 1.5)
@@ -77,13 +77,22 @@ def told_by(encoder, name):
     return f"{POINTS}:{name.partition(':')[2] or NUM_POINTS}:{encoder}"
 
 
+@functools.lru_cache(CACHED_TOLD)
 def told_points(scene, name):
     """Points of a scene's obstacles as an encoder with a decoder tells them: float32 (n, 3), m.
 
     Of a grid of `TOLD_CELL` those that the decoder says are nearer than `TOLD_REACH` to an
-    obstacle. They come from z_E alone, and are remembered with it.
+    obstacle. They come from z_E alone. The last scenes are remembered.
+
+    Raises NetworkError: there is no decoder, or it cannot be used.
     """
-    return scene_encoder(name).told_points(scene)
+    encoder, coarse = scene_encoder(name), 3 * TOLD_CELL
+    middles = _grid(coarse)
+    # Where it may be that near somewhere in a coarse cell, all 27 of its cells are asked about.
+    near = encoder.distances(scene, middles) < TOLD_REACH + coarse * 3**0.5 / 2
+    around = TOLD_CELL * (np.stack(np.indices((3, 3, 3)), axis=-1).reshape(-1, 3) - 1)
+    points = (middles[near][:, None] + around.astype(np.float32)).reshape(-1, 3)
+    return points[encoder.distances(scene, points) < TOLD_REACH] if len(points) else points
 
 
 @functools.lru_cache(CACHED_CHECKERS)
@@ -240,24 +249,14 @@ class SceneEncoder:
             raise NetworkError(f"{self.name} has no decoder: it cannot tell how far obstacles are")
         return load_network(self.path.with_suffix(DECODER))
 
-    @functools.cached_property
-    def _told(self):
-        return functools.lru_cache(CACHED_SCENES)(self._tell)
+    def distances(self, scene, points):
+        """How far points (n, 3), m, are from the nearest obstacle as z_E tells: float32 (n,), m.
 
-    def told_points(self, scene):
-        """See `told_points`."""
-        return self._told(scene)
-
-    def _tell(self, scene):
-        z = torch.from_numpy(self(scene))[None]
-        coarse = 3 * TOLD_CELL
-        at = _grid(coarse)
-        # What is nearer than half a coarse cell's diagonal may have something in it.
-        near = self.decoder(z, at)[0] < TOLD_REACH + coarse * 3**0.5 / 2
-        steps = torch.arange(-1, 2) * TOLD_CELL
-        around = torch.cartesian_prod(steps, steps, steps)
-        fine = (at[0, near].unsqueeze(1) + around).flatten(0, 1)
-        return fine[self.decoder(z, fine[None])[0] < TOLD_REACH].numpy()
+        Raises NetworkError: there is no decoder, or it cannot be used.
+        """
+        inputs = {"latent": self(scene), "points": np.float32(points)}
+        inputs = {name: torch.from_numpy(array)[None] for name, array in inputs.items()}
+        return self.decoder.row(inputs, len(points))
 
     def close(self):
         """Close the world it looks into."""
@@ -288,6 +287,6 @@ class LatentTable:
 
 @functools.cache
 def _grid(cell):
-    """The middles of cells between `TOLD_LOW` and `TOLD_HIGH`: float32 (1, n, 3), m."""
-    axes = [torch.arange(a + cell / 2, b, cell) for a, b in zip(TOLD_LOW, TOLD_HIGH, strict=True)]
-    return torch.cartesian_prod(*axes)[None]
+    """The middles of cells between `TOLD_LOW` and `TOLD_HIGH`: float32 (n, 3), m."""
+    axes = [np.arange(a + cell / 2, b, cell) for a, b in zip(TOLD_LOW, TOLD_HIGH, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)

@@ -1,6 +1,7 @@
 """What an encoder with a decoder tells of obstacles: points, distances, policies that use them."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,6 +79,43 @@ def test_distances_are_those_of_what_is_told(encoder):
     # The true obstacles count for nothing.
     boxed = Scene((Box((0.0, 0.5, 0.4), (0.3, 0.3, 0.3)),))
     np.testing.assert_array_equal(told_checker(boxed, encoder).nearest(states).distance, expected)
+
+
+class NotANumber(DistanceFromTheBall):
+    def forward(self, latent, points):
+        return super().forward(latent, points) * float("nan")
+
+
+class OneNumber(DistanceFromTheBall):
+    def forward(self, latent, points):
+        return super().forward(latent, points)[:, :1]
+
+
+@pytest.mark.parametrize("decoder", [NotANumber, OneNumber])
+def test_what_tells_nothing_is_refused(decoder, encoder, tmp_path):
+    """It must not be taken for a scene without obstacles."""
+    path = tmp_path / "encoder.pt"
+    path.write_bytes(Path(encoder).read_bytes())
+    inputs = {"latent": torch.rand(2, 4), "points": torch.rand(2, 5, 3)}
+    save_network(path.with_suffix(".decoder.pt"), decoder(), inputs, {"kind": "field"})
+    with pytest.raises(NetworkError, match=r"encoder.decoder.pt: its output is not"):
+        told_points(Scene(), str(path))
+
+
+def test_nothing_may_be_there(tmp_path, encoder):
+    path = tmp_path / "encoder.pt"
+    path.write_bytes(Path(encoder).read_bytes())
+    inputs = {"latent": torch.rand(2, 4), "points": torch.rand(2, 5, 3)}
+    save_network(path.with_suffix(".decoder.pt"), FarAway(), inputs, {"kind": "field"})
+    assert told_points(Scene(), str(path)).shape == (0, 3)
+    states = np.random.default_rng(0).uniform(-1, 1, (50, 7))
+    one, other = (check(Scene(())) for check in (checker_of(str(path)), true_checker))
+    np.testing.assert_array_equal(one.is_free(states), other.is_free(states))
+
+
+class FarAway(DistanceFromTheBall):
+    def forward(self, latent, points):
+        return 5.0 + super().forward(latent, points)
 
 
 def test_in_an_environment(encoder):
