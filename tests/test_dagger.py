@@ -158,7 +158,9 @@ def test_the_action_before_it_has_learned_is_straight_to_the_goal(some):
 
 
 def test_tokens_have_no_order_and_what_is_not_there_does_not_count(some):
-    actor, _, batch = some
+    actor, env, batch = some
+    if env.encoder.row_size == env.encoder.size:
+        pytest.skip("z_E is a single token")
     inputs = inputs_of(batch)
     direction, length = actor.outputs(**inputs)
     tokens = inputs["observation"][:, 10:].unflatten(1, (-1, actor.num_numbers))

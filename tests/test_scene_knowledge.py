@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import torch
 
+from envs import panda
+from envs.collision import CollisionChecker
 from envs.encoders import oracle
 from envs.scenes import Box, Scene, Sphere
 
@@ -93,6 +95,46 @@ def test_a_set_of_obstacles_is_their_union():
     logits = knowledge.AnyObstacle(Fixed())(codes[None])[0]
     one, other = torch.sigmoid(torch.tensor([[0.5, -1.0], [2.0, -0.5]]))
     torch.testing.assert_close(torch.sigmoid(logits), 1 - (1 - one) * (1 - other))
+
+
+def test_where_links_are_and_how_far_from_obstacles():
+    scenes = [Scene((Sphere((0.5, 0.0, 0.5), 0.1),)), Scene(())]
+    places, distances, states = knowledge.link_distances(scenes, 3)
+    assert places.shape == (2, knowledge.POSES, 63) and distances.shape == (2, knowledge.POSES, 10)
+    # The end-effector is 0.212 m along the last joint's axis.
+    tips = places[..., 54:57] + 0.212 * places[..., 60:63]
+    np.testing.assert_allclose(tips, panda.forward_kinematics(panda.denormalise(states)), atol=1e-5)
+    assert (distances[1] == np.float32(knowledge.FAR)).all()  # no table, no floor
+    bare = Scene(scenes[0].obstacles, table=None, floor=None)
+    expected = CollisionChecker(bare).nearest(states[0], self_collisions=False).distance
+    np.testing.assert_allclose(distances[0], np.minimum(expected, knowledge.FAR), atol=1e-6)
+
+
+def test_the_nearest_of_a_set_of_obstacles_counts():
+    class Fixed(torch.nn.Module):
+        def forward(self, rows):
+            return rows[..., 2:4] + rows[..., -1:]  # the position's x and y, and a link's place
+
+    spheres = Sphere((0.2, 0.3, 0), 0.1), Sphere((0.1, 0.35, 0), 0.1)
+    inputs = torch.as_tensor([*oracle(Scene(spheres)), 0.01])[None]
+    found = knowledge.NearestObstacle(Fixed())(inputs)[0]
+    torch.testing.assert_close(found, torch.tensor([0.11, 0.31]))
+
+
+@pytest.mark.parametrize("is_set", [False, True])
+def test_the_second_probe_finds_what_the_codes_say(is_set):
+    rng = np.random.default_rng(0)
+    middles = rng.uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 0.8], (400, 3))
+    scenes = [Scene((Sphere(tuple(middle), 0.1),)) for middle in middles.tolist()]
+    codes = middles.astype(np.float32)
+    if is_set:
+        codes = np.stack([oracle(scene) for scene in scenes])
+    data = knowledge.link_distances(scenes[:300], 0), knowledge.link_distances(scenes[300:], 1)
+    data = codes[:300], data[0], codes[300:], data[1]
+    knows = knowledge.distance_probe(*data, is_set, epochs=40)
+    nothing = np.zeros((400, 1), np.float32)
+    guesses = knowledge.distance_probe(nothing[:300], data[1], nothing[300:], data[3], epochs=40)
+    assert 0.0 < knows < 0.75 * guesses
 
 
 def test_inference_times(tmp_path):
