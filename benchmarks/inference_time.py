@@ -5,8 +5,11 @@
 
 Seconds on one core, means over the first test queries of `random_boxes_hard`: rendering what the
 sensors see, and encoding it, once per episode; one action; all actions of an episode with the
-encoding (the paper's total, without rendering). The scenes' cache is not used. Of RRT-Connect:
-finding a path, within 5 s. Nothing else should run beside it. The last line is JSON.
+encoding (the paper's total, without rendering). The scenes' cache is not used. With `--encoder`
+what points tell a policy comes from that encoder's z_E. Encoding includes thinning points, asking a
+decoder, and what distances need; an action includes distances, and a last layer. Of planning, with
+the true obstacles, with what is seen, and with what the encoder tells: finding a path, within 5 s,
+and looking before. Nothing else should run beside it. The last line is JSON.
 """
 
 import argparse
@@ -24,9 +27,9 @@ from tqdm import tqdm
 
 import envs
 from envs.datasets import load_queries
-from envs.encoders import ORACLE, SceneEncoder
-from envs.exported_networks import load_network
-from envs.policies import ENV_ARGUMENTS, policy_file
+from envs.encoders import ORACLE, scene_encoder, told_by
+from envs.policies import find_policy, make_policy
+from envs.seeing import checker_of, seen_points
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "clean_rl_scripts"))
 from evaluate import evaluate
@@ -34,29 +37,48 @@ from evaluate import evaluate
 TASK = "random_boxes_hard"
 
 
-def policy_times(policy, queries):
+def seeing_times(env, scene):
+    """`rendering` and `encoding` (s) of a scene that was not seen before."""
+    encoder, encoding = env.encoder, 0.0
+    if encoder.name == ORACLE:
+        return 0.0, 0.0
+    began = time.perf_counter()
+    if encoder.path is None and encoder.proximity == "points":
+        seen_points(scene)
+        rendering = time.perf_counter() - began
+    else:
+        network = encoder if encoder.path else scene_encoder(encoder.proximity)
+        seen = network.look(scene)
+        rendering = time.perf_counter() - began
+        network.encode(seen)
+        encoding = time.perf_counter() - began - rendering
+        network(scene)  # which it remembers, so that it does not count below
+    began = time.perf_counter()
+    encoder(scene)
+    if "proximity" in env.observation_space.spaces:
+        checker_of(encoder.proximity)(scene)
+    return rendering, encoding + time.perf_counter() - began
+
+
+def policy_times(policy, queries, encoder=None):
     """Means (s) of `rendering`, `encoding`, `action`, `total`; and `success_rate`."""
-    program = load_network(policy_file(policy))
-    trained = program.metadata["env"]
-    arguments = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
+    name, arguments = find_policy(policy)
+    if encoder is not None:
+        arguments |= {"encoder": told_by(encoder, arguments["encoder"]), "proximity": encoder}
     env = envs.make(TASK, **arguments)
-    sees = arguments.get("encoder") not in (None, ORACLE)
-    encoder = SceneEncoder(arguments["encoder"]) if sees else None
+    begin = make_policy(name, env)
     rows, actions, successes = [], 0, 0
-    for query in tqdm(queries, desc=str(policy), unit="query"):
-        rendering = encoding = acting = 0.0
-        if encoder is not None:
-            began = time.perf_counter()
-            seen = encoder.look(query.scene)
-            rendered = time.perf_counter()
-            encoder.encode(seen)
-            rendering, encoding = rendered - began, time.perf_counter() - rendered
+    for number, query in enumerate(tqdm(queries, desc=str(policy), unit="query")):
+        sees = arguments.get("encoder") is not None
+        rendering, encoding = seeing_times(env, query.scene) if sees else (0.0, 0.0)
+        act, acting = begin(number, query).act, 0.0
         observation, info = env.reset_specific(*query)
         ended = info["is_success"]
         while not ended:
             began = time.perf_counter()
-            inputs = {name: torch.from_numpy(observation[name])[None] for name in program.inputs}
-            action = program(**inputs)[0].numpy()
+            action = act(observation)
+            if "proximity" in observation:  # which the environment has computed
+                env.proximity_at(observation["observation"][:7])
             acting += time.perf_counter() - began
             actions += 1
             observation, _, terminated, truncated, info = env.step(action)
@@ -78,22 +100,31 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("policies", nargs="*", metavar="POLICY")
     parser.add_argument("--num", type=int, default=1000, help="queries (1,000, as in the paper)")
+    parser.add_argument("--encoder", help="with a decoder, e.g. field")
     parser.add_argument("--time-limit", type=float, default=5.0, help="of RRT-Connect (5 s)")
     args = parser.parse_args()
     torch.set_num_threads(1)
     queries = load_queries(TASK)
     queries = [queries[i] for i in range(min(args.num, len(queries)))]
     results = {policy: policy_times(policy, queries) for policy in args.policies}
+    for policy in args.policies:
+        knows = find_policy(policy)[1]
+        if args.encoder is not None and knows.get("proximity") == "points":
+            times = policy_times(policy, queries, args.encoder)
+            results[f"{policy}, {args.encoder}"] = times
     print(
         "| policy | rendering | encoding | an action | total | success |\n|---|---|---|---|---|---|"
     )
     for policy, result in results.items():
         numbers = " | ".join(f"{result[name]:.4f}" for name in list(result)[:4])
         print(f"| `{policy}` | {numbers} | {result['success_rate']:.3f} |", flush=True)
-    planned = evaluate("planner", TASK, num_queries=len(queries), time_limit=args.time_limit)
-    results["RRT-Connect"] = {name: planned[name] for name in ("planning_seconds", "success_rate")}
-    seconds, success = results["RRT-Connect"].values()
-    print(f"| RRT-Connect, {args.time_limit:g} s at most | | | | {seconds:.4f} | {success:.3f} |")
+    limit = {"num_queries": len(queries), "time_limit": args.time_limit}
+    for knows in (None, "points", *([args.encoder] if args.encoder else [])):
+        planned = evaluate("planner", TASK, encoder=knows, **limit)
+        name = "RRT-Connect" if knows is None else f"RRT-Connect, {knows}"
+        results[name] = {key: planned[key] for key in ("planning_seconds", "success_rate")}
+        seconds, success = results[name].values()
+        print(f"| {name}, {args.time_limit:g} s at most | | | | {seconds:.4f} | {success:.3f} |")
     print(json.dumps({"num_queries": len(queries)} | results))
 
 
