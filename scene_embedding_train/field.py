@@ -56,7 +56,7 @@ from scene_embedding_train.training_data import load_obstacles, open_observation
 REACH, HEIGHT = 1.0, 1.5
 DEEPEST, FARTHEST = -0.05, 0.4
 NEAR = 0.1  # m: the distances that matter most
-# Cells of angle, distance from the axis, and height; z_E has as many numbers for each sector.
+# Cells of angle, distance from the axis, and height; sectors, each with as much of z_E.
 ANGLES, RADII, HEIGHTS = 64, 16, 12
 SECTORS = 8
 
@@ -176,7 +176,7 @@ class SeesPictures(nn.Module):
         size, channels = args.picture_size, [3]
         self.cameras = nn.ModuleList()
         while size > 7 and size % 2 == 0:
-            channels.append(args.width // 8 * 2 ** (len(channels) - 1))
+            channels.append(max(1, args.width // 8) * 2 ** (len(channels) - 1))
             size //= 2
         for _ in range(num_cameras):
             layers = []
