@@ -44,7 +44,7 @@ from envs.scenes import (
     scene_to_json,
     to_array,
 )
-from envs.tasks import TASKS, get_task, has_name, is_task, task_name
+from envs.tasks import TRAINING_SCENES, TASKS, get_task, has_name, is_task, task_name
 
 SPLITS = ("test", "validation")
 ORIGINAL = "original"  # split of queries that were not sampled; few tasks have it
@@ -144,7 +144,12 @@ def task_file(task, folder, suffix):
 
 
 def locate(task_or_path, path_of_task):
-    """(path, task it must be for): `task_or_path` is a task, or the path of any file."""
+    """(path, task it must be for): `task_or_path` is a task, or the path of any file.
+
+    Raises DatasetError: no files are made for this task.
+    """
+    if task_or_path in TRAINING_SCENES:
+        raise DatasetError(f"{task_or_path} are to learn from: there are no queries in them")
     if is_task(task_or_path):
         return path_of_task(task_or_path), task_or_path
     return Path(task_or_path), None

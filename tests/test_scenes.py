@@ -129,7 +129,7 @@ def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
 
 
 def test_there_are_no_queries_in_mixed_scenes():
-    with pytest.raises(DatasetError, match="mixed_scenes.h5: no such file"):
+    with pytest.raises(DatasetError, match="mixed_scenes are to learn from: there are no queries"):
         load_queries("mixed_scenes")
     env = envs.make("mixed_scenes")
     env.reset(seed=0)
