@@ -44,7 +44,7 @@ from envs.scenes import (
     scene_to_json,
     to_array,
 )
-from envs.tasks import TRAINING_SCENES, TASKS, get_task, has_name, is_task, task_name
+from envs.tasks import TASKS, TRAINING_SCENES, get_task, has_name, is_task, task_name
 
 SPLITS = ("test", "validation")
 ORIGINAL = "original"  # split of queries that were not sampled; few tasks have it
