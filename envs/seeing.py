@@ -97,5 +97,9 @@ def checker_of(source):
         return seen_checker
     from envs import encoders  # here, because PyTorch takes a while to import
 
-    encoders.scene_encoder(source).decoder  # noqa: B018 (or it raises)
+    try:
+        encoders.scene_encoder(source).decoder  # noqa: B018 (or it raises)
+    except ValueError as error:
+        message = "what is known must be 'obstacles', 'points' or an encoder with a decoder"
+        raise ValueError(f"{message}: {error}") from error
     return functools.partial(encoders.told_checker, name=source)
