@@ -108,7 +108,7 @@ def test_nearest_within_a_distance_is_the_same_and_beyond_it_nothing():
 
 
 def test_unknown_proximity_is_refused():
-    with pytest.raises(ValueError, match="'points' or an encoder with a decoder: lidar: cannot be read"):
+    with pytest.raises(ValueError, match="or an encoder with a decoder: lidar: cannot be read"):
         envs.make("wall", proximity="lidar")
 
 
