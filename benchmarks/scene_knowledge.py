@@ -11,14 +11,15 @@ neither it nor an encoder has seen. Two figures, over all cells that are not alw
 
 - information: the share of the uncertainty that z_E removes, 1 - (cross-entropy of the
   prediction) / (cross-entropy of each cell's mean); the mean has 0, perfect knowledge 1;
-- IoU: of the cells predicted as occupied (probability over one half) and those that are.
+- IoU: of the cells predicted as occupied (probability over one half) and those that are. For an
+  encoder that has a decoder also of the cells in which that says that something is, without any
+  network (nearer than a distance that is chosen on training scenes).
 
 What a policy needs is how far its links are from obstacles (m, clipped to 0.4). A second network,
 as large, learns that from z_E and where the links are, at `POSES` random configurations per scene:
 
 - links: mean error in cm for links that are within 10 cm of an obstacle;
-- decoded: the same for an encoder that has a decoder, without any network: distances from the
-  points that it tells of (`envs.encoders.told_checker`).
+- decoded: the same by the points that a decoder tells of (`envs.encoders.told_checker`).
 """
 
 import argparse
@@ -39,6 +40,7 @@ from envs.encoders import (
     MAX_OBSTACLES,
     ORACLE,
     TOLD_RADIUS,
+    TOLD_REACH,
     packaged_encoders,
     scene_encoder,
     told_points,
@@ -227,6 +229,29 @@ def decoded_error(name, scenes, distances, states):
     return float(np.concatenate(errors).mean())
 
 
+def told_cells(name, scenes, reach):
+    """Cells with points that a decoder says are nearer than `reach` (m) to something: bool."""
+    cells = np.zeros((len(scenes), *SHAPE), bool)
+    for grid, scene in zip(cells, scenes, strict=True):
+        points = told_points(scene, name)
+        points = points[scene_encoder(name).distances(scene, points) < reach]
+        at = np.floor((points - LOW) / CELL).astype(int)
+        grid[tuple(at[((at >= 0) & (at < SHAPE)).all(1)].T)] = True
+    return cells.reshape(len(scenes), -1)
+
+
+def decoded_iou(name, training, cells, testing, test_cells):
+    """IoU of the cells that a decoder tells of; `cells` are bool (n, all cells)."""
+
+    def iou(guess, truth):
+        return float((guess & truth).sum() / (guess | truth).sum())
+
+    some = training[:200]
+    reaches = [-0.005, 0.0, 0.0025, 0.005, 0.0075, 0.01, TOLD_REACH]
+    best = max(reaches, key=lambda reach: iou(told_cells(name, some, reach), cells[: len(some)]))
+    return iou(told_cells(name, tqdm(testing, desc="decoded cells"), best), test_cells)
+
+
 def cross_entropy(probabilities, cells):
     """Mean over scenes and cells, in nats."""
     p = np.clip(probabilities, 1e-6, 1 - 1e-6)
@@ -274,6 +299,7 @@ def main():
         error = distance_probe(codes, data, test_codes, test_data, is_set)
         results[name]["links_cm"] = 100 * error
         if encoder.has_decoder:
+            results[name]["decoded_iou"] = decoded_iou(name, training, grids[0], testing, grids[1])
             error = decoded_error(name, testing, *test_data[1:])
             results[name]["decoded_cm"] = 100 * error
     print(f"{len(training)} scenes to learn from, {len(testing)} to test, {cells.shape[1]} cells,")
@@ -281,8 +307,9 @@ def main():
     for name, result in results.items():
         line = f"{name:40} information {result['information']:.3f}  IoU {result['iou']:.3f}"
         line += f"  links {result['links_cm']:.2f} cm"
-        decoded = result.get("decoded_cm")
-        print(line if decoded is None else f"{line}, decoded {decoded:.2f} cm")
+        if "decoded_cm" in result:
+            line += f"; decoded: IoU {result['decoded_iou']:.3f}, {result['decoded_cm']:.2f} cm"
+        print(line)
     if args.json is not None:
         args.json.write_text(json.dumps(results, indent=1) + "\n")
 
