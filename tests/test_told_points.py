@@ -1,11 +1,14 @@
 """What an encoder with a decoder tells of obstacles: points, distances, policies that use them."""
 
+import importlib
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from trainers import ROOT
 
 import envs
 from clean_rl_scripts.evaluate import EvaluationError, evaluate
@@ -23,7 +26,7 @@ from envs.encoders import (
 )
 from envs.exported_networks import NetworkError, save_network
 from envs.observations import sensors_to_json
-from envs.scenes import Box, Scene
+from envs.scenes import Box, Scene, Sphere
 from envs.seeing import checker_of, seen_checker, true_checker
 from envs.sensors import PointCloud, cardinal
 
@@ -116,6 +119,22 @@ def test_nothing_may_be_there(tmp_path, encoder):
 class FarAway(DistanceFromTheBall):
     def forward(self, latent, points):
         return 5.0 + super().forward(latent, points)
+
+
+def test_cells_that_are_told(encoder):
+    """Those of `benchmarks/scene_knowledge.py`, and how many of them are right."""
+    sys.path.append(str(ROOT / "benchmarks"))
+    knowledge = importlib.import_module("scene_knowledge")
+    (cells,) = knowledge.told_cells(encoder, [Scene()], 0.0)
+    points = told_points(Scene(), encoder)
+    inside = points[np.linalg.norm(points - BALL[:3], axis=1) < BALL[3]]
+    at = np.unique(np.floor((inside - knowledge.LOW) / knowledge.CELL).astype(int), axis=0)
+    assert 4 <= len(at) == cells.sum() and cells.reshape(knowledge.SHAPE)[tuple(at.T)].all()
+    truth = knowledge.occupied([Sphere(BALL[:3], BALL[3])]).ravel()
+    assert (truth | ~cells).all()
+    scenes, cells = [Scene(), Scene()], np.stack([truth, truth])
+    found = knowledge.decoded_iou(encoder, scenes, cells, scenes, cells)
+    assert 0.5 < found <= 1.0
 
 
 def test_in_an_environment(encoder):
