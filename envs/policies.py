@@ -182,7 +182,7 @@ def _checker_of(encoder):
     try:
         return checker_of(encoder or "obstacles")
     except ValueError as error:
-        raise PolicyError(f"what a planner knows: {error}") from error
+        raise PolicyError(str(error)) from error
 
 
 def _via_points(seed, tries, checker_of):
