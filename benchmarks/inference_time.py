@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 import envs
 from envs.datasets import load_queries
-from envs.encoders import ORACLE, scene_encoder, told_by
+from envs.encoders import ORACLE, scene_encoder, with_told
 from envs.policies import find_policy, make_policy
 from envs.seeing import checker_of, seen_points
 
@@ -64,12 +64,12 @@ def policy_times(policy, queries, encoder=None):
     """Means (s) of `rendering`, `encoding`, `action`, `total`; and `success_rate`."""
     name, arguments = find_policy(policy)
     if encoder is not None:
-        arguments |= {"encoder": told_by(encoder, arguments["encoder"]), "proximity": encoder}
+        arguments = with_told(encoder, arguments)
     env = envs.make(TASK, **arguments)
     begin = make_policy(name, env)
     rows, actions, successes = [], 0, 0
+    sees = arguments.get("encoder") is not None
     for number, query in enumerate(tqdm(queries, desc=str(policy), unit="query")):
-        sees = arguments.get("encoder") is not None
         rendering, encoding = seeing_times(env, query.scene) if sees else (0.0, 0.0)
         act, acting = begin(number, query).act, 0.0
         observation, info = env.reset_specific(*query)

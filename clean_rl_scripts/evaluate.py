@@ -73,7 +73,7 @@ from tqdm import tqdm
 import envs
 from envs import flags, panda, workers
 from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
-from envs.encoders import told_by
+from envs.encoders import with_told
 from envs.files import check_writable, write_atomically
 from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Workers
 from envs.last_layer import LastLayer
@@ -404,8 +404,8 @@ def _prepare(
                         f"cannot be evaluated with {goal_type!r}"
                     )
                 env, goal_type = trained, trained["goal_type"]
-                if encoder not in (None, "points") and env.get("proximity") == "points":
-                    env |= {"encoder": told_by(encoder, env["encoder"]), "proximity": encoder}
+                if encoder not in (None, "points"):
+                    env = with_told(encoder, env)
         env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
         if last_layer is None:
             last_layer = own_layer(policy)

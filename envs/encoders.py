@@ -72,9 +72,17 @@ def points(scene, number=NUM_POINTS, encoder=None):
     return farthest_points(there, number).ravel()
 
 
-def told_by(encoder, name):
-    """The name of the points that an encoder tells of, as many as in `points` or `points:N`."""
-    return f"{POINTS}:{name.partition(':')[2] or NUM_POINTS}:{encoder}"
+def with_told(encoder, arguments):
+    """Arguments of `envs.make`, a dict, with what an encoder tells in the place of seen points.
+
+    Those are the points in `encoder`, and `proximity` of points.
+    """
+    told = dict(arguments)
+    if told.get("proximity") == POINTS:
+        told["proximity"] = encoder
+    if match := re.fullmatch(rf"{POINTS}(?::(\d+))?", str(told.get("encoder"))):
+        told["encoder"] = f"{POINTS}:{match[1] or NUM_POINTS}:{encoder}"
+    return told
 
 
 @functools.lru_cache(CACHED_TOLD)
