@@ -3,17 +3,19 @@
     pip install -c constraints.txt -e ".[bench]"
     python benchmarks/keep_encoders.py runs/RUN ...    # of vae.py, vqvae.py, pointnet2.py, field.py
 
-Of each finished run, `encoder.pt` becomes `scene_embedding_train/encoders/<exp_name>.pt`, in half
-precision, which is what `--encoder <exp_name>` finds, and its decoder, if there is one,
-`<exp_name>.decoder.pt`; the JSON beside it has data, updates, figures on validation
-scenes and flags; `docs/pictures/encoder_<exp_name>.png` is TensorBoard's picture of a validation
-scene at the update whose encoder was kept.
+Of each finished run, `encoder.pt` becomes `scene_embedding_train/encoders/<exp_name>.pt`, which is
+what `--encoder <exp_name>` finds, and its decoder, if there is one, `<exp_name>.decoder.pt`; with
+`--halve` in half precision, after which policies that use it have to be evaluated again. The JSON
+beside it has data, updates, figures on validation scenes and flags;
+`docs/pictures/encoder_<exp_name>.png` is TensorBoard's picture of a validation scene at the update
+whose encoder was kept.
 """
 
 import argparse
 import datetime
 import io
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -42,7 +44,7 @@ def picture(run, step):
     return image.resize((image.width * ENLARGED, image.height * ENLARGED), Image.NEAREST)
 
 
-def keep(run, encoders, pictures):
+def keep(run, encoders, pictures, halve=False):
     """Copy one run's encoder, write its JSON and its picture; the JSON's dict is returned."""
     trained = json.loads((run / "result.json").read_text())
     name = trained["args"]["exp_name"]
@@ -52,9 +54,10 @@ def keep(run, encoders, pictures):
         result["observations"] = attribute(shard, "made_by")
     result["args"] = {key: value for key, value in trained["args"].items() if key not in PATHS}
     encoders.mkdir(parents=True, exist_ok=True)
-    halve_network(run / "encoder.pt", encoders / f"{name}.pt")
-    if (run / f"encoder{DECODER}").exists():
-        halve_network(run / f"encoder{DECODER}", encoders / f"{name}{DECODER}")
+    for ending in (".pt", DECODER):
+        if (run / f"encoder{ending}").exists():
+            copy = halve_network if halve else shutil.copyfile
+            copy(run / f"encoder{ending}", encoders / f"{name}{ending}")
     write_atomically(encoders / f"{name}.json", (json.dumps(result, indent=1) + "\n").encode())
     picture(run, trained["best_update"]).save(pictures / f"encoder_{name}.png", optimize=True)
     return result
@@ -65,12 +68,13 @@ def main():
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a finished run's folder")
     parser.add_argument("--encoders", type=Path, default=PACKAGED, help="where programs go")
     parser.add_argument("--pictures", type=Path, default=PICTURES, help="where pictures go")
+    parser.add_argument("--halve", action="store_true", help="in half precision")
     args = parser.parse_args()
     for run in args.runs:
         if not (run / "result.json").exists():
             parser.error(f"{run} is no finished run (it has no result.json)")
     for run in args.runs:
-        result = keep(run, args.encoders, args.pictures)
+        result = keep(run, args.encoders, args.pictures, args.halve)
         print(f"{run}:", {key: value for key, value in result.items() if key != "args"})
 
 

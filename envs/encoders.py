@@ -28,7 +28,7 @@ from envs.collision import CollisionChecker
 from envs.exported_networks import NetworkError, load_network
 from envs.files import write_atomically
 from envs.observations import sensors_from_json
-from envs.scenes import ROW, to_array
+from envs.scenes import ROW, padded_rows
 from envs.seeing import farthest_points, keep_points, seen_points
 from envs.sensors import POSE, PointCloud, SensorWorld
 
@@ -56,10 +56,7 @@ def oracle(scene):
     count = len(scene.obstacles)
     if count > MAX_OBSTACLES:
         raise ValueError(f"the oracle has room for {MAX_OBSTACLES} obstacles, not for {count}")
-    rows = np.zeros((MAX_OBSTACLES, 1 + ROW), np.float32)
-    rows[:count, 0] = 1.0
-    rows[:count, 1:] = to_array(scene.obstacles)
-    return rows.ravel()
+    return padded_rows(scene.obstacles, MAX_OBSTACLES).ravel()
 
 
 def points(scene, number=NUM_POINTS, encoder=None):

@@ -142,6 +142,14 @@ def to_array(obstacles):
     return rows
 
 
+def padded_rows(obstacles, number):
+    """Obstacles -> float32 array (number, 12): 1 and a row of `to_array`, then rows of zeros."""
+    rows = np.zeros((number, 1 + ROW), np.float32)
+    rows[: len(obstacles), 0] = 1.0
+    rows[: len(obstacles), 1:] = to_array(obstacles)
+    return rows
+
+
 def from_array(rows):
     """The inverse of `to_array`. Raises ValueError for another shape or an unknown kind."""
     rows = np.asarray(rows, dtype=np.float64)

@@ -50,6 +50,7 @@ from envs.runs import (
 )
 from scene_embedding_train.clouds import load_obstacle_points, on_obstacles, whole_clouds
 from scene_embedding_train.pictures import averaged, load_pictures
+from scene_embedding_train.pictures import batch_of as pictures_of
 from scene_embedding_train.training_data import load_obstacles, open_observations, split
 
 # The field: around the robot's axis, m. Distances are clipped at both ends.
@@ -107,6 +108,28 @@ class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     eval_scenes: PositiveInt = 512
     """validation scenes per evaluation"""
     # END SHARED
+
+
+# SHARED: networks for pictures
+def num_halvings(size):
+    """How often pictures of `size` pixels can be halved until at most 7 are left."""
+    halvings = 0
+    while size > 7 and size % 2 == 0:
+        size, halvings = size // 2, halvings + 1
+    return halvings
+
+
+def convolutions(size, width):
+    """Pictures (n, 3, size, size) -> features (n, k), and k."""
+    halvings = num_halvings(size)
+    channels = [3, *(width * 2**i for i in range(halvings))]
+    layers = []
+    for a, b in zip(channels, channels[1:], strict=False):
+        layers += [nn.Conv2d(a, b, 4, stride=2, padding=1), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Flatten()), channels[-1] * (size // 2**halvings) ** 2
+
+
+# END SHARED
 
 
 # MODEL
@@ -173,20 +196,13 @@ class SeesPictures(nn.Module):
 
     def __init__(self, num_cameras, args):
         super().__init__()
-        size, channels = args.picture_size, [3]
-        self.cameras = nn.ModuleList()
-        while size > 7 and size % 2 == 0:
-            channels.append(max(1, args.width // 8) * 2 ** (len(channels) - 1))
-            size //= 2
+        self.cameras, inputs = nn.ModuleList(), 0
         for _ in range(num_cameras):
-            layers = []
-            for a, b in zip(channels, channels[1:], strict=False):
-                layers += [nn.Conv2d(a, b, 4, stride=2, padding=1), nn.ReLU()]
-            self.cameras.append(nn.Sequential(*layers, nn.Flatten()))
-        inputs = num_cameras * channels[-1] * size**2
-        self.head = nn.Sequential(
-            nn.Linear(inputs, 256), nn.ReLU(), nn.Linear(256, args.latent_size)
-        )
+            camera, features = convolutions(args.picture_size, max(1, args.width // 8))
+            self.cameras.append(camera)
+            inputs += features
+        layers = nn.Linear(inputs, 256), nn.ReLU(), nn.Linear(256, args.latent_size)
+        self.head = nn.Sequential(*layers)
 
     def forward(self, pictures):
         seen = [camera(pictures[:, i]) for i, camera in enumerate(self.cameras)]
@@ -251,7 +267,7 @@ def distances(obstacles, points):
     # Into the obstacles' own axes.
     offset = rotated(points.unsqueeze(2) - place, turn * turn.new_tensor([-1.0, -1.0, -1.0, 1.0]))
     x, y, z = offset.unbind(-1)
-    # A cylinder is a rectangle, from its axis outwards; the third number says nothing.
+    # A cylinder is a rectangle, from its axis outwards; its y is always inside and says nothing.
     flat = torch.stack([(x.square() + y.square()).sqrt(), torch.zeros_like(x), z], dim=-1)
     half_flat = size * size.new_tensor([1.0, 0.0, 0.5]) + size.new_tensor([0.0, 1.0, 0.0])
     cylinder = kind == 1.0
@@ -361,10 +377,11 @@ def batch_of(data, rows, args, device):
     obstacles.
     """
     rows = np.sort(rows)
-    seen = [torch.as_tensor(array[rows], device=device) for array in data]
     if args.sees == "images":
-        seen[0] = seen[0].permute(0, 1, 4, 2, 3).float() / 255.0
-    return seen
+        images, obstacles = data
+        pictures = pictures_of(images, rows, device)
+        return [pictures, torch.as_tensor(obstacles[rows], device=device)]
+    return [torch.as_tensor(array[rows], device=device) for array in data]
 
 
 def slices(model, seen, obstacles, size=96):

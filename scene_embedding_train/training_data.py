@@ -13,7 +13,7 @@ from tqdm import tqdm
 from envs.datasets import DatasetError
 from envs.files import new_contents
 from envs.observations import Observations, shard_path
-from envs.scenes import ROW, to_array
+from envs.scenes import padded_rows
 
 
 def open_observations(folder):
@@ -86,10 +86,8 @@ def load_obstacles(observations):
     """
     shards = range(len(observations.offsets) - 1)
     scenes = [scene for shard in shards for scene in observations.scenes(shard)]
-    obstacles = np.zeros((len(scenes), max(len(s.obstacles) for s in scenes), 1 + ROW), np.float32)
-    for rows, scene in zip(obstacles, scenes, strict=True):
-        rows[: len(scene.obstacles), 0] = 1.0
-        rows[: len(scene.obstacles), 1:] = to_array(scene.obstacles)
+    most = max(len(scene.obstacles) for scene in scenes)
+    obstacles = np.stack([padded_rows(scene.obstacles, most) for scene in scenes])
     turns = obstacles[..., 5:9]
     turns /= np.maximum(np.linalg.norm(turns, axis=-1, keepdims=True), 1e-9)
     return obstacles

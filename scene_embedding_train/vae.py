@@ -97,16 +97,20 @@ def num_halvings(size):
     return halvings
 
 
-def convolutions(size, args):
+def convolutions(size, width):
     """Pictures (n, 3, size, size) -> features (n, k), and k."""
     halvings = num_halvings(size)
-    channels = [3, *(args.width * 2**i for i in range(halvings))]
+    channels = [3, *(width * 2**i for i in range(halvings))]
     layers = []
     for a, b in zip(channels, channels[1:], strict=False):
         layers += [nn.Conv2d(a, b, 4, stride=2, padding=1), nn.ReLU()]
     return nn.Sequential(*layers, nn.Flatten()), channels[-1] * (size // 2**halvings) ** 2
 
 
+# END SHARED
+
+
+# SHARED: a decoder of pictures
 class Decoder(nn.Module):
     """A latent (n, inputs) -> one camera's pictures (n, 3, size, size) in [0, 1]."""
 
@@ -135,7 +139,7 @@ class Encoder(nn.Module):
 
     def __init__(self, size, args):
         super().__init__()
-        self.convolutions, features = convolutions(size, args)
+        self.convolutions, features = convolutions(size, args.width)
         self.head = nn.Linear(features, 2 * args.latent_size)
 
     def forward(self, pictures):

@@ -385,9 +385,9 @@ def test_an_encoder_learns_something_tiny(name, observations):
 
     optimizer = torch.optim.Adam(model.parameters(), lr=3e-3, fused=True)
     before = error()
-    for _ in range(150):
+    for _ in range(300 if name == "field" else 150):
         module.update(model, optimizer, batch, *inputs, args)
-    assert error() < 0.5 * before
+    assert error() < 0.4 * before
 
 
 @pytest.mark.parametrize(("size", "halvings"), [(224, 5), (64, 4), (112, 4), (16, 2), (8, 1)])
@@ -654,10 +654,12 @@ def shared_blocks(name):
 
 def test_shared_blocks_have_not_drifted_apart():
     blocks = shared_blocks("vae")
-    assert shared_blocks("vqvae") == blocks and len(blocks) == 7
+    assert shared_blocks("vqvae") == blocks and len(blocks) == 8
     of_clouds = shared_blocks("pointnet2")
     assert len(of_clouds) == 4 and all(blocks[name] == of_clouds[name] for name in of_clouds)
-    assert shared_blocks("field") == of_clouds
+    of_field = shared_blocks("field")
+    assert of_field.keys() - of_clouds.keys() == {"# SHARED: networks for pictures"}
+    assert len(of_field) == 5 and all(blocks[name] == of_field[name] for name in of_field)
 
 
 def test_a_run_leaves_an_encoder_a_result_and_events(run):
@@ -688,12 +690,17 @@ def test_a_run_is_kept_with_its_figures_and_picture(run, tmp_path):
     script = FOLDER.parent / "benchmarks" / "keep_encoders.py"
     where = ["--encoders", str(tmp_path), "--pictures", str(tmp_path)]
     command = [sys.executable, str(script), str(folder), *where]
+    command += ["--halve"] if name == "field" else []
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    for ending in ("", ".decoder") if name == "field" else ("",):
-        kept, whole = tmp_path / f"{name}{ending}.pt", folder / f"encoder{ending}.pt"
-        assert kept.stat().st_size < whole.stat().st_size
-        assert load_network(kept).metadata == load_network(whole).metadata
+    if name == "field":
+        for ending in ("", ".decoder"):
+            kept, whole = tmp_path / f"{name}{ending}.pt", folder / f"encoder{ending}.pt"
+            assert kept.stat().st_size < whole.stat().st_size
+            assert load_network(kept).metadata == load_network(whole).metadata
+    else:
+        kept = (tmp_path / f"{name}.pt").read_bytes()
+        assert kept == (folder / "encoder.pt").read_bytes()
     assert Image.open(tmp_path / f"encoder_{name}.png").height > 0
     text = (tmp_path / f"{name}.json").read_text()
     result = json.loads(text)
