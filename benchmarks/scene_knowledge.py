@@ -86,23 +86,10 @@ def link_distances(scenes, seed):
         link_proximity(CollisionChecker(replace(scene, table=None, floor=None)), some, within=FAR)
         for scene, some in zip(tqdm(scenes, desc="distances"), states, strict=True)
     ]
-    return _frames(panda.denormalise(states)), np.stack(distances)[..., 0], states
-
-
-def _frames(configurations):
-    position, rotation = np.zeros((*configurations.shape[:-1], 3)), np.eye(3)
-    parts = []
-    for joint, (x, y, z, roll) in enumerate(panda.JOINT_FRAMES):
-        position = position + rotation @ np.array([x, y, z])
-        turn = np.zeros((*configurations.shape[:-1], 3, 3))
-        c, s = np.cos(configurations[..., joint]), np.sin(configurations[..., joint])
-        cr, sr = np.cos(roll), np.sin(roll)
-        turn[..., 0, 0], turn[..., 0, 1] = c, -s
-        turn[..., 1, 0], turn[..., 1, 1], turn[..., 1, 2] = cr * s, cr * c, -sr
-        turn[..., 2, 0], turn[..., 2, 1], turn[..., 2, 2] = sr * s, sr * c, cr
-        rotation = rotation @ turn
-        parts += [position, rotation[..., :, 0], rotation[..., :, 2]]
-    return np.concatenate(parts, axis=-1).astype(np.float32)
+    frames = panda.joint_frames(panda.denormalise(states))
+    parts = [part for place, axes in frames for part in (place, axes[..., :, 0], axes[..., :, 2])]
+    places = np.concatenate(parts, axis=-1).astype(np.float32)
+    return places, np.stack(distances)[..., 0], states
 
 
 def _rotation(quaternion):

@@ -75,6 +75,16 @@ _FLANGE_TO_EE = FLANGE_LENGTH + 0.105
 
 def forward_kinematics(configuration):
     """Joint angles in rad, (..., 7) -> end-effector position in m from the base, (..., 3)."""
+    for position, rotation in joint_frames(configuration):  # noqa: B007 (the last one counts)
+        pass
+    return position + _FLANGE_TO_EE * rotation[..., :, 2]
+
+
+def joint_frames(configuration):
+    """Joint angles in rad, (..., 7) -> joint by joint, its place (..., 3), m, and axes (..., 3, 3).
+
+    A generator; the axes are columns, and a joint turns about the third.
+    """
     configuration = np.asarray(configuration, dtype=np.float64)
     position = np.zeros((*configuration.shape[:-1], 3))
     rotation = np.broadcast_to(np.eye(3), (*configuration.shape[:-1], 3, 3))
@@ -87,7 +97,7 @@ def forward_kinematics(configuration):
             [c, -s, zero, cr * s, cr * c, zero - sr, sr * s, sr * c, zero + cr], axis=-1
         ).reshape(*c.shape, 3, 3)
         rotation = rotation @ turn
-    return position + _FLANGE_TO_EE * rotation[..., :, 2]
+        yield position, rotation
 
 
 _FOLDER = Path(pybullet_data.getDataPath(), "franka_panda")
