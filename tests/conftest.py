@@ -1,11 +1,22 @@
+import random
 import signal
 
+import numpy as np
 import pytest
+import torch
 
 from envs import protocol
 
 # Ctrl-C can be tested also where it is ignored, as in the background of a shell.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    """What a test draws from global generators is the same in every run and order."""
+    random.seed(0)
+    np.random.seed(0)
+    torch.manual_seed(0)
 
 
 @pytest.fixture
