@@ -43,7 +43,8 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
 
     # The algorithm
     total_updates: flags.PositiveInt = 1_000_000
-    """batches of the whole run (paper: 1,000,000)"""
+    """batches of the whole run (paper: 1,000,000); a resumed run may have more, and has then the
+    learning rate of that longer run"""
     batch_size: flags.PositiveInt = 256
     """transitions per batch"""
     learning_rate: flags.PositiveFloat = 1e-3
@@ -211,7 +212,7 @@ def update(actor, optimizer, observation, goal, action):
 
 
 if __name__ == "__main__":
-    args = runs.parse_args(Args, may_change={"test_queries"})
+    args = runs.parse_args(Args, may_change={"total_updates", "test_queries"})
     device = runs.seed_torch(args)
     validation, test = protocol.load_task(args)
     try:

@@ -9,10 +9,10 @@ A cell is a run: algorithm, goal type, task, p of the demo injection. It is trai
 (flags that differ from the defaults: `RECIPES`) in `--runs-dir`, where one that was stopped goes
 on. Its best policy by validation goes to `policies/` beside the script, in half precision, is
 evaluated on test queries as it is there, and gets its result beside it, in JSON: what has one is
-done, with as many steps or more. The page,
-docs/results.md, and its pictures are made of those results and of the paper's numbers
-(`paper_cells.csv`: sections 5.2 and 5.3 and the tables of the appendix; means and standard
-deviations of four seeds).
+done, with the same flags and as many steps or more. (With `--no-keep-policies` the result stays
+alone.) The page, docs/results.md, and its pictures are made of those results, of the planners' and
+of `go-to-goal`'s (docs/baselines.json), and of the paper's numbers (`paper_cells.csv`: sections 5.2
+and 5.3 and the tables of the appendix; means and standard deviations of four seeds).
 """
 
 import csv
@@ -33,9 +33,11 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import numpy as np
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from clean_rl_scripts.evaluate import wilson_interval
 from envs.datasets import load_queries
 from envs.exported_networks import halve_network
 from envs.files import check_folder, write_atomically
@@ -43,6 +45,8 @@ from envs.flags import PositiveInt, Seed, check
 
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = Path(__file__).with_name("paper_cells.csv")
+BASELINES = ROOT / "docs" / "baselines.json"
+UNSEEN = ROOT / "docs" / "unseen_obstacles.json"
 PAGE, PICTURES = ROOT / "docs" / "results.md", ROOT / "docs" / "pictures"
 SCRIPTS = {
     "bc": ROOT / "bc_script" / "bc.py",
@@ -50,11 +54,11 @@ SCRIPTS = {
     "td3": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
 }
 STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
-# Settings for long runs (docs/training.md). Those of TD3 were made without the penalty.
+# Settings for long runs (docs/training.md).
 RECIPES = {
     "bc": ["--eval-every", "25000"],
     "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3"],
-    "td3": ["--gamma", "0.98", "--num-hidden-layers", "3", "--preactivation-penalty", "0"],
+    "td3": ["--gamma", "0.98", "--num-hidden-layers", "3", "--preactivation-penalty", "0.1"],
 }
 GOALS = {"ee": "end-effector", "config": "configuration", "combined": "combined"}
 ENCODERS = {
@@ -65,6 +69,8 @@ ENCODERS = {
 }
 LINES = {"bc": ":", "sac": "-", "td3": "--"}  # of the curves
 FAR_BELOW = 0.05  # of the paper's mean: worth an explanation
+FLOOR, CEILING = "go-to-goal", "RRT-Connect, 5 s"  # in docs/baselines.json
+LONG_RUN = 7_000_000  # steps of the paper's runs with encoders (section 5.3)
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,15 @@ class Cell:
             flags += ["--her-probability", "0"]
         return flags
 
+    def is_recipe_of(self, args):
+        """Whether a run with the flags `args`, a dict from its JSON, is one of this cell."""
+        given = self.flags()
+        for flag, value in dict(zip(given[::2], given[1::2], strict=True)).items():
+            had = args.get(flag.removeprefix("--").replace("-", "_"))
+            if str(had) != value and not (isinstance(had, float) and had == float(value)):
+                return False
+        return True
+
 
 def read_cells(path=CELLS):
     """All `Cell`s, in the paper's order."""
@@ -130,13 +145,17 @@ def policies_of(algorithm):
     return SCRIPTS[algorithm].parent / "policies"
 
 
-def run(cell, seed, steps, num_queries, runs_dir):
+def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
     """Train, evaluate and keep one cell's policy with one seed; what was done is not done again."""
     script, name = SCRIPTS[cell.algorithm], f"{cell.name}-s{seed}"
     kept = policies_of(cell.algorithm) / f"{name}.json"
-    if kept.exists() and json.loads(kept.read_text())["steps"] >= steps:
-        print(f"{name}: done before")
-        return
+    if kept.exists():
+        result = json.loads(kept.read_text())
+        if not cell.is_recipe_of(result["args"]):
+            print(f"{name}: the one that is kept had other flags")
+        elif result["steps"] >= steps:
+            print(f"{name}: done before")
+            return
     if cell.task != cell.trained_on:  # a policy of another cell
         trained = replace(cell, task=cell.trained_on)
         run(trained, seed, steps, num_queries, runs_dir)
@@ -150,17 +169,22 @@ def run(cell, seed, steps, num_queries, runs_dir):
     folder = runs_dir / name
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, script, STEPS[cell.algorithm], str(steps), "--test-queries", "10"]
-    begun = sorted(folder.glob("*/args.json"))
+    begun = [
+        path.parent
+        for path in sorted(folder.glob("*/args.json"))
+        if cell.is_recipe_of(json.loads(path.read_text()))
+    ]
     if begun:
-        command += ["--resume", begun[-1].parent]
+        command += ["--resume", begun[-1]]
     else:
         command += [*cell.flags(), "--seed", str(seed), "--runs-dir", folder]
     print(f"{name}: {' '.join(map(str, command[1:]))}", flush=True)
     subprocess.run(command, check=True)
-    trained = max(folder.glob("*/result.json")).parent
+    trained = begun[-1] if begun else max(folder.glob("*/result.json")).parent
     kept.parent.mkdir(exist_ok=True)
     kept.unlink(missing_ok=True)  # a result is never beside another's policy
-    policy = kept.with_suffix(".pt")
+    kept.with_suffix(".pt").unlink(missing_ok=True)
+    policy = (kept if keep_policies else folder / kept.name).with_suffix(".pt")
     halve_network(trained / "policy.pt", policy)
     evaluation = evaluate(policy, cell.task, num_queries, folder / "evaluation.json")
     result = summary(cell, trained, evaluation)
@@ -220,33 +244,63 @@ def load_results(folders):
     for folder in folders:
         for path in sorted(folder.glob("*.json")):
             result = json.loads(path.read_text())
+            result["kept"] = path.with_name(f"{result.get('policy', path.stem)}.pt").exists()
             results.setdefault(result["cell"], []).append(result)
     return {name: sorted(found, key=lambda r: r["seed"]) for name, found in results.items()}
 
 
 def ours(found):
-    """Success of a cell's results: with its interval, or over seeds mean ± standard deviation."""
-    if len(found) == 1:
-        low, high = found[0]["success_rate_interval"]
-        return f"{found[0]['success_rate']:.3f} [{low:.3f}, {high:.3f}]"
+    """Success of a cell's results, and its interval over all queries; ± the seeds' deviation."""
     rates = [result["success_rate"] for result in found]
-    return f"{statistics.mean(rates):.3f} ± {statistics.stdev(rates):.3f} ({len(rates)} seeds)"
+    counts = [result["num_queries"] for result in found]
+    rate = statistics.mean(rates)
+    low, high = wilson_interval(round(np.dot(rates, counts)), sum(counts))
+    deviation = f" ± {statistics.stdev(rates):.3f}" if len(rates) > 1 else ""
+    return f"{rate:.3f}{deviation} [{low:.3f}, {high:.3f}]"
 
 
-def table(cells, results, column):
-    """Markdown: a row per algorithm, a column per `column(cell)`; ours, and the paper's below."""
-    rows, columns = {}, []
+def in_small(found):
+    """How many steps and seeds a cell's results have."""
+    steps = sorted({result["steps"] for result in found})
+    steps = " to ".join(f"{n:,}" for n in (steps[0], steps[-1])[: len(steps)])
+    return f"<sub>{steps} steps, {len(found)} seed{'s' * (len(found) > 1)}</sub>"
+
+
+def table(cells, results, column, baselines):
+    """Markdown: a row per algorithm, a column per `column(cell)`; ours, and the paper's below.
+
+    Where the columns are tasks, `baselines` (docs/baselines.json) gives the first and last row.
+    """
+    rows, columns = {}, {}
     for cell in cells:
-        if column(cell) not in columns:
-            columns.append(column(cell))
+        columns[column(cell)] = cell.task
         found = results.get(cell.name)
-        text = f"**{ours(found)}**" if found else "not run"
+        text = f"**{ours(found)}**<br>{in_small(found)}" if found else "not run"
         label = cell.label + (f", {ENCODERS[cell.encoder]}" if cell.encoder else "")
         rows.setdefault(label, {})[column(cell)] = f"{text}<br>{cell.paper}"
     lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    for name, word in ((FLOOR, "floor"), (CEILING, "ceiling")):
+        known = {text: baselines.get(task, {}).get(name) for text, task in columns.items()}
+        if len(set(columns.values())) == len(columns) and any(known.values()):
+            rates = {text: f"{one['success_rate']:.3f}" for text, one in known.items() if one}
+            rows[f"*{word}: {name}*"] = rates
     for label, texts in rows.items():
         lines.append("| " + " | ".join([label, *(texts.get(name, "") for name in columns)]) + " |")
     return lines
+
+
+def long_runs(cells, results):
+    """A sentence: how long runs with encoders of as many steps as the paper's would take here."""
+    hours = {}
+    for cell in cells:
+        for result in results.get(cell.name, []):
+            if cell.encoder and cell.algorithm != "bc":
+                rate = result["training_seconds"] / result["steps"]
+                hours.setdefault(cell.algorithm.upper(), []).append(LONG_RUN * rate / 3600)
+    if not hours:
+        return []
+    took = ", ".join(f"{name} {statistics.mean(found):.0f} h" for name, found in hours.items())
+    return ["", f"A run of {LONG_RUN:,} steps would take, as those that were begun did: {took}."]
 
 
 def runs_table(cells, results):
@@ -258,46 +312,54 @@ def runs_table(cells, results):
     for cell in cells:
         for result in results.get(cell.name, []):
             minutes = result["training_seconds"] / 60
+            clean = result["clean_success_rate"]
+            clean = "not known" if clean is None else f"{clean:.3f}"
+            name = f"`{cell.name}-s{result['seed']}`" + ("" if result["kept"] else ", not kept")
+            if cell.algorithm in RECIPES and not cell.is_recipe_of(result["args"]):
+                name += ", other flags"
             lines.append(
-                f"| `{cell.name}-s{result['seed']}` | {ours([result])} "
-                f"| {result['clean_success_rate']:.3f} "
+                f"| {name} | {ours([result])} | {clean} "
                 f"| {result['steps']:,} ({result['policy_step']:,}) | {result['num_queries']:,} "
                 f"| {minutes:.0f} min | {result['date']}, {result['commit']} |"
             )
     return lines
 
 
-def page(cells, results):
+def page(cells, results, baselines):
     """docs/results.md."""
     goals = [cell for cell in cells if not cell.encoder and cell.hindsight != "no"]
     lines = [
         "# Results",
         "",
-        "Success on test queries: in bold ours, below it the paper's (mean ± standard deviation of",
-        "four seeds, after 1,000,000 steps; 7,000,000 for random boxes). Ours: one seed with its",
-        "95 % interval, or mean ± standard deviation over seeds.",
+        "![floor, paper, ours, ceiling](pictures/results_story.png)",
+        "",
+        "Success on test queries: in bold ours with its 95 % interval (of several seeds: mean,",
+        "deviation, interval of all their queries), in small the steps (BC: batches) and seeds;",
+        "below it the paper's, mean ± standard deviation of four seeds, after 1,000,000 steps",
+        f"({LONG_RUN:,} for random boxes). Floor and ceiling do not learn, and know a goal",
+        "configuration ([baselines.md](baselines.md)). With p = 0, queries are those of the",
+        "demonstrations, which are not shown; in the paper they are sampled.",
         "`python benchmarks/paper_tables.py` runs cells and writes this page;",
-        "`clean_rl_scripts/evaluate.py --policy NAME` runs any of the policies below.",
-        "`not run`: no policy of that cell was kept. Two earlier runs, whose policies were not:",
-        "[experiments.md](experiments.md#the-first-long-runs).",
+        "`clean_rl_scripts/evaluate.py --policy NAME` runs any policy below that was kept.",
+        "Earlier runs: [experiments.md](experiments.md#the-first-long-runs).",
         "The words: [glossary.md](glossary.md).",
     ]
     for goal_type, text in GOALS.items():
         chosen = [cell for cell in goals if cell.goal_type == goal_type]
         lines += ["", f"## Goal: {text} (`{goal_type}`)", ""]
-        lines += table(chosen, results, lambda cell: f"`{cell.task}`")
+        lines += table(chosen, results, lambda cell: f"`{cell.task}`", baselines)
     hindsight = [
         cell
         for cell in cells
         if (cell.algorithm, cell.goal_type, cell.task) == ("sac", "combined", "no_obstacles")
     ]
     lines += ["", "## Hindsight: `no_obstacles`, goal `combined`", ""]
-    lines += table(
-        hindsight, results, lambda cell: "no hindsight" if cell.hindsight == "no" else "hindsight"
-    )
+    names = {"yes": "hindsight", "no": "no hindsight"}
+    lines += table(hindsight, results, lambda cell: names[cell.hindsight], {})
     lines += ["", "## Encoders: trained on `random_boxes_hard`, goal `combined`", ""]
     encoded = [cell for cell in cells if cell.encoder]
-    lines += table(encoded, results, lambda cell: f"`{cell.task}`")
+    lines += table(encoded, results, lambda cell: f"`{cell.task}`", baselines)
+    lines += long_runs(cells, results)
     lines += ["", "## The runs", ""]
     done = [cell for cell in cells if cell.name in results]
     if not done:
@@ -307,17 +369,58 @@ def page(cells, results):
     lines[-1] += "; ".join(
         f"{name}: `{' '.join(flags)}`" for name, flags in RECIPES.items() if flags
     )
-    lines[-1] += ". Each policy's JSON has all of its flags. (The paper's networks have two hidden"
+    lines[-1] += (
+        ". Each policy's JSON has all of its flags, also where it says `other flags` (TD3's"
+    )
+    lines[-1] += " are older than its penalty). (The paper's networks have two hidden"
     lines[-1] += " layers, with encoders four.)"
     below = []
     for cell in done:
         mean = statistics.mean(result["success_rate"] for result in results[cell.name])
         if cell.mean is not None and mean < cell.mean - FAR_BELOW:
             below.append(f"`{cell.name}` ({mean:.3f}, paper {cell.mean:.3f})")
-    lines += ["", f"Below the paper by more than {FAR_BELOW}: {', '.join(below) or 'none'}."]
+    lines += ["", f"Below the paper by more than {FAR_BELOW}: {', '.join(below) or 'none'}"]
+    lines[-1] += " of these runs."
     lines += ["", "![success over steps](pictures/results_curves.png)"]
     lines += ["", "![success per task](pictures/results_bars.png)", ""]
     return "\n".join(lines)
+
+
+def draw_story(cells, results, baselines, unseen, path):
+    """Per task: from floor to ceiling, the best of the paper's cells, and the best of ours.
+
+    `unseen` (docs/unseen_obstacles.json) has policies that see points and have a last layer.
+    """
+    tasks = list(dict.fromkeys(cell.task for cell in cells))
+    figure, axes = plt.subplots(figsize=(10, 4.5), layout="constrained")
+    marks = {
+        "paper, the best of its policies": ("D", "tab:gray"),
+        "ours, the best of the same cells": ("o", "tab:blue"),
+        "ours, sees points, with a last layer; trained on random boxes": ("s", "tab:orange"),
+    }
+    points = {name: [] for name in marks}
+    for x, task in enumerate(tasks):
+        known = [baselines.get(task, {}).get(name) for name in (FLOOR, CEILING)]
+        if all(known):
+            low, high = (one["success_rate"] for one in known)
+            axes.bar(x, high - low, 0.7, low, color="0.9", label="floor to ceiling")
+        papers = [cell.mean for cell in cells if cell.task == task and cell.mean is not None]
+        own = [r for cell in cells if cell.task == task for r in results.get(cell.name, [])]
+        rates = (papers, [r["success_rate"] for r in own])
+        sees = unseen.get(task, {}).get("dagger, points")
+        rates += ([sees["success_rate"]] if sees else [],)
+        for name, found in zip(marks, rates, strict=True):
+            if found:
+                points[name].append((x, max(found)))
+    for (name, (marker, color)), found in zip(marks.items(), points.values(), strict=True):
+        if found:
+            axes.scatter(*zip(*found, strict=True), 60, color=color, marker=marker, label=name)
+    axes.set_xticks(range(len(tasks)), [task.replace("_", "\n") for task in tasks])
+    axes.set(ylabel="success on test queries", ylim=(0, 1.02))
+    handles = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=2, fontsize="small")
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 def draw_curves(cells, results, path):
@@ -376,6 +479,8 @@ class Args:
     """test queries"""
     runs_dir: Path = Path("runs/paper_tables")
     """where runs are made, and go on"""
+    keep_policies: bool = True
+    """keep policies beside their scripts, not the results alone: these stay in `--runs-dir`"""
     list: bool = False
     """list cells and what is done; run none"""
 
@@ -417,16 +522,18 @@ def main():
     for cell in chosen:
         for seed in args.seeds:
             try:
-                run(cell, seed, args.steps, args.num_queries, args.runs_dir)
+                run(cell, seed, args.steps, args.num_queries, args.runs_dir, args.keep_policies)
             except subprocess.CalledProcessError as error:
                 sys.exit(f"error: {cell.name}, seed {seed}: exit code {error.returncode}")
             except KeyboardInterrupt:
                 sys.exit("interrupted; the same command goes on from the last checkpoint")
     results = load_results(folders)
+    baselines, unseen = (json.loads(path.read_text()) for path in (BASELINES, UNSEEN))
     if results:
+        draw_story(cells, results, baselines, unseen, PICTURES / "results_story.png")
         draw_curves(cells, results, PICTURES / "results_curves.png")
         draw_bars(cells, results, PICTURES / "results_bars.png")
-    write_atomically(PAGE, page(cells, results).encode())
+    write_atomically(PAGE, page(cells, results, baselines).encode())
     print(f"{PAGE} written")
 
 

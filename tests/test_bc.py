@@ -95,7 +95,12 @@ def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path, short_episode
     assert json.loads((run / "args.json").read_text())["demos"] == [path, path]
     (run / "result.json").unlink()
     run_here(PATHS["bc"], "--resume", run)
-    assert (run / "result.json").exists()
+    updates = json.loads((run / "result.json").read_text())["steps"]
+    run_here(PATHS["bc"], "--resume", run, "--total-updates", 2 * updates)
+    assert json.loads((run / "result.json").read_text())["steps"] == 2 * updates
+    rates = EventAccumulator(str(run)).Reload().Scalars("charts/learning_rate")
+    assert [event.step for event in rates] == [1000, 2000]
+    assert rates[-1].value == pytest.approx(1e-3 * (1 - 1999 / (2 * updates)))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The results page: from the paper's cells and a folder of results, and from a run."""
 
+import functools
 import importlib.util
 import json
 import re
@@ -41,8 +42,12 @@ def result(name, seed, success, **more):
         "date": "2026-01-02",
         "commit": "abc1234",
         "curve": [[100_000, success / 2], [300_000, success]],
+        "args": {},
     }
     return made_up | more
+
+
+BASELINES = {"wall": {"go-to-goal": {"success_rate": 0.7}, "RRT-Connect, 5 s": {"success_rate": 1}}}
 
 
 @pytest.fixture
@@ -61,7 +66,8 @@ def results(tmp_path):
 def test_the_papers_cells():
     papers = [cell for cell in CELLS.values() if cell.mean is not None]
     assert len(papers) == 3 * 9 * 5 + 4 + 3 + 9 * 6  # goals, hindsight, encoders with BC and SAC
-    assert {cell.encoder for cell in CELLS.values() if cell.mean is None} == {"oracle"}
+    others = {cell.name for cell in CELLS.values() if cell.mean is None}
+    assert all("oracle" in name or re.match("bc-.*-on-|td3-", name) for name in others)
     assert {cell.task for cell in CELLS.values()} <= set(envs.TASKS)
     for name, mean, std in [  # as in the issue's table, and the ends of each of the paper's
         ("bc-ee-no_obstacles", 0.073, 0.036),
@@ -87,18 +93,25 @@ def test_a_cell_is_a_command():
 
 
 def test_the_page_shows_what_was_run_and_what_was_not(results):
-    page = paper_tables.page(list(CELLS.values()), results)
-    assert "**0.950 [0.940, 0.960]**<br>0.971 ± 0.003" in page
-    deviation = statistics.stdev([0.981, 0.982, 0.983])
-    assert f"**0.982 ± {deviation:.3f} (3 seeds)**<br>0.986 ± 0.002" in page
+    page = paper_tables.page(list(CELLS.values()), results, BASELINES)
+    in_small = "<sub>300,000 steps, 1 seed</sub><br>0.971 ± 0.003"
+    assert f"**0.950 [0.946, 0.954]**<br>{in_small}" in page
+    deviation = statistics.stdev([0.981, 0.982, 0.983])  # the interval is that of 30,000 queries
+    in_small = "<sub>300,000 steps, 3 seeds</sub><br>0.986 ± 0.002"
+    assert f"**0.982 ± {deviation:.3f} [0.980, 0.983]**<br>{in_small}" in page
     assert "not run<br>0.848 ± 0.027" in page
     # The `combined` cells on `no_obstacles` with p stand in two tables.
-    assert page.count("<br>") == len(CELLS) + 4
-    assert page.count("not run<br>") == page.count("<br>") - 4
+    assert page.count("<br>") - page.count("<sub>") == len(CELLS) + 4
+    assert page.count("not run<br>") == len(CELLS) + 4 - page.count("<sub>")
+    assert page.count("<sub>") == 4
+    assert page.count("| *floor: go-to-goal* |  | 0.700 |") == 3
+    assert page.count("| *ceiling: RRT-Connect, 5 s* |  | 1.000 |") == 3
+    below = "`sac-ee-double_walls-p1` (0.830, paper 0.916) of these runs."
+    assert f"Below the paper by more than 0.05: {below}" in page
     assert (
-        "Below the paper by more than 0.05: `sac-ee-double_walls-p1` (0.830, paper 0.916)." in page
+        "| `bc-combined-no_obstacles-s2`, not kept, other flags | 0.982 [0.979, 0.984] | 0.491 |"
+        in page
     )
-    assert "| `bc-combined-no_obstacles-s2` | 0.982 [0.972, 0.992] | 0.491 |" in page
     assert "300,000 (275,000) | 10,000 | 10 min | 2026-01-02, abc1234 |" in page
     for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
         assert len({line.count("|") for line in table.splitlines()}) == 1
@@ -108,21 +121,24 @@ def test_an_algorithm_of_ones_own(results, tmp_path):
     header, *rows = paper_tables.CELLS.read_text().splitlines()
     (tmp_path / "cells.csv").write_text("\n".join([header, *rows, "mine,ee,wall,wall,1,yes,,,"]))
     cells = paper_tables.read_cells(tmp_path / "cells.csv")
-    results["mine-ee-wall-p1"] = [result("mine-ee-wall-p1", 1, 0.5)]
-    page = paper_tables.page(cells, results)
-    assert "| MINE-MP (p = 1) |  | **0.500 [0.490, 0.510]**<br>not in the paper |" in page
+    results["mine-ee-wall-p1"] = [result("mine-ee-wall-p1", 1, 0.5, kept=True)]
+    page = paper_tables.page(cells, results, {})
+    found = "**0.500 [0.490, 0.510]**<br><sub>300,000 steps, 1 seed</sub>"
+    assert f"| MINE-MP (p = 1) |  | {found}<br>not in the paper |" in page
     assert "`mine-ee-wall-p1` (" not in page
     paper_tables.draw_bars(cells, results, tmp_path / "bars.png")
 
 
 def test_the_page_without_any_result():
-    page = paper_tables.page(list(CELLS.values()), {})
+    page = paper_tables.page(list(CELLS.values()), {}, {})
     assert "**" not in page and page.rstrip().endswith("None yet.")
 
 
 def test_the_pictures(results, tmp_path):
-    for draw in (paper_tables.draw_curves, paper_tables.draw_bars):
-        draw(list(CELLS.values()), results, tmp_path / "picture.png")
+    unseen = {"wall": {"dagger, points": {"success_rate": 0.99}}}
+    story = functools.partial(paper_tables.draw_story, baselines=BASELINES, unseen=unseen)
+    for draw in (paper_tables.draw_curves, paper_tables.draw_bars, story):
+        draw(list(CELLS.values()), results, path=tmp_path / "picture.png")
         with Image.open(tmp_path / "picture.png") as picture:
             assert len(picture.convert("RGB").getcolors(1_000_000)) > 10
 
@@ -163,3 +179,12 @@ def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
     assert other["policy"] == "bc-config-wall-s5" and other["num_queries"] == 3
     assert other["curve"] == kept["curve"]
     assert "--total-updates" not in capfd.readouterr().out
+
+    # Other flags are another run. Its result may stand alone.
+    monkeypatch.setitem(paper_tables.RECIPES, "bc", [*few, "--hidden-size", "8"])
+    paper_tables.run(cell, 5, 30, 2, tmp_path / "runs", keep_policies=False)
+    assert "bc-config-wall-s5: the one that is kept had other flags\n" in capfd.readouterr().out
+    assert len(list((tmp_path / "runs" / "bc-config-wall-s5").glob("*/args.json"))) == 2
+    (found,) = paper_tables.load_results([tmp_path / "policies"])["bc-config-wall"]
+    assert found["args"]["hidden_size"] == 8 and found["steps"] == 30 and not found["kept"]
+    assert not (tmp_path / "policies" / "bc-config-wall-s5.pt").exists()
