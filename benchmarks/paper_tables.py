@@ -35,6 +35,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from clean_rl_scripts.evaluate import wilson_interval
@@ -419,8 +420,7 @@ def draw_story(cells, results, baselines, unseen, path):
     axes.set(ylabel="success on test queries", ylim=(0, 1.02))
     handles = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=2, fontsize="small")
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    _save(figure, path)
 
 
 def draw_curves(cells, results, path):
@@ -435,8 +435,7 @@ def draw_curves(cells, results, path):
     axes.set(xlabel="environment steps (BC: batches)", ylabel="validation success", ylim=(0, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    _save(figure, path)
 
 
 def draw_bars(cells, results, path):
@@ -458,8 +457,16 @@ def draw_bars(cells, results, path):
         axes.set(title=task, xlim=(0, 1))
     handles, labels = all_axes[0, 0].get_legend_handles_labels()
     figure.legend(handles[:2], labels[:2], loc="outside lower center", ncols=2)
+    _save(figure, path)
+
+
+def _save(figure, path):
+    """A quarter as large as it would be with all colours."""
     figure.savefig(path, dpi=100)
     plt.close(figure)
+    with Image.open(path) as picture:
+        picture = picture.convert("RGB").quantize(128)
+    picture.save(path, optimize=True)
 
 
 def _bar_label(cell):
