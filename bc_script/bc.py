@@ -72,6 +72,7 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     of what sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default
     nothing"""
     velocities: ClassVar[bool] = False  # demonstrations have none
+    proximity: ClassVar[str | None] = None
 
     # Evaluation and bookkeeping
     eval_every: flags.PositiveInt = 50_000
@@ -87,8 +88,7 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
 class Features(nn.Module):
     """Network inputs: observation, desired goal, and functions of them that speed up learning."""
 
-    def __init__(self, args, scene_size=0):
-        """`scene_size`: numbers of the encoded scene at the end of observations."""
+    def __init__(self, args, observation_size):
         super().__init__()
         self.goal_type, self.relative_goal = args.goal_type, args.relative_goal
         self.trigonometric = args.trigonometric
@@ -97,8 +97,8 @@ class Features(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
         self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
-        self.size = self.ee.stop + scene_size + goal_size
-        self.size += 14 * args.trigonometric
+        self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.proximity else None
+        self.size = observation_size + goal_size + 14 * args.trigonometric + 10 * bool(self.near)
         self.size += 3 * (args.relative_goal and args.goal_type != "config")
 
     def forward(self, observation, desired_goal):
@@ -109,6 +109,8 @@ class Features(nn.Module):
             inputs += [torch.sin(angles), torch.cos(angles)]
         if self.relative_goal and self.goal_type != "config":
             inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
+        if self.near is not None:
+            inputs.append(10.0 * observation[:, self.near])  # the links' distances, which are small
         return torch.cat(inputs, dim=1)
 
 
@@ -145,9 +147,9 @@ LOG_STD_MIN = -5
 class Actor(nn.Module):
     """A mixture of Gaussians with diagonal covariances over the action, in units of `MAX_STEP`."""
 
-    def __init__(self, args, scene_size=0):
+    def __init__(self, args, observation_size):
         super().__init__()
-        self.features = Features(args, scene_size)
+        self.features = Features(args, observation_size)
         self.num_modes = args.num_modes
         self.mlp = MLP(self.features.size, 15 * args.num_modes, args, layer_norm=False)
 
@@ -229,19 +231,19 @@ if __name__ == "__main__":
         torch.as_tensor(np.concatenate(arrays), device=device)
         for arrays in zip(*parts, strict=True)
     ]
-    latents, scene_size = None, 0  # the encoded scene of each demonstration
+    latents = None  # the encoded scene of each demonstration
     if args.encoder is not None:
         encoded = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
         firsts = np.cumsum([0, *map(len, encoded)])
         numbers = [first + part[3] for first, part in zip(firsts, parts, strict=False)]
         latents = torch.as_tensor(np.concatenate(encoded), device=device)
         data[3] = torch.as_tensor(np.concatenate(numbers), device=device)
-        scene_size = latents.shape[1]
     del files, parts
 
     # ALGO LOGIC: network and optimiser
-    actor = Actor(args, scene_size).to(device)
-    actor_average = Actor(args, scene_size).to(device).eval()  # evaluated and saved
+    observation_size = eval_envs[0].observation_space["observation"].shape[0]
+    actor = Actor(args, observation_size).to(device)
+    actor_average = Actor(args, observation_size).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
     parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)

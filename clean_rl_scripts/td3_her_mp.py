@@ -113,8 +113,7 @@ class Args(runs.RunFlags, protocol.EnvFlags):
 class Features(nn.Module):
     """Network inputs: observation, desired goal, and functions of them that speed up learning."""
 
-    def __init__(self, args, scene_size=0):
-        """`scene_size`: numbers of the encoded scene at the end of observations."""
+    def __init__(self, args, observation_size):
         super().__init__()
         self.goal_type, self.relative_goal = args.goal_type, args.relative_goal
         self.trigonometric = args.trigonometric
@@ -123,8 +122,8 @@ class Features(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
         self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
-        self.size = self.ee.stop + scene_size + goal_size
-        self.size += 14 * args.trigonometric
+        self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.proximity else None
+        self.size = observation_size + goal_size + 14 * args.trigonometric + 10 * bool(self.near)
         self.size += 3 * (args.relative_goal and args.goal_type != "config")
 
     def forward(self, observation, desired_goal):
@@ -135,6 +134,8 @@ class Features(nn.Module):
             inputs += [torch.sin(angles), torch.cos(angles)]
         if self.relative_goal and self.goal_type != "config":
             inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
+        if self.near is not None:
+            inputs.append(10.0 * observation[:, self.near])  # the links' distances, which are small
         return torch.cat(inputs, dim=1)
 
 
@@ -183,13 +184,13 @@ class Critics(nn.Module):
 
 
 class Actor(nn.Module):
-    def __init__(self, args, scene_size=0):
+    def __init__(self, args, observation_size):
         super().__init__()
-        self.features = Features(args, scene_size)
+        self.features = Features(args, observation_size)
         self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
         self.mlp = MLP(self.features.size, 7, args, layer_norm=False)
 
-    def forward(self, observation, achieved_goal, desired_goal):
+    def forward(self, observation, achieved_goal, desired_goal, **_):
         """The action (N, 7) without noise; this is what policy.pt contains."""
         return self.squashed(self.mlp(self.features(observation, desired_goal)))
 
@@ -209,8 +210,9 @@ class HerReplayBuffer:
     """
 
     def __init__(self, env, capacity, her_probability, rng):
-        spaces = env.unwrapped.observation_space
-        observation_size = spaces["observation"].shape[0]  # without the encoded scene
+        spaces, encoder = env.observation_space, getattr(env, "encoder", None)
+        self.latents = LatentTable(0 if encoder is None else encoder.size)
+        observation_size = spaces["observation"].shape[0] - self.latents.size
         goal_size = spaces["desired_goal"].shape[0]
         sizes = {"observation": observation_size, "action": 7}
         sizes |= {"next_observation": observation_size, "next_achieved_goal": goal_size}
@@ -219,8 +221,6 @@ class HerReplayBuffer:
         self.columns = {n: slice(end - sizes[n], end) for n, end in zip(sizes, ends, strict=True)}
         self.rows = np.zeros((capacity, ends[-1]), np.float32)
         self.remaining = np.zeros(capacity, np.int32)
-        seen_size = env.observation_space["observation"].shape[0]
-        self.latents = LatentTable(seen_size - observation_size)
         self.latent_row = np.zeros(capacity, np.int32)  # of each transition
         self.env, self.rng = env, rng
         self.capacity, self.her_probability = capacity, her_probability
@@ -349,11 +349,11 @@ def batches(buffer, number, batch_size, device):
 
 # ALGO LOGIC: networks, optimisers and one update
 class TD3:
-    def __init__(self, args, scene_size, device):
+    def __init__(self, args, observation_size, device):
         self.args = args
-        self.actor, self.actor_target = (Actor(args, scene_size).to(device) for _ in range(2))
+        self.actor, self.actor_target = (Actor(args, observation_size).to(device) for _ in range(2))
         self.actor_target.load_state_dict(self.actor.state_dict())
-        self.actor_average = Actor(args, scene_size).to(device).eval()  # evaluated and saved
+        self.actor_average = Actor(args, observation_size).to(device).eval()  # evaluated and saved
         self.actor_average.load_state_dict(self.actor.state_dict())
         self.critics, self.critics_target = (
             Critics(args, self.actor.features.size).to(device) for _ in range(2)
@@ -447,7 +447,7 @@ if __name__ == "__main__":
     progress |= {"best_success": -1.0, "best_step": 0, "demos_injected": 0}
     # END SHARED
 
-    agent = TD3(args, buffer.latents.size, device)
+    agent = TD3(args, eval_envs[0].observation_space["observation"].shape[0], device)
 
     # SHARED: resuming and episodes
     saved_parts = agent.saved_parts() | {"buffer": buffer, "rng": rng, "progress": progress}

@@ -10,7 +10,7 @@ from envs.tasks import TASKS, get_task
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
 
 
-def make(task, encoder=None, proximity=None, **kwargs):
+def make(task, encoder=None, proximity=None, append_proximity=False, **kwargs):
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
     Args:
@@ -20,6 +20,7 @@ def make(task, encoder=None, proximity=None, **kwargs):
         proximity: add `proximity` to observations, how far each link is from the nearest thing
             (`envs.wrappers.ProximityWrapper`): of the true `obstacles`, of the `points` that four
             sensors saw of them, or what z_E of an encoder tells; None for nothing.
+        append_proximity: with `proximity`: append it to `observation`, too, before z_E.
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:
@@ -29,6 +30,8 @@ def make(task, encoder=None, proximity=None, **kwargs):
     for name, value in (("task", task), ("encoder", encoder), ("proximity", proximity)):
         if not isinstance(value, (str, Path)) and (value is not None or name == "task"):
             raise ValueError(f"{name} must be a name or a path, got {value!r}")
+    if not isinstance(append_proximity, bool) or append_proximity and proximity is None:
+        raise ValueError(f"append_proximity, {append_proximity!r}, is a bool and needs proximity")
     env = RoboArmEnv(get_task(task).scene, **kwargs)
     # What takes long to import is imported only where it is needed.
     if encoder is not None:
@@ -40,7 +43,7 @@ def make(task, encoder=None, proximity=None, **kwargs):
         from envs.seeing import checker_of
         from envs.wrappers import ProximityWrapper
 
-        env = ProximityWrapper(env, checker_of(proximity))
+        env = ProximityWrapper(env, checker_of(proximity), append_proximity)
     return env
 
 

@@ -49,11 +49,16 @@ class EnvFlags:
     `vqvae`, `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `points`
     of what sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default
     nothing"""
+    proximity: str | None = None
+    """append to the observation, too, how far each link is from the nearest thing, and in which
+    direction that grows: of the true `obstacles`, of `points` that sensors see, or as z_E of an
+    encoder tells (`field`, or a path); by default nothing"""
 
 
 def env_arguments_of(args):
     """The `EnvFlags` in a trainer's flags as a dict, for `envs.make`."""
-    return {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
+    arguments = {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
+    return arguments | {"append_proximity": args.proximity is not None}
 
 
 def load_task(args):
@@ -91,7 +96,8 @@ def make_envs(task, number, **kwargs):
     try:
         return [envs.make(task, **kwargs) for _ in range(number)]
     except ValueError as error:
-        sys.exit(f"--encoder: {error}" if kwargs.get("encoder") is not None else str(error))
+        given = [name for name in ("encoder", "proximity") if kwargs.get(name) is not None]
+        sys.exit(f"--{' or --'.join(given)}: {error}" if given else str(error))
 
 
 def make_eval_envs(task, **kwargs):

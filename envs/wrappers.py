@@ -144,25 +144,37 @@ class ProximityWrapper(_ObservingWrapper):
         env: a `RoboArmEnv`, possibly in a `SceneEncodingWrapper`.
         checker_of: from a `Scene` to the `CollisionChecker` that tells: `envs.seeing.true_checker`
             or `seen_checker`.
+        append: whether `observation` has `proximity`, too: 80 numbers, before an encoded scene.
     """
 
-    def __init__(self, env, checker_of):
+    def __init__(self, env, checker_of, append=False):
         super().__init__(env)
-        self._checker_of = checker_of
+        self._checker_of, self.appends_proximity = checker_of, append
         names = ["proximity"] + ["goal_proximity"] * (env.goal_type != "ee")
         # (Inside of something, a distance is at least minus the way out.)
         space = gym.spaces.Box(-np.inf, np.inf, (10, 8), np.float32)
-        self.observation_space = gym.spaces.Dict(
-            env.observation_space.spaces | {name: space for name in names}
-        )
+        spaces = env.observation_space.spaces | {name: space for name in names}
+        if append:
+            size = spaces["observation"].shape[0] + 80
+            spaces["observation"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.observation_space = gym.spaces.Dict(spaces)
         self._goal, self._of_goal = None, None
 
-    def proximity_at(self, states):
-        """What `proximity` would be in other configurations: (..., 7) -> float32 (..., 10, 8)."""
-        return link_proximity(self._checker_of(self.unwrapped.scene), states)
+    def proximity_at(self, states, scene=None):
+        """What `proximity` would be in other configurations: (..., 7) -> float32 (..., 10, 8).
+
+        `scene`: a `Scene`, by default that of the environment.
+        """
+        checker = self._checker_of(self.unwrapped.scene if scene is None else scene)
+        return link_proximity(checker, states)
 
     def _with_more(self, observation):
-        more = {"proximity": self.proximity_at(observation["observation"][:7])}
+        seen = observation["observation"]
+        more = {"proximity": self.proximity_at(seen[:7])}
+        if self.appends_proximity:
+            size = self.unwrapped.observation_space["observation"].shape[0]
+            parts = seen[:size], more["proximity"].ravel(), seen[size:]
+            more["observation"] = np.concatenate(parts)
         if self.goal_type != "ee":
             goal = observation["desired_goal"][:7]
             key = self.unwrapped.scene, goal.tobytes()

@@ -43,7 +43,7 @@ def test_polyak_update_by_hand():
 
 def test_log_probability_is_the_squashed_gaussians():
     torch.manual_seed(0)
-    actor = sac.Actor(sac.Args(bf16=False)).eval()
+    actor = sac.Actor(sac.Args(bf16=False), 10).eval()
     observation, goal = torch.randn(64, 10), torch.randn(64, 3)
     action, log_prob = actor.sample(actor.features(observation, goal))
     mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
@@ -65,7 +65,7 @@ def test_network_inputs():
     c = rng.uniform(panda.LOWER, panda.UPPER, (5, 7))
     position, goal = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
     observation = torch.tensor(np.hstack([panda.normalise(c), position]), dtype=torch.float32)
-    features = sac.Features(sac.Args())
+    features = sac.Features(sac.Args(), 10)
     inputs = features(observation, torch.tensor(goal, dtype=torch.float32)).numpy()
     assert inputs.shape == (5, features.size)
     expected = np.hstack([observation, goal, np.sin(c), np.cos(c), 5 * (goal - position)])
@@ -78,7 +78,7 @@ def test_networks_fit_every_observation(goal_type, velocities):
     args = sac.Args(goal_type=goal_type, velocities=velocities, num_hidden_layers=4)
     env = envs.make("wall", goal_type=goal_type, velocities=velocities)
     batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
-    actor = sac.Actor(args)
+    actor = sac.Actor(args, 10)
     action = actor(**batch)
     assert action.shape == (2, 7)
     features = actor.features(batch["observation"], batch["desired_goal"])

@@ -55,7 +55,7 @@ def test_exploration_adds_noise_of_the_size_asked_for(tmp_path):
     flags = ["--updates-per-step", "0", "--exploration-noise", "0.2"]
     run = run_script("td3_her_mp", tmp_path, *flags)
     state = torch.load(run / "checkpoint.pt", weights_only=True)
-    actor = td3.Actor(td3.Args(hidden_size=16, bf16=False)).eval()
+    actor = td3.Actor(td3.Args(hidden_size=16, bf16=False), 10).eval()
     actor.load_state_dict(state["actor"])
     rows = state["buffer"]["rows"][-900:]  # the first 200 steps are random
     with torch.no_grad():
@@ -70,7 +70,7 @@ def test_the_penalty_keeps_the_tanh_from_saturating(tmp_path):
         flags = ["--updates-per-step", "0.5", "--preactivation-penalty", penalty]
         run = run_script("td3_her_mp", tmp_path / penalty, *flags)
         state = torch.load(run / "checkpoint.pt", weights_only=True)
-        actor = td3.Actor(td3.Args(hidden_size=16, bf16=False)).eval()
+        actor = td3.Actor(td3.Args(hidden_size=16, bf16=False), 10).eval()
         actor.load_state_dict(state["actor"])
         rows = state["buffer"]["rows"]
         with torch.no_grad():

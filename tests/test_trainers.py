@@ -109,7 +109,7 @@ def test_the_running_average_of_the_policy_is_what_is_saved(tmp_path, trainer, s
     run = run_script(trainer, tmp_path, *flags)
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     args = module.Args(hidden_size=16, bf16=False, goal_type="ee")
-    actor, average = module.Actor(args).eval(), module.Actor(args).eval()
+    actor, average = (module.Actor(args, 10).eval() for _ in range(2))
     actor.load_state_dict(state["actor"])
     average.load_state_dict(state["actor_average"])
     observation, goal = torch.randn(8, 10), torch.randn(8, 3)

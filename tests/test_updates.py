@@ -34,7 +34,7 @@ def batch(seed=0):
 def make(module, kind, **flags):
     torch.manual_seed(1)
     args = module.Args(hidden_size=16, bf16=False, batch_size=N, **flags)
-    return getattr(module, kind)(args, 0, torch.device("cpu"))
+    return getattr(module, kind)(args, 10, torch.device("cpu"))
 
 
 def take_apart(agent, *names):
@@ -233,7 +233,7 @@ def test_it_learns_which_action_is_best(module, kind):
 
 def test_an_update_of_behavioural_cloning():
     torch.manual_seed(1)
-    actor = bc.Actor(bc.Args(goal_type="ee", hidden_size=16, num_modes=1))
+    actor = bc.Actor(bc.Args(goal_type="ee", hidden_size=16, num_modes=1), 10)
     optimizer = torch.optim.Adam(actor.parameters(), lr=0.01, fused=True)
     data, old = batch(), copy.deepcopy(actor)
     inputs = data["observation"], data["desired_goal"], data["action"] / 0.03
