@@ -14,10 +14,10 @@ A **policy** is a network from `observation` (N, 10 or 17), `achieved_goal` and 
 (N, 3, 7 or 10), float32 as `RoboArmEnv` gives them, to the deterministic action (N, 7), float32 in
 [-1, 1]. Its metadata hold `kind` ("policy"), `task`, and `env`, a dict of the arguments of
 `envs.make` it was trained with (`goal_type`, `action_mode`, `max_step`, `velocities`, `encoder`,
-`proximity`, `append_proximity`). With an encoder, `observation` is longer by z_E; with proximity,
-`proximity` and `goal_proximity` (N, 10, 8) may be inputs, too. `last_layer`, a dict of `keep` (m) and `way_out`, is
-there where an `envs.last_layer.LastLayer` is part of the policy: whoever runs it by name
-(`envs.policies`) has that around it.
+`proximity`, `append_proximity`). With an encoder, `observation` is longer by z_E, and with appended
+proximity by 80; with proximity, `proximity` and `goal_proximity` (N, 10, 8) may be inputs, too.
+`last_layer`, a dict of `keep` (m) and `way_out`, is there where an `envs.last_layer.LastLayer` is
+part of the policy: whoever runs it by name (`envs.policies`) has that around it.
 """
 
 import copy
