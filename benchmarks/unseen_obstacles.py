@@ -59,6 +59,9 @@ for _encoder, _layer in (
         f"bc, {_encoder}": [*_flags, *_layer],
     }
 for _name, _policy, _layer, _encoder in (
+    ("dagger, vae", f"vae-{HARD}", POINTS[:2], []),
+    ("dagger, vqvae", f"vqvae-{HARD}", POINTS[:2], []),
+    ("dagger, pointnet2", f"pointnet2-{HARD}", POINTS[:2], []),
     ("dagger, points", f"points-{HARD}", POINTS[:2], []),
     ("dagger, field", f"points-{HARD}", POINTS[:2], ["--encoder", "field"]),
     ("dagger, points, mixed scenes", "points-mixed_scenes", POINTS[:2], []),
@@ -78,6 +81,18 @@ ROWS = (
     ("`bc.py`", "64 numbers (VQ-VAE)", "points", "bc, vqvae, alone", "bc, vqvae"),
     ("`bc.py`", "64 numbers (PointNet++)", "points", "bc, pointnet2, alone", "bc, pointnet2"),
     ("`bc.py`", "the obstacles", "the obstacles", "bc, oracle, alone", "bc, oracle"),
+    (
+        *("`dagger.py`", "64 numbers (VAE); points, how near", "points"),
+        *("dagger, vae, alone", "dagger, vae"),
+    ),
+    (
+        *("`dagger.py`", "64 numbers (VQ-VAE); points, how near", "points"),
+        *("dagger, vqvae, alone", "dagger, vqvae"),
+    ),
+    (
+        *("`dagger.py`", "64 numbers (PointNet++); points, how near", "points"),
+        *("dagger, pointnet2, alone", "dagger, pointnet2"),
+    ),
     (
         *("`dagger.py`", "64 numbers (field)", "64 numbers (field)"),
         *("dagger, field, alone", "dagger, field"),
