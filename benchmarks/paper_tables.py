@@ -159,10 +159,13 @@ def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
             return
     if cell.task != cell.trained_on:  # a policy of another cell
         trained = replace(cell, task=cell.trained_on)
-        run(trained, seed, steps, num_queries, runs_dir)
-        policy = kept.with_name(f"{trained.name}-s{seed}.pt")
+        run(trained, seed, steps, num_queries, runs_dir, keep_policies)
+        trained_result = kept.with_name(f"{trained.name}-s{seed}.json")
+        policy = trained_result.with_suffix(".pt")
+        if not policy.exists():  # the result stands alone
+            policy = runs_dir / policy.stem / policy.name
         evaluation = evaluate(policy, cell.task, num_queries, runs_dir / f"{name}.json")
-        result = json.loads(policy.with_suffix(".json").read_text())
+        result = json.loads(trained_result.read_text())
         result |= {"cell": cell.name, "policy": policy.stem, **evaluation}
         result["date"] = datetime.date.today().isoformat()
         write_atomically(kept, (json.dumps(result, indent=1) + "\n").encode())

@@ -34,8 +34,10 @@ PLANNING = ("via-points", "planner")
 UNTRAINED = ("go-to-goal", "random", *PLANNING)
 # What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
 # they decide what a success is.
-ENV_ARGUMENTS = ("goal_type", "action_mode", "max_step", "velocities")
-ENV_ARGUMENTS += ("encoder", "proximity", "append_proximity")
+ENV_ARGUMENTS = (
+    *("goal_type", "action_mode", "max_step", "velocities"),
+    *("encoder", "proximity", "append_proximity"),
+)
 # Packages with a folder `policies`. Only data are found there: `envs` imports no trainer.
 PACKAGES = ("bc_script", "clean_rl_scripts")
 TRIES = 16  # of `via-points`, by default

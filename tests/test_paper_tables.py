@@ -188,3 +188,7 @@ def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
     (found,) = paper_tables.load_results([tmp_path / "policies"])["bc-config-wall"]
     assert found["args"]["hidden_size"] == 8 and found["steps"] == 30 and not found["kept"]
     assert not (tmp_path / "policies" / "bc-config-wall-s5.pt").exists()
+    (tmp_path / "policies" / f"{elsewhere.name}-s5.json").unlink()
+    paper_tables.run(elsewhere, 5, 30, 2, tmp_path / "runs", keep_policies=False)
+    other = json.loads((tmp_path / "policies" / f"{elsewhere.name}-s5.json").read_text())
+    assert other["args"]["hidden_size"] == 8 and other["num_queries"] == 2
