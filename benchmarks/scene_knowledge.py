@@ -41,6 +41,7 @@ from envs.encoders import (
     ORACLE,
     TOLD_RADIUS,
     TOLD_REACH,
+    oracle,
     packaged_encoders,
     scene_encoder,
     told_points,
@@ -52,6 +53,8 @@ TASK = "random_boxes_hard"
 CELL = 0.2  # m
 LOW, HIGH = np.array([-0.8, -0.8, 0.0]), np.array([0.8, 0.8, 1.6])
 POSES, NEAR, FAR = 16, 0.1, 0.4
+# m: from when on what a decoder tells of counts as being in a cell; one of them is chosen.
+REACHES = [-0.005, 0.0, 0.0025, 0.005, 0.0075, 0.01, TOLD_REACH]
 SHAPE = tuple(np.round((HIGH - LOW) / CELL).astype(int))
 
 
@@ -205,38 +208,66 @@ def distance_probe(codes, data, test_codes, test_data, is_set=False, seed=0, epo
     return error[test_distances.flatten(0, 1) < NEAR].mean().item()
 
 
-def decoded_error(name, scenes, distances, states):
-    """Mean error (m) of distances from the points that an encoder tells of."""
-    errors = []
-    for scene, truth, some in zip(tqdm(scenes, desc="decoded"), distances, states, strict=True):
-        bare = replace(scene, table=None, floor=None)
-        told = CollisionChecker(replace(bare, obstacles=()), told_points(scene, name), TOLD_RADIUS)
-        error = np.abs(link_proximity(told, some, within=FAR)[..., 0] - truth)
-        errors.append(error[truth < NEAR])
-    return float(np.concatenate(errors).mean())
+def told_cells(points):
+    """Cells that points (n, 3), m, are in: bool (all cells,)."""
+    grid = np.zeros(SHAPE, bool)
+    at = np.floor((points - LOW) / CELL).astype(int)
+    grid[tuple(at[((at >= 0) & (at < SHAPE)).all(1)].T)] = True
+    return grid.ravel()
 
 
-def told_cells(name, scenes, reach):
-    """Cells with points that a decoder says are nearer than `reach` (m) to something: bool."""
-    cells = np.zeros((len(scenes), *SHAPE), bool)
-    for grid, scene in zip(cells, scenes, strict=True):
-        points = told_points(scene, name)
-        points = points[scene_encoder(name).distances(scene, points) < reach]
-        at = np.floor((points - LOW) / CELL).astype(int)
-        grid[tuple(at[((at >= 0) & (at < SHAPE)).all(1)].T)] = True
-    return cells.reshape(len(scenes), -1)
+def decoded(name, training, cells, testing, test_cells, test_data):
+    """What the points know that a decoder tells of: `decoded_iou` and `decoded_cm`.
 
+    Args:
+        training, testing: scenes. With the first 200 of `training` it is chosen how near something
+            must be for its cell to count as occupied.
+        cells, test_cells: bool (n, all cells), the truth.
+        test_data: of `testing`, see `link_distances`.
+    """
+    encoder = scene_encoder(name)
 
-def decoded_iou(name, training, cells, testing, test_cells):
-    """IoU of the cells that a decoder tells of; `cells` are bool (n, all cells)."""
+    def nearer(scene, points, reach):
+        return points[encoder.distances(scene, points) < reach]
 
     def iou(guess, truth):
         return float((guess & truth).sum() / (guess | truth).sum())
 
-    some = training[:200]
-    reaches = [-0.005, 0.0, 0.0025, 0.005, 0.0075, 0.01, TOLD_REACH]
-    best = max(reaches, key=lambda reach: iou(told_cells(name, some, reach), cells[: len(some)]))
-    return iou(told_cells(name, tqdm(testing, desc="decoded cells"), best), test_cells)
+    guesses = {reach: [] for reach in REACHES}
+    for scene in tqdm(training[:200], desc="decoded, to choose"):
+        points = told_points(scene, name)
+        for reach, found in guesses.items():
+            found.append(told_cells(nearer(scene, points, reach)))
+    best = max(REACHES, key=lambda reach: iou(np.stack(guesses[reach]), cells[:200]))
+    found, errors = [], []
+    _, distances, states = test_data
+    for scene, truth, some in zip(tqdm(testing, desc="decoded"), distances, states, strict=True):
+        points = told_points(scene, name)
+        found.append(told_cells(nearer(scene, points, best)))
+        bare = replace(scene, obstacles=(), table=None, floor=None)
+        checker = CollisionChecker(bare, points, TOLD_RADIUS)
+        error = np.abs(link_proximity(checker, some, within=FAR)[..., 0] - truth)
+        errors.append(error[truth < NEAR])
+    mean = 100 * float(np.concatenate(errors).mean())
+    return {"decoded_iou": iou(np.stack(found), test_cells), "decoded_cm": mean}
+
+
+def latents(names, scenes):
+    """z_E of scenes by each encoder, float32 (n, size), by name. The same sensors look once."""
+    groups = []  # of encoders
+    for encoder in map(scene_encoder, names):
+        group = next((some for some in groups if some[0].sensors == encoder.sensors), None)
+        if group is None:
+            groups.append([encoder])
+        else:
+            group.append(encoder)
+    found = {name: [] for name in names}
+    for scene in tqdm(scenes, desc="looking"):
+        for group in groups:
+            seen = group[0].look(scene)
+            for encoder in group:
+                found[encoder.name].append(encoder.encode(seen))
+    return {name: np.stack(z) for name, z in found.items()}
 
 
 def cross_entropy(probabilities, cells):
@@ -277,18 +308,21 @@ def main():
     nothing = np.zeros((len(training), 1), np.float32), np.zeros((len(testing), 1), np.float32)
     error = distance_probe(nothing[0], data, nothing[1], test_data)
     results["mean"]["links_cm"] = 100 * error
-    for name in [ORACLE, *(args.encoders or packaged_encoders())]:
-        encoder = scene_encoder(name)
-        codes = encoder.encode_demos(demos)[: len(training)]
-        test_codes = np.stack([encoder(scene) for scene in tqdm(testing, desc=name)])
-        is_set = name == ORACLE
-        results[name] = figures(probe(codes, cells, test_codes, is_set), means, test_cells)
-        error = distance_probe(codes, data, test_codes, test_data, is_set)
-        results[name]["links_cm"] = 100 * error
-        if encoder.has_decoder:
-            results[name]["decoded_iou"] = decoded_iou(name, training, grids[0], testing, grids[1])
-            error = decoded_error(name, testing, *test_data[1:])
-            results[name]["decoded_cm"] = 100 * error
+    names = args.encoders or packaged_encoders()
+    known, test_known = latents(names, training), latents(names, testing)
+    known[ORACLE], test_known[ORACLE] = (
+        np.stack([oracle(scene) for scene in scenes]) for scenes in (training, testing)
+    )
+    for name in tqdm([ORACLE, *names], desc="encoders"):
+        codes, is_set = (known[name], test_known[name]), name == ORACLE
+        result = figures(probe(codes[0], cells, codes[1], is_set), means, test_cells)
+        error = distance_probe(codes[0], data, codes[1], test_data, is_set)
+        result["links_cm"] = 100 * error
+        if scene_encoder(name).has_decoder:
+            result |= decoded(name, training, grids[0], testing, grids[1], test_data)
+        results[name] = result
+        if args.json is not None:
+            args.json.write_text(json.dumps(results, indent=1) + "\n")
     print(f"{len(training)} scenes to learn from, {len(testing)} to test, {cells.shape[1]} cells,")
     print(f"{test_cells.mean():.3f} of them occupied")
     for name, result in results.items():
@@ -297,8 +331,6 @@ def main():
         if "decoded_cm" in result:
             line += f"; decoded: IoU {result['decoded_iou']:.3f}, {result['decoded_cm']:.2f} cm"
         print(line)
-    if args.json is not None:
-        args.json.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

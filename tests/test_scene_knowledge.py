@@ -13,7 +13,8 @@ import torch
 
 from envs import panda
 from envs.collision import CollisionChecker
-from envs.encoders import oracle
+from envs.datasets import load_demos
+from envs.encoders import oracle, scene_encoder
 from envs.scenes import Box, Scene, Sphere
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -135,6 +136,21 @@ def test_the_second_probe_finds_what_the_codes_say(is_set):
     nothing = np.zeros((400, 1), np.float32)
     guesses = knowledge.distance_probe(nothing[:300], data[1], nothing[300:], data[3], epochs=40)
     assert 0.0 < knows < 0.75 * guesses
+
+
+def test_encoders_with_the_same_sensors_look_together_and_what_a_decoder_tells():
+    demos = load_demos("random_boxes_hard")
+    scenes = [demos.scenes[i] for i in range(12)]
+    found = knowledge.latents(["vae", "field", "vqvae"], scenes[:3])
+    for name, z in found.items():
+        np.testing.assert_array_equal(z, [scene_encoder(name)(scene) for scene in scenes[:3]])
+    cells = np.stack([knowledge.occupied(scene.obstacles).ravel() for scene in scenes])
+    data = knowledge.link_distances(scenes[6:], 0)
+    told = knowledge.decoded("field", scenes[:6], cells[:6], scenes[6:], cells[6:], data)
+    assert 0.7 < told["decoded_iou"] < 1 and 0.1 < told["decoded_cm"] < 3
+    # Of other scenes they tell nothing.
+    other = knowledge.decoded("field", scenes[:6], cells[:6], scenes[:6], cells[6:], data)
+    assert other["decoded_iou"] < 0.5 and other["decoded_cm"] > 5
 
 
 def test_inference_times(tmp_path):
