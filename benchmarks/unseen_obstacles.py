@@ -46,24 +46,23 @@ CELLS = {
     "look, then plan, field": [*PLANNER, "--encoder", "field"],
     "RRT-Connect": PLANNER,
 }
-for _encoder, _layer in (
-    ("vae", POINTS),
-    ("vqvae", POINTS),
-    ("pointnet2", POINTS),
-    ("oracle", OBSTACLES),
-):
+# What the layer around a policy of bc.py with an encoder knows.
+BC_LAYERS = {"vae": POINTS, "vqvae": POINTS, "pointnet2": POINTS, "oracle": OBSTACLES}
+for _encoder, _layer in BC_LAYERS.items():
     _flags = ["--policy", f"bc-combined-{_encoder}-{HARD}-s1"]
     CELLS |= {
         f"bc, {_encoder}, alone": _flags,
         f"bc, {_encoder}, no way out": [*_flags, *_layer, "--no-way-out"],
         f"bc, {_encoder}": [*_flags, *_layer],
     }
+TOLD = "dagger, points told by field"  # trained with points that are seen
 for _name, _policy, _layer, _encoder in (
     ("dagger, vae", f"vae-{HARD}", POINTS[:2], []),
     ("dagger, vqvae", f"vqvae-{HARD}", POINTS[:2], []),
     ("dagger, pointnet2", f"pointnet2-{HARD}", POINTS[:2], []),
+    ("dagger, field", f"field-{HARD}", POINTS[:2], []),
+    (TOLD, f"points-{HARD}", POINTS[:2], ["--encoder", "field"]),
     ("dagger, points", f"points-{HARD}", POINTS[:2], []),
-    ("dagger, field", f"points-{HARD}", POINTS[:2], ["--encoder", "field"]),
     ("dagger, points, mixed scenes", "points-mixed_scenes", POINTS[:2], []),
     ("dagger, oracle", f"oracle-{HARD}", OBSTACLES, []),
 ):
@@ -73,6 +72,7 @@ for _name, _policy, _layer, _encoder in (
         f"{_name}, no way out": [*_flags, *_layer, "--no-way-out"],
         _name: _flags,  # its own layer
     }
+LAYERS = ("alone", "with the layer", "and the way out")
 # What stands in the first table: policy, what it knows, what its layer knows, and its cells.
 ROWS = (
     ("`go-to-goal`", "nothing", "points", "go-to-goal", "reactive, points"),
@@ -97,6 +97,10 @@ ROWS = (
         *("`dagger.py`", "64 numbers (field)", "64 numbers (field)"),
         *("dagger, field, alone", "dagger, field"),
     ),
+    (
+        *("`dagger.py`, with points", "64 numbers (field): points", "64 numbers (field)"),
+        *(f"{TOLD}, alone", TOLD),
+    ),
     ("`dagger.py`", "points", "points", "dagger, points, alone", "dagger, points"),
     (
         *("`dagger.py`, mixed scenes", "points", "points"),
@@ -107,15 +111,26 @@ ROWS = (
 # And in the second one, for every task.
 EVERYWHERE = (
     "reactive, points",
-    "dagger, field",
     "dagger, points",
     "dagger, points, mixed scenes",
     "dagger, oracle",
     "look, then plan",
 )
+# In the third one, for tasks with scenes of other kinds, and the random boxes.
+WITH_ENCODERS = (
+    *("dagger, vae", "dagger, vqvae", "dagger, pointnet2", "dagger, field"),
+    *(TOLD, "dagger, points", "dagger, oracle"),
+)
+UNSEEN = [
+    name for name, task in envs.TASKS.items() if name.startswith("random") or not task.trainable
+]
 # What docs/baselines.json has, too: whatever the goal is said to be, these do the same, and
 # `combined` is reached like `ee`.
-OF_BASELINES = {"go-to-goal": "go-to-goal", "look, then plan": "look, then plan, 5 s"}
+OF_BASELINES = {
+    "go-to-goal": "go-to-goal",
+    "look, then plan": "look, then plan, 5 s",
+    "RRT-Connect": "RRT-Connect, 5 s",
+}
 # The paper's best learned policy, sections 5.3 and 5.4. It knew 64 numbers of the scene.
 PAPER = {
     HARD: 0.304,
@@ -174,44 +189,47 @@ def run(tasks, names, num, workers):
             write_atomically(RESULTS, (json.dumps(results, indent=1) + "\n").encode())
 
 
-def tables(results, baselines):
-    """In Markdown."""
-    names = ("go-to-goal", *EVERYWHERE)
-    results = {
-        task: {
-            ours: baselines[task][theirs]
-            for ours, theirs in OF_BASELINES.items()
-            if theirs in baselines[task]
-        }
-        | results.get(task, {})
-        for task in envs.TASKS
+def others_results(baselines):
+    """Of cells that other benchmarks ran: dict of task -> dict of cell's name -> its result."""
+    found = {
+        task: {ours: of[theirs] for ours, theirs in OF_BASELINES.items() if theirs in of}
+        for task, of in baselines.items()
     }
-    lines = [
-        "| policy | knows | its layer | alone | with the layer | and the way out | ms per action |",
-        "|---" * 7 + "|",
-    ]
+    for encoder in BC_LAYERS:
+        path = POLICIES / f"bc-combined-{encoder}-{HARD}-s1.json"
+        found[HARD][f"bc, {encoder}, alone"] = json.loads(path.read_text())
+    return found
+
+
+def tables(results, others):
+    """In Markdown. `others` are the results of `others_results`."""
+    results = {task: others.get(task, {}) | results.get(task, {}) for task in envs.TASKS}
     hard = results[HARD]
+    lines = _row("policy", "knows", "its layer", *LAYERS, "ms per action", is_head=True)
     for policy, knows, layer_knows, alone, layered in ROWS:
         cells = [_cell(hard.get(name)) for name in (alone, f"{layered}, no way out", layered)]
         taken = f"{hard[layered]['ms_per_action']:.1f}" if layered in hard else "not run"
-        lines.append("| " + " | ".join([policy, knows, layer_knows, *cells, taken]) + " |")
+        lines += _row(policy, knows, layer_knows, *cells, taken)
     for policy, knows, name in (
         ("look, then plan", "64 numbers (field)", "look, then plan, field"),
         ("look, then plan", "points", "look, then plan"),
         ("RRT-Connect", "the obstacles", "RRT-Connect"),
     ):
         seconds = f"searches {hard[name]['planning_seconds']:.3f} s" if name in hard else "not run"
-        cells = [policy, knows, "none", _cell(hard.get(name)), "", "", seconds]
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += ["", "| task | paper's best policy | " + " | ".join(names) + " |"]
-    lines.append("|---" * (2 + len(names)) + "|")
-    for task in envs.TASKS:
-        cells = [_cell(results[task].get(name)) for name in names]
-        paper = f"{PAPER[task]:.3f}" if task in PAPER else "none given"
-        lines.append("| " + " | ".join([f"`{task}`", paper, *cells]) + " |")
+        lines += _row(policy, knows, "none", _cell(hard.get(name)), "", "", seconds)
+    for names, tasks in (("go-to-goal", *EVERYWHERE), envs.TASKS), (WITH_ENCODERS, UNSEEN):
+        lines += ["", *_row("task", "paper's best policy", *names, is_head=True)]
+        for task in tasks:
+            paper = f"{PAPER[task]:.3f}" if task in PAPER else "none given"
+            lines += _row(f"`{task}`", paper, *(_cell(results[task].get(name)) for name in names))
     dates = sorted({result["date"] for cells in results.values() for result in cells.values()})
     lines += ["", f"In brackets, test queries and the 95 % interval of success. To {dates[-1]}."]
     return "\n".join(lines) + "\n"
+
+
+def _row(*cells, is_head=False):
+    """Lines of a table."""
+    return [f"| {' | '.join(cells)} |", *["|---" * len(cells) + "|"] * is_head]
 
 
 def _cell(result):
@@ -238,10 +256,13 @@ def main():
             run([HARD], args.cells or CELLS, args.num, args.workers)
         others = [task for task in args.only or envs.TASKS if task != HARD]
         run(others, args.cells or EVERYWHERE, args.num, args.workers)
+        if args.cells is None:
+            unseen = [task for task in others if task in UNSEEN]
+            run(unseen, WITH_ENCODERS, args.num, args.workers)
     before, _, rest = PAGE.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
-    baselines = json.loads(BASELINES.read_text())
-    page = before + BEGIN + tables(load_results(), baselines) + END + after
+    others = others_results(json.loads(BASELINES.read_text()))
+    page = before + BEGIN + tables(load_results(), others) + END + after
     write_atomically(PAGE, page.encode())
     print(f"{PAGE} written")
 
