@@ -53,7 +53,7 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     """let the learning rate fall linearly, to zero at the end"""
     num_modes: flags.Width = 1
     """Gaussians of the policy's mixture; the most likely one's mean is the action in evaluation"""
-    policy_average: flags.Share = 0.001
+    policy_average: flags.PositiveShare = 0.001
     """share of the policy that moves into its running average per update; the average is what is
     evaluated and saved (1: no averaging)"""
     hidden_size: flags.Width = 256

@@ -60,7 +60,7 @@ class Args(runs.RunFlags):
     """learning rate (Adam) at the start"""
     anneal: bool = True
     """let the learning rate fall linearly, to zero at the end"""
-    policy_average: flags.Share = 0.003
+    policy_average: flags.PositiveShare = 0.003
     """share of the policy that moves into its running average per update; the average is what is
     evaluated and saved (1: no averaging)"""
     pool_size: flags.PositiveInt = 200_000
@@ -95,7 +95,7 @@ class Args(runs.RunFlags):
     # DAgger
     round_every: flags.NonNegativeInt = 2_000
     """updates between rounds (0: none)"""
-    round_queries: flags.NonNegativeInt = 40
+    round_queries: flags.PositiveInt = 40
     """queries of a round, each in a scene of the paths"""
     round_labels: flags.NonNegativeInt = 16
     """of the states that the policy came to on a query, how many are labelled"""
@@ -260,7 +260,8 @@ class Examples:
                 continue  # rounded, the environment might refuse it
             query = Query(*panda.denormalise(ends).astype(np.float32), scene)
             visited.clear()
-            result = protocol.evaluate(act, [env], [query], self.device, last_layer)
+            seed = int(rng.integers(2**32))  # of the ways out of dead ends
+            result = protocol.evaluate(act, [env], [query], self.device, last_layer, seed)
             reached.append(result["success_rate"])
             states = np.array(visited)
             chances = np.ones(len(states))

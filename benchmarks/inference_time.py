@@ -1,23 +1,21 @@
 """How long policies think, beside RRT-Connect on the same queries (paper: "Prediction times").
 
     python benchmarks/inference_time.py POLICY ...       # runs' folders, or names (docs/results.md)
-    python benchmarks/inference_time.py --num 200 sac-combined-vae-random_boxes_hard-p0.5-s1
+    python benchmarks/inference_time.py --num 200 bc-combined-vae-random_boxes_hard-s1
 
 Seconds on one core, means over the first test queries of `random_boxes_hard`: rendering what the
-sensors see, and encoding it, once per episode; one action; all actions of an episode with the
-encoding (the paper's total, without rendering). The scenes' cache is not used. With `--encoder`
-what points tell a policy comes from that encoder's z_E. Encoding includes thinning points, asking a
-decoder, and what distances need; an action includes distances, and a last layer. Of planning, with
-the true obstacles, with what is seen, and with what the encoder tells: finding a path, within 5 s,
-and looking before. Nothing else should run beside it. The last line is JSON.
+sensors see, and encoding it, once per episode; finding a path, within 5 s, for those that search;
+one action; all of an episode but rendering (the paper's total). Queries share scenes, but nothing
+that was seen for one serves another. With `--encoder` what points tell a policy comes from that
+encoder's z_E, too. Encoding includes thinning points, asking a decoder, and what distances need; an
+action includes distances, and a last layer. RRT-Connect knows the true obstacles, what is seen, and
+what the encoder tells. Nothing else should run beside it. The last line is JSON.
 """
 
 import argparse
 import json
 import os
-import sys
 import time
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -26,54 +24,80 @@ import torch
 from tqdm import tqdm
 
 import envs
+from envs import encoders, seeing
 from envs.datasets import load_queries
-from envs.encoders import ORACLE, scene_encoder, with_told
+from envs.encoders import scene_encoder, with_told
 from envs.policies import find_policy, make_policy
 from envs.seeing import checker_of, seen_points
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "clean_rl_scripts"))
-from evaluate import evaluate
-
 TASK = "random_boxes_hard"
+SHOWN = ("rendering", "encoding", "planning", "action", "total")
 
 
-def seeing_times(env, scene):
-    """`rendering` and `encoding` (s) of a scene that was not seen before."""
-    encoder, encoding = env.encoder, 0.0
-    if encoder.name == ORACLE:
-        return 0.0, 0.0
+def forget(names):
+    """Forget all scenes that were seen; `names` of encoders."""
+    checkers = seeing.seen_checker, seeing.true_checker, encoders.told_checker
+    for cached in (seeing._look, encoders.told_points, *checkers):
+        cached.cache_clear()
+    for name in names:
+        scene_encoder(name)._cached.cache_clear()
+
+
+def seeing_times(encoder, near, scene):
+    """`rendering` and `encoding` (s) of a scene that was not seen before.
+
+    Args:
+        encoder: the policy's `SceneEncoder`, or None.
+        near: what distances are from, as `envs.make(proximity=...)` takes it, or None.
+        scene: the `Scene`.
+    """
+    tells = None if encoder is None else encoder.name if encoder.path else encoder.proximity
+    sources = {near, tells} - {None, "obstacles"}
+    networks = {name: scene_encoder(name) for name in sources - {"points"}}
+    forget(networks)
     began = time.perf_counter()
-    if encoder.path is None and encoder.proximity == "points":
+    if "points" in sources:
         seen_points(scene)
-        rendering = time.perf_counter() - began
-    else:
-        network = encoder if encoder.path else scene_encoder(encoder.proximity)
-        seen = network.look(scene)
-        rendering = time.perf_counter() - began
-        network.encode(seen)
-        encoding = time.perf_counter() - began - rendering
+    seen = {name: network.look(scene) for name, network in networks.items()}
+    rendering = time.perf_counter() - began
+    for name, network in networks.items():
+        network.encode(seen[name])
+    encoding = time.perf_counter() - began - rendering
+    for network in networks.values():
         network(scene)  # which it remembers, so that it does not count below
     began = time.perf_counter()
-    encoder(scene)
-    if "proximity" in env.observation_space.spaces:
-        checker_of(encoder.proximity)(scene)
+    if encoder is not None:
+        encoder(scene)
+    if near is not None:
+        checker_of(near)(scene)
     return rendering, encoding + time.perf_counter() - began
 
 
-def policy_times(policy, queries, encoder=None):
-    """Means (s) of `rendering`, `encoding`, `action`, `total`; and `success_rate`."""
-    name, arguments = find_policy(policy)
-    if encoder is not None:
+def times(policy, queries, encoder=None, time_limit=5.0):
+    """Means (s) of what is `SHOWN`, and `success_rate`.
+
+    Args:
+        policy: as `envs.policies.find_policy` takes it.
+        queries: list of `Query`.
+        encoder: what tells a policy of points; what a planner knows instead of the true obstacles.
+        time_limit: s, of a planner.
+    """
+    found, arguments = find_policy(policy)
+    searches, arguments = policy == "planner", arguments or {}
+    if encoder is not None and not searches:
         arguments = with_told(encoder, arguments)
     env = envs.make(TASK, **arguments)
-    begin = make_policy(name, env)
-    rows, actions, successes = [], 0, 0
-    sees = arguments.get("encoder") is not None
-    for number, query in enumerate(tqdm(queries, desc=str(policy), unit="query")):
-        rendering, encoding = seeing_times(env, query.scene) if sees else (0.0, 0.0)
-        act, acting = begin(number, query).act, 0.0
+    begin = make_policy(found, env, time_limit=time_limit, encoder=encoder if searches else None)
+    near = encoder or "obstacles" if searches else arguments.get("proximity")
+    seen_by = env.encoder if arguments.get("encoder") else None
+
+    def episode(number, query):
+        rendering, encoding = seeing_times(seen_by, near, query.scene)
+        began = time.perf_counter()
+        act = begin(number, query).act  # None: no path was found
+        planning, acting, actions = time.perf_counter() - began, 0.0, 0
         observation, info = env.reset_specific(*query)
-        ended = info["is_success"]
+        ended = info["is_success"] or act is None
         while not ended:
             began = time.perf_counter()
             action = act(observation)
@@ -83,16 +107,19 @@ def policy_times(policy, queries, encoder=None):
             actions += 1
             observation, _, terminated, truncated, info = env.step(action)
             ended = terminated or truncated
-        successes += info["is_success"]
-        rows.append((rendering, encoding, acting))
+        return rendering, encoding, planning, acting, actions, info["is_success"]
+
+    episode(0, queries[0])  # loads compiled code, which does not count
+    rows = [episode(*one) for one in enumerate(tqdm(queries, desc=str(policy), unit="query"))]
     env.close()
-    rendering, encoding, acting = np.mean(rows, axis=0)
+    rendering, encoding, planning, acting, actions, successes = np.mean(rows, axis=0)
     return {
         "rendering": rendering,
         "encoding": encoding,
-        "action": acting * len(rows) / max(1, actions),
-        "total": encoding + acting,
-        "success_rate": successes / len(rows),
+        "planning": planning,
+        "action": acting / actions if actions else 0.0,
+        "total": encoding + planning + acting,
+        "success_rate": successes,
     }
 
 
@@ -106,26 +133,19 @@ def main():
     torch.set_num_threads(1)
     queries = load_queries(TASK)
     queries = [queries[i] for i in range(min(args.num, len(queries)))]
-    results = {policy: policy_times(policy, queries) for policy in args.policies}
+    jobs = {policy: (policy, None) for policy in args.policies}
     for policy in args.policies:
-        knows = find_policy(policy)[1]
-        if args.encoder is not None and knows.get("proximity") == "points":
-            times = policy_times(policy, queries, args.encoder)
-            results[f"{policy}, {args.encoder}"] = times
-    print(
-        "| policy | rendering | encoding | an action | total | success |\n|---|---|---|---|---|---|"
-    )
-    for policy, result in results.items():
-        numbers = " | ".join(f"{result[name]:.4f}" for name in list(result)[:4])
-        print(f"| `{policy}` | {numbers} | {result['success_rate']:.3f} |", flush=True)
-    limit = {"num_queries": len(queries), "time_limit": args.time_limit}
+        if args.encoder is not None and find_policy(policy)[1].get("proximity") == "points":
+            jobs[f"{policy}, {args.encoder}"] = policy, args.encoder
     for knows in (None, "points", *([args.encoder] if args.encoder else [])):
-        planned = evaluate("planner", TASK, encoder=knows, **limit)
-        name = "RRT-Connect" if knows is None else f"RRT-Connect, {knows}"
-        results[name] = {key: planned[key] for key in ("planning_seconds", "success_rate")}
-        seconds, success = results[name].values()
-        print(f"| {name}, {args.time_limit:g} s at most | | | | {seconds:.4f} | {success:.3f} |")
-    print(json.dumps({"num_queries": len(queries)} | results))
+        jobs["RRT-Connect" if knows is None else f"RRT-Connect, {knows}"] = "planner", knows
+    results = {}
+    print(f"| policy | {' | '.join(SHOWN)} | success |\n{'|---' * (2 + len(SHOWN))}|")
+    for name, (policy, knows) in jobs.items():
+        results[name] = result = times(policy, queries, knows, args.time_limit)
+        numbers = " | ".join(f"{result[name]:.4f}" for name in SHOWN)
+        print(f"| `{name}` | {numbers} | {result['success_rate']:.3f} |", flush=True)
+    print(json.dumps({"num_queries": len(queries), "time_limit": args.time_limit} | results))
 
 
 if __name__ == "__main__":

@@ -157,6 +157,7 @@ def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
         elif result["steps"] >= steps:
             print(f"{name}: done before")
             return
+    runs_dir.mkdir(parents=True, exist_ok=True)
     if cell.task != cell.trained_on:  # a policy of another cell
         trained = replace(cell, task=cell.trained_on)
         run(trained, seed, steps, num_queries, runs_dir, keep_policies)
@@ -254,11 +255,11 @@ def load_results(folders):
 
 
 def ours(found):
-    """Success of a cell's results, and its interval over all queries; ± the seeds' deviation."""
+    """Success over all seeds' queries, and its interval; ± the seeds' deviation."""
     rates = [result["success_rate"] for result in found]
     counts = [result["num_queries"] for result in found]
-    rate = statistics.mean(rates)
-    low, high = wilson_interval(round(np.dot(rates, counts)), sum(counts))
+    successes, count = round(np.dot(rates, counts)), sum(counts)
+    rate, (low, high) = successes / count, wilson_interval(successes, count)
     deviation = f" ± {statistics.stdev(rates):.3f}" if len(rates) > 1 else ""
     return f"{rate:.3f}{deviation} [{low:.3f}, {high:.3f}]"
 

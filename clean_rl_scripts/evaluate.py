@@ -59,7 +59,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -575,10 +575,15 @@ def _draw(job):
 
 
 def _last_layer(args):
-    """As `evaluate` takes it."""
-    if not args.keep_distance:
-        return None if args.keep_distance is None else False
-    return LastLayer(args.keep_distance, args.way_out)
+    """As `evaluate` takes it. Raises ValueError: there is no way out that could be left out."""
+    if args.keep_distance is not None:
+        return LastLayer(args.keep_distance, args.way_out) if args.keep_distance else False
+    if args.way_out:
+        return None
+    own = own_layer(find_policy(args.policy)[0])
+    if own is None:
+        raise ValueError("--no-way-out: the policy has no last layer; --keep-distance puts one")
+    return replace(own, way_out=False)
 
 
 def main(arguments=None):

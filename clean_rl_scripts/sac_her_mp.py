@@ -57,21 +57,21 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     """demonstration file to use with --demo-prob; by default the task's own"""
     gamma: flags.Share = 0.95
     """discount factor (CleanRL: 0.99)"""
-    tau: flags.Share = 0.005
+    tau: flags.PositiveShare = 0.005
     """share of the critics that moves into the target critics per update"""
     policy_lr: flags.PositiveFloat = 1e-3
     """learning rate of the policy (Adam; CleanRL: 3e-4)"""
     q_lr: flags.PositiveFloat = 1e-3
     """learning rate of the critics (Adam)"""
     alpha: flags.PositiveFloat = 0.2
-    """entropy coefficient, if it is not tuned"""
+    """entropy coefficient; where tuning begins, if it is tuned"""
     autotune: bool = True
     """tune the entropy coefficient to the target entropy"""
     target_entropy: flags.FiniteFloat = -7.0
     """entropy that the tuning aims at, of the unscaled action (CleanRL: minus its dimensions)"""
     policy_frequency: flags.PositiveInt = 2
     """updates of the critics per update of the policy (CleanRL: as often as the critics)"""
-    policy_average: flags.Share = 0.001
+    policy_average: flags.PositiveShare = 0.001
     """share of the policy that moves into its running average per update of the policy; the average
     is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
     hidden_size: flags.Width = 256

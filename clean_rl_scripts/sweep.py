@@ -113,7 +113,7 @@ def train(trainer, flags, folder):
     """The result (dict) of one run of the trainer in `folder`, which goes on if it was stopped.
 
     Raises:
-        RuntimeError: it failed; the message has the end of what it said.
+        RuntimeError: it failed; the message has the end of what it said. Or it trains no policy.
         Stopped: it was killed.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,10 @@ def train(trainer, flags, folder):
             if code > 0:
                 end = (folder / "log.txt").read_text(errors="replace").strip()[-500:]
                 raise RuntimeError(f"the trainer ended with {code}: {end}")
-    return json.loads(next(folder.glob("*/result.json")).read_text())
+    result = json.loads(next(folder.glob("*/result.json")).read_text())
+    if METRIC not in result:
+        raise RuntimeError(f"its result has no {METRIC}: it trains no policy")
+    return result
 
 
 def folder_of(trial):

@@ -57,7 +57,7 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     """demonstration file to use with --demo-prob; by default the task's own"""
     gamma: flags.Share = 0.95
     """discount factor (CleanRL: 0.99)"""
-    tau: flags.Share = 0.005
+    tau: flags.PositiveShare = 0.005
     """share of policy and critics that moves into the target networks, per update of the policy"""
     policy_lr: flags.PositiveFloat = 1e-3
     """learning rate of the policy (Adam; CleanRL: 3e-4)"""
@@ -72,7 +72,7 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     """bound of the noise that smooths the critics' target, in units of action_scale"""
     policy_frequency: flags.PositiveInt = 2
     """updates of the critics per update of the policy and of all target networks"""
-    policy_average: flags.Share = 0.001
+    policy_average: flags.PositiveShare = 0.001
     """share of the policy that moves into its running average per update of the policy; the average
     is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
     preactivation_penalty: flags.NonNegativeFloat = 0.1

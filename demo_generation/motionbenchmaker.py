@@ -33,8 +33,9 @@ def read_problems(path):
 
 
 def _scene(obstacles):
-    if set(obstacles) - {"box", "cylinder"} and any(obstacles.get("sphere", [])):
-        raise KeyError("sphere")
+    for kind in sorted(set(obstacles) - {"box", "cylinder"}):
+        if obstacles[kind]:
+            raise KeyError(kind)
     boxes = [
         Box(tuple(box["position"]), tuple(box["size"]), tuple(box["quat_xyzw"]))
         for box in obstacles["box"]

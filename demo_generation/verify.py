@@ -16,9 +16,8 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from demo_generation.collect import make_planner
+from demo_generation.collect import demonstrate, make_planner
 from demo_generation.following import follow
-from demo_generation.planning import PlanningError
 from envs import flags, workers
 from envs.arm_env import RoboArmEnv
 from envs.datasets import DatasetError, demo_path, load_demos, write_demos
@@ -66,20 +65,11 @@ class Verifier:
         if verdict in ("good", "changed"):
             return index, verdict, _demo(demo.plan, execution, seed)
         rng = np.random.default_rng([seed, index])
-        for attempt in range(MEND_ATTEMPTS):
-            seed = int(rng.integers(1, 2**32))
-            try:
-                plan = self.planner.plan(
-                    demo.start, demo.goal, demo.scene, seed=seed, caution=0.5**attempt
-                )
-            except PlanningError:
-                continue
-            execution = follow(self.env, plan, demo.scene)
-            short = len(execution.states) - 1 <= self.env.horizon
-            clean = self.allow_collisions or not execution.collided
-            if execution.reached and clean and short:
-                return index, verdict, _demo(plan, execution, seed)
-        return index, verdict, None
+        found = demonstrate(
+            *(self.planner, demo.start, demo.goal, rng, MEND_ATTEMPTS),
+            allow_collisions=self.allow_collisions,
+        )
+        return index, verdict, found and _demo(*found)
 
     def _verdict(self, demo, execution):
         if not execution.reached:

@@ -136,8 +136,15 @@ class QueryScenes:
 
 
 def task_file(task, folder, suffix):
-    """The path of a task's file in a folder of `envs`, or beside a scene file."""
+    """The path of a task's file in a folder of `envs`, or beside a scene file.
+
+    Raises:
+        ValueError: there is no such task.
+        DatasetError: no files are made for this one.
+    """
     get_task(task)  # refuses an unknown task
+    if task in TRAINING_SCENES:
+        raise DatasetError(f"{task} are to learn from: no queries or demonstrations are in them")
     if has_name(task):
         return Path(__file__).parent / folder / f"{task}.h5"
     return Path(task).with_name(task_name(task) + suffix)
@@ -148,8 +155,6 @@ def locate(task_or_path, path_of_task):
 
     Raises DatasetError: no files are made for this task.
     """
-    if task_or_path in TRAINING_SCENES:
-        raise DatasetError(f"{task_or_path} are to learn from: there are no queries in them")
     if is_task(task_or_path):
         return path_of_task(task_or_path), task_or_path
     return Path(task_or_path), None

@@ -10,6 +10,7 @@
 Paper: sections 5.1 and 5.3. `SceneEncodingWrapper` is in `envs.wrappers`.
 """
 
+import contextlib
 import functools
 import hashlib
 import importlib.resources
@@ -184,9 +185,11 @@ class SceneEncoder:
         So do those who ask for their points (`envs.seeing`), with `points`.
 
         A trained encoder looks at them once, with a progress bar: z_E is kept in a file beside it,
-        `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others.
+        `<encoder>.<task>.npz`, which is made anew when the encoder or the scenes are others; where
+        that cannot be written, it is not.
         """
         seen = [demos.scenes[i] for i in range(len(demos))]
+        different = list(dict.fromkeys(seen))
         quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
 
         def encode():
@@ -196,12 +199,11 @@ class SceneEncoder:
         if self.path is None:
             if self.name.startswith(POINTS) and self._told_by is None:
                 for scene in tqdm(
-                    seen, f"looking at {demos.task}", unit="scene", mininterval=quiet
+                    different, f"looking at {demos.task}", unit="scene", mininterval=quiet
                 ):
                     keep_points(scene)
-            latents = np.stack([self._encode(scene) for scene in seen])
-            self._of_demos |= zip(seen, latents, strict=True)
-            return latents
+            self._of_demos |= {scene: self._encode(scene) for scene in different}
+            return np.stack([self._of_demos[scene] for scene in seen])
         path = self.path.with_suffix(f".{demos.task}.npz")
         key = hashlib.sha256(self.path.read_bytes() + repr(seen).encode()).hexdigest()
         latents = _read_latents(path, key)
@@ -209,7 +211,8 @@ class SceneEncoder:
             latents = encode()
             file = io.BytesIO()
             np.savez(file, key=key, codes=latents)
-            write_atomically(path, file.getvalue())
+            with contextlib.suppress(OSError):  # where nothing can be written, it is not kept
+                write_atomically(path, file.getvalue())
         self._of_demos |= zip(seen, latents, strict=True)
         return latents
 

@@ -43,6 +43,7 @@ Width = _number(int, 1, 2**16, "in [1, 65536]", "IN [1, 65536]")
 Pixels = _number(int, 1, 4096, "in [1, 4096]", "IN [1, 4096]")  # PyBullet gets slow long before
 Environments = _number(int, 1, 1000, "in [1, 1000]", "IN [1, 1000]")  # PyBullet has room for 1,024
 Share = _number(float, 0.0, 1.0, "in [0, 1]", "IN [0, 1]")
+PositiveShare = _number(float, sys.float_info.min, 1.0, "above 0, and at most 1", "IN (0, 1]")
 PositiveFloat = _number(float, sys.float_info.min, LARGEST, "above 0, and finite", "> 0")
 NonNegativeFloat = _number(float, 0.0, LARGEST, "at least 0, and finite", ">= 0")
 FiniteFloat = _number(float, -LARGEST, LARGEST, "finite", "")

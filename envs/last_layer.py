@@ -49,15 +49,15 @@ class LastLayer:
         way_out: whether it leaves dead ends.
 
     Raises:
-        ValueError: `keep` is no distance, or `way_out` not a bool.
+        ValueError: `keep` is no distance below `NEAR`, or `way_out` not a bool.
     """
 
     keep: float = 0.01
     way_out: bool = True
 
     def __post_init__(self):
-        if not (is_number(self.keep) and self.keep >= 0):
-            raise ValueError(f"keep must be a distance in m, got {self.keep!r}")
+        if not (is_number(self.keep) and 0 <= self.keep < NEAR):
+            raise ValueError(f"keep must be a distance below {NEAR} m, got {self.keep!r}")
         if not isinstance(self.way_out, bool):
             raise ValueError(f"way_out must be a bool, got {self.way_out!r}")
 

@@ -65,7 +65,8 @@ def _walls(rng):
         size = shape["length"], shape["thickness"], shape["height"]
         turned = rng.uniform(-TURNED, TURNED)
         walls.append(_placed(centre, size, azimuth + turned))
-        # The next one is opposite of this one, or at least a sixth of a turn away from all.
+        # The next one is opposite of this one, or at least a sixth of a turn from it. A third one
+        # may come near the first.
         between = math.pi if number == 0 and opposite else rng.uniform(math.pi / 3, math.pi * 5 / 6)
         azimuth += between
     return walls

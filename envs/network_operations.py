@@ -191,11 +191,16 @@ def _group_norm(x, weight, bias, rows, channels, size, groups, eps):
     return _at_least(1, groups) and channels % groups == 0 and list(x.flatten(2).shape) == shape
 
 
+def _batch_norm(x, weight, bias, mean, variance, momentum, eps):
+    return all(one is None or one.shape == x.shape[1:2] for one in (weight, bias, mean, variance))
+
+
 _RULES = {
     "aten.convolution.default": _convolution,
     "aten.avg_pool2d.default": _pool,
     "aten.max_pool2d_with_indices.default": _pool,
     "aten.native_group_norm.default": _group_norm,
+    "aten._native_batch_norm_legit_no_training.default": _batch_norm,
 }
 
 

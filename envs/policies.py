@@ -32,6 +32,7 @@ from envs.subgoals import subgoals
 PLANNING = ("via-points", "planner")
 """The policies that look for a motion before they move."""
 UNTRAINED = ("go-to-goal", "random", *PLANNING)
+DISPLACING = ("go-to-goal", *PLANNING)
 # What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
 # they decide what a success is.
 ENV_ARGUMENTS = (
@@ -155,6 +156,8 @@ def make_policy(
 
 
 def _make_policy(policy, env, seed, tries, time_limit, encoder):
+    if policy in DISPLACING and env.action_mode != "relative":
+        raise PolicyError(f"{policy} gives displacements, not actions of mode {env.action_mode!r}")
     if policy == "go-to-goal":
         return lambda number, query: EpisodePolicy(_go_to_goal(query.goal))
     if policy == "random":
@@ -267,7 +270,10 @@ def _trained(path, env):
 
     from envs.exported_networks import NetworkError
 
-    network = _load(path)[0]
+    network, trained, _ = _load(path)
+    mode = trained.get("action_mode", "relative")
+    if mode != env.action_mode:
+        raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
 
     # One observation at a time: in a batch its last bits would depend on the batch's size, for a
     # gain of a tenth of the time at most.

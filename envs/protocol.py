@@ -22,6 +22,7 @@ from envs.exported_networks import load_network, save_network
 from envs.flags import PositiveFloat, PositiveInt
 from envs.last_layer import layer_of
 from envs.runs import check_finite, write_json
+from envs.subgoals import MAX_STEP
 
 NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
 PICTURE_SIZE = (240, 180)
@@ -163,7 +164,7 @@ def log_episode(writer, step, episode_return, info, recent_success):
 
 
 @torch.no_grad()
-def evaluate(policy, envs, queries, device, last_layer=None):
+def evaluate(policy, envs, queries, device, last_layer=None, seed=0):
     """Run a deterministic policy on every query, each env one at a time; mean results.
 
     Args:
@@ -173,6 +174,7 @@ def evaluate(policy, envs, queries, device, last_layer=None):
         queries: `envs.datasets.Queries`, or a list of `Query`.
         device: of the policy.
         last_layer: an `envs.last_layer.LastLayer` around the policy, or None.
+        seed: of the layer's ways out, >= 0.
 
     Returns:
         A dict of floats: `success_rate`, `clean_success_rate` (without a touch), `collision_rate`
@@ -191,7 +193,7 @@ def evaluate(policy, envs, queries, device, last_layer=None):
             running[env] = env.reset_specific(*queries[i])[0]
             acts[env] = lambda observation: proposed[env]
             if last_layer is not None:
-                acts[env] = last_layer.around(acts[env], env, np.random.default_rng([0, i]))
+                acts[env] = last_layer.around(acts[env], env, np.random.default_rng([seed, i]))
 
     for env in envs:
         start(env)
@@ -295,7 +297,8 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
     """Test `policy.pt` on test queries: `result.json`, and a line on the console.
 
     Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed, also
-    where the policy was trained under others: results are to be compared. File and line say so.
+    where the policy was trained under others: results are to be compared. File and line say so,
+    and that they cannot be where its steps are longer or shorter (`deviations`).
 
     Args:
         run: the run's folder.
@@ -315,6 +318,8 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
     rules = {name: getattr(test_envs[0], name) for name in RULES}
     trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}
     result |= {"rules": rules, "rules_in_training": trained}
+    longest = own.get("max_step", MAX_STEP)  # what the policy learned to act with
+    result |= {"deviations": {} if longest == MAX_STEP else {"max_step": longest}}
     result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
     result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
     result |= {"validation_success_rate": progress["best_success"]}
@@ -322,6 +327,8 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
     write_json(run / "result.json", result | {"args": asdict(args)})
     if rules != trained:
         print(f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:")
+    if result["deviations"]:
+        print(f"not comparable: max_step is {longest}, not {MAX_STEP}")
     print(
         f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
         f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "

@@ -14,6 +14,14 @@ MAX_LENGTH, MAX_SCENE_OBSTACLES = 1000.0, 10_000
 """m, of sizes and coordinates, and obstacles of a scene: more is a mistake."""
 
 
+def _as_tuples(body):
+    """Vectors may be given as lists or arrays; bodies can be compared and hashed all the same."""
+    for name in ("position", "size", "orientation"):
+        value = getattr(body, name, ())
+        if type(value) is not tuple:
+            object.__setattr__(body, name, tuple(value))
+
+
 @dataclass(frozen=True)
 class Box:
     """A box: centre, full edges, and orientation as a quaternion (x, y, z, w)."""
@@ -21,6 +29,8 @@ class Box:
     position: tuple[float, float, float]
     size: tuple[float, float, float]
     orientation: tuple[float, float, float, float] = IDENTITY
+
+    __post_init__ = _as_tuples
 
 
 @dataclass(frozen=True)
@@ -32,6 +42,8 @@ class Cylinder:
     length: float
     orientation: tuple[float, float, float, float] = IDENTITY
 
+    __post_init__ = _as_tuples
+
 
 @dataclass(frozen=True)
 class Sphere:
@@ -39,6 +51,8 @@ class Sphere:
 
     position: tuple[float, float, float]
     radius: float
+
+    __post_init__ = _as_tuples
 
 
 Obstacle = Box | Cylinder | Sphere
@@ -72,6 +86,7 @@ class Scene:
     friction: float = FRICTION
 
     def __post_init__(self):
+        object.__setattr__(self, "obstacles", tuple(self.obstacles))
         for obstacle in self.obstacles:
             if not isinstance(obstacle, Obstacle):
                 raise TypeError(f"obstacles must be Box, Cylinder or Sphere, got {obstacle!r}")

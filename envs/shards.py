@@ -31,7 +31,7 @@ def shard_paths(folder, what):
     one is missing.
     """
     numbers = sorted(
-        int(match[1]) for path in Path(folder).glob("*") if (match := _SHARD.match(path.name))
+        int(match[1]) for path in Path(folder).glob("*") if (match := _SHARD.fullmatch(path.name))
     )
     if not numbers:
         raise DatasetError(f"{folder}: no {what} (shard_00000.h5, ...) in this folder")

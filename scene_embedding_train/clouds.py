@@ -55,7 +55,7 @@ def load_clouds(observations, num_points):
 
 
 def load_obstacle_points(observations, num_points):
-    """What the sensors saw of obstacles: `points` and `there`, arrays that are mapped into memory.
+    """What the sensors saw of obstacles: their names, and `points` and `there`, mapped into memory.
 
     `points`: float32 (scenes, sensors * num_points, 3), m, evenly spaced among a sensor's points on
     obstacles; `there`: bool (scenes, sensors * num_points), false where a sensor saw none.

@@ -293,13 +293,15 @@ if __name__ == "__main__":
         progress["updates"] = step = progress["updates"] + 1
         bar.update()
         if step % args.restart_every == 0:
-            for codebook, vectors in zip(model.codebooks, latents, strict=True):
-                used = codebook.restart(vectors.flatten(0, 1))
+            used = [
+                codebook.restart(vectors.flatten(0, 1))
+                for codebook, vectors in zip(model.codebooks, latents, strict=True)
+            ]
         if step % 100 == 0:
             for name, value in losses.items():
                 writer.add_scalar(f"losses/{name}", value.item(), step)
             if step % args.restart_every == 0:
-                writer.add_scalar("charts/codes_used", used, step)
+                writer.add_scalar("charts/codes_used", np.mean(used), step)
             writer.add_scalar("charts/updates_per_second", rate(bar), step)
 
         # SHARED: evaluate, keep the best encoder

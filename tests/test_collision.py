@@ -581,7 +581,8 @@ def test_nothing_there():
     near = checker.nearest(STATE, self_collisions=False)
     assert (near.distance == np.inf).all() and (near.thing == NOTHING).all()
     assert not near.direction.any() and not near.point.any()
-    assert checker.is_free(STATE, margin=0.4, clearance=0.4) in (True, False)
+    # Clearance is from obstacles, a margin from the other links, too.
+    assert checker.is_free(STATE, clearance=0.4) and not checker.is_free(STATE, margin=0.4)
     folded = panda.normalise([1.0, -0.5, 0.0, -1.8, 0.0, -0.08, 0.0])
     assert checker.is_free([STATE, folded]).tolist() == [True, False]  # the arm is there
 

@@ -518,6 +518,7 @@ def test_make_queries_command_repeats_itself(tmp_path):
     ("arguments", "complaint"),
     [
         (["--task", "wall", "wal"], "unknown task 'wal'"),
+        (["--task", "mixed_scenes"], "mixed_scenes are to learn from"),
         (["--task", "wall", "--output", "no/such/folder/wall.h5"], "cannot write no/such/folder"),
         (["--task", "wall", "--output", "envs"], "envs is a directory"),
         (["--task", "all", "--output", "some.h5"], "one task"),

@@ -758,6 +758,7 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(run, observations,
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     folder = next(tmp_path.iterdir())
+    assert not (folder / "result.json").exists()
     resume = [sys.executable, str(FOLDER / f"{name}.py"), "--resume", str(folder)]
     done = subprocess.run(resume, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

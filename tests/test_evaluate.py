@@ -296,6 +296,11 @@ def test_a_last_layer_around_a_policy(tmp_path):
         assert found[name]["collision_rate"] < 0.6 * found["bare"]["collision_rate"]
     rates = {name: result["success_rate"] for name, result in found.items()}
     assert rates["bare"] < rates["layer"] < rates["way out"]
+    own = ["--policy", "dagger-combined-points-random_boxes_hard-s1", "--task", "wall"]
+    own += ["--num-queries", "1", "--no-way-out", "--json", str(tmp_path / "result.json")]
+    assert evaluation.main(own) == 0
+    found = json.loads((tmp_path / "result.json").read_text())
+    assert not found["last_layer"]["way_out"] and found["last_layer"]["keep"] > 0
     assert found["points"]["seed"] == 0 and found["bare"]["seed"] is None
 
 
@@ -458,6 +463,7 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"encoder": "points"}, "encoder is for via-points, planner and a last layer"),
         ({"policy": near, "keep-distance": "0.1", "encoder": "points"}, "from obstacles, not"),
         ({"policy": subgoal, "keep-distance": "0.01"}, "a last layer changes displacements"),
+        ({"policy": "go-to-goal", "keep-distance": "0.15"}, "keep must be a distance below 0.15"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),

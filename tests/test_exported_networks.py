@@ -393,8 +393,11 @@ def _squared(times):
     return nodes
 
 
+BATCH_NORM = "aten._native_batch_norm_legit_no_training.default"
+ONE = {"tensor": "one"}  # parameters of one channel
 HOSTILE = {
     "no groups": [["aten.native_group_norm.default", [X, None, None, 2, 3, 1, 0, 1e-5], {}]],
+    "channels": [[BATCH_NORM, [X, ONE, ONE, ONE, ONE, 0.1, 1e-5], {}]],
     "other sizes": [["aten.native_group_norm.default", [X, None, None, 9, 3, 9, 3, 1e-5], {}]],
     "no stride": [["aten.convolution.default", [X, X, None, [0], [0], [1], False, [0], 1], {}]],
     "no group": [["aten.convolution.default", [X, X, None, [1], [0], [1], False, [0], 0], {}]],
@@ -423,7 +426,7 @@ def test_hostile_networks_are_refused_before_they_run(name, tmp_path):
     """In a second and a gigabyte: nothing large is made, no kernel sees such arguments."""
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
     with pytest.raises(NetworkError, match=r"net.pt"):
-        _network(tmp_path, *HOSTILE[name])(torch.ones(2, 3))
+        _network(tmp_path, *HOSTILE[name], one=torch.ones(1))(torch.ones(2, 3))
     assert time.perf_counter() - began < 5.0  # on a busy machine
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1_000_000  # kB
 

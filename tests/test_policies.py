@@ -50,6 +50,16 @@ def test_a_policy_in_an_environment_without_what_it_sees():
     env.close()
 
 
+def test_a_policy_whose_actions_mean_something_else():
+    env = envs.make("wall", action_mode="subgoal")
+    trained = find_policy("sac-ee-wall-p1-s1")[0]
+    for policy in ("go-to-goal", "via-points", "planner", trained):
+        with pytest.raises(PolicyError, match="of mode"):
+            make_policy(policy, env)
+    make_policy("random", env)
+    env.close()
+
+
 def test_a_shipped_policy_brings_what_it_sees_and_its_last_layer():
     path, arguments = find_policy("dagger-combined-points-random_boxes_hard-s1")
     assert arguments == {"goal_type": "combined", "encoder": "points:32", "proximity": "points"}

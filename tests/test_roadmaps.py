@@ -251,6 +251,7 @@ def test_more_scenes_go_on_from_what_is_there(collected, tmp_path):
 def test_a_corrupt_shard_is_named(collected, tmp_path):
     for name, contents in files(collected).items():
         (tmp_path / name).write_bytes(contents)
+    (tmp_path / "shard_00000.h5.bak").write_bytes(b"")  # no shard
     path = shard_path(tmp_path, 1)
     good = path.read_bytes()
     points = load_roadmap_paths(tmp_path).of_scene(2)[0]

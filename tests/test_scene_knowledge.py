@@ -160,4 +160,6 @@ def test_inference_times(tmp_path):
     times = json.loads(done.stdout.splitlines()[-1])
     assert times["num_queries"] == 3 and times[policy]["encoding"] == 0
     assert 0 < times[policy]["action"] < times[policy]["total"] < 60
-    assert 0 < times["RRT-Connect"]["planning_seconds"] < 5.5
+    assert times["RRT-Connect"]["rendering"] == 0 < times["RRT-Connect"]["planning"] < 5.5
+    seen = times["RRT-Connect, points"]
+    assert seen["rendering"] > 0.001 and seen["total"] > seen["planning"]

@@ -76,6 +76,12 @@ def test_what_is_no_scene_is_refused_with_the_reason(fields):
         Scene(**fields)
 
 
+def test_vectors_may_be_lists_and_arrays():
+    given = Scene([Box([1, 2, 3], np.ones(3)), Cylinder(np.zeros(3), 0.1, 1.0)], table=None)
+    plain = Scene((Box((1, 2, 3), (1, 1, 1)), Cylinder((0, 0, 0), 0.1, 1.0)), table=None)
+    assert given == plain and hash(given) == hash(plain) and len({given, plain}) == 1
+
+
 # --- The distribution
 
 
@@ -129,7 +135,7 @@ def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
 
 
 def test_there_are_no_queries_in_mixed_scenes():
-    with pytest.raises(DatasetError, match="mixed_scenes are to learn from: there are no queries"):
+    with pytest.raises(DatasetError, match="mixed_scenes are to learn from: no queries or dem"):
         load_queries("mixed_scenes")
     env = envs.make("mixed_scenes")
     env.reset(seed=0)

@@ -195,6 +195,12 @@ def test_on_ray(trainer):
         cluster.shutdown()
 
 
+def test_a_trainer_of_no_policy_is_a_failure(trainer):
+    trainer.write_text(TRAINER.replace("validation_success_rate", "error_near"))
+    with pytest.raises(SystemExit, match="every trial failed"):
+        sweep.main(arguments(trainer, "--trials", "1"))
+
+
 def test_every_trial_failed(trainer):
     with pytest.raises(SystemExit, match="every trial failed"):
         sweep.main(arguments(trainer, "--trials", "2", "--", "--other", "no number"))
