@@ -338,14 +338,15 @@ def page(cells, results, baselines):
         "",
         "![floor, paper, ours, ceiling](pictures/results_story.png)",
         "",
-        "Success on test queries: in bold ours with its 95 % interval (of several seeds: mean,",
-        "deviation, interval of all their queries), in small the steps (BC: batches) and seeds;",
+        "Success on test queries: in bold ours with its 95 % interval (of several seeds: over",
+        "all their queries, and the seeds' deviation), in small the steps (BC: batches) and seeds;",
         "below it the paper's, mean ± standard deviation of four seeds, after 1,000,000 steps",
         f"({LONG_RUN:,} for random boxes). Floor and ceiling do not learn, and know a goal",
-        "configuration ([baselines.md](baselines.md)). With p = 0, queries are those of the",
-        "demonstrations, which are not shown; in the paper they are sampled.",
+        "configuration (measured with goal `ee`: [baselines.md](baselines.md)). With p = 0,",
+        "queries are those of the demonstrations, which are not shown; the paper samples them.",
         "`python benchmarks/paper_tables.py` runs cells and writes this page;",
         "`clean_rl_scripts/evaluate.py --policy NAME` runs any policy below that was kept.",
+        "Minutes are of one core of an AMD EPYC or Intel Xeon, mostly beside other jobs.",
         "Earlier runs: [experiments.md](experiments.md#the-first-long-runs).",
         "The words: [glossary.md](glossary.md).",
     ]
@@ -375,7 +376,7 @@ def page(cells, results, baselines):
         f"{name}: `{' '.join(flags)}`" for name, flags in RECIPES.items() if flags
     )
     lines[-1] += (
-        ". Each policy's JSON has all of its flags, also where it says `other flags` (TD3's"
+        ". Each kept policy's JSON has all of its flags, also where it says `other flags` (TD3's"
     )
     lines[-1] += " are older than its penalty). (The paper's networks have two hidden"
     lines[-1] += " layers, with encoders four.)"

@@ -28,10 +28,10 @@ The last two check collisions with the true obstacles (`envs.collision`), which 
 does not see; with `--encoder points`, with what four point clouds see of them: look, then plan;
 with the name of an encoder that has a decoder (`--encoder field`), with what its 64 numbers tell.
 
-Around any policy, `--keep-distance` puts a last layer (`envs.last_layer`): no link comes nearer to
-anything than so many metres, and the arm leaves dead ends. It knows the true obstacles, too, or
-with `--encoder points` what is seen. A policy that was trained with points and distances from them
-may get those that an encoder tells of: `--encoder field`.
+Around any policy, `--keep-distance` puts a last layer (`envs.last_layer`): links stay that far (m)
+from everything, as far as it can, and the arm leaves dead ends. It knows the true obstacles, too,
+or with `--encoder points` what is seen. A policy that was trained with points and distances from
+them may get those that an encoder tells of: `--encoder field`.
 
 What comes out:
 
@@ -91,7 +91,7 @@ FRAMES = 8  # of a picture
 class Args:
     policy: str
     """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy network, a run's folder
-    with a `policy.pt` in it, or the name of a policy of docs/results.md"""
+    with a `policy.pt` in it, or the name of a shipped one (docs/results.md)"""
     task: str
     """the task, one of `envs.TASKS`, or a scene file (.yaml)"""
     goal_type: Literal["ee", "config", "combined"] | None = None
