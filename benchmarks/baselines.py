@@ -30,7 +30,7 @@ RESULTS, TABLE = ROOT / "docs" / "baselines.json", ROOT / "docs" / "baselines.md
 CELLS = {
     "go-to-goal": ["--policy", "go-to-goal"],
     "reactive, points": [
-        *("--policy", "go-to-goal", "--keep-distance", "0.015", "--encoder", "points")
+        *("--policy", "go-to-goal", "--keep-distance", "0.01", "--encoder", "points")
     ],
     "reactive, obstacles": ["--policy", "go-to-goal", "--keep-distance", "0.01"],
     "via-points, K = 16": ["--policy", "via-points", "--tries", "16"],

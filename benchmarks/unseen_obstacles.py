@@ -37,7 +37,7 @@ POLICIES = ROOT / "bc_script" / "policies"
 HARD = "random_boxes_hard"
 # What a last layer around any policy keeps: see docs/last_layer.md.
 OBSTACLES = ["--keep-distance", "0.01"]
-POINTS = ["--keep-distance", "0.015", "--encoder", "points"]
+POINTS = ["--keep-distance", "0.01", "--encoder", "points"]
 STRAIGHT = ["--policy", "go-to-goal", "--goal-type", "combined"]
 PLANNER = ["--policy", "planner", "--goal-type", "combined"]
 CELLS = {

@@ -63,7 +63,7 @@ def test_a_policy_whose_actions_mean_something_else():
 def test_a_shipped_policy_brings_what_it_sees_and_its_last_layer():
     path, arguments = find_policy("dagger-combined-points-random_boxes_hard-s1")
     assert arguments == {"goal_type": "combined", "encoder": "points:32", "proximity": "points"}
-    assert own_layer(path) == LastLayer(keep=0.015, way_out=True)
+    assert own_layer(path) == LastLayer(keep=0.01, way_out=True)
     assert own_layer(policy_file("bc-config-double_walls-s1")) is None
 
 
