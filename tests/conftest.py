@@ -11,6 +11,19 @@ from envs import protocol
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# Files that take a minute and more. They begin first, so that no process is left alone with one.
+LONG = (
+    *("test_trainers", "test_encoder_policies", "test_encoders", "test_devices", "test_td3_her_mp"),
+    *("test_dagger", "test_bc", "test_collect", "test_own_algorithm", "test_evaluate"),
+    *("test_paper_tables", "test_own_scene", "test_sac_her_mp"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    ranks = {name: rank for rank, name in enumerate(LONG)}
+    items.sort(key=lambda item: ranks.get(item.path.stem, len(LONG)))
+
+
 @pytest.fixture(autouse=True)
 def seeded():
     """What a test draws from global generators is the same in every run and order."""
