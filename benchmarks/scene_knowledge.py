@@ -290,12 +290,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("encoders", nargs="*", help="programs (encoder.pt); default: the packaged")
     parser.add_argument("--num", type=int, default=10_000, help="scenes to learn from (10,000)")
+    parser.add_argument("--num-test", type=int, default=2_000, help="scenes to test on (2,000)")
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     args = parser.parse_args()
     torch.set_num_threads(1)
     demos, queries = load_demos(TASK), load_queries(TASK)
     training = [demos.scenes[i] for i in range(min(args.num, len(demos)))]
-    testing = list(dict.fromkeys(queries.scenes[i] for i in range(len(queries))))
+    testing = list(dict.fromkeys(queries.scenes[i] for i in range(len(queries))))[: args.num_test]
     grids = [
         np.stack([occupied(scene.obstacles).ravel() for scene in tqdm(scenes, desc="cells")])
         for scenes in (training, testing)
