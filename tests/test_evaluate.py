@@ -299,8 +299,8 @@ def test_a_last_layer_around_a_policy(tmp_path):
     own = ["--policy", "dagger-combined-points-random_boxes_hard-s1", "--task", "wall"]
     own += ["--num-queries", "1", "--no-way-out", "--json", str(tmp_path / "result.json")]
     assert evaluation.main(own) == 0
-    found = json.loads((tmp_path / "result.json").read_text())
-    assert not found["last_layer"]["way_out"] and found["last_layer"]["keep"] > 0
+    layer = json.loads((tmp_path / "result.json").read_text())["last_layer"]
+    assert not layer["way_out"] and layer["keep"] > 0
     assert found["points"]["seed"] == 0 and found["bare"]["seed"] is None
 
 
