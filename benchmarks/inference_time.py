@@ -51,6 +51,8 @@ def seeing_times(encoder, near, scene):
         near: what distances are from, as `envs.make(proximity=...)` takes it, or None.
         scene: the `Scene`.
     """
+    if encoder is None and near is None:
+        return 0.0, 0.0
     tells = None if encoder is None else encoder.name if encoder.path else encoder.proximity
     sources = {near, tells} - {None, "obstacles"}
     networks = {name: scene_encoder(name) for name in sources - {"points"}}
@@ -59,7 +61,7 @@ def seeing_times(encoder, near, scene):
     if "points" in sources:
         seen_points(scene)
     seen = {name: network.look(scene) for name, network in networks.items()}
-    rendering = time.perf_counter() - began
+    rendering = time.perf_counter() - began if sources else 0.0
     for name, network in networks.items():
         network.encode(seen[name])
     encoding = time.perf_counter() - began - rendering

@@ -121,19 +121,20 @@ class FarAway(DistanceFromTheBall):
 
 
 def test_cells_that_are_told(encoder):
-    """Those of `benchmarks/scene_knowledge.py`, and how many of them are right."""
+    """Those of `benchmarks/scene_knowledge.py`: how many are right, and links' distances."""
     sys.path.append(str(ROOT / "benchmarks"))
     knowledge = importlib.import_module("scene_knowledge")
-    (cells,) = knowledge.told_cells(encoder, [Scene()], 0.0)
     points = told_points(Scene(), encoder)
     inside = points[np.linalg.norm(points - BALL[:3], axis=1) < BALL[3]]
+    cells = knowledge.told_cells(inside)
     at = np.unique(np.floor((inside - knowledge.LOW) / knowledge.CELL).astype(int), axis=0)
     assert 4 <= len(at) == cells.sum() and cells.reshape(knowledge.SHAPE)[tuple(at.T)].all()
     truth = knowledge.occupied([Sphere(BALL[:3], BALL[3])]).ravel()
     assert (truth | ~cells).all()
-    scenes, cells = [Scene(), Scene()], np.stack([truth, truth])
-    found = knowledge.decoded_iou(encoder, scenes, cells, scenes, cells)
-    assert 0.5 < found <= 1.0
+    scenes, cells = [Scene((Sphere(BALL[:3], BALL[3]),))] * 2, np.stack([truth, truth])
+    data = knowledge.link_distances(scenes, 0)
+    found = knowledge.decoded(encoder, scenes, cells, scenes, cells, data)
+    assert 0.5 < found["decoded_iou"] <= 1.0 and 0.0 < found["decoded_cm"] < 2.0
 
 
 def test_in_an_environment(encoder):
