@@ -14,6 +14,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from PIL import Image
+from unseen_obstacles import BASELINES, HARD, load_results, others_results
 
 import envs
 from envs.datasets import load_queries
@@ -24,9 +25,7 @@ from envs.show import film, rollout
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-ROOT = Path(__file__).resolve().parent.parent
-RESULTS, PICTURES = ROOT / "docs" / "unseen_obstacles.json", ROOT / "docs" / "pictures"
-HARD = "random_boxes_hard"
+PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 FRAMES, SECONDS_PER_FRAME, LAST_SECONDS, COLOURS = 36, 0.12, 1.5, 48
 # Of the bars: cell of the results, and its name.
 ALONE = (
@@ -112,11 +111,9 @@ def main():
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 4, 8])
     parser.add_argument("--size", type=int, nargs=2, default=(224, 168))
     args = parser.parse_args()
-    baselines, results = (
-        json.loads(path.read_text())[HARD]
-        for path in (RESULTS.with_name("baselines.json"), RESULTS)
-    )
-    write_atomically(PICTURES / "unseen_bars.png", bars(baselines | results))
+    others = others_results(json.loads(BASELINES.read_text()))
+    results = others[HARD] | load_results()[HARD]
+    write_atomically(PICTURES / "unseen_bars.png", bars(results))
     contents = animation(args.policy, args.queries, tuple(args.size))
     write_atomically(PICTURES / "unseen_episodes.gif", contents)
     print(f"{len(contents) / 1e6:.2f} MB")
