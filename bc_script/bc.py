@@ -222,7 +222,7 @@ if __name__ == "__main__":
     except DatasetError as error:
         sys.exit(f"--demos: {error}")
     env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
-    eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
+    eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     run = runs.run_folder(args, task_name(args.task))
 
     # ALGO LOGIC: data

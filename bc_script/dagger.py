@@ -358,7 +358,7 @@ if __name__ == "__main__":
     except DatasetError as error:
         sys.exit(f"--paths: {error}")
     env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder, "proximity": proximity}
-    eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
+    eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     last_layer = LastLayer(args.keep_distance, args.way_out)
     run = runs.run_folder(args, task_name(args.task))
 

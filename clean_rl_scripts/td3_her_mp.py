@@ -437,7 +437,7 @@ if __name__ == "__main__":
     validation, test = protocol.load_task(args)
     env_arguments = protocol.env_arguments_of(args)
     envs = protocol.make_training_envs(args)
-    eval_envs = protocol.make_eval_envs(args.task, **env_arguments)
+    eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     run = runs.run_folder(args, task_name(args.task))
     if args.bf16 is None:
         args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()

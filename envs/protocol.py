@@ -24,7 +24,7 @@ from envs.last_layer import layer_of
 from envs.runs import check_finite, write_json
 from envs.subgoals import MAX_STEP
 
-NUM_ENVS = 8  # that an evaluation runs together; the first of them takes the pictures
+NUM_ENVS = 8  # that an evaluation runs together at most; the first of them takes the pictures
 PICTURE_SIZE = (240, 180)
 RULES = ("horizon", "stop_on_collision")  # which decide what a success is
 
@@ -101,10 +101,13 @@ def make_envs(task, number, **kwargs):
         sys.exit(f"--{' or --'.join(given)}: {error}" if given else str(error))
 
 
-def make_eval_envs(task, **kwargs):
-    """The environments of `validate` and `final_test`, as `make_envs`."""
+def make_eval_envs(task, num_queries, **kwargs):
+    """The environments of `validate` and `final_test` for so many queries, as `make_envs`.
+
+    At least two, as `save_policy` wants.
+    """
     pictured = make_envs(task, 1, render_mode="rgb_array", render_size=PICTURE_SIZE, **kwargs)
-    return pictured + make_envs(task, NUM_ENVS - 1, **kwargs)
+    return pictured + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
 
 
 def make_training_envs(args):
@@ -312,7 +315,7 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
     """
     policy = load_network(run / "policy.pt").to(device)
     own = {name: value for name, value in env_arguments.items() if name not in RULES}
-    test_envs = make_eval_envs(args.task, **own)
+    test_envs = make_eval_envs(args.task, len(queries), **own)
     last_layer = layer_of(policy.metadata)
     result = evaluate(policy, test_envs, queries, device, last_layer)
     rules = {name: getattr(test_envs[0], name) for name in RULES}

@@ -98,7 +98,7 @@ def result_of(run, capsys, **env_arguments):
     """`result.json` and the printed lines for a policy that needs more than 50 steps."""
     args = SimpleNamespace(task="no_obstacles", goal_type="config", exp_name="x", seed=1)
     env_arguments |= {"goal_type": "config"}
-    made = protocol.make_eval_envs(args.task, **env_arguments)
+    made = protocol.make_eval_envs(args.task, 3, **env_arguments)
     protocol.save_policy(run, Toward(0.01), made, "cpu", args, env_arguments, 7)
     queries = load_queries("no_obstacles", "test")[:3]
     progress = {"seconds": 2.0, "best_success": 0.5, "best_step": 7}
