@@ -11,7 +11,7 @@ other links, of which it does not: where they are is known. As a link's nearest 
 one after the step, the layer looks once more, at where the action leads.
 
 That alone stands still where it cannot go on; so where the arm has hardly moved for some steps, it
-goes into a random direction for a while.
+goes into a random direction for a while, and does not come near that dead end again.
 """
 
 import functools
@@ -37,7 +37,11 @@ GROWTH = 0.03
 SWEEPS = 12  # of projections, one link after the other
 # A dead end is where so many steps have moved the arm by less than this (L2, normalised).
 PATIENCE, PROGRESS = 10, 0.06
-DETOUR = 25  # steps into one random direction, to get out
+DETOUR = 10  # steps into one random direction, to get out
+CARRYING = 4  # joints, from the base on, that decide where the arm is; the others turn the hand
+# Those stay so far from where the arm was stuck (L2, normalised), at most this share of the goal's
+# distance from there. Beside links' distances a unit of that counts as so many metres.
+AVOIDED, SHARE, METRES = 0.5, 0.9, 0.3
 
 
 @dataclass(frozen=True)
@@ -88,38 +92,31 @@ class LastLayer:
             rng: a NumPy Generator, for the directions out of dead ends.
         """
         proximity_at, max_step = env.get_wrapper_attr("proximity_at"), env.max_step
-        before, left, direction = deque(maxlen=PATIENCE + 1), 0, None
-        goal_distances = None
+        dead_ends, goal_distances = _DeadEnds(rng, max_step), None
 
         def act_safely(observation):
-            nonlocal left, direction, goal_distances
-            state = observation["observation"][: panda.NUM_JOINTS]
-            before.append(state)
-            moved = np.linalg.norm(state - before[0])
-            if left == 0 and self.way_out and len(before) > PATIENCE and moved < PROGRESS:
-                left, direction = DETOUR, rng.standard_normal(panda.NUM_JOINTS)
-                direction *= max_step / np.linalg.norm(direction)
-            if left == 0:
-                action = act(observation)
-            else:
-                left -= 1
-                action = direction
-                if left == 0:
-                    before.clear()
-            keep = self.keep
+            nonlocal goal_distances
+            state, goal = observation["observation"][: panda.NUM_JOINTS], None
+            here = np.concatenate([observation["proximity"], _own_proximity(state)])
+            keep = np.broadcast_to(self.keep, len(here))
             if "goal_proximity" in observation:
                 goal = observation["desired_goal"][: panda.NUM_JOINTS]
                 if goal_distances is None:
                     rows = observation["goal_proximity"], _own_proximity(goal)
                     goal_distances = np.concatenate(rows)[:, 0]
                 keep = self.kept(goal_distances, np.linalg.norm(state - goal))
-            here = np.concatenate([observation["proximity"], _own_proximity(state)])
-            keep = np.broadcast_to(keep, len(here))
-            move = self(action, here, keep, max_step)
+            action = dead_ends.detour(state, goal) if self.way_out else None
+            action = act(observation) if action is None else action
+            # Dead ends come first: things have the last word.
+            avoided = dead_ends.rows(state)
+            here = np.concatenate([avoided, here])
+            kept_here = np.concatenate([np.zeros(len(avoided)), keep])
+            move = self(action, here, kept_here, max_step)
             # The second look: what is near there, as if its gradient were the same all the way.
             there = np.concatenate([proximity_at(state + move), _own_proximity(state + move)])
             there[:, 0] -= there[:, 1:] @ move
-            return self(action, np.concatenate([here, there]), np.tile(keep, 2), max_step)
+            rows, kept = np.concatenate([here, there]), np.concatenate([kept_here, keep])
+            return self(action, rows, kept, max_step)
 
         return act_safely
 
@@ -131,6 +128,48 @@ class LastLayer:
             away: from the goal, L2, normalised.
         """
         return np.minimum(self.keep, goal_distances + GROWTH * away)
+
+
+class _DeadEnds:
+    """Those of one episode: how to leave them, and where not to come again."""
+
+    def __init__(self, rng, max_step):
+        self.rng, self.max_step = rng, max_step
+        self.before, self.left, self.direction = deque(maxlen=PATIENCE + 1), 0, None
+        self.avoided = []  # configurations of the carrying joints, and how far they stay from there
+
+    def detour(self, state, goal):
+        """The next action of a way out (7,), or None: there is none to leave.
+
+        Args:
+            state: configuration (7,), normalised.
+            goal: the goal's configuration, or None: nobody knows where not to go.
+        """
+        self.before.append(state)
+        moved = np.linalg.norm(state - self.before[0])
+        if self.left == 0 and len(self.before) > PATIENCE and moved < PROGRESS:
+            direction = self.rng.standard_normal(CARRYING)
+            self.left, self.direction = DETOUR, np.zeros(panda.NUM_JOINTS)
+            self.direction[:CARRYING] = direction * (self.max_step / np.linalg.norm(direction))
+            if goal is not None:
+                away = np.linalg.norm((goal - state)[:CARRYING])
+                self.avoided.append((state[:CARRYING], min(AVOIDED, SHARE * away)))
+        if self.left == 0:
+            return None
+        self.left -= 1
+        if self.left == 0:
+            self.before.clear()
+        return self.direction
+
+    def rows(self, state):
+        """(dead ends, 8), as `envs.wrappers.ProximityWrapper` has links; none in a detour."""
+        rows = np.zeros((len(self.avoided) if self.left == 0 else 0, 8))
+        for row, (centre, radius) in zip(rows, self.avoided, strict=False):
+            away = state[:CARRYING] - centre
+            distance = np.linalg.norm(away)
+            row[0] = METRES * (distance - radius)
+            row[1 : 1 + CARRYING] = METRES * away / max(distance, 1e-6)
+        return rows
 
 
 def check_env(env):

@@ -10,7 +10,7 @@ import envs
 from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
-from envs.last_layer import BRAKE, DETOUR, NEAR, PATIENCE, PUSH, LastLayer
+from envs.last_layer import AVOIDED, BRAKE, CARRYING, DETOUR, NEAR, PATIENCE, PUSH, SHARE, LastLayer
 from envs.policies import PolicyError, make_policy
 from envs.seeing import seen_checker
 from envs.wrappers import PROXIMITY_RANGE
@@ -311,5 +311,29 @@ def test_out_of_a_dead_end():
     detour = moves[PATIENCE:-1]
     assert len(detour) == DETOUR and (detour == detour[0]).all()
     assert np.linalg.norm(detour[0]) == pytest.approx(0.03)
+    assert detour[0, :CARRYING].all() and not detour[0, CARRYING:].any()
     assert len(asked) == PATIENCE + 1
     assert (walk(1) == moves).all() and (walk(2) != moves).any()
+
+
+@pytest.mark.parametrize(("to_goal", "avoided"), [(1.0, AVOIDED), (0.2, SHARE * 0.2)])
+def test_it_does_not_come_near_a_dead_end_again(to_goal, avoided):
+    """A policy that wants to go back there is kept away, less where the goal is near."""
+    begin = np.array([0.0, 0.0, 0.0, -0.3, 0.0, 0.3, 0.0])  # no link is near another one
+    goal = begin + np.array([to_goal, 0, 0, 0, 0, 0, 0.5])
+
+    def back(observation):
+        return np.clip(begin - observation["observation"][:7], -0.01, 0.01)
+
+    rows = proximity(*[(NEAR,)] * 10)
+    env = SimpleNamespace(max_step=0.03, get_wrapper_attr=lambda name: lambda state: rows)
+    act = LastLayer().around(back, env, np.random.default_rng(1))
+    state, away = begin.copy(), []
+    for _ in range(PATIENCE + DETOUR + 35):  # (it is not stuck a second time)
+        observation = {"observation": np.concatenate([state, np.zeros(3)]), "proximity": rows}
+        observation |= {"desired_goal": goal, "goal_proximity": rows}
+        state = state + act(observation)
+        away.append(np.linalg.norm((state - begin)[:CARRYING]))
+    assert max(away[:PATIENCE]) == 0.0
+    assert away[PATIENCE + DETOUR - 1] == pytest.approx(0.03 * DETOUR, rel=0.01)
+    assert avoided - 0.03 < away[-1] < avoided + 0.06 and state[6] == 0.0
