@@ -39,8 +39,11 @@ SWEEPS = 12  # of projections, one link after the other
 PATIENCE, PROGRESS = 10, 0.06
 DETOUR = 10  # steps into one random direction, to get out
 CARRYING = 4  # joints, from the base on, that decide where the arm is; the others turn the hand
-# Those stay so far from where the arm was stuck (L2, normalised), at most this share of the goal's
-# distance from there. Beside links' distances a unit of that counts as so many metres.
+# After a detour the arm's own direction counts beside the policy's action: so many times as much as
+# the longest one, fading over so many steps.
+MOMENTUM, FADING = 2.0, 40
+# The carrying joints stay so far from where the arm was stuck (L2, normalised), at most this share
+# of the goal's distance from there. Beside links' distances a unit of that counts as so many m.
 AVOIDED, SHARE, METRES = 0.5, 0.9, 0.3
 
 
@@ -106,7 +109,8 @@ class LastLayer:
                     goal_distances = np.concatenate(rows)[:, 0]
                 keep = self.kept(goal_distances, np.linalg.norm(state - goal))
             action = dead_ends.detour(state, goal) if self.way_out else None
-            action = act(observation) if action is None else action
+            if action is None:
+                action = dead_ends.hurried(act(observation))
             # Dead ends come first: things have the last word.
             avoided = dead_ends.rows(state)
             here = np.concatenate([avoided, here])
@@ -116,7 +120,8 @@ class LastLayer:
             there = np.concatenate([proximity_at(state + move), _own_proximity(state + move)])
             there[:, 0] -= there[:, 1:] @ move
             rows, kept = np.concatenate([here, there]), np.concatenate([kept_here, keep])
-            return self(action, rows, kept, max_step)
+            dead_ends.last_action = self(action, rows, kept, max_step)
+            return dead_ends.last_action
 
         return act_safely
 
@@ -136,6 +141,7 @@ class _DeadEnds:
     def __init__(self, rng, max_step):
         self.rng, self.max_step = rng, max_step
         self.before, self.left, self.direction = deque(maxlen=PATIENCE + 1), 0, None
+        self.momentum, self.last_action = 0.0, None
         self.avoided = []  # configurations of the carrying joints, and how far they stay from there
 
     def detour(self, state, goal):
@@ -159,7 +165,16 @@ class _DeadEnds:
         self.left -= 1
         if self.left == 0:
             self.before.clear()
+            self.momentum = MOMENTUM
         return self.direction
+
+    def hurried(self, action):
+        """The policy's action (7,) with what is left of the momentum of the last detour."""
+        if self.momentum <= 0.0:
+            return action
+        self.momentum -= MOMENTUM / FADING
+        length = max(np.linalg.norm(self.last_action), 1e-6)
+        return action + self.momentum * self.max_step / length * self.last_action
 
     def rows(self, state):
         """(dead ends, 8), as `envs.wrappers.ProximityWrapper` has links; none in a detour."""

@@ -10,7 +10,19 @@ import envs
 from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
-from envs.last_layer import AVOIDED, BRAKE, CARRYING, DETOUR, NEAR, PATIENCE, PUSH, SHARE, LastLayer
+from envs.last_layer import (
+    AVOIDED,
+    BRAKE,
+    CARRYING,
+    DETOUR,
+    FADING,
+    MOMENTUM,
+    NEAR,
+    PATIENCE,
+    PUSH,
+    SHARE,
+    LastLayer,
+)
 from envs.policies import PolicyError, make_policy
 from envs.seeing import seen_checker
 from envs.wrappers import PROXIMITY_RANGE
@@ -287,7 +299,7 @@ def test_an_environments_longest_step():
 
 
 def test_out_of_a_dead_end():
-    """It stands for `PATIENCE` steps, is away for `DETOUR`, and a seed gives the same way."""
+    """It stands for `PATIENCE` steps, is off for `DETOUR`, and a seed gives the same way."""
     layer, asked = LastLayer(), []
 
     def stay(observation):
@@ -295,24 +307,27 @@ def test_out_of_a_dead_end():
         return np.zeros(7)
 
     nothing = proximity(*[(NEAR,)] * 10)
-    env = SimpleNamespace(max_step=0.03, get_wrapper_attr=lambda name: lambda state: nothing)
+    env = SimpleNamespace(max_step=0.01, get_wrapper_attr=lambda name: lambda state: nothing)
 
     def walk(seed):
         state, moves = np.zeros(10), []
         state[3], state[5] = -0.3, 0.3  # no link is near another one, and will be
         act = layer.around(stay, env, np.random.default_rng(seed))
-        for _ in range(PATIENCE + DETOUR + 1):
+        for _ in range(PATIENCE + DETOUR + 25):
             moves.append(act({"observation": state, "proximity": nothing}))
             state = np.concatenate([state[:7] + moves[-1], state[7:]])
         return np.array(moves)
 
     moves = walk(1)
-    assert not moves[:PATIENCE].any() and not moves[-1].any()
-    detour = moves[PATIENCE:-1]
-    assert len(detour) == DETOUR and (detour == detour[0]).all()
-    assert np.linalg.norm(detour[0]) == pytest.approx(0.03)
+    assert not moves[:PATIENCE].any()
+    detour, after = np.split(moves[PATIENCE:], [DETOUR])
+    assert (detour == detour[0]).all()
+    assert np.linalg.norm(detour[0]) == pytest.approx(0.01)
+    # Momentum: on in that direction, as fast as can be while it is more than the longest action.
+    steps = (MOMENTUM * (1 - np.arange(1, 26) / FADING)).clip(0, 1)
+    assert after == pytest.approx(steps[:, None] * detour[0], abs=1e-6) and steps[-1] < 0.8
     assert detour[0, :CARRYING].all() and not detour[0, CARRYING:].any()
-    assert len(asked) == PATIENCE + 1
+    assert len(asked) == PATIENCE + 25
     assert (walk(1) == moves).all() and (walk(2) != moves).any()
 
 
@@ -329,11 +344,12 @@ def test_it_does_not_come_near_a_dead_end_again(to_goal, avoided):
     env = SimpleNamespace(max_step=0.03, get_wrapper_attr=lambda name: lambda state: rows)
     act = LastLayer().around(back, env, np.random.default_rng(1))
     state, away = begin.copy(), []
-    for _ in range(PATIENCE + DETOUR + 35):  # (it is not stuck a second time)
+    for _ in range(PATIENCE + DETOUR + FADING):  # (it is not stuck a second time)
         observation = {"observation": np.concatenate([state, np.zeros(3)]), "proximity": rows}
         observation |= {"desired_goal": goal, "goal_proximity": rows}
         state = state + act(observation)
         away.append(np.linalg.norm((state - begin)[:CARRYING]))
     assert max(away[:PATIENCE]) == 0.0
     assert away[PATIENCE + DETOUR - 1] == pytest.approx(0.03 * DETOUR, rel=0.01)
+    print(away, state)
     assert avoided - 0.03 < away[-1] < avoided + 0.06 and state[6] == 0.0
