@@ -26,6 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import envs
 from envs.exported_networks import halve_network
 from envs.files import write_atomically
+from envs.last_layer import VERSION
 from envs.policies import PolicyError, find_policy
 from envs.roadmap_paths import load_roadmap_paths
 
@@ -176,14 +177,13 @@ def write_results(results):
 
 
 def run(tasks, names, num, workers):
-    """Fill in the cells that are missing, had fewer queries, or other flags.
+    """Fill in the cells that are missing, had fewer queries, other flags, or an older last layer.
 
     Those of a policy that is not there are left out.
     """
     for task in tasks:
         for name in names:
-            done = load_results().get(task, {}).get(name)
-            if done is not None and done["num_queries"] >= num and done["flags"] == CELLS[name]:
+            if is_done(load_results().get(task, {}).get(name), name, num):
                 continue
             try:
                 find_policy(CELLS[name][1])
@@ -202,6 +202,18 @@ def run(tasks, names, num, workers):
             results = load_results()  # again: another run of this may have added to it
             results.setdefault(task, {})[name] = result
             write_results(results)
+
+
+def is_done(result, name, num):
+    if result is None or result["num_queries"] < num or result["flags"] != CELLS[name]:
+        return False
+    return not is_older(result)
+
+
+def is_older(result):
+    """Whether dead ends were left otherwise than they are now."""
+    layer = result.get("last_layer")
+    return layer is not None and layer["way_out"] and layer.get("version", 1) < VERSION
 
 
 def papers_best():
@@ -253,6 +265,7 @@ def tables(results, others):
             lines += _row(f"`{task}`", paper, *(_cell(results[task].get(name)) for name in names))
     dates = sorted({result["date"] for cells in results.values() for result in cells.values()})
     lines += ["", f"In brackets, test queries and the 95 % interval of success. To {dates[-1]}."]
+    lines += ["\\*: with the way out of dead ends as it was before 2026-11-24, without a memory."]
     return "\n".join(lines) + "\n"
 
 
@@ -266,7 +279,8 @@ def _cell(result):
         return "not run"
     low, high = result["success_rate_interval"]
     rates = f"{result['success_rate']:.3f}, {result['clean_success_rate']:.3f}"
-    return f"{rates} [{result['num_queries']:,}: {low:.3f}, {high:.3f}]"
+    mark = "\\*" if is_older(result) else ""
+    return f"{rates}{mark} [{result['num_queries']:,}: {low:.3f}, {high:.3f}]"
 
 
 def main():

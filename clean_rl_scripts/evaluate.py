@@ -76,7 +76,7 @@ from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
 from envs.encoders import with_told
 from envs.files import check_writable, write_atomically
 from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Workers
-from envs.last_layer import LastLayer
+from envs.last_layer import VERSION, LastLayer
 from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy, own_layer
 from envs.scenes import Scene
 from envs.tasks import get_task, task_name
@@ -501,7 +501,7 @@ def _summary(job, outcomes):
             if job.env.get(name, standard) != standard
         },
         "encoder": job.encoder,
-        "last_layer": asdict(job.last_layer) if job.last_layer else None,
+        "last_layer": asdict(job.last_layer) | {"version": VERSION} if job.last_layer else None,
         "seed": job.seed if job.policy in ("random", *PLANNING) or job.last_layer else None,
         "tries": job.tries if job.policy == "via-points" else None,
         "time_limit": job.time_limit if job.policy == "planner" else None,

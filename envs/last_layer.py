@@ -26,6 +26,9 @@ from envs.scenes import Scene, is_number
 from envs.subgoals import MAX_STEP
 from envs.wrappers import link_proximity
 
+# Of what the layer does, in results: with 1 it left dead ends otherwise, and did not remember them.
+VERSION = 2
+
 # The numbers below were chosen on validation queries of `random_boxes_hard`: docs/last_layer.md.
 NEAR = 0.15  # m, from where on a link is looked at
 # Share of the way that is left that one step may take: the arm does not stop at once.

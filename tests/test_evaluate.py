@@ -20,6 +20,7 @@ from demo_generation.planning import Planner
 from envs import panda
 from envs.datasets import load_queries, write_queries
 from envs.exported_networks import save_network
+from envs.last_layer import VERSION
 from envs.policies import make_policy
 from envs.scene_files import save_scene
 from envs.scenes import Box, Scene
@@ -282,9 +283,9 @@ def test_a_last_layer_around_a_policy(tmp_path):
     assert _numbers(found["none"]) == _numbers(found["bare"])
     layers = {name: result["last_layer"] for name, result in found.items()}
     assert layers["bare"] is layers["none"] is None
-    assert layers["layer"] == {"keep": 0.01, "way_out": False}
-    assert layers["way out"] == {"keep": 0.01, "way_out": True}
-    assert layers["points"] == {"keep": 0.015, "way_out": True}
+    assert layers["layer"] == {"keep": 0.01, "way_out": False, "version": VERSION}
+    assert layers["way out"] == {"keep": 0.01, "way_out": True, "version": VERSION}
+    assert layers["points"] == {"keep": 0.015, "way_out": True, "version": VERSION}
     knows = {name: result["env"].get("proximity") for name, result in found.items()}
     assert knows == {name: "obstacles" for name in knows} | {
         "bare": None,

@@ -10,6 +10,7 @@ import torch
 
 import envs
 from envs.exported_networks import load_network, save_network
+from envs.last_layer import VERSION
 from envs.roadmap_paths import shard_bytes
 from envs.shards import shard_path
 
@@ -38,6 +39,8 @@ def test_the_tables_between_the_marks_are_of_the_results(tmp_path, monkeypatch):
     page.write_text(f"# Before\n\n{unseen.BEGIN}outdated\n{unseen.END}\nAfter\n")
     hard = {"dagger, points": result(0.93, 0.91, 3000), "dagger, points, alone": result(0.7, 0.4)}
     found = {unseen.HARD: hard, "wall": {"dagger, points": result(0.8, 0.75)}}
+    found["wall"]["dagger, oracle"] = result(0.7, 0.6) | {"last_layer": {"way_out": True}}
+    found["boxes"] = {"dagger, oracle": result(0.7, 0.6) | {"last_layer": {"way_out": False}}}
     results.write_text(json.dumps(found))
     monkeypatch.setattr(unseen, "PAGE", page)
     monkeypatch.setattr(unseen, "RESULTS", results)
@@ -49,11 +52,30 @@ def test_the_tables_between_the_marks_are_of_the_results(tmp_path, monkeypatch):
     assert "| 0.700, 0.400 [200: 0.670, 0.730] | not run | 0.930, 0.910 [3,000: 0.9" in row
     assert row.endswith("| 1.2 |")
     (wall,) = [line for line in text.splitlines() if line.startswith("| `wall` |")]
-    assert "0.800, 0.750 [200" in wall and wall.count("not run") == 3
+    assert "0.800, 0.750 [200" in wall and wall.count("not run") == 2
+    assert "| 0.700, 0.600\\* [200" in wall  # an older way out
+    assert text.count("\\*") == 2
     assert all(f"| `{task}` |" in text for task in envs.TASKS)
     # Again, the same.
     unseen.main()
     assert page.read_text() == text
+
+
+def test_what_is_run_again():
+    name = "dagger, points"
+    layer = {"keep": 0.01, "way_out": True, "version": VERSION}
+    done = result(0.9, 0.8) | {"flags": unseen.CELLS[name], "last_layer": layer}
+    assert unseen.is_done(done, name, 200)
+    for change in (
+        {"num_queries": 100},
+        {"flags": [*unseen.CELLS[name], "--seed", "1"]},
+        {"last_layer": layer | {"version": VERSION - 1}},
+        {"last_layer": {"keep": 0.01, "way_out": True}},
+    ):
+        assert not unseen.is_done(done | change, name, 200)
+    assert not unseen.is_done(None, name, 200)
+    without = layer | {"way_out": False, "version": VERSION - 1}  # the same in all versions
+    assert unseen.is_done(done | {"last_layer": without}, name, 200)
 
 
 def test_a_runs_policy_is_kept_by_name_and_says_how_it_was_made(tmp_path, monkeypatch):
