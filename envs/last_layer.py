@@ -29,7 +29,7 @@ from envs.wrappers import link_proximity
 # Of what the layer does, in results: with 1 it left dead ends otherwise, and did not remember them.
 VERSION = 2
 
-# The numbers below were chosen on validation queries of `random_boxes_hard`: docs/last_layer.md.
+# The numbers below were chosen on validation and fresh queries: docs/last_layer.md.
 NEAR = 0.15  # m, from where on a link is looked at
 # Share of the way that is left that one step may take: the arm does not stop at once.
 BRAKE = 0.2
@@ -113,7 +113,7 @@ class LastLayer:
                 keep = self.kept(goal_distances, np.linalg.norm(state - goal))
             action = dead_ends.detour(state, goal) if self.way_out else None
             if action is None:
-                action = dead_ends.hurried(act(observation))
+                action = dead_ends.with_momentum(act(observation))
             # Dead ends come first: things have the last word.
             avoided = dead_ends.rows(state)
             here = np.concatenate([avoided, here])
@@ -171,7 +171,7 @@ class _DeadEnds:
             self.momentum = MOMENTUM
         return self.direction
 
-    def hurried(self, action):
+    def with_momentum(self, action):
         """The policy's action (7,) with what is left of the momentum of the last detour."""
         if self.momentum <= 0.0:
             return action
