@@ -22,7 +22,7 @@ from envs import protocol
 from envs.collision import CollisionChecker
 from envs.encoders import PACKAGED
 from envs.exported_networks import load_network
-from envs.last_layer import LastLayer
+from envs.last_layer import VERSION, LastLayer
 from envs.policies import PolicyError, find_policy, make_policy
 from envs.roadmap_paths import load_roadmap_paths, shard_bytes
 from envs.shards import shard_path
@@ -259,7 +259,7 @@ def test_a_run_killed_and_resumed_its_policy_by_name(tmp_path, folder):
     best = one["progress"]
     result = evaluate(whole, HARD, split="validation", num_queries=2)
     assert result["success_rate"] == best["best_success"]
-    assert result["last_layer"] == {"keep": 0.012, "way_out": True}
+    assert result["last_layer"] == {"keep": 0.012, "way_out": True, "version": VERSION}
     assert result["env"]["proximity"] == "points" and result["env"]["encoder"] == "points:8"
     bare = evaluate(whole, HARD, split="validation", num_queries=2, last_layer=False)
     assert bare["last_layer"] is None and bare["mean_steps"] != result["mean_steps"]
