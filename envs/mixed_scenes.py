@@ -1,15 +1,15 @@
 """Scenes of several kinds to learn from: random boxes, walls with gaps, and racks of shelves.
 
-For one policy that is to know them all. Sizes and places are uniform in the ranges below, which
-were written down before any policy was trained with them; none of the scenes is one of the tasks'
-own, but for the random boxes (docs/tasks.md).
+For policies and encoders that are to know them all. Sizes and places are uniform in the ranges
+below, which were written down before anything was trained with them; none of the scenes is one of
+the tasks' own, but for the random boxes (docs/tasks.md).
 """
 
 import math
 from dataclasses import dataclass
 
 from envs.random_boxes import FRICTION, TURN, RandomBoxes, rounded
-from envs.scenes import Box, Scene
+from envs.scenes import Box, Cylinder, Scene
 
 BOXES = RandomBoxes(2, 8)
 # m. Walls stand on the table, edge-on to the robot; two of three pairs leave a gap that the robot
@@ -21,16 +21,18 @@ WALL = {
     "height": (0.4, 1.0),
 }
 WALLS, OPPOSITE, TURNED = 3, 2 / 3, math.radians(15)
-# m. Racks of boards that face the robot: with sides, with poles, or with neither.
+# m. Racks of boards that face the robot: with sides, with poles, or with neither. Things stand on
+# the boards of half of them.
 RACK = {
-    "near": (0.3, 0.5),
-    "width": (0.3, 1.0),
-    "depth": (0.2, 0.4),
-    "lowest": (0.1, 0.35),
+    "near": (0.3, 0.75),
+    "width": (0.3, 1.2),
+    "depth": (0.2, 1.2),
+    "lowest": (0.05, 0.35),
     "spacing": (0.18, 0.4),
 }
 RACKS, BOARDS, TOP, BOARD, POLE = 4, 6, 1.1, 0.03, 0.04
 UPRIGHTS = 2, 4, 0  # two sides, four poles, or nothing that holds the boards
+THINGS, RADIUS, LENGTH = 12, (0.02, 0.05), (0.08, 0.2)  # at most so many cylinders in a rack; m
 MOST = 32  # obstacles: as many as the encoder `oracle` has room for
 
 
@@ -90,18 +92,27 @@ def _racks(rng):
         y = (width - size[1]) / 2
         of_rack = [((near + depth / 2, 0.0, z), (depth, width, BOARD)) for z in heights]
         of_rack += [((x, side, top / 2), size) for x in xs[uprights] for side in (y, -y)]
+        things = int(rng.integers(min(THINGS, MOST // count - len(of_rack)) + 1))
+        for _ in range(things * int(rng.integers(2))):
+            radius, length = rng.uniform(*RADIUS), rng.uniform(*LENGTH)
+            aside = width / 2 - BOARD - radius
+            place = rng.uniform(near + radius, near + depth - radius), rng.uniform(-aside, aside)
+            z = heights[rng.integers(boards)] + (BOARD + length) / 2
+            of_rack.append(((*place, z), (radius, length)))
         azimuth = first + quarter * math.pi / 2
         parts += [_placed(*part, azimuth) for part in of_rack]
     return parts
 
 
 def _placed(centre, size, azimuth):
-    """A box that was described in front of the robot, turned about the robot's axis."""
+    """What was described in front of the robot, turned about its axis.
+
+    A box with three sizes, or an upright cylinder with its radius and length.
+    """
     half = round(azimuth / TURN) * TURN / 2
     cos, sin = math.cos(2 * half), math.sin(2 * half)
     x, y, z = centre
-    return Box(
-        rounded(cos * x - sin * y, sin * x + cos * y, z),
-        rounded(*size),
-        (0.0, 0.0, math.sin(half), math.cos(half)),
-    )
+    place = rounded(cos * x - sin * y, sin * x + cos * y, z)
+    if len(size) == 2:
+        return Cylinder(place, *rounded(*size))
+    return Box(place, rounded(*size), (0.0, 0.0, math.sin(half), math.cos(half)))

@@ -121,17 +121,19 @@ def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
     drawn = [mixed.sample(np.random.default_rng([0, i])) for i in range(300)]
     assert len(set(drawn)) == 300 and not {task.scene for task in TASKS.values()} & set(drawn)
     assert max(len(scene.obstacles) for scene in drawn) <= MAX_OBSTACLES
-    walls = racks = 0
+    walls = racks = things = 0
     for scene in drawn:
         assert scene == replace(mixed.base, obstacles=scene.obstacles)
         assert min(map(distance_to_robot, scene.obstacles)) > KEEP_CLEAR - 0.02
-        sizes = np.array([box.size for box in scene.obstacles])
-        places = np.array([box.position for box in scene.obstacles])
+        boxes = [obstacle for obstacle in scene.obstacles if isinstance(obstacle, Box)]
+        sizes = np.array([box.size for box in boxes])
+        places = np.array([box.position for box in boxes])
         walls += (sizes[:, 0] > 0.39).all() and np.allclose(
             places[:, 2], sizes[:, 2] / 2, atol=GRID
         )
         racks += len(np.unique(places[:, :2], axis=0)) < len(places)  # boards above each other
-    assert 70 < walls < 130 and 70 < racks < 130
+        things += len(boxes) < len(scene.obstacles)
+    assert 70 < walls < 130 and 70 < racks < 130 and 40 < things < racks
 
 
 def test_there_are_no_queries_in_mixed_scenes():
