@@ -14,6 +14,7 @@ import torch
 from envs.sensors import NOTHING, OBSTACLE, PointCloud, deproject
 from scene_embedding_train.training_data import unpacked
 
+WITHIN = 1.1  # m from the robot's axis: what is further away it does not reach
 TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
 DEEPEST = 65_535  # how far a sensor sees, in the units of stored depths: there was nothing
 # Of the classes, robot, table and floor, obstacle, nothing (as in the paper's figure).
@@ -58,7 +59,8 @@ def load_obstacle_points(observations, num_points):
     """What the sensors saw of obstacles: their names, and `points` and `there`, mapped into memory.
 
     `points`: float32 (scenes, sensors * num_points, 3), m, evenly spaced among a sensor's points on
-    obstacles; `there`: bool (scenes, sensors * num_points), false where a sensor saw none.
+    obstacles `WITHIN` reach; `there`: bool (scenes, sensors * num_points), false where a sensor saw
+    none.
     """
     sensors = [k for k, one in observations.sensors.items() if isinstance(one, PointCloud)]
     if not sensors:
@@ -72,12 +74,12 @@ def load_obstacle_points(observations, num_points):
     count = len(sensors) * num_points
     arrays = {"points": (np.float32, (count, 3)), "there": (np.bool_, (count,))}
     shards = (rows(shard) for shard in range(len(observations.offsets) - 1))
-    found = unpacked(observations, f"obstacle_points_{num_points}", arrays, shards)
+    found = unpacked(observations, f"obstacle_points_{num_points}_{WITHIN}", arrays, shards)
     return sensors, found["points"], found["there"]
 
 
 def on_obstacles(clouds, num_points):
-    """Of each cloud `num_points` points on obstacles, evenly spaced among those that there are.
+    """Of each cloud `num_points` points on obstacles `WITHIN` reach, evenly spaced among those.
 
     Args:
         clouds: list of a sensor's points (n, p, 3), m, and labels (n, p).
@@ -88,9 +90,10 @@ def on_obstacles(clouds, num_points):
     """
     all_points, all_there = [], []
     for points, labels in clouds:
-        chosen = thin_out(labels == OBSTACLE, num_points)
+        wanted = (labels == OBSTACLE) & (points[..., :2].square().sum(2) < WITHIN**2)
+        chosen = thin_out(wanted, num_points)
         all_points.append(gather(points, chosen))
-        all_there.append(gather(labels.unsqueeze(2), chosen).squeeze(2) == OBSTACLE)
+        all_there.append(gather(wanted.unsqueeze(2), chosen).squeeze(2))
     return torch.cat(all_points, dim=1), torch.cat(all_there, dim=1)
 
 

@@ -20,6 +20,7 @@ this file and change the parts under `# MODEL`. Parts between `# SHARED` and `# 
 those of `vae.py`.
 """
 
+import contextlib
 import math
 import sys
 from dataclasses import asdict, dataclass
@@ -101,6 +102,8 @@ class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
     width: Width = 128
     """features of a sector; of pictures, an eighth of it is the channels of the first convolution,
     and each further one has twice as many"""
+    bf16: bool | None = None
+    """train with products in bfloat16; by default where the hardware has it"""
 
     # SHARED: bookkeeping
     eval_every: PositiveInt = 2_000
@@ -251,11 +254,15 @@ class Field(nn.Module):
         return F.layer_norm(z, z.shape[1:])
 
 
-def rotated(points, quaternions):
-    """Points (..., 3) turned by quaternions (..., 4), x, y, z, w."""
-    axis = quaternions[..., :3].expand_as(points)
-    cross = torch.linalg.cross(axis, points)
-    return points + 2.0 * (quaternions[..., 3:] * cross + torch.linalg.cross(axis, cross))
+def axes_of(quaternions):
+    """Quaternions (..., 4), x, y, z, w, as rotation matrices (..., 3, 3)."""
+    x, y, z, w = quaternions.unbind(-1)
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+        (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
+        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
 def distances(obstacles, points):
@@ -263,9 +270,12 @@ def distances(obstacles, points):
 
     Obstacles as `load_obstacles` has them. Negative inside; clipped to [`DEEPEST`, `FARTHEST`].
     """
-    there, kind, place, turn, size = obstacles.unsqueeze(1).split((1, 1, 3, 4, 3), dim=-1)
-    # Into the obstacles' own axes.
-    offset = rotated(points.unsqueeze(2) - place, turn * turn.new_tensor([-1.0, -1.0, -1.0, 1.0]))
+    there, kind, place, turn, size = obstacles.split((1, 1, 3, 4, 3), dim=2)
+    # Into the obstacles' own axes, all in one product.
+    axes = axes_of(turn)
+    offset = (points @ axes.transpose(1, 2).flatten(2)).unflatten(2, (-1, 3))
+    offset = offset - (place.unsqueeze(2) @ axes).transpose(1, 2)
+    there, kind, size = there.unsqueeze(1), kind.unsqueeze(1), size.unsqueeze(1)
     x, y, z = offset.unbind(-1)
     # A cylinder is a rectangle, from its axis outwards; its y is always inside and says nothing.
     flat = torch.stack([(x.square() + y.square()).sqrt(), torch.zeros_like(x), z], dim=-1)
@@ -282,18 +292,24 @@ def queries(obstacles, number, spread):
     """Points to ask about (n, number, 3), m: the first half around obstacles, the others anywhere.
 
     Those around obstacles are somewhere in one of them (in the box around a cylinder, or around the
-    middle half of a sphere), and a random way of standard deviation `spread` from there.
+    middle half of a sphere), and a random way of standard deviation `spread` from there. What is
+    beyond `REACH` comes anywhere between that and the robot's axis.
     """
     n, half, device = len(obstacles), number // 2, obstacles.device
     which = (torch.rand(n, half, device=device) * obstacles[..., 0].sum(1, keepdim=True)).long()
     chosen = obstacles.gather(1, which.unsqueeze(2).expand(-1, -1, obstacles.shape[2]))
     _, kind, place, turn, size = chosen.split((1, 1, 3, 4, 3), dim=2)
     size = torch.where(kind == 0.0, size, size * size.new_tensor([2.0, 2.0, 1.0]))  # radii
-    near = place + rotated(size * (torch.rand_like(size) - 0.5), turn)
+    inside = size * (torch.rand_like(size) - 0.5)
+    near = place + (axes_of(turn) @ inside.unsqueeze(3)).squeeze(3)
     near = near + spread * torch.randn_like(near)
     low, high = obstacles.new_tensor([[-REACH, -REACH, 0.0], [REACH, REACH, HEIGHT]])
     anywhere = low + (high - low) * torch.rand(n, number - half, 3, device=device)
-    return torch.cat([near, anywhere], dim=1)
+    points = torch.cat([near, anywhere], dim=1)
+    radius = points[..., :2].norm(dim=2, keepdim=True)
+    inwards = REACH * torch.rand_like(radius).sqrt() / radius.clamp(min=REACH)
+    points[..., :2] *= torch.where(radius > REACH, inwards, 1.0)
+    return points
 
 
 def turned(*points):
@@ -334,8 +350,10 @@ def update(model, optimizer, seen, obstacles, args):
         points, there = seen
         points, asked = turned(points, asked)
         seen = points, there
-    z = model.encode(*seen)
-    predicted = model.decoder(z + args.latent_noise * torch.randn_like(z), asked)
+    device = asked.device.type
+    with torch.autocast(device, torch.bfloat16) if args.bf16 else contextlib.nullcontext():
+        z = model.encode(*seen)
+        predicted = model.decoder(z + args.latent_noise * torch.randn_like(z), asked)
     error = (predicted - truth).abs()
     near = truth < NEAR
     weights = 1.0 + args.near_weight * near
@@ -409,6 +427,8 @@ if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     if args.latent_size % SECTORS:
         sys.exit(f"--latent-size must be a multiple of {SECTORS}, got {args.latent_size}")
+    if args.bf16 is None:
+        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
     observations = open_observations(args.observations)
     num_training, validation = split(observations, args)
     if args.sees == "clouds":
