@@ -2,9 +2,9 @@
 
     python docs/make_pictures.py
 
-For each task: one test query (where scenes vary, six draws), the arm at its start and as a ghost at
-the goal; and where the scene is fixed, the end-effector paths of the first demonstrations, from
-light (start) to dark (goal).
+For each task, and `mixed_scenes`: one test query (where scenes vary, six draws), the arm at its
+start and as a ghost at the goal; and where the scene is fixed, the end-effector paths of the first
+demonstrations, from light (start) to dark (goal).
 """
 
 from pathlib import Path
@@ -48,9 +48,9 @@ def draw_path(client, positions, colour):
 
 def main():
     fixed = []
-    for task in tqdm(envs.TASKS, unit="task"):
+    for task in tqdm([*envs.TASKS, "mixed_scenes"], unit="task"):
         env = envs.make(task, render_mode="rgb_array")
-        if not isinstance(envs.TASKS[task].scene, Scene):
+        if not isinstance(envs.get_task(task).scene, Scene):
             pixels, rng = [], np.random.default_rng(0)
             for _ in range(ROWS * COLUMNS):
                 env.sample_scene(rng)
