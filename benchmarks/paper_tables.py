@@ -9,10 +9,11 @@ A cell is a run: algorithm, goal type, task, p of the demo injection. It is trai
 (flags that differ from the defaults: `RECIPES`) in `--runs-dir`, where one that was stopped goes
 on. Its best policy by validation goes to `policies/` beside the script, in half precision, is
 evaluated on test queries as it is there, and gets its result beside it, in JSON: what has one is
-done, with the same flags and as many steps or more. (With `--no-keep-policies` the result stays
-alone.) The page, docs/results.md, and its pictures are made of those results, of the planners' and
-of `go-to-goal`'s (docs/baselines.json), and of the paper's numbers (`paper_cells.csv`: sections 5.2
-and 5.3 and the tables of the appendix; means and standard deviations of four seeds).
+done, with the same flags and as many steps or more; on more queries than before the same policy is
+only evaluated again. (With `--no-keep-policies` the result stays alone.) The page, docs/results.md,
+and its pictures are made of those results, of the planners' and of `go-to-goal`'s
+(docs/baselines.json), and of the paper's numbers (`paper_cells.csv`: sections 5.2 and 5.3 and the
+tables of the appendix; means and standard deviations of four seeds).
 """
 
 import csv
@@ -156,21 +157,18 @@ def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
         if not cell.is_recipe_of(result["args"]):
             print(f"{name}: the one that is kept had other flags")
         elif result["steps"] >= steps:
-            print(f"{name}: done before")
+            evaluate_on_more(kept, result, cell.task, num_queries, runs_dir)
             return
     runs_dir.mkdir(parents=True, exist_ok=True)
     if cell.task != cell.trained_on:  # a policy of another cell
         trained = replace(cell, task=cell.trained_on)
         run(trained, seed, steps, num_queries, runs_dir, keep_policies)
-        trained_result = kept.with_name(f"{trained.name}-s{seed}.json")
-        policy = trained_result.with_suffix(".pt")
-        if not policy.exists():  # the result stands alone
-            policy = runs_dir / policy.stem / policy.name
+        policy = policy_file(f"{trained.name}-s{seed}", kept.parent, runs_dir)
         evaluation = evaluate(policy, cell.task, num_queries, runs_dir / f"{name}.json")
-        result = json.loads(trained_result.read_text())
+        result = json.loads((kept.parent / f"{policy.stem}.json").read_text())
         result |= {"cell": cell.name, "policy": policy.stem, **evaluation}
         result["date"] = datetime.date.today().isoformat()
-        write_atomically(kept, (json.dumps(result, indent=1) + "\n").encode())
+        write_result(kept, result)
         return
     folder = runs_dir / name
     folder.mkdir(parents=True, exist_ok=True)
@@ -193,8 +191,30 @@ def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
     policy = (kept if keep_policies else folder / kept.name).with_suffix(".pt")
     halve_network(trained / "policy.pt", policy)
     evaluation = evaluate(policy, cell.task, num_queries, folder / "evaluation.json")
-    result = summary(cell, trained, evaluation)
-    write_atomically(kept, (json.dumps(result, indent=1) + "\n").encode())
+    write_result(kept, summary(cell, trained, evaluation))
+
+
+def policy_file(name, policies, runs_dir):
+    """Where a policy is: beside its result, or with its run, if the result stands alone."""
+    beside = policies / f"{name}.pt"
+    return beside if beside.exists() else runs_dir / name / beside.name
+
+
+def evaluate_on_more(kept, result, task, num_queries, runs_dir):
+    """Evaluate the policy of a result again, if that was on fewer test queries."""
+    policy = policy_file(result.get("policy", kept.stem), kept.parent, runs_dir)
+    if result["num_queries"] >= num_queries:
+        print(f"{kept.stem}: done before")
+    elif not policy.exists():
+        print(f"{kept.stem}: done on {result['num_queries']} queries; its policy is gone")
+    else:
+        print(f"{kept.stem}: on {num_queries} queries, not {result['num_queries']}", flush=True)
+        evaluation = evaluate(policy, task, num_queries, runs_dir / f"{kept.stem}.json")
+        write_result(kept, result | evaluation)
+
+
+def write_result(path, result):
+    write_atomically(path, (json.dumps(result, indent=1) + "\n").encode())
 
 
 def evaluate(policy, task, num_queries, path):
@@ -343,8 +363,8 @@ def page(cells, results, baselines):
         "all their queries, and the seeds' deviation), in small the steps (BC: batches) and seeds;",
         "below it the paper's, mean ± standard deviation of four seeds, after 1,000,000 steps",
         f"({LONG_RUN:,} for random boxes). The last three rows do not learn, and know a goal",
-        "configuration (measured with goal `ee`: [baselines.md](baselines.md)); `reactive, points` is",
-        "`go-to-goal` with a [last layer](last_layer.md) that sees points. With p = 0,",
+        "configuration (measured with goal `ee`: [baselines.md](baselines.md)); `reactive,",
+        "points` is `go-to-goal` with a [last layer](last_layer.md) that sees points. With p = 0,",
         "queries are those of the demonstrations, which are not shown; the paper samples them.",
         "`python benchmarks/paper_tables.py` runs cells and writes this page;",
         "`clean_rl_scripts/evaluate.py --policy NAME` runs any policy below that was kept.",

@@ -172,6 +172,12 @@ def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
     capfd.readouterr()
     paper_tables.run(cell, 5, 60, 4, tmp_path / "runs")
     assert capfd.readouterr().out == "bc-config-wall-s5: done before\n"
+    paper_tables.run(cell, 5, 60, 6, tmp_path / "runs")  # more queries: no training
+    assert "--total-updates" not in capfd.readouterr().out
+    more = json.loads((tmp_path / "policies" / "bc-config-wall-s5.json").read_text())
+    evaluated = ("success_rate", "success_rate_interval", "clean_success_rate", "num_queries")
+    assert more["num_queries"] == 6
+    assert all(more[name] == kept[name] for name in kept if name not in evaluated)
     elsewhere = replace(cell, task="double_walls")  # another task, the same policy
     paper_tables.run(elsewhere, 5, 60, 3, tmp_path / "runs")
     other = json.loads((tmp_path / "policies" / f"{elsewhere.name}-s5.json").read_text())
@@ -187,6 +193,11 @@ def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
     assert len(list((tmp_path / "runs" / "bc-config-wall-s5").glob("*/args.json"))) == 2
     (found,) = paper_tables.load_results([tmp_path / "policies"])["bc-config-wall"]
     assert found["args"]["hidden_size"] == 8 and found["steps"] == 30 and not found["kept"]
+    paper_tables.run(cell, 5, 30, 3, tmp_path / "runs", keep_policies=False)
+    (found,) = paper_tables.load_results([tmp_path / "policies"])["bc-config-wall"]
+    assert found["num_queries"] == 3
+    paper_tables.run(cell, 5, 30, 4, tmp_path / "elsewhere", keep_policies=False)
+    assert "done on 3 queries; its policy is gone" in capfd.readouterr().out
     assert not (tmp_path / "policies" / "bc-config-wall-s5.pt").exists()
     (tmp_path / "policies" / f"{elsewhere.name}-s5.json").unlink()
     paper_tables.run(elsewhere, 5, 30, 2, tmp_path / "runs", keep_policies=False)
