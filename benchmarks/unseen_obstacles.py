@@ -14,6 +14,7 @@ for that there is `evaluate.py --split validation`.
 import argparse
 import csv
 import datetime
+import hashlib
 import json
 import os
 import subprocess
@@ -24,6 +25,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import envs
+from envs.encoders import PACKAGED
 from envs.exported_networks import halve_network
 from envs.files import write_atomically
 from envs.last_layer import VERSION
@@ -177,7 +179,8 @@ def write_results(results):
 
 
 def run(tasks, names, num, workers):
-    """Fill in the cells that are missing, had fewer queries, other flags, or an older last layer.
+    """Fill in the cells that are missing, or had fewer queries, other flags, an older last layer or
+    encoder.
 
     Those of a policy that is not there are left out.
     """
@@ -199,6 +202,7 @@ def run(tasks, names, num, workers):
                 result = json.loads(path.read_text())
             result = {key: result[key] for key in KEPT}
             result |= {"flags": CELLS[name], "date": datetime.date.today().isoformat()}
+            result["encoders"] = digests(result)
             results = load_results()  # again: another run of this may have added to it
             results.setdefault(task, {})[name] = result
             write_results(results)
@@ -207,7 +211,23 @@ def run(tasks, names, num, workers):
 def is_done(result, name, num):
     if result is None or result["num_queries"] < num or result["flags"] != CELLS[name]:
         return False
-    return not is_older(result)
+    return not is_older(result) and not had_other_encoder(result)
+
+
+def digests(result):
+    """Of the packaged encoders that a result depends on, by name."""
+    knows = result["encoder"], *(result["env"].get(key) for key in ("encoder", "proximity"))
+    files = {name: PACKAGED / f"{name}.pt" for text in knows if text for name in text.split(":")}
+    return {
+        name: hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+        for name, path in files.items()
+        if path.exists()
+    }
+
+
+def had_other_encoder(result):
+    """Whether an encoder that it depends on has been replaced since."""
+    return "encoders" in result and result["encoders"] != digests(result)
 
 
 def is_older(result):
@@ -266,6 +286,7 @@ def tables(results, others):
     dates = sorted({result["date"] for cells in results.values() for result in cells.values()})
     lines += ["", f"In brackets, test queries and the 95 % interval of success. To {dates[-1]}."]
     lines += ["\\*: with the way out of dead ends as it was before 2026-11-24, without a memory."]
+    lines += ["†: with an encoder that has been replaced since."]
     return "\n".join(lines) + "\n"
 
 
@@ -279,7 +300,7 @@ def _cell(result):
         return "not run"
     low, high = result["success_rate_interval"]
     rates = f"{result['success_rate']:.3f}, {result['clean_success_rate']:.3f}"
-    mark = "\\*" if is_older(result) else ""
+    mark = "\\*" * is_older(result) + "†" * had_other_encoder(result)
     return f"{rates}{mark} [{result['num_queries']:,}: {low:.3f}, {high:.3f}]"
 
 

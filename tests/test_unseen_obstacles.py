@@ -74,6 +74,11 @@ def test_what_is_run_again():
     ):
         assert not unseen.is_done(done | change, name, 200)
     assert not unseen.is_done(None, name, 200)
+    seen_by = done | {"encoder": None, "env": {"encoder": "points:32:field", "proximity": "points"}}
+    assert unseen.digests(seen_by).keys() == {"field"}
+    assert unseen.is_done(seen_by | {"encoders": unseen.digests(seen_by)}, name, 200)
+    replaced = seen_by | {"encoders": {"field": "0123456789ab"}}
+    assert not unseen.is_done(replaced, name, 200) and "0.800† [" in unseen._cell(replaced)
     without = layer | {"way_out": False, "version": VERSION - 1}  # the same in all versions
     assert unseen.is_done(done | {"last_layer": without}, name, 200)
 
