@@ -354,7 +354,7 @@ def update(model, optimizer, seen, obstacles, args):
     with torch.autocast(device, torch.bfloat16) if args.bf16 else contextlib.nullcontext():
         z = model.encode(*seen)
         predicted = model.decoder(z + args.latent_noise * torch.randn_like(z), asked)
-    error = (predicted - truth).abs()
+    error = (predicted.float() - truth).abs()
     near = truth < NEAR
     weights = 1.0 + args.near_weight * near
     loss = (weights * error).sum() / weights.sum()

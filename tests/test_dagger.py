@@ -2,6 +2,7 @@
 
 import copy
 import importlib
+import json
 import os
 import signal
 import subprocess
@@ -13,8 +14,9 @@ import meta_device
 import numpy as np
 import pytest
 import torch
+from one_type import OneType
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import PATHS, ROOT, command, load, refusal, run_script
+from trainers import PATHS, ROOT, command, load, refusal, run_here, run_script
 
 import envs
 from demo_generation.roadmaps import Roadmap
@@ -267,15 +269,28 @@ def test_a_run_killed_and_resumed_its_policy_by_name(tmp_path, folder):
 
 
 def test_nothing_of_a_run_needs_the_cpu(tmp_path, folder, short_episodes):
-    """Updates, a round, and an evaluation, with the `meta` device in CUDA's place."""
+    """Updates, a round, an evaluation and a resume, with the `meta` device in CUDA's place."""
     few = ["--total-updates", "4", "--eval-every", "4", "--round-every", "2", "--eval-queries", "1"]
     flags = ["--paths", str(folder), "--encoder", "oracle", "--device", "meta", *few]
     with meta_device.in_cudas_place():
         run = run_script("dagger", tmp_path, *flags)
     assert load_network(run / "policy.pt").metadata["step"] == 4
+    assert json.loads((run / "result.json").read_text())["steps"] == 4
+    args = json.loads((run / "args.json").read_text())
+    (run / "args.json").write_text(json.dumps(args | {"total_updates": 6}))
+    with meta_device.in_cudas_place():
+        run_here(PATHS["dagger"], "--resume", run)
+    assert json.loads((run / "result.json").read_text())["steps"] == 6
     state = torch.load(run / "checkpoint.pt", weights_only=True)
-    assert state["progress"]["updates"] == 4
-    assert all(tensor.is_meta for tensor in state["actor"].values())
+    assert state["progress"]["updates"] == 6
+    for name in ("actor", "visited"):  # a round came after the resume, too
+        assert state[name] and all(tensor.is_meta for tensor in state[name].values())
+
+
+def test_no_kernel_gets_two_types(tmp_path, folder, short_episodes):
+    few = ["--total-updates", "4", "--eval-every", "4", "--round-every", "2", "--eval-queries", "1"]
+    with OneType():
+        run_script("dagger", tmp_path, "--paths", str(folder), "--bf16", "True", *few)
 
 
 @pytest.mark.parametrize(

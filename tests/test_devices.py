@@ -9,6 +9,7 @@ import json
 import meta_device
 import pytest
 import torch
+from one_type import OneType
 from trainers import PATHS, TRAINERS, command, run_here
 
 import envs.protocol
@@ -43,9 +44,12 @@ def test_update_evaluation_and_resume_on_another_device(
     assert state["progress"]["updates"] > 0
     assert all(tensor.is_meta for tensor in state["actor"].values())
     (run / "result.json").unlink()
-    longer = [] if trainer == "bc" else ["--total-timesteps", "120"]
-    run_here(PATHS[trainer], "--resume", run, *longer)
-    assert json.loads((run / "result.json").read_text())["steps"] == (2 if trainer == "bc" else 120)
+    longer, steps = ("--total-updates", 4) if trainer == "bc" else ("--total-timesteps", 120)
+    run_here(PATHS[trainer], "--resume", run, longer, steps)
+    assert json.loads((run / "result.json").read_text())["steps"] == steps
+    resumed = torch.load(run / "checkpoint.pt", weights_only=True)
+    assert resumed["progress"]["updates"] > state["progress"]["updates"]
+    assert all(tensor.is_meta for tensor in resumed["actor"].values())
 
 
 def test_a_tensor_left_on_the_cpu_is_noticed(tmp_path, meta, monkeypatch):
@@ -55,27 +59,21 @@ def test_a_tensor_left_on_the_cpu_is_noticed(tmp_path, meta, monkeypatch):
         run_here(*command("bc", tmp_path, *flags("bc"))[1:])
 
 
-class OneType(torch.overrides.TorchFunctionMode):
-    """Refuses floating-point tensors of two types in one call, as many of CUDA's kernels do."""
-
-    ALLOWED = ("copy_", "type_as", "to", "set_data", "__set__")
-
-    def __torch_function__(self, function, types, args=(), kwargs=None):
-        kwargs = kwargs or {}
-        leaves = torch.utils._pytree.tree_leaves((args, kwargs))
-        kinds = {
-            one.dtype
-            for one in leaves
-            if isinstance(one, torch.Tensor) and one.is_floating_point() and one.dim() > 0
-        }
-        name = getattr(function, "__name__", str(function))
-        assert len(kinds) < 2 or name in self.ALLOWED, f"{name} of {kinds}"
-        return function(*args, **kwargs)
-
-
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_no_kernel_gets_two_types(trainer, tmp_path):
     few = [flag for flag in flags(trainer) if flag not in ("--device", "meta")]
     given = command(trainer, tmp_path, *few, "--bf16", *(["True"] if trainer != "bc" else []))[1:]
     with OneType():
         run_here(*given)
+
+
+def test_two_types_are_noticed():
+    x, norm = torch.zeros(2, 8, dtype=torch.bfloat16), torch.nn.LayerNorm(8)
+    linear = torch.nn.Linear(8, 8)
+    with OneType():
+        linear(x.float())
+        with torch.autocast("cpu", torch.bfloat16):
+            linear(x)
+        for mixed in (lambda: norm(x), lambda: x + norm.weight):
+            with pytest.raises(AssertionError, match="of .*bfloat16"):
+                mixed()

@@ -18,6 +18,7 @@ import pybullet as p
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from one_type import OneType
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainers import run_here
@@ -790,6 +791,18 @@ def test_nothing_of_a_run_needs_the_cpu(name, observations, tmp_path):
     assert json.loads((folder / "result.json").read_text())["updates"] == 2
     weights = torch.load(folder / "checkpoint.pt", weights_only=True)["model"].values()
     assert all(tensor.is_meta for tensor in weights)
+
+
+@pytest.mark.parametrize("sees", ["clouds", "images"])
+def test_no_kernel_of_the_field_gets_two_types(sees):
+    args = field.Args(width=8, sees=sees, picture_size=16, num_queries=12, bf16=True)
+    model = field.Field(4, args)
+    clouds_seen = torch.rand(3, 20, 3) - 0.5, torch.rand(3, 20) < 0.8
+    seen = clouds_seen if sees == "clouds" else (torch.rand(3, 4, 3, 16, 16),)
+    rows = oracle(Scene(OBSTACLES)).reshape(1, MAX_OBSTACLES, 12)
+    with OneType():
+        losses = one_update(field, model, seen, args, torch.from_numpy(rows).expand(3, -1, -1))
+    assert losses["loss"].isfinite()
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
