@@ -1,4 +1,4 @@
-"""Put trained scene encoders into the repository: program, how it was made, and a picture.
+"""Put trained scene encoders into the repository: network, how it was made, and a picture.
 
     pip install -c constraints.txt -e ".[bench]"
     python benchmarks/keep_encoders.py runs/RUN ...    # of vae.py, vqvae.py, pointnet2.py, field.py
@@ -66,7 +66,7 @@ def keep(run, encoders, pictures, halve=False):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a finished run's folder")
-    parser.add_argument("--encoders", type=Path, default=PACKAGED, help="where programs go")
+    parser.add_argument("--encoders", type=Path, default=PACKAGED, help="where networks go")
     parser.add_argument("--pictures", type=Path, default=PICTURES, help="where pictures go")
     parser.add_argument("--halve", action="store_true", help="in half precision")
     args = parser.parse_args()

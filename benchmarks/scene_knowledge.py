@@ -114,27 +114,27 @@ class AnyObstacle(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, codes):
-        rows = codes.unflatten(1, (MAX_OBSTACLES, 1 + ROW))
+    def forward(self, latents):
+        rows = latents.unflatten(1, (MAX_OBSTACLES, 1 + ROW))
         rows = rows[:, : int(rows[..., 0].sum(1).max())]
         free = (F.logsigmoid(-self.network(rows)) * rows[..., :1]).sum(1).clamp(max=-1e-6)
         return torch.log(-torch.expm1(free)) - free
 
 
-def probe(codes, cells, test_codes, is_set=False, seed=0, epochs=60):
+def probe(latents, cells, test_latents, is_set=False, seed=0, epochs=60):
     """Train the network; its probabilities (n, cells) on the test scenes.
 
     A tenth of the training scenes decides when it is best.
     """
     torch.manual_seed(seed)
     if not is_set:
-        mean, std = codes.mean(0), codes.std(0) + 1e-3
-        codes, test_codes = (codes - mean) / std, (test_codes - mean) / std
-    codes, test_codes = torch.as_tensor(codes), torch.as_tensor(test_codes)
+        mean, std = latents.mean(0), latents.std(0) + 1e-3
+        latents, test_latents = (latents - mean) / std, (test_latents - mean) / std
+    latents, test_latents = torch.as_tensor(latents), torch.as_tensor(test_latents)
     cells = torch.as_tensor(cells).float()
-    split = len(codes) * 9 // 10
+    split = len(latents) * 9 // 10
     network = nn.Sequential(
-        nn.Linear(1 + ROW if is_set else codes.shape[1], 256), nn.ReLU(),
+        nn.Linear(1 + ROW if is_set else latents.shape[1], 256), nn.ReLU(),
         nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, cells.shape[1]),
     )  # fmt: skip
     if is_set:
@@ -143,14 +143,14 @@ def probe(codes, cells, test_codes, is_set=False, seed=0, epochs=60):
     best, probabilities = np.inf, None
     for _ in range(epochs):
         for rows in torch.randperm(split).split(128):
-            loss = F.binary_cross_entropy_with_logits(network(codes[rows]), cells[rows])
+            loss = F.binary_cross_entropy_with_logits(network(latents[rows]), cells[rows])
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
         with torch.no_grad():
-            error = F.binary_cross_entropy_with_logits(network(codes[split:]), cells[split:])
+            error = F.binary_cross_entropy_with_logits(network(latents[split:]), cells[split:])
             if error < best:
-                best, probabilities = error, torch.sigmoid(network(test_codes))
+                best, probabilities = error, torch.sigmoid(network(test_latents))
     return probabilities.numpy()
 
 
@@ -162,24 +162,24 @@ class NearestObstacle(nn.Module):
         self.network = network
 
     def forward(self, inputs):
-        codes, places = inputs.split((MAX_OBSTACLES * (1 + ROW), inputs.shape[1] - 384), dim=1)
-        rows = codes.unflatten(1, (MAX_OBSTACLES, 1 + ROW))
+        latents, places = inputs.split((MAX_OBSTACLES * (1 + ROW), inputs.shape[1] - 384), dim=1)
+        rows = latents.unflatten(1, (MAX_OBSTACLES, 1 + ROW))
         rows = rows[:, : int(rows[..., 0].sum(1).max())]
         places = places.unsqueeze(1).expand(-1, rows.shape[1], -1)
         found = self.network(torch.cat([rows, places], dim=2))
         return (found + FAR * (1.0 - rows[..., :1])).amin(1)
 
 
-def distance_probe(codes, data, test_codes, test_data, is_set=False, seed=0, epochs=10):
+def distance_probe(latents, data, test_latents, test_data, is_set=False, seed=0, epochs=10):
     """Train the second network; its mean error (m) on the test scenes' links within `NEAR`."""
     torch.manual_seed(seed)
     if not is_set:
-        mean, std = codes.mean(0), codes.std(0) + 1e-3
-        codes, test_codes = (codes - mean) / std, (test_codes - mean) / std
-    codes, test_codes, places, distances, test_places, test_distances = (
-        torch.as_tensor(x) for x in (codes, test_codes, *data[:2], *test_data[:2])
+        mean, std = latents.mean(0), latents.std(0) + 1e-3
+        latents, test_latents = (latents - mean) / std, (test_latents - mean) / std
+    latents, test_latents, places, distances, test_places, test_distances = (
+        torch.as_tensor(x) for x in (latents, test_latents, *data[:2], *test_data[:2])
     )
-    size = (1 + ROW if is_set else codes.shape[1]) + places.shape[2]
+    size = (1 + ROW if is_set else latents.shape[1]) + places.shape[2]
     network = nn.Sequential(
         nn.Linear(size, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(),
         nn.Linear(256, distances.shape[2]),
@@ -187,12 +187,12 @@ def distance_probe(codes, data, test_codes, test_data, is_set=False, seed=0, epo
     if is_set:
         network = NearestObstacle(network)
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
-    updates, done = epochs * -(-len(codes) * POSES // 512), 0
+    updates, done = epochs * -(-len(latents) * POSES // 512), 0
     for _ in range(epochs):
-        for rows in torch.randperm(len(codes) * POSES).split(512):
+        for rows in torch.randperm(len(latents) * POSES).split(512):
             scene, pose = rows // POSES, rows % POSES
             truth = distances[scene, pose]
-            predicted = network(torch.cat([codes[scene], places[scene, pose]], dim=1))
+            predicted = network(torch.cat([latents[scene], places[scene, pose]], dim=1))
             weights = 1.0 + 4.0 * (truth < NEAR)
             loss = (weights * (predicted - truth).abs()).sum() / weights.sum()
             optimizer.param_groups[0]["lr"] = 1e-3 * (1.0 - done / updates)
@@ -201,7 +201,7 @@ def distance_probe(codes, data, test_codes, test_data, is_set=False, seed=0, epo
             optimizer.step()
             done += 1
     with torch.no_grad():
-        spread = test_codes.unsqueeze(1).expand(-1, POSES, -1)
+        spread = test_latents.unsqueeze(1).expand(-1, POSES, -1)
         inputs = torch.cat([spread, test_places], dim=2).flatten(0, 1)
         predicted = torch.cat([network(some) for some in inputs.split(4096)])
     error = (predicted - test_distances.flatten(0, 1)).abs()
@@ -288,7 +288,7 @@ def figures(probabilities, means, cells):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("encoders", nargs="*", help="programs (encoder.pt); default: the packaged")
+    parser.add_argument("encoders", nargs="*", help="networks (encoder.pt); default: the packaged")
     parser.add_argument("--num", type=int, default=10_000, help="scenes to learn from (10,000)")
     parser.add_argument("--num-test", type=int, default=2_000, help="scenes to test on (2,000)")
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
@@ -315,9 +315,9 @@ def main():
         np.stack([oracle(scene) for scene in scenes]) for scenes in (training, testing)
     )
     for name in tqdm([ORACLE, *names], desc="encoders"):
-        codes, is_set = (known[name], test_known[name]), name == ORACLE
-        result = figures(probe(codes[0], cells, codes[1], is_set), means, test_cells)
-        error = distance_probe(codes[0], data, codes[1], test_data, is_set)
+        (z, test_z), is_set = (known[name], test_known[name]), name == ORACLE
+        result = figures(probe(z, cells, test_z, is_set), means, test_cells)
+        error = distance_probe(z, data, test_z, test_data, is_set)
         result["links_cm"] = 100 * error
         if scene_encoder(name).has_decoder:
             result |= decoded(name, training, grids[0], testing, grids[1], test_data)

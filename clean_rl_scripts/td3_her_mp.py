@@ -265,8 +265,8 @@ class HerReplayBuffer:
         return {
             "rows": torch.from_numpy(self.rows[: self.size]),
             "remaining": torch.from_numpy(self.remaining[: self.size]),
-            "scene": torch.from_numpy(self.latent_row[: self.size]),
-            "codes": torch.from_numpy(self.latents.rows),
+            "latent_row": torch.from_numpy(self.latent_row[: self.size]),
+            "latents": torch.from_numpy(self.latents.rows),
             "position": self.position,
         }
 
@@ -274,8 +274,8 @@ class HerReplayBuffer:
         self.size, self.position = len(state["rows"]), state["position"]
         self.rows[: self.size] = state["rows"].numpy()
         self.remaining[: self.size] = state["remaining"].numpy()
-        self.latent_row[: self.size] = state["scene"].numpy()
-        for latent in state["codes"].numpy():
+        self.latent_row[: self.size] = state["latent_row"].numpy()
+        for latent in state["latents"].numpy():
             self.latents.row_of(latent)
 
 

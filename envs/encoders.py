@@ -111,7 +111,7 @@ def _read_latents(path, key):
     """What `SceneEncoder.encode_demos` kept; None if it is not there, damaged or out of date."""
     try:
         with np.load(path) as file:
-            return file["codes"] if file["key"] == key else None
+            return file["latents"] if file["key"] == key else None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
@@ -210,7 +210,7 @@ class SceneEncoder:
         if latents is None:
             latents = encode()
             file = io.BytesIO()
-            np.savez(file, key=key, codes=latents)
+            np.savez(file, key=key, latents=latents)
             with contextlib.suppress(OSError):  # where nothing can be written, it is not kept
                 write_atomically(path, file.getvalue())
         self._of_demos |= zip(seen, latents, strict=True)

@@ -7,7 +7,7 @@ because nothing in it is unpickled as an object (`weights_only`) and only the op
 promises less: it may unpickle objects, and evaluates strings of the file as Python expressions.)
 
     save_network("encoder.pt", encoder, {"points": points}, {"kind": "encoder"})
-    code = load_network("encoder.pt")(points=points)
+    z = load_network("encoder.pt")(points=points)
     halve_network("encoder.pt", "smaller.pt")
 
 A **policy** is a network from `observation` (N, 10 or 17), `achieved_goal` and `desired_goal`

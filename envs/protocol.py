@@ -172,7 +172,7 @@ def evaluate(policy, envs, queries, device, last_layer=None, seed=0):
 
     Args:
         policy: from `observation`, `achieved_goal`, `desired_goal` and what else is observed,
-            tensors (N, ...), to actions (N, 7); a module or a program.
+            tensors (N, ...), to actions (N, 7); a module or an exported network.
         envs: the environments to do it in.
         queries: `envs.datasets.Queries`, or a list of `Query`.
         device: of the policy.

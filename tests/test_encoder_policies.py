@@ -51,7 +51,7 @@ def test_the_buffer_gives_each_transition_the_code_of_its_scene(env):
     sac = load("sac_her_mp")
     env.reset(seed=0)
     buffer = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
-    assert buffer.rows.shape[1] < 50  # codes are not in the rows
+    assert buffer.rows.shape[1] < 50  # latents are not in the rows
     known = {}
     for _ in range(8):  # the oldest ones are overwritten
         episode = steps(env, 10)
@@ -111,13 +111,13 @@ def flags(trainer):
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
     run = run_script(trainer, tmp_path / "whole", *flags(trainer), "--goal-type", "combined")
-    program = torch.load(run / "policy.pt", weights_only=True)
-    assert program["metadata"]["env"]["encoder"] == "oracle"
+    network = torch.load(run / "policy.pt", weights_only=True)
+    assert network["metadata"]["env"]["encoder"] == "oracle"
     arguments = ["--policy", run, "--num-queries", "3", "--task", HARD]
     arguments += ["--json", tmp_path / "result.json"]
     assert evaluate.main(list(map(str, arguments))) == 0
     assert json.loads((tmp_path / "result.json").read_text())["goal_type"] == "combined"
-    assert program["metadata"]["env"].get("append_proximity", False) == (trainer != "bc")
+    assert network["metadata"]["env"].get("append_proximity", False) == (trainer != "bc")
     if trainer == "bc":
         show = [sys.executable, "-m", "envs.show", HARD, "--policy", str(run)]
         show += ["--size", "60", "40", "--output", str(tmp_path / "rollout.gif")]

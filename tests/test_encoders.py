@@ -886,9 +886,9 @@ def test_packaged_encoders_are_found_by_name():
     queries = load_queries("random_boxes_hard")
     for name in SCRIPTS:
         encoder, path = SceneEncoder(name), PACKAGED / f"{name}.pt"
-        codes = np.stack([encoder(queries.scenes[i]) for i in (0, 9_999)])
-        assert codes.shape == (2, 64) and np.isfinite(codes).all()
-        assert np.abs(codes[0] - codes[1]).max() > 0.1  # it sees the difference
+        latents = np.stack([encoder(queries.scenes[i]) for i in (0, 9_999)])
+        assert latents.shape == (2, 64) and np.isfinite(latents).all()
+        assert np.abs(latents[0] - latents[1]).max() > 0.1  # it sees the difference
         result = json.loads(path.with_suffix(".json").read_text())
         assert result["scenes"] >= 19_000
         if path.stem == "pointnet2":
@@ -905,9 +905,9 @@ def test_demonstrations_are_encoded_once(run, tmp_path, monkeypatch):
     path.write_bytes((run[1] / "encoder.pt").read_bytes())
     demos = replace(load_demos("random_boxes_hard"), start=np.zeros((5, 7)))  # the first 5
     encoder = SceneEncoder(path)
-    codes = encoder.encode_demos(demos)
-    assert codes.shape == (5, 64) and codes.dtype == np.float32
-    np.testing.assert_array_equal(codes[3], SceneEncoder(path)(demos.scenes[3]))
+    latents = encoder.encode_demos(demos)
+    assert latents.shape == (5, 64) and latents.dtype == np.float32
+    np.testing.assert_array_equal(latents[3], SceneEncoder(path)(demos.scenes[3]))
     kept = tmp_path / "encoder.random_boxes_hard.npz"
     look, looked = SceneEncoder.look, []
     monkeypatch.setattr(
@@ -915,8 +915,8 @@ def test_demonstrations_are_encoded_once(run, tmp_path, monkeypatch):
     )
     again = SceneEncoder(path)
     looked.clear()
-    np.testing.assert_array_equal(again.encode_demos(demos), codes)
-    np.testing.assert_array_equal(again(demos.scenes[3]), codes[3])
+    np.testing.assert_array_equal(again.encode_demos(demos), latents)
+    np.testing.assert_array_equal(again(demos.scenes[3]), latents[3])
     assert not looked
     fresh = SceneEncoder(path)
     looked.clear()
@@ -925,7 +925,7 @@ def test_demonstrations_are_encoded_once(run, tmp_path, monkeypatch):
     kept.write_bytes(kept.read_bytes()[:-40])  # damaged: the same
     fresh = SceneEncoder(path)
     looked.clear()
-    np.testing.assert_array_equal(fresh.encode_demos(demos), codes)
+    np.testing.assert_array_equal(fresh.encode_demos(demos), latents)
     assert len(looked) == 5
     np.testing.assert_array_equal(
         SceneEncoder("oracle").encode_demos(demos)[2], oracle(demos.scenes[2])

@@ -1,4 +1,4 @@
-"""What z_E knows of a scene: the cells by hand, the probe on codes that say everything."""
+"""What z_E knows of a scene: the cells by hand, the probe on latents that say everything."""
 
 import importlib.util
 import json
@@ -74,13 +74,13 @@ def test_the_probe_finds_what_the_codes_say(is_set):
     if is_set:
         places = [rng.uniform(-0.6, 0.6, (rng.integers(1, 4), 2)) for _ in range(1500)]
         scenes = [Scene(tuple(Box((*xy, 0.1), (0.1, 0.1, 0.1)) for xy in one)) for one in places]
-        codes = np.stack([oracle(scene) for scene in scenes])
+        latents = np.stack([oracle(scene) for scene in scenes])
         cells = np.stack([knowledge.occupied(scene.obstacles).ravel() for scene in scenes])
         cells = cells[:, cells.any(0)]
     else:
-        codes = rng.normal(size=(1500, 6)).astype(np.float32)
-        cells = codes > 0
-    probabilities = knowledge.probe(codes[:1200], cells[:1200], codes[1200:], is_set)
+        latents = rng.normal(size=(1500, 6)).astype(np.float32)
+        cells = latents > 0
+    probabilities = knowledge.probe(latents[:1200], cells[:1200], latents[1200:], is_set)
     found = knowledge.figures(probabilities, cells[:1200].mean(0), cells[1200:])
     assert found["information"] > 0.6 and found["iou"] > 0.5
 
@@ -90,10 +90,10 @@ def test_a_set_of_obstacles_is_their_union():
         def forward(self, rows):
             return rows[..., 2:4]  # logits of two cells: the position's x and y
 
-    codes = torch.as_tensor(
+    latents = torch.as_tensor(
         oracle(Scene((Sphere((0.5, -1.0, 0), 0.1), Sphere((2.0, -0.5, 0), 0.1))))
     )
-    logits = knowledge.AnyObstacle(Fixed())(codes[None])[0]
+    logits = knowledge.AnyObstacle(Fixed())(latents[None])[0]
     one, other = torch.sigmoid(torch.tensor([[0.5, -1.0], [2.0, -0.5]]))
     torch.testing.assert_close(torch.sigmoid(logits), 1 - (1 - one) * (1 - other))
 
@@ -127,11 +127,11 @@ def test_the_second_probe_finds_what_the_codes_say(is_set):
     rng = np.random.default_rng(0)
     middles = rng.uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 0.8], (400, 3))
     scenes = [Scene((Sphere(tuple(middle), 0.1),)) for middle in middles.tolist()]
-    codes = middles.astype(np.float32)
+    latents = middles.astype(np.float32)
     if is_set:
-        codes = np.stack([oracle(scene) for scene in scenes])
+        latents = np.stack([oracle(scene) for scene in scenes])
     data = knowledge.link_distances(scenes[:300], 0), knowledge.link_distances(scenes[300:], 1)
-    data = codes[:300], data[0], codes[300:], data[1]
+    data = latents[:300], data[0], latents[300:], data[1]
     knows = knowledge.distance_probe(*data, is_set, epochs=40)
     nothing = np.zeros((400, 1), np.float32)
     guesses = knowledge.distance_probe(nothing[:300], data[1], nothing[300:], data[3], epochs=40)
