@@ -180,17 +180,17 @@ class Actor(nn.Module):
 def transitions(demos, goal_type, num_demos=None):
     """The observations, goals and actions of demonstrations: float32 (n, 10), (n, g), (n, 7).
 
-    And the number of the demonstration that each is of: int64 (n,).
+    And the index of the demonstration that each is of: int64 (n,).
     All of a demonstration, beyond where its goal counts as reached: it goes on to the very goal.
     Actions are in units of `MAX_STEP`.
     """
     number = len(demos) if num_demos is None else min(num_demos, len(demos))
-    which = np.repeat(np.arange(number), np.diff(demos.offsets[: number + 1]))
-    commanded = np.ones(len(which), bool)
+    demo_index = np.repeat(np.arange(number), np.diff(demos.offsets[: number + 1]))
+    commanded = np.ones(len(demo_index), bool)
     commanded[demos.offsets[1 : number + 1] - 1] = False  # from the last, nothing was
-    rows, which = np.flatnonzero(commanded), which[commanded]
+    rows, demo_index = np.flatnonzero(commanded), demo_index[commanded]
     observation, _, goal = observed(demos.states[rows], demos.goal[:number], goal_type)
-    return observation, goal[which], demos.actions[rows] / MAX_STEP, which
+    return observation, goal[demo_index], demos.actions[rows] / MAX_STEP, demo_index
 
 
 # SHARED: averaging
@@ -227,6 +227,9 @@ if __name__ == "__main__":
 
     # ALGO LOGIC: data
     parts = [transitions(demos, args.goal_type, args.num_demos) for demos in files]
+    firsts = np.cumsum([0, *map(len, files[:-1])])
+    for first, (*_, demo_index) in zip(firsts, parts, strict=True):
+        demo_index += first  # it counts on from file to file
     data = [
         torch.as_tensor(np.concatenate(arrays), device=device)
         for arrays in zip(*parts, strict=True)
@@ -234,10 +237,7 @@ if __name__ == "__main__":
     latents = None  # the encoded scene of each demonstration
     if args.encoder is not None:
         encoded = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
-        firsts = np.cumsum([0, *map(len, encoded)])
-        numbers = [first + part[3] for first, part in zip(firsts, parts, strict=False)]
         latents = torch.as_tensor(np.concatenate(encoded), device=device)
-        data[3] = torch.as_tensor(np.concatenate(numbers), device=device)
     del files, parts
 
     # ALGO LOGIC: network and optimiser
@@ -263,9 +263,9 @@ if __name__ == "__main__":
             remaining = 1.0 - progress["updates"] / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         rows = torch.randint(len(data[0]), (args.batch_size,), device=device)
-        observation, goal, action, number = (tensor[rows] for tensor in data)
+        observation, goal, action, demo_index = (tensor[rows] for tensor in data)
         if latents is not None:
-            observation = torch.cat([observation, latents[number]], dim=1)
+            observation = torch.cat([observation, latents[demo_index]], dim=1)
         loss = update(actor, optimizer, observation, goal, action)
         polyak_update(average_parameters, parameters, args.policy_average)
         progress["updates"] += 1

@@ -48,8 +48,8 @@ def test_the_action_is_the_likeliest_modes_mean():
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
 def test_transitions_are_those_of_the_demonstrations(goal_type):
     demos = load_demos("wall")
-    observations, goals, actions, numbers = bc.transitions(demos, goal_type, num_demos=3)
-    assert numbers.tolist() == [i for i in range(3) for _ in range(len(demos[i].actions))]
+    observations, goals, actions, demo_index = bc.transitions(demos, goal_type, num_demos=3)
+    assert demo_index.tolist() == [i for i in range(3) for _ in range(len(demos[i].actions))]
     expected = []
     for i in range(3):
         demo = demos[i]
