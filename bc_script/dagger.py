@@ -147,12 +147,12 @@ class Actor(nn.Module):
 
     def __init__(self, args):
         super().__init__()
-        self.num_numbers = scene_encoder(args.encoder).row_size  # of a token
+        self.row_size = scene_encoder(args.encoder).row_size  # numbers of a token
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         size = 10 + {"config": 7, "combined": 10}[args.goal_type] + 28 + 2 * 80
-        self.of_token = nn.Linear(self.num_numbers, args.token_size)
+        self.of_token = nn.Linear(self.row_size, args.token_size)
         self.of_arm = nn.Linear(size, args.token_size)
         self.of_both = Hidden(args.token_size, args.token_size, args.bf16)
         self.first = nn.Linear(size + args.token_size, args.hidden_size)
@@ -174,7 +174,7 @@ class Actor(nn.Module):
     def outputs(self, observation, desired_goal, proximity, goal_proximity):
         """The direction (N, 7), of any length, and the length of the rest of the way (N,)."""
         features = self.features(observation, desired_goal, proximity, goal_proximity)
-        tokens = observation[:, 10:].unflatten(1, (-1, self.num_numbers))
+        tokens = observation[:, 10:].unflatten(1, (-1, self.row_size))
         seen = F.relu(self.of_token(tokens) + self.of_arm(features).unsqueeze(1))
         seen = F.relu(self.of_both(seen))
         there = (tokens != 0.0).any(dim=2, keepdim=True)
@@ -218,7 +218,8 @@ class Examples:
         self.with_paths = np.flatnonzero(np.diff(paths.path_offsets))  # numbers of scenes
         steps = np.linalg.norm(np.diff(paths.points, axis=0), axis=1)
         steps[paths.offsets[1:-1] - 1] = 1.0  # from the end of a path to the next one: anything
-        self.come = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+        # Length of all paths up to each point.
+        self.travelled = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
 
     def draw(self, number):
         """Examples anywhere on the paths of one scene; they depend on seed and `number` only."""
@@ -227,12 +228,12 @@ class Examples:
         which = np.arange(self.args.examples_per_update) // PER_PATH
         first, last = first[which], last[which]
         backwards = (rng.random(len(first)) < 0.5)[which]
-        rest = rng.random(len(first)) * (self.come[last] - self.come[first])
+        rest = rng.random(len(first)) * (self.travelled[last] - self.travelled[first])
 
         def at(rest):  # the points on the paths from where so much is left
-            come = np.where(backwards, self.come[first] + rest, self.come[last] - rest)
-            i = np.clip(np.searchsorted(self.come, come, side="right") - 1, first, last - 1)
-            share = (come - self.come[i]) / (self.come[i + 1] - self.come[i])
+            here = np.where(backwards, self.travelled[first] + rest, self.travelled[last] - rest)
+            i = np.clip(np.searchsorted(self.travelled, here, side="right") - 1, first, last - 1)
+            share = (here - self.travelled[i]) / (self.travelled[i + 1] - self.travelled[i])
             tail, head = self.paths.points[i], self.paths.points[i + 1]
             return tail + share[:, None] * (head - tail)
 
@@ -309,9 +310,9 @@ def some(examples, number):
     return {name: tensor[rows] for name, tensor in examples.items()}
 
 
-def with_scene(batch, latents, num_numbers):
+def with_scene(batch, latents, row_size):
     """The batch with encoded scenes (scenes, z) in observations, as far as there are any tokens."""
-    tokens = latents[batch["scene"]].unflatten(1, (-1, num_numbers))
+    tokens = latents[batch["scene"]].unflatten(1, (-1, row_size))
     tokens = tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)]
     observation = torch.cat([batch["observation"], tokens.flatten(1)], dim=1)
     return batch | {"observation": observation}
@@ -401,7 +402,7 @@ if __name__ == "__main__":
             count = int(args.batch_size * weight / (weight + len(pool["scene"])))
             batch = joined([some(visited, count), batch])
             batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
-        batch = with_scene(batch, latents, actor.num_numbers)
+        batch = with_scene(batch, latents, actor.row_size)
         direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
         polyak_update(average_parameters, parameters, args.policy_average)
         oldest = progress["updates"] % num_draws * args.examples_per_update
@@ -419,7 +420,8 @@ if __name__ == "__main__":
 
         # ALGO LOGIC: a round of DAgger
         if args.round_every and step % args.round_every == 0 and step < args.total_updates:
-            found, reached = examples.visit(actor_average, eval_envs[0], last_layer, step)
+            # In the last environment: the first one draws, and is slower to change its scene.
+            found, reached = examples.visit(actor_average, eval_envs[-1], last_layer, step)
             visited |= joined([visited, found]) if visited else found
             writer.add_scalar("charts/round_success", reached, step)
 

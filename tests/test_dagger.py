@@ -72,7 +72,7 @@ def some(request, folder, tmp_path_factory):
     actor = dagger.Actor(args)
     torch.nn.init.normal_(actor.head.weight)  # (it begins as go-to-goal, whatever is there)
     latents = torch.as_tensor(env.encoder.encode_demos(paths))
-    yield actor, env, dagger.with_scene(batch, latents, actor.num_numbers)
+    yield actor, env, dagger.with_scene(batch, latents, actor.row_size)
     env.close()
 
 
@@ -92,20 +92,20 @@ def test_examples_say_how_paths_go_on_to_either_end(tmp_path):
     states, goals = drawn["observation"][:, :7], drawn["desired_goal"][:, :7]
     offset = states[:, 6:]  # of the second path
     assert set(offset.ravel().round(5)) == {0.0, 0.25}
-    come = (states - offset).sum(1)  # from the path's first point
+    travelled = (states - offset).sum(1)  # from the path's first point
     forwards = goals[:, 1] - offset[:, 0] > 0.25
     assert 20 < forwards.sum() < 76
     np.testing.assert_allclose(goals - offset, np.where(forwards[:, None], CORNER[2], 0), atol=1e-6)
 
-    def at(come):
-        points = np.zeros((len(come), 7))
-        points[:, 0], points[:, 1] = np.minimum(come, 0.5), np.maximum(come - 0.5, 0.0)
+    def at(travelled):
+        points = np.zeros((len(travelled), 7))
+        points[:, 0], points[:, 1] = np.minimum(travelled, 0.5), np.maximum(travelled - 0.5, 0.0)
         return points
 
-    np.testing.assert_allclose(states - offset, at(come), atol=1e-6)
-    assert come.min() < 0.15 and come.max() > 0.85 and np.ptp(come[forwards]) > 0.7
-    after = np.clip(np.where(forwards, come + 0.1, come - 0.1), 0.0, 1.0)
-    moves = at(after) - at(come)
+    np.testing.assert_allclose(states - offset, at(travelled), atol=1e-6)
+    assert travelled.min() < 0.15 and travelled.max() > 0.85 and np.ptp(travelled[forwards]) > 0.7
+    after = np.clip(np.where(forwards, travelled + 0.1, travelled - 0.1), 0.0, 1.0)
+    moves = at(after) - at(travelled)
     lengths = np.linalg.norm(moves, axis=1)
     np.testing.assert_allclose(drawn["direction"] * lengths[:, None], moves, atol=1e-5)
     left = np.where(forwards, 1.0 - after, after)
@@ -171,7 +171,7 @@ def test_tokens_have_no_order_and_what_is_not_there_does_not_count(some):
         pytest.skip("z_E is a single token")
     inputs = inputs_of(batch)
     direction, length = actor.outputs(**inputs)
-    tokens = inputs["observation"][:, 10:].unflatten(1, (-1, actor.num_numbers))
+    tokens = inputs["observation"][:, 10:].unflatten(1, (-1, actor.row_size))
     assert (tokens == 0.0).all(2).all(1).any()  # an empty scene
     assert direction.isfinite().all()
     more = torch.cat([tokens.flip(1), torch.zeros_like(tokens)], dim=1).flatten(1)
