@@ -292,9 +292,10 @@ def inject_demonstration(is_success, demo_prob, rng):
 
 
 def smoothed(action, noise, noise_clip, action_scale):
-    """Target policy smoothing: the action (N, 7) plus clipped noise, within the actions' range.
+    """The action (N, 7) plus clipped noise, within the actions' range.
 
-    `noise` (N, 7) and `noise_clip` are in units of `action_scale`.
+    For target policy smoothing, and with `noise_clip` infinite for exploration. `noise` (N, 7) and
+    `noise_clip` are in units of `action_scale`.
     """
     noise = noise.clamp(-noise_clip, noise_clip)
     return (action + action_scale * noise).clamp(-action_scale, action_scale)
