@@ -251,8 +251,6 @@ if __name__ == "__main__":
     saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
     saved_parts |= {"progress": progress}
     runs.load_checkpoint(args, saved_parts)
-    if "best_update" in progress:  # its name in older runs
-        progress["best_step"] = progress.pop("best_update")
     writer = runs.summary_writer(run, args, progress["updates"])
     seconds_before = progress["seconds"]
     bar = runs.progress_bar(args.total_updates, progress["updates"], "update")
@@ -288,7 +286,7 @@ if __name__ == "__main__":
                 )
             bar.set_postfix(eval=success, best=progress["best_success"])
             progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, saved_parts)
+            runs.save_checkpoint(run, saved_parts, device)
     bar.close()
     protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
     writer.close()

@@ -344,8 +344,7 @@ def update(actor, optimizer, batch, length_weight):
 if __name__ == "__main__":
     args = runs.parse_args(Args, may_change={"test_queries"})
     device = runs.seed_torch(args)
-    if args.bf16 is None:
-        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
+    runs.resolve_bf16(args)
     validation, test = protocol.load_task(args)
     try:
         proximity = scene_encoder(args.encoder).proximity
@@ -436,7 +435,7 @@ if __name__ == "__main__":
                 )
             bar.set_postfix(eval=success, best=progress["best_success"])
             progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, saved_parts)
+            runs.save_checkpoint(run, saved_parts, device)
     bar.close()
     background.shutdown()
     protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)

@@ -11,6 +11,7 @@ is imported from `envs` is the benchmark, not the algorithm.
 """
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -242,10 +243,8 @@ class HerReplayBuffer:
             width = columns.stop - columns.start  # without the encoded scene
             values = [np.atleast_1d(transition[name])[:width] for transition in transitions]
             self.rows[index, columns] = np.stack(values)
-        observation_size = self.columns["observation"].stop
-        self.latent_row[index] = self.latents.row_of(
-            transitions[0]["observation"][observation_size:]
-        )
+        latent = transitions[0]["observation"][self.columns["observation"].stop :]
+        self.latent_row[index] = self.latents.row_of(latent)
         self.remaining[index] = np.arange(len(transitions))[::-1]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
@@ -436,13 +435,14 @@ if __name__ == "__main__":
     # SHARED: checks, environments, folder
     args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = runs.seed_torch(args)
+    runs.resolve_bf16(args)
+    if args.buffer_size < args.horizon:
+        sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
     validation, test = protocol.load_task(args)
     env_arguments = protocol.env_arguments_of(args)
-    envs = protocol.make_training_envs(args)
+    envs = protocol.make_training_envs(args, args.demo_prob, args.demos)
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     run = runs.run_folder(args, task_name(args.task))
-    if args.bf16 is None:
-        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
     rng = np.random.default_rng(args.seed)
     buffer = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
     progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
@@ -510,7 +510,7 @@ if __name__ == "__main__":
                 buffer.add_episode(episode)
             staged, returns = [[] for _ in envs], [0.0 for _ in envs]
             progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, saved_parts)
+            runs.save_checkpoint(run, saved_parts, device)
             # A resumed run goes on exactly as this one does: with new episodes.
             observations = protocol.begin_episodes(envs, args.seed, step)
             stop = args.stop_at_success is not None and success >= args.stop_at_success

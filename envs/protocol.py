@@ -110,21 +110,24 @@ def make_eval_envs(task, num_queries, **kwargs):
     return pictured + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
 
 
-def make_training_envs(args):
-    """`args.num_envs` environments; with `args.demo_prob` on the queries of demonstrations.
+def make_training_envs(args, demo_prob=None, demos=None):
+    """`args.num_envs` environments, on random queries, or with `demo_prob` on demonstrations'.
+
+    Args:
+        args: the flags, with `EnvFlags` among them.
+        demo_prob: value of the flag, if the trainer has it.
+        demos: demonstration file, as well; by default the task's own.
 
     Raises:
         SystemExit: an argument is refused, or the demonstrations do not fit.
     """
-    if args.buffer_size < args.horizon:
-        sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
-    if args.demo_prob is None and args.demos is not None:
+    if demo_prob is None and demos is not None:
         sys.exit("--demos goes with --demo-prob")
     made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
-    if args.demo_prob is None:
+    if demo_prob is None:
         return made
     try:
-        demos = load_demos_for(made[0], args.demos or args.task, args.task)
+        demos = load_demos_for(made[0], demos or args.task, args.task)
     except ValueError as error:
         sys.exit(f"--demo-prob: {error}")
     if args.encoder is not None:

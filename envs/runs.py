@@ -8,7 +8,7 @@
     writer = summary_writer(run, args, progress["updates"])
     bar = progress_bar(args.total_updates, progress["updates"], "update")
     ...
-    save_checkpoint(run, saved_parts)
+    save_checkpoint(run, saved_parts, device)
 
 Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `exp_name` at least.
 These functions are for scripts: where the user is wrong, they end the program with a message.
@@ -57,7 +57,7 @@ class RunFlags:
     resume: Path | None = None
     """continue the run in this folder from its last checkpoint; its own flags are used"""
     device: str = "cpu"
-    """`cpu` or `cuda`"""
+    """`cpu`, `cuda` or one of several, `cuda:1`"""
     threads: Threads = 1
     """torch threads; one is fastest for small networks, and leaves the other cores alone"""
     track: bool = False
@@ -96,8 +96,10 @@ def parse_args(Args, may_change=()):
         device = torch.device(args.device)
     except RuntimeError:
         sys.exit(f"--device must be `cpu` or `cuda`, got {args.device!r}")
-    if device.type == "cuda" and not torch.cuda.is_available():
-        sys.exit(f"--device {args.device}: PyTorch sees no CUDA device here")
+    if device.type == "cuda":
+        number = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (device.index or 0) >= number:
+            sys.exit(f"--device {args.device}: PyTorch sees {number or 'no'} CUDA device(s) here")
     if args.track and importlib.util.find_spec("wandb") is None:
         sys.exit("--track: wandb is not installed (pip install wandb)")
     return args
@@ -198,6 +200,16 @@ def seed_torch(args):
     return torch.device(args.device)
 
 
+def resolve_bf16(args):
+    """Decide `args.bf16` where it is None: in bfloat16 where the hardware has it.
+
+    To be called before `run_folder`, whose `args.json` says what was decided: a run that goes on
+    elsewhere stays as it is.
+    """
+    if args.bf16 is None:
+        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
+
+
 def check_finite(name, values):
     """Raise FloatingPointError, which ends a run with a line, where training has diverged.
 
@@ -207,7 +219,7 @@ def check_finite(name, values):
         raise FloatingPointError(f"{name} are no longer finite")
 
 
-def save_checkpoint(run, parts):
+def save_checkpoint(run, parts, device):
     """Write `checkpoint.pt`: the states of the run's parts, and of torch's random numbers.
 
     Args:
@@ -215,6 +227,7 @@ def save_checkpoint(run, parts):
         parts: dict from a name to what changes in the run: anything with `state_dict` and
             `load_state_dict` (modules, optimisers), a tensor, a dict of plain values, or a NumPy
             generator.
+        device: of the run. If it is a GPU, its random numbers are saved, too.
 
     Raises:
         FloatingPointError: a module's parameters are not finite. The checkpoint stays what it was.
@@ -225,8 +238,8 @@ def save_checkpoint(run, parts):
                 check_finite(f"the parameters of `{name}`", parameter)
     state = {name: _state_of(part) for name, part in parts.items()}
     state["torch_rng"] = torch.get_rng_state()
-    if torch.cuda.is_initialized():
-        state["cuda_rng"] = torch.cuda.get_rng_state()
+    if torch.device(device).type == "cuda":
+        state["cuda_rng"] = torch.cuda.get_rng_state(device)
     try:
         with new_contents(run / "checkpoint.pt") as temporary:
             torch.save(state, temporary)
@@ -252,14 +265,14 @@ def load_checkpoint(args, parts):
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever a damaged file leads to
         sys.exit(f"--resume: {path} is damaged: {error}")
-    missing = parts.keys() - state.keys()
-    if missing:
-        sys.exit(f"--resume: {path} is of another version: it has no {', '.join(sorted(missing))}")
-    for name, part in parts.items():
-        _restore(part, state[name])
+    try:
+        for name, part in parts.items():
+            _restore(part, state[name])
+    except KeyError as error:
+        sys.exit(f"--resume: {path} is of another version: it has no {error.args[0]}")
     torch.set_rng_state(state["torch_rng"])
     if "cuda_rng" in state:
-        torch.cuda.set_rng_state(state["cuda_rng"])
+        torch.cuda.set_rng_state(state["cuda_rng"], args.device)
 
 
 def _state_of(part):
@@ -276,6 +289,8 @@ def _restore(part, state):
     elif isinstance(part, torch.Tensor):
         part.data.copy_(state)
     elif isinstance(part, dict):
+        if missing := part.keys() - state.keys():
+            raise KeyError(min(missing))
         part.update(state)
     else:
         part.load_state_dict(state)

@@ -43,6 +43,7 @@ from envs.runs import (
     parse_args,
     progress_bar,
     rate,
+    resolve_bf16,
     run_folder,
     save_checkpoint,
     seed_torch,
@@ -427,8 +428,7 @@ if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     if args.latent_size % SECTORS:
         sys.exit(f"--latent-size must be a multiple of {SECTORS}, got {args.latent_size}")
-    if args.bf16 is None:
-        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
+    resolve_bf16(args)
     observations = open_observations(args.observations)
     num_training, validation = split(observations, args)
     if args.sees == "clouds":
@@ -504,7 +504,7 @@ if __name__ == "__main__":
             bar.set_postfix(near=f"{result['error_near']:.4f}")
             # SHARED: checkpoint and result
             progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, saved_parts)
+            save_checkpoint(run, saved_parts, device)
     bar.close()
 
     result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}

@@ -402,7 +402,7 @@ if __name__ == "__main__":
             bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
             # SHARED: checkpoint and result
             progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, saved_parts)
+            save_checkpoint(run, saved_parts, device)
     bar.close()
 
     result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}

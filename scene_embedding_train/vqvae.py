@@ -324,7 +324,7 @@ if __name__ == "__main__":
             # END SHARED
             # SHARED: checkpoint and result
             progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, saved_parts)
+            save_checkpoint(run, saved_parts, device)
     bar.close()
 
     result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}

@@ -277,6 +277,7 @@ def test_nothing_of_a_run_needs_the_cpu(tmp_path, folder, short_episodes):
     assert load_network(run / "policy.pt").metadata["step"] == 4
     assert json.loads((run / "result.json").read_text())["steps"] == 4
     args = json.loads((run / "args.json").read_text())
+    assert args["bf16"] is True
     (run / "args.json").write_text(json.dumps(args | {"total_updates": 6}))
     with meta_device.in_cudas_place():
         run_here(PATHS["dagger"], "--resume", run)

@@ -1,6 +1,7 @@
 """envs/protocol.py: what trainers count, and under which rules. (Whole runs: test_trainers.py.)"""
 
 import json
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -114,6 +115,7 @@ def test_the_test_is_run_under_the_standard_rules(tmp_path, capsys, monkeypatch)
     assert (standard["policy_step"], standard["steps"], standard["seconds"]) == (7, 10, 2)
     assert standard["validation_success_rate"] == 0.5
     assert "trained with" not in line and "3 test queries: success" in line
+    assert standard["deviations"] == {} and "not comparable" not in line
     for other in ({"horizon": 50}, {"stop_on_collision": True}):
         result, lines = result_of(tmp_path, capsys, **other)
         assert result["rules"] == {"horizon": 400, "stop_on_collision": False}
@@ -121,3 +123,24 @@ def test_the_test_is_run_under_the_standard_rules(tmp_path, capsys, monkeypatch)
         assert result["success_rate"] == standard["success_rate"]
         assert result["episode_length"] == standard["episode_length"]
         assert "tested under the standard rules, 400 steps, contacts allowed:" in lines
+
+
+def test_other_steps_are_not_comparable(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(protocol, "asdict", vars)
+    result, lines = result_of(tmp_path, capsys, max_step=0.02)
+    assert result["deviations"] == {"max_step": 0.02}
+    assert "not comparable: max_step is 0.02, not 0.03" in lines
+    assert result["rules"] == result["rules_in_training"]
+
+
+def test_a_trainer_without_replay_buffer_or_demonstrations():
+    @dataclass
+    class Args(protocol.EnvFlags):
+        task: str = "wall"
+        num_envs: int = 2
+
+    made = protocol.make_training_envs(Args(goal_type="config", velocities=True))
+    assert len(made) == 2
+    for observation in protocol.begin_episodes(made, seed=1, step=0):
+        assert observation["observation"].shape == (17,)
+        assert observation["desired_goal"].shape == (7,)

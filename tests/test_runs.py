@@ -89,6 +89,31 @@ def test_no_run_and_no_gpu(parse, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(SystemExit, match="PyTorch sees no CUDA device"):
         parse("--device", "cuda")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    assert parse("--device", "cuda:1").device == "cuda:1"
+    with pytest.raises(SystemExit, match=r"--device cuda:2: PyTorch sees 2 CUDA device\(s\) here"):
+        parse("--device", "cuda:2")
+
+
+def test_what_is_decided_about_bfloat16_is_kept(parse, tmp_path, monkeypatch):
+    @dataclass
+    class WithBf16(Args):
+        bf16: bool | None = None
+
+    def begin(supported, *flags):
+        monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: supported)
+        monkeypatch.setattr("sys.argv", ["trainer.py", *map(str, flags)])
+        args = runs.parse_args(WithBf16)
+        runs.resolve_bf16(args)
+        return args.bf16, runs.run_folder(args, "wall")
+
+    for number, supported in enumerate((False, True)):
+        bf16, run = begin(supported, "--runs-dir", tmp_path / str(number))
+        assert bf16 is supported
+        assert json.loads((run / "args.json").read_text())["bf16"] is supported
+        assert begin(not supported, "--resume", run)[0] is supported
+    assert begin(False, "--runs-dir", tmp_path, "--bf16", "True")[0] is True
 
 
 def parts():
@@ -123,7 +148,7 @@ def test_a_checkpoint_brings_every_part_back(parse, tmp_path):
     before = parts()
     runs.load_checkpoint(args, before)  # a new run: nothing happens
     learn(before)
-    runs.save_checkpoint(run, before)
+    runs.save_checkpoint(run, before, "cpu")
     assert {path.name for path in run.iterdir()} == {"args.json", "checkpoint.pt"}
     expected = [learn(before) for _ in range(3)]
 
@@ -132,8 +157,24 @@ def test_a_checkpoint_brings_every_part_back(parse, tmp_path):
     runs.load_checkpoint(args, after)
     assert after["progress"]["updates"] == 1 and after["alpha"].requires_grad
     assert [learn(after) for _ in range(3)] == expected
-    with pytest.raises(SystemExit, match="of another version: it has no critic"):
-        runs.load_checkpoint(args, after | {"critic": torch.nn.Linear(1, 1)})
+    for newer, name in (
+        ({"critic": torch.nn.Linear(1, 1)}, "critic"),
+        ({"progress": {"updates": 0, "best_step": 0}}, "best_step"),
+    ):
+        with pytest.raises(SystemExit, match=f"of another version: it has no {name}"):
+            runs.load_checkpoint(args, after | newer)
+
+
+def test_the_random_numbers_of_the_runs_own_gpu(parse, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    states, given = {"cuda:0": torch.tensor([3]), "cuda:1": torch.tensor([7])}, []
+    monkeypatch.setattr("torch.cuda.get_rng_state", lambda device: states[str(device)])
+    monkeypatch.setattr("torch.cuda.set_rng_state", lambda *state: given.append(state))
+    run = runs.run_folder(parse("--runs-dir", tmp_path, "--device", "cuda:1"), "wall")
+    runs.save_checkpoint(run, parts(), torch.device("cuda:1"))
+    runs.load_checkpoint(parse("--resume", run), parts())
+    assert given == [(torch.tensor([7]), "cuda:1")]
 
 
 def test_files_are_found_from_another_folder(parse, tmp_path, monkeypatch):
@@ -162,7 +203,7 @@ def test_what_a_kill_has_left_is_cleared_away(parse, tmp_path):
         being_written.write_text("whole")
     assert {path.name for path in run.iterdir()} == {"args.json", "policy.pt"}
     left.touch()
-    runs.save_checkpoint(run, parts())
+    runs.save_checkpoint(run, parts(), "cpu")
     assert not left.exists()
 
 
@@ -179,7 +220,7 @@ class Args(runs.RunFlags):
 args = runs.parse_args(Args)
 run = runs.run_folder(args, "wall")
 numbers = torch.zeros(1000)
-runs.save_checkpoint(run, {"numbers": numbers})
+runs.save_checkpoint(run, {"numbers": numbers}, "cpu")
 """
 
 
@@ -196,7 +237,7 @@ runs.save_checkpoint(run, {"numbers": numbers})
     ],
 )
 def test_what_is_no_mistake_of_the_program_is_said_plainly(tmp_path, happening, said):
-    save = "def save():\n    runs.save_checkpoint(run, {'numbers': numbers + 1})\n"
+    save = "def save():\n    runs.save_checkpoint(run, {'numbers': numbers + 1}, 'cpu')\n"
     command = [sys.executable, "-c", SCRIPT + save + happening, "--runs-dir", tmp_path]
     ended = subprocess.run(command, capture_output=True, text=True)
     run = next(tmp_path.iterdir())
@@ -218,7 +259,7 @@ def test_a_checkpoint_of_a_damaged_file_says_which(parse, tmp_path):
     run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
     args = parse("--resume", run)
     runs.load_checkpoint(args, parts())  # stopped before the first checkpoint
-    runs.save_checkpoint(run, parts())
+    runs.save_checkpoint(run, parts(), "cpu")
     content = (run / "checkpoint.pt").read_bytes()
     (run / "checkpoint.pt").write_bytes(content[: len(content) // 2])
     with pytest.raises(SystemExit, match="checkpoint.pt is damaged"):

@@ -79,6 +79,7 @@ def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run, traine
     assert result["steps"] == 1200 and result["num_queries"] == 4
     assert 0 <= result["clean_success_rate"] <= result["success_rate"] <= 1
     assert result["args"]["goal_type"] == "combined"
+    assert isinstance(json.loads((finished_run / "args.json").read_text())["bf16"], bool)
 
     events = EventAccumulator(str(finished_run))
     events.Reload()

@@ -59,7 +59,7 @@ def make_files(folder):
     observe.collect(observe.Args(output=folder / "observations", **small), progress=False)
     paths["observations"] = folder / "observations" / "shard_00000.h5"
     paths["checkpoint"] = folder / "checkpoint.pt"
-    runs.save_checkpoint(folder, parts_of_a_run())
+    runs.save_checkpoint(folder, parts_of_a_run(), "cpu")
     paths["args"] = folder / "args.json"
     runs.write_json(paths["args"], {"seed": 3, "runs_dir": "runs", "exp_name": "x", "rates": [1.0]})
     return paths
