@@ -72,7 +72,8 @@ from tqdm import tqdm
 
 import envs
 from envs import flags, panda, workers
-from envs.datasets import MAX_STEP, Query, QueryScenes, load_queries, validate
+from envs.arm_env import STANDARD_RULES, deviations
+from envs.datasets import Query, QueryScenes, load_queries, validate
 from envs.encoders import with_told
 from envs.files import check_writable, write_atomically
 from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Workers
@@ -81,8 +82,6 @@ from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy,
 from envs.scenes import Scene
 from envs.tasks import get_task, task_name
 
-# Rules that an evaluation may deviate from, and then says so.
-STANDARD_RULES = {"max_step": MAX_STEP, "stop_on_collision": False}
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
 
@@ -185,15 +184,15 @@ class _Job:
     policy: str | Path | Callable
     task: str
     env: dict
-    seed: int
-    tries: int
-    time_limit: float
     encoder: str | None
     last_layer: LastLayer | None
     start: np.ndarray
     goal: np.ndarray
     scenes: Sequence[Scene]
     split: str | None
+    seed: int
+    tries: int
+    time_limit: float
     workers: int
 
     def make(self, **kwargs):
@@ -347,26 +346,13 @@ def evaluate(
     Raises:
         EvaluationError: the policy, the task or the queries cannot be used.
     """
-    job = _prepare(
-        policy,
-        task,
-        goal_type,
-        queries,
-        split,
-        num_queries,
-        stop_on_collision,
-        seed,
-        tries,
-        time_limit,
-        encoder,
-        last_layer,
-        workers,
-        env,
-    )
+    arguments = {name: value for name, value in locals().items() if name != "progress"}
+    job = _prepare(**arguments)
     return _summary(job, _run(job, progress))
 
 
 def _prepare(
+    *,
     policy,
     task,
     goal_type,
@@ -374,25 +360,24 @@ def _prepare(
     split,
     num_queries,
     stop_on_collision,
-    seed,
-    tries,
-    time_limit,
     encoder,
     last_layer,
-    workers,
     env,
+    **options,
 ):
-    """The `_Job` of `evaluate`'s arguments, once everything about them has been checked."""
+    """The `_Job` of `evaluate`'s arguments, once everything about them has been checked.
+
+    `options`: those that the `_Job` has as they are, `seed`, `tries`, `time_limit`, `workers`.
+    """
     try:
         scene = get_task(task).scene
     except ValueError as error:
         raise EvaluationError(str(error)) from error
-    if workers < 1:
-        raise EvaluationError(f"workers must be at least 1, got {workers}")
-    if tries < 1:
-        raise EvaluationError(f"tries must be at least 1, got {tries}")
-    if not 0 < time_limit < math.inf:
-        raise EvaluationError(f"time_limit must be a positive number of seconds, got {time_limit}")
+    for name in ("workers", "tries"):
+        if options[name] < 1:
+            raise EvaluationError(f"{name} must be at least 1, got {options[name]}")
+    if not 0 < (seconds := options["time_limit"]) < math.inf:
+        raise EvaluationError(f"time_limit must be a positive number of seconds, got {seconds}")
     env = dict(env or {})
     try:
         if not callable(policy):
@@ -444,16 +429,13 @@ def _prepare(
         policy,
         str(task),
         env,
-        seed,
-        tries,
-        time_limit,
         encoder,
         last_layer,
         queries.start[:count],
         queries.goal[:count],
         scenes,
         getattr(queries, "split", None),
-        workers,
+        **options,
     )
 
 
@@ -495,11 +477,7 @@ def _summary(job, outcomes):
         "ms_per_action": 1e3 * float(columns.policy_seconds.sum()) / actions if actions else None,
         **planning,
         "env": job.env,
-        "deviations": {
-            name: job.env[name]
-            for name, standard in STANDARD_RULES.items()
-            if job.env.get(name, standard) != standard
-        },
+        "deviations": deviations(job.env),
         "encoder": job.encoder,
         "last_layer": asdict(job.last_layer) | {"version": VERSION} if job.last_layer else None,
         "seed": job.seed if job.policy in ("random", *PLANNING) or job.last_layer else None,
@@ -594,22 +572,9 @@ def main(arguments=None):
         for path in (args.json, args.picture):
             if path is not None:
                 check_writable(path)
-        job = _prepare(
-            args.policy,
-            args.task,
-            args.goal_type,
-            args.queries,
-            args.split,
-            args.num_queries,
-            args.stop_on_collision,
-            args.seed,
-            args.tries,
-            args.time_limit,
-            args.encoder,
-            _last_layer(args),
-            args.workers,
-            env=None,
-        )
+        of_the_command = ("keep_distance", "way_out", "json", "picture")
+        given = {name: flag for name, flag in vars(args).items() if name not in of_the_command}
+        job = _prepare(**given, last_layer=_last_layer(args), env=None)
         result = _summary(job, _run(job, progress=True))
     except ValueError as error:
         print(f"evaluate.py: {error}", file=sys.stderr)

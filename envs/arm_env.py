@@ -12,6 +12,7 @@ import pybullet as p
 
 from envs import panda
 from envs.scenes import is_number
+from envs.subgoals import MAX_STEP
 from envs.world import (  # some of them only for those who import them from here
     HOLD_DRIFT,  # noqa: F401
     HOLD_STEPS,
@@ -28,6 +29,15 @@ GOAL_TYPES = ("ee", "config", "combined")
 ACTION_MODES = ("relative", "subgoal")
 # With larger ones hardly any query is farther from its goal than that: m, and L2, normalised.
 MAX_EE_TOLERANCE, MAX_CONFIG_TOLERANCE = 1.0, 2.0
+HORIZON = 400
+STANDARD_RULES = {"max_step": MAX_STEP, "horizon": HORIZON, "stop_on_collision": False}
+"""Results under other ones are not comparable."""
+
+
+def deviations(arguments):
+    """Those of `RoboArmEnv`'s `arguments`, a dict, that are other than `STANDARD_RULES`."""
+    given = {name: arguments.get(name, rule) for name, rule in STANDARD_RULES.items()}
+    return {name: value for name, value in given.items() if value != STANDARD_RULES[name]}
 
 
 class RoboArmEnv(gym.Env):
@@ -86,8 +96,8 @@ class RoboArmEnv(gym.Env):
         ee_tolerance=0.02,
         config_tolerance=0.05,
         action_mode="relative",
-        max_step=0.03,
-        horizon=400,
+        max_step=MAX_STEP,
+        horizon=HORIZON,
         stop_on_collision=False,
         reward="sparse",
         sink_state=False,
