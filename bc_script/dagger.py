@@ -67,7 +67,7 @@ class Args(runs.RunFlags):
     """examples at hand, of which batches are drawn"""
     examples_per_update: flags.PositiveInt = 256
     """new examples per update, all of one scene; they replace the oldest. With an eighth of a batch
-    they are learned by heart (docs/training.md)"""
+    they are learned by heart (docs/experiments.md)"""
     noise: flags.NonNegativeFloat = 0.03
     """standard deviation of the configurations drawn around paths (normalised, each joint)"""
     length_weight: flags.NonNegativeFloat = 0.1
