@@ -15,7 +15,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 LONG = (
     *("test_trainers", "test_encoder_policies", "test_encoders", "test_devices", "test_td3_her_mp"),
     *("test_dagger", "test_bc", "test_collect", "test_own_algorithm", "test_evaluate"),
-    *("test_paper_tables", "test_own_scene", "test_sac_her_mp"),
+    *("test_paper_tables", "test_own_scene", "test_sac_her_mp", "test_learning"),
 )
 
 
