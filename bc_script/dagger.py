@@ -1,6 +1,6 @@
 """Imitation of a roadmap planner, with rounds of DAgger. One file: read it top to bottom.
 
-    python -m demo_generation.roadmaps --task random_boxes_hard --scenes 1500 --output roadmaps
+    python -m demo_generation.roadmaps --task random_boxes_hard --scenes 800 --output roadmaps
     python bc_script/dagger.py --paths roadmaps --encoder oracle
 
 A policy for scenes that it never saw. It learns the direction in which a roadmap's smoothed path

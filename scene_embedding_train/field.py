@@ -1,6 +1,6 @@
 """A distance field in 64 numbers: z_E of what four sensors see. Read it from the top.
 
-    python -m scene_embedding_train.collect --sensors clouds --num 40000
+    python -m scene_embedding_train.collect --task mixed_scenes --sensors clouds --num 40000
     python scene_embedding_train/field.py --observations observations
 
 What a policy needs to know of a scene is where the arm would touch something. So z_E is trained to
