@@ -1,5 +1,6 @@
 """What is seen of obstacles: points, collision checks against them, and encodings."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -55,6 +56,22 @@ def test_nothing_to_see():
     assert (seen.nearest(states).distance == true.nearest(states).distance).all()
     assert not farthest_points(seen_points(EMPTY), 5).any()
     assert not SceneEncoder("points")(EMPTY).any()
+
+
+def test_what_is_there_but_hidden_is_not_known():
+    """A small box inside of the table."""
+    hidden = Scene((Box((0.0, 0.0, -0.2), (0.05, 0.05, 0.05)),))
+    assert seen_points(hidden).shape == (0, 3)
+    env = envs.make("wall", encoder="points:4", proximity="points")
+    other = envs.make("wall", encoder="points:4", proximity="points")
+    query = env.sample_query(np.random.default_rng(0))
+    observed = [
+        one.reset_specific(*query, scene)[0] for one, scene in ((env, hidden), (other, EMPTY))
+    ]
+    for name, value in observed[0].items():
+        np.testing.assert_array_equal(value, observed[1][name])
+    assert not observed[0]["observation"][10:].any()
+    env.close(), other.close()
 
 
 def test_points_are_balls():
@@ -131,3 +148,22 @@ def test_points_as_an_encoding():
     for name in ("points:0", "points:x"):
         with pytest.raises(NetworkError, match=name):
             SceneEncoder(name)
+
+
+def test_vector_environments_see_as_single_ones_do():
+    def make():
+        sees = {"encoder": "points:8", "proximity": "points"}
+        return envs.make("random_boxes_hard", goal_type="combined", **sees)
+
+    several, one = gym.vector.SyncVectorEnv([make, make]), make()
+    together, _ = several.reset(seed=[4, 5])
+    for row, seed in enumerate((4, 5)):
+        alone, _ = one.reset(seed=seed)
+        for name, value in alone.items():
+            np.testing.assert_array_equal(together[name][row], value)
+    assert together["proximity"].shape == (2, 10, 8) and together["observation"].shape == (2, 34)
+    actions = np.full((2, 7), 0.01, np.float32)
+    stepped, *_ = several.step(actions)
+    after, *_ = one.step(actions[1])
+    np.testing.assert_array_equal(stepped["proximity"][1], after["proximity"])
+    several.close(), one.close()
