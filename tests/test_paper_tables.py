@@ -93,7 +93,7 @@ def test_a_cell_is_a_command():
 
 
 def test_the_page_shows_what_was_run_and_what_was_not(results):
-    page = paper_tables.page(list(CELLS.values()), results, BASELINES)
+    page = paper_tables.page(list(CELLS.values()), results, BASELINES, {})
     in_small = "<sub>300,000 steps, 1 seed</sub><br>0.971 ± 0.003"
     assert f"**0.950 [0.946, 0.954]**<br>{in_small}" in page
     deviation = statistics.stdev([0.981, 0.982, 0.983])  # the interval is that of 30,000 queries
@@ -122,15 +122,26 @@ def test_an_algorithm_of_ones_own(results, tmp_path):
     (tmp_path / "cells.csv").write_text("\n".join([header, *rows, "mine,ee,wall,wall,1,yes,,,"]))
     cells = paper_tables.read_cells(tmp_path / "cells.csv")
     results["mine-ee-wall-p1"] = [result("mine-ee-wall-p1", 1, 0.5, kept=True)]
-    page = paper_tables.page(cells, results, {})
+    page = paper_tables.page(cells, results, {}, {})
     found = "**0.500 [0.490, 0.510]**<br><sub>300,000 steps, 1 seed</sub>"
     assert f"| MINE-MP (p = 1) |  | {found}<br>not in the paper |" in page
     assert "`mine-ee-wall-p1` (" not in page
     paper_tables.draw_bars(cells, results, tmp_path / "bars.png")
 
 
+def test_imitation_stands_beside_the_papers_encoders(results):
+    found = {"success_rate": 0.9, "success_rate_interval": [0.88, 0.92], "num_queries": 1000}
+    unseen = {"narrow_shelves": {"dagger, points": found}, "wall": {"dagger, oracle": found}}
+    page = paper_tables.page(list(CELLS.values()), results, BASELINES, unseen)
+    (row,) = (line for line in page.splitlines() if line.startswith("| DAgger"))
+    assert row.startswith("| DAgger with a last layer: seen points |  |  |")
+    assert row.endswith("|  | **0.900 [0.880, 0.920]**<br><sub>1,000 queries, 1 seed</sub> |")
+    for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
+        assert len({line.count("|") for line in table.splitlines()}) == 1
+
+
 def test_the_page_without_any_result():
-    page = paper_tables.page(list(CELLS.values()), {}, {})
+    page = paper_tables.page(list(CELLS.values()), {}, {}, {})
     assert "**" not in page and page.rstrip().endswith("None yet.")
 
 
