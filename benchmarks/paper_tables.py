@@ -419,12 +419,10 @@ def page(cells, results, baselines, unseen):
         lines += [
             "",
             "DAgger imitates a roadmap planner in other scenes of `random_boxes_hard`, and has",
+            "what the paper's policies have not, a last layer that keeps links away from things.",
+            "Which version of it, clean success, and without it:",
+            "[unseen_obstacles.md](unseen_obstacles.md).",
         ]
-        lines += [
-            "what the paper's policies have not, a last layer that keeps links away from things."
-        ]
-        lines += ["Which version of it, clean success, and without it:"]
-        lines += ["[unseen_obstacles.md](unseen_obstacles.md)."]
     lines += long_runs(cells, results)
     lines += ["", "Why behavioural cloning with z_E gets lost in scenes of other kinds:"]
     lines += ["[experiments.md](experiments.md#behavioural-cloning-in-scenes-of-other-kinds)."]
