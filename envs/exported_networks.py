@@ -17,7 +17,9 @@ A **policy** is a network from `observation` (N, 10 or 17), `achieved_goal` and 
 `proximity`, `append_proximity`). With an encoder, `observation` is longer by z_E, and with appended
 proximity by 80; with proximity, `proximity` and `goal_proximity` (N, 10, 8) may be inputs, too.
 `last_layer`, a dict of `keep` (m) and `way_out`, is there where an `envs.last_layer.LastLayer` is
-part of the policy: whoever runs it by name (`envs.policies`) has that around it.
+part of the policy: whoever runs it by name (`envs.policies`) has that around it. A policy with a
+`memory` of so many numbers takes them as an input of that name, (N, memory), zeros at an episode's
+start, and returns what it takes with the next observation beside the action: (action, memory).
 """
 
 import copy
@@ -227,7 +229,16 @@ class ExportedNetwork:
 
         Raises NetworkError: that is not what comes out, or not all of it is finite.
         """
-        output = self(**inputs)
+        return self._row(self(**inputs), size)
+
+    def rows(self, inputs, sizes):
+        """As `row`, of a network that returns several: a list of arrays of these sizes."""
+        outputs = self(**inputs)
+        if not isinstance(outputs, list) or len(outputs) != len(sizes):
+            raise NetworkError(f"{self._path}: its output is not a sequence of {len(sizes)}")
+        return [self._row(output, size) for output, size in zip(outputs, sizes, strict=True)]
+
+    def _row(self, output, size):
         if (
             not isinstance(output, torch.Tensor)
             or output.dtype != torch.float32

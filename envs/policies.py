@@ -43,6 +43,7 @@ ENV_ARGUMENTS = (
 PACKAGES = ("bc_script", "clean_rl_scripts")
 TRIES = 16  # of `via-points`, by default
 TIME_LIMIT = 5.0  # s, of `planner`, by default
+MAX_MEMORY = 65_536  # numbers
 
 
 class PolicyError(ValueError):
@@ -111,6 +112,23 @@ def own_layer(policy):
     return None if callable(policy) or policy in UNTRAINED else _load(policy)[2]
 
 
+def memory_size(policy):
+    """How many numbers a trained policy hands on to itself with every action; 0: it has no memory.
+
+    Args:
+        policy: an exported network, whose metadata say so (`memory`), or a module that may have a
+            `memory_size`. How it is called: `envs.exported_networks`.
+
+    Raises:
+        PolicyError: that is no number of numbers, or more than `MAX_MEMORY`.
+    """
+    metadata = getattr(policy, "metadata", None)
+    size = getattr(policy, "memory_size", 0) if metadata is None else metadata.get("memory", 0)
+    if type(size) is not int or not 0 <= size <= MAX_MEMORY:
+        raise PolicyError(f"a policy's memory has 0 to {MAX_MEMORY:,} numbers, not {size!r}")
+    return size
+
+
 def make_policy(
     policy, env, seed=0, tries=TRIES, time_limit=TIME_LIMIT, encoder=None, last_layer=None
 ):
@@ -166,8 +184,10 @@ def _make_policy(policy, env, seed, tries, time_limit, encoder):
         return _via_points(seed, tries, _checker_of(encoder))
     if policy == "planner":
         return _planner(env, seed, time_limit, _checker_of(encoder))
-    act = policy if callable(policy) else _trained(policy, env)
-    return lambda number, query: EpisodePolicy(act)
+    if callable(policy):
+        return lambda number, query: EpisodePolicy(policy)
+    begin = _trained(policy, env)
+    return lambda number, query: EpisodePolicy(begin())
 
 
 # --- Those that learn nothing
@@ -252,6 +272,7 @@ def _load(path):
     try:
         network = load_network(path)
         last_layer = layer_of(network.metadata)
+        memory_size(network)  # or it raises
     except NetworkError as error:
         raise PolicyError(str(error)) from error
     except ValueError as error:
@@ -265,7 +286,10 @@ def _load(path):
 
 
 def _trained(path, env):
-    """A policy network as a function from an observation to an action."""
+    """A policy network as a function without arguments, called at the start of an episode.
+
+    It returns another one, from an observation to an action.
+    """
     import torch
 
     from envs.exported_networks import NetworkError
@@ -274,21 +298,30 @@ def _trained(path, env):
     mode = trained.get("action_mode", "relative")
     if mode != env.action_mode:
         raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
+    size = memory_size(network)
 
-    # One observation at a time: in a batch its last bits would depend on the batch's size, for a
-    # gain of a tenth of the time at most.
-    def act(observation):
-        inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
-        return network.row(inputs, panda.NUM_JOINTS)
+    def begin():
+        memory = np.zeros(size, np.float32)
+
+        # One observation at a time: in a batch its last bits would depend on the batch's size, for
+        # a gain of a tenth of the time at most.
+        def act(observation):
+            nonlocal memory
+            known = observation | {"memory": memory} if size else observation
+            inputs = {name: torch.from_numpy(known[name])[None] for name in network.inputs}
+            if not size:
+                return network.row(inputs, panda.NUM_JOINTS)
+            action, memory = network.rows(inputs, (panda.NUM_JOINTS, size))
+            return action
+
+        return act
 
     space = env.observation_space
-    unknown = set(network.inputs) - set(space)
+    unknown = set(network.inputs) - {*space, *(["memory"] if size else [])}
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
     try:
-        network.row(
-            {name: torch.zeros(1, *space[name].shape) for name in network.inputs}, panda.NUM_JOINTS
-        )
+        begin()({name: np.zeros(one.shape, np.float32) for name, one in space.items()})
     except NetworkError as error:
         raise PolicyError(str(error)) from error
-    return act
+    return begin

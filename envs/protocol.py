@@ -22,6 +22,7 @@ from envs.demo_episodes import DemoQueriesWrapper, load_demos_for
 from envs.exported_networks import load_network, save_network
 from envs.flags import PositiveFloat, PositiveInt
 from envs.last_layer import layer_of
+from envs.policies import memory_size
 from envs.runs import check_finite, write_json
 from envs.subgoals import MAX_STEP
 
@@ -177,7 +178,8 @@ def evaluate(policy, envs, queries, device, last_layer=None, seed=0):
 
     Args:
         policy: from `observation`, `achieved_goal`, `desired_goal` and what else is observed,
-            tensors (N, ...), to actions (N, 7); a module or an exported network.
+            tensors (N, ...), to actions (N, 7); a module or an exported network. One with a memory
+            (`envs.policies.memory_size`) is given that, too, and returns it beside the actions.
         envs: the environments to do it in.
         queries: `envs.datasets.Queries`, or a list of `Query`.
         device: of the policy.
@@ -189,27 +191,33 @@ def evaluate(policy, envs, queries, device, last_layer=None, seed=0):
         and `episode_length` in steps.
 
     Raises:
-        FloatingPointError: the policy's actions are not finite.
+        FloatingPointError: the policy's actions are not finite, or its memory.
     """
-    waiting = iter(range(len(queries)))
-    running, proposed, acts, results = {}, {}, {}, []  # env -> observation, action, function
+    waiting, size = iter(range(len(queries))), memory_size(policy)
+    running, memories, proposed = {}, {}, {}  # env -> observation, memory, action and next memory
+    acts, results = {}, []  # env -> function
 
     def start(env):
         i = next(waiting, None)
         running.pop(env, None)
+
+        def act(observation):  # (In a detour the last layer does not ask: nothing is remembered.)
+            action, memories[env] = proposed[env]
+            return action
+
         if i is not None:
             running[env] = env.reset_specific(*queries[i])[0]
-            acts[env] = lambda observation: proposed[env]
+            acts[env], memories[env] = act, np.zeros(size, np.float32)
             if last_layer is not None:
                 acts[env] = last_layer.around(acts[env], env, np.random.default_rng([seed, i]))
 
     for env in envs:
         start(env)
     while running:
-        actions = policy(**stack(list(running.values()), device)).cpu().numpy()
-        check_finite("the policy's actions", actions)
-        for env, action in zip(list(running), actions, strict=True):
-            proposed[env] = action
+        before = [memories[env] for env in running]
+        actions, after = _actions(policy, list(running.values()), before, device)
+        for env, action, memory in zip(list(running), actions, after, strict=True):
+            proposed[env] = action, memory
             action = acts[env](running[env])
             running[env], _, terminated, truncated, info = env.step(action)
             if terminated or truncated:
@@ -226,6 +234,18 @@ def evaluate(policy, envs, queries, device, last_layer=None, seed=0):
     }
 
 
+def _actions(policy, observations, memories, device):
+    """Actions (n, 7) for n observations, and the policy's memories after them, n arrays."""
+    if not len(memories[0]):
+        actions = policy(**stack(observations, device)).cpu().numpy()
+    else:
+        known = [o | {"memory": memory} for o, memory in zip(observations, memories, strict=True)]
+        actions, memories = (x.cpu().numpy() for x in policy(**stack(known, device)))
+        check_finite("the policy's memory", memories)
+    check_finite("the policy's actions", actions)
+    return actions, memories
+
+
 @torch.no_grad()
 def picture_of_rollout(policy, env, query, device, last_layer=None, frames=8):
     """An image strip (height, frames * width, 3), uint8, of the policy on one query.
@@ -233,8 +253,12 @@ def picture_of_rollout(policy, env, query, device, last_layer=None, frames=8):
     `env`: one that renders.
     """
 
+    memories = [np.zeros(memory_size(policy), np.float32)]
+
     def act(observation):
-        return policy(**stack([observation], device))[0].cpu().numpy()
+        nonlocal memories
+        actions, memories = _actions(policy, [observation], memories, device)
+        return actions[0]
 
     if last_layer is not None:
         act = last_layer.around(act, env, np.random.default_rng([0, 0]))
@@ -285,7 +309,7 @@ def save_policy(run, policy, envs, device, args, env_arguments, step, last_layer
     Args:
         run: the run's folder.
         policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else is
-            observed.
+            observed; with a `memory_size`, its `memory`, too.
         envs: some of its environments, for examples of observations.
         device: of the policy.
         args: the flags; `task`, `exp_name` and `seed` are noted in the file.
@@ -298,6 +322,9 @@ def save_policy(run, policy, envs, device, args, env_arguments, step, last_layer
         metadata["last_layer"] = {"keep": last_layer.keep, "way_out": last_layer.way_out}
     metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
     example = stack([env.reset(seed=0)[0] for env in envs[:2]], device)
+    if size := memory_size(policy):
+        metadata["memory"] = size
+        example["memory"] = torch.zeros(len(envs[:2]), size, device=device)
     save_network(run / "policy.pt", policy, example, metadata)
 
 

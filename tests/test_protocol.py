@@ -9,9 +9,12 @@ import pytest
 import torch
 
 import envs
+from clean_rl_scripts.evaluate import evaluate
 from envs import protocol
 from envs.datasets import load_queries
+from envs.exported_networks import load_network, save_network
 from envs.last_layer import LastLayer
+from envs.policies import PolicyError, make_policy
 
 
 class Toward(torch.nn.Module):
@@ -81,6 +84,94 @@ def test_a_last_layer_has_its_own_state_in_every_episode():
     assert found["success_rate"] == success and found["episode_length"] == steps
     bare = protocol.evaluate(policy, several, queries, "cpu")
     assert found["collision_rate"] < bare["collision_rate"]
+
+
+class Hesitant(torch.nn.Module):
+    """Toward the goal, in turns fast and slowly: steps and moves are in the memory."""
+
+    memory_size = 8
+
+    def forward(self, observation, achieved_goal, desired_goal, memory):
+        steps, moved = memory[:, :1], memory[:, 1:]
+        speed = 0.03 + 0.02 * torch.sin(steps) - 0.002 * torch.abs(moved)
+        action = speed * torch.tanh(10 * (desired_goal - observation[:, :7]))
+        return action, torch.cat([steps + 1, moved + action], dim=1)
+
+
+def test_a_memory_is_fresh_in_every_episode_and_the_same_by_name(tmp_path):
+    arguments, queries = {"goal_type": "config"}, load_queries("wall", "validation")[:5]
+    several = protocol.make_eval_envs("wall", 3, **arguments)
+    found, policy, outcomes = protocol.evaluate(Hesitant(), several, queries, "cpu"), Hesitant(), []
+    env = envs.make("wall", **arguments)
+    for query in queries:
+        observation, _ = env.reset_specific(*query)
+        over, memory = False, torch.zeros(1, 8)
+        while not over:
+            action, memory = policy(**protocol.stack([observation], "cpu"), memory=memory)
+            observation, _, terminated, truncated, info = env.step(action[0].numpy())
+            over = terminated or truncated
+        assert memory[0, 0] == info["elapsed_steps"]
+        outcomes.append((info["is_success"], info["elapsed_steps"]))
+    assert len({steps for _, steps in outcomes}) == 5
+    success, steps = np.mean(outcomes, axis=0)
+    assert found["success_rate"] == success and found["episode_length"] == steps
+
+    args = SimpleNamespace(task="wall", exp_name="hesitant", seed=1)
+    protocol.save_policy(tmp_path, policy, several, "cpu", args, arguments, 7)
+    saved = load_network(tmp_path / "policy.pt")
+    assert saved.metadata["memory"] == 8 and "memory" in saved.inputs
+    assert protocol.evaluate(saved, several, queries, "cpu") == found
+    picture = protocol.picture_of_rollout(saved, several[0], queries[0], "cpu", frames=3)
+    assert (
+        picture == protocol.picture_of_rollout(policy, several[0], queries[0], "cpu", frames=3)
+    ).all()
+    result = evaluate(tmp_path, "wall", split="validation", num_queries=5)
+    assert result["success_rate"] == success
+    reached = [steps for success, steps in outcomes if success]
+    assert result["mean_steps"] == pytest.approx(np.mean(reached))
+
+
+def test_in_a_detour_of_the_last_layer_nothing_is_remembered(tmp_path):
+    arguments = {"goal_type": "config", "proximity": "obstacles"}
+    queries = load_queries("random_boxes_hard", "validation")[:3]
+    several, asked = protocol.make_eval_envs("random_boxes_hard", 3, **arguments), []
+
+    class Counting(torch.nn.Module):
+        memory_size = 1
+
+        def forward(self, observation, achieved_goal, desired_goal, memory, **_):
+            asked.append(memory[:, 0])
+            return 0.05 * (desired_goal - observation[:, :7]), memory + 1
+
+    layer = LastLayer()
+    for query in queries:
+        asked.clear()
+        result = protocol.evaluate(Counting(), several[:1], [query], "cpu", layer)
+        if result["episode_length"] > asked[-1] + 1:  # there were detours
+            break
+    assert result["episode_length"] == len(asked) > asked[-1] + 1
+
+
+@pytest.mark.parametrize("size", [-1, 2.0, True, 10**9])
+def test_a_memory_that_makes_no_sense_is_refused(size):
+    policy = SimpleNamespace(memory_size=size)
+    with pytest.raises(PolicyError, match="memory has 0 to 65,536 numbers"):
+        protocol.evaluate(policy, [], [], "cpu")
+
+
+def test_a_file_whose_memory_is_not_what_it_returns(tmp_path):
+    env = envs.make("wall", goal_type="config")
+    example = protocol.stack([env.reset(seed=0)[0]] * 2, "cpu")
+    metadata = {"kind": "policy", "env": {"goal_type": "config"}}
+    path = tmp_path / "policy.pt"
+    save_network(path, Toward(0.05), example, metadata | {"memory": 8})
+    with pytest.raises(PolicyError, match="not a sequence of 2"):
+        make_policy(path, env)
+    example["memory"] = torch.zeros(2, 8)
+    for size, message in ((0, "needs memory"), (7, "do not fit|failed"), (9, "do not fit|failed")):
+        save_network(path, Hesitant(), example, metadata | {"memory": size})
+        with pytest.raises(PolicyError, match=message):
+            make_policy(path, env)
 
 
 def test_of_equally_good_policies_the_latest_is_the_best(monkeypatch):
