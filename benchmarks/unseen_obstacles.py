@@ -144,6 +144,7 @@ KEPT = (
     *("num_queries", "ms_per_action", "planning_seconds", "mean_steps", "path_length"),
     *("env", "encoder", "last_layer", "seed"),
 )
+LAYER_MARKS = {1: "\\*", 2: "‡"}
 BEGIN, END = "<!-- written by benchmarks/unseen_obstacles.py -->\n", "<!-- until here -->\n"
 
 
@@ -230,10 +231,18 @@ def had_other_encoder(result):
     return "encoders" in result and result["encoders"] != digests(result)
 
 
-def is_older(result):
-    """Whether dead ends were left otherwise than they are now."""
+def version_of_layer(result):
+    """Of the last layer that a result had; today's, if it had none."""
     layer = result.get("last_layer")
-    return layer is not None and layer["way_out"] and layer.get("version", 1) < VERSION
+    if layer is None:
+        return VERSION
+    # The first two differ in the way out of dead ends only.
+    return max(layer.get("version", 1), 1 if layer["way_out"] else 2)
+
+
+def is_older(result):
+    """Whether the last layer did otherwise than it does now."""
+    return version_of_layer(result) < VERSION
 
 
 def papers_best():
@@ -286,6 +295,7 @@ def tables(results, others):
     dates = sorted({result["date"] for cells in results.values() for result in cells.values()})
     lines += ["", f"In brackets, test queries and the 95 % interval of success. To {dates[-1]}."]
     lines += ["\\*: with the way out of dead ends as it was before 2026-11-24, without a memory."]
+    lines += ["‡: with the last layer as it was when it took slow arrivals for dead ends."]
     lines += ["†: with an encoder that has been replaced since."]
     return "\n".join(lines) + "\n"
 
@@ -300,7 +310,7 @@ def _cell(result):
         return "not run"
     low, high = result["success_rate_interval"]
     rates = f"{result['success_rate']:.3f}, {result['clean_success_rate']:.3f}"
-    mark = "\\*" * is_older(result) + "†" * had_other_encoder(result)
+    mark = LAYER_MARKS.get(version_of_layer(result), "") + "†" * had_other_encoder(result)
     return f"{rates}{mark} [{result['num_queries']:,}: {low:.3f}, {high:.3f}]"
 
 

@@ -26,20 +26,23 @@ from envs.scenes import Scene, is_number
 from envs.subgoals import MAX_STEP
 from envs.wrappers import link_proximity
 
-# Of what the layer does, in results: with 1 it left dead ends otherwise, and did not remember them.
-VERSION = 2
+# Of what the layer does, in results: with 1 it left dead ends otherwise, and did not remember them;
+# with 2 it took slow arrivals for dead ends, and braked as much near a goal as elsewhere.
+VERSION = 3
 
 # The numbers below were chosen on validation and fresh queries: docs/last_layer.md.
 NEAR = 0.15  # m, from where on a link is looked at
 # Share of the way that is left that one step may take: the arm does not stop at once.
 BRAKE = 0.2
+ARRIVING = 0.2  # L2, normalised: nearer to the goal than that, it may be more: all of it in the end
 PUSH = 0.002  # m per step, by which a link that is too near moves away
 # Near a goal that is itself nearer to something than what is kept, as much is kept as there, and
 # this much (m) more per unit of normalised distance from it, as planners do.
 GROWTH = 0.03
 SWEEPS = 12  # of projections, one link after the other
-# A dead end is where so many steps have moved the arm by less than this (L2, normalised).
-PATIENCE, PROGRESS = 10, 0.06
+# A dead end is where so many steps have moved the arm by less than this (L2, normalised), and by
+# less than this share of what was left to the goal: it arrives slowly where there is little room.
+PATIENCE, PROGRESS, ARRIVAL = 10, 0.06, 0.3
 DETOUR = 10  # steps into one random direction, to get out
 CARRYING = 4  # joints, from the base on, that decide where the arm is; the others turn the hand
 # After a detour the arm's own direction counts beside the policy's action: so many times as much as
@@ -71,7 +74,7 @@ class LastLayer:
         if not isinstance(self.way_out, bool):
             raise ValueError(f"way_out must be a bool, got {self.way_out!r}")
 
-    def __call__(self, actions, proximity, keep=None, max_step=MAX_STEP):
+    def __call__(self, actions, proximity, keep=None, max_step=MAX_STEP, brake=BRAKE):
         """Actions (..., 7), changed as little as needed: float32.
 
         Args:
@@ -79,12 +82,13 @@ class LastLayer:
             proximity: (..., rows, 8), as `envs.wrappers.ProximityWrapper` has it.
             keep: m, (..., rows), instead of the layer's.
             max_step: longest action (L2, normalised).
+            brake: share of the way that is left to what is kept, that one step may take.
         """
         actions, proximity = np.array(actions, np.float64), np.asarray(proximity, np.float64)
         rows = proximity.shape[-2]
         keep = np.broadcast_to(self.keep if keep is None else keep, proximity.shape[:-1])
         keep = keep.astype(np.float64).reshape(-1, rows)
-        _project(actions.reshape(-1, 7), proximity.reshape(-1, rows, 8), keep, max_step)
+        _project(actions.reshape(-1, 7), proximity.reshape(-1, rows, 8), keep, max_step, brake)
         return actions.astype(np.float32)
 
     def around(self, act, env, rng):
@@ -104,13 +108,15 @@ class LastLayer:
             nonlocal goal_distances
             state, goal = observation["observation"][: panda.NUM_JOINTS], None
             here = np.concatenate([observation["proximity"], _own_proximity(state)])
-            keep = np.broadcast_to(self.keep, len(here))
+            keep, brake = np.broadcast_to(self.keep, len(here)), BRAKE
             if "goal_proximity" in observation:
                 goal = observation["desired_goal"][: panda.NUM_JOINTS]
                 if goal_distances is None:
                     rows = observation["goal_proximity"], _own_proximity(goal)
                     goal_distances = np.concatenate(rows)[:, 0]
-                keep = self.kept(goal_distances, np.linalg.norm(state - goal))
+                away = np.linalg.norm(state - goal)
+                keep = self.kept(goal_distances, away)
+                brake = max(BRAKE, 1.0 - (1.0 - BRAKE) * away / ARRIVING)
             action = dead_ends.detour(state, goal) if self.way_out else None
             if action is None:
                 action = dead_ends.with_momentum(act(observation))
@@ -118,12 +124,12 @@ class LastLayer:
             avoided = dead_ends.rows(state)
             here = np.concatenate([avoided, here])
             kept_here = np.concatenate([np.zeros(len(avoided)), keep])
-            move = self(action, here, kept_here, max_step)
+            move = self(action, here, kept_here, max_step, brake)
             # The second look: what is near there, as if its gradient were the same all the way.
             there = np.concatenate([proximity_at(state + move), _own_proximity(state + move)])
             there[:, 0] -= there[:, 1:] @ move
             rows, kept = np.concatenate([here, there]), np.concatenate([kept_here, keep])
-            dead_ends.last_action = self(action, rows, kept, max_step)
+            dead_ends.last_action = self(action, rows, kept, max_step, brake)
             return dead_ends.last_action
 
         return act_safely
@@ -155,8 +161,10 @@ class _DeadEnds:
             goal: the goal's configuration, or None: nobody knows where not to go.
         """
         self.before.append(state)
-        moved = np.linalg.norm(state - self.before[0])
-        if self.left == 0 and len(self.before) > PATIENCE and moved < PROGRESS:
+        moved, least = np.linalg.norm(state - self.before[0]), PROGRESS
+        if goal is not None:
+            least = min(PROGRESS, ARRIVAL * np.linalg.norm(goal - self.before[0]))
+        if self.left == 0 and len(self.before) > PATIENCE and moved < least:
             direction = self.rng.standard_normal(CARRYING)
             self.left, self.direction = DETOUR, np.zeros(panda.NUM_JOINTS)
             self.direction[:CARRYING] = direction * (self.max_step / np.linalg.norm(direction))
@@ -224,7 +232,7 @@ def _own_proximity(state):
 
 
 @compiled
-def _project(actions, proximity, keep, max_step):
+def _project(actions, proximity, keep, max_step, brake):
     """Change actions (n, 7) in place."""
     for i in range(actions.shape[0]):
         action = actions[i]
@@ -238,7 +246,7 @@ def _project(actions, proximity, keep, max_step):
                 for j in range(7):
                     squared += row[1 + j] * row[1 + j]
                     along += row[1 + j] * action[j]
-                short = min(BRAKE * (keep[i, link] - row[0]), PUSH) - along
+                short = min(brake * (keep[i, link] - row[0]), PUSH) - along
                 if short > 0.0 and squared > 1e-12:
                     for j in range(7):
                         action[j] += row[1 + j] * short / squared
