@@ -11,6 +11,7 @@ from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
 from envs.last_layer import (
+    ARRIVING,
     AVOIDED,
     BRAKE,
     CARRYING,
@@ -351,5 +352,38 @@ def test_it_does_not_come_near_a_dead_end_again(to_goal, avoided):
         away.append(np.linalg.norm((state - begin)[:CARRYING]))
     assert max(away[:PATIENCE]) == 0.0
     assert away[PATIENCE + DETOUR - 1] == pytest.approx(0.03 * DETOUR, rel=0.01)
-    print(away, state)
     assert avoided - 0.03 < away[-1] < avoided + 0.06 and state[6] == 0.0
+
+
+@pytest.mark.parametrize(("share", "arrives"), [(0.05, True), (0.01, False)])
+def test_a_slow_arrival_is_no_dead_end(share, arrives):
+    """Near the goal, what counts is the share of the rest that ten steps make."""
+    begin = np.array([0.0, 0.0, 0.0, -0.3, 0.0, 0.3, 0.0])
+    goal, rows = begin + 0.03, proximity(*[(NEAR,)] * 10)
+    env = SimpleNamespace(max_step=0.03, get_wrapper_attr=lambda name: lambda state: rows)
+    act = LastLayer().around(
+        lambda seen: share * (goal - seen["observation"][:7]), env, np.random.default_rng(1)
+    )
+    state, away = begin, [np.linalg.norm(goal - begin)]
+    for _ in range(4 * PATIENCE):
+        observation = {"observation": np.concatenate([state, np.zeros(3)]), "proximity": rows}
+        state = state + act(observation | {"desired_goal": goal, "goal_proximity": rows})
+        away.append(np.linalg.norm(goal - state))
+    assert away[0] < 0.08  # so all of the way there would not be enough elsewhere
+    assert (np.diff(away) < 0).all() == arrives
+    assert away[-1] == pytest.approx(away[0] * 0.95 ** (4 * PATIENCE), rel=1e-3) or not arrives
+
+
+@pytest.mark.parametrize(
+    ("away", "brake"), [(0.5, BRAKE), (ARRIVING, BRAKE), (ARRIVING / 2, (1 + BRAKE) / 2)]
+)
+def test_near_the_goal_it_brakes_less(away, brake):
+    state = np.array([0.0, 0.0, 0.0, -0.3, 0.0, 0.3, 0.0])
+    goal = state + np.array([away, 0, 0, 0, 0, 0, 0])
+    rows = proximity((0.015, -1.0), *[(NEAR,)] * 9)  # a wall ahead of the first joint, 15 mm away
+    env = SimpleNamespace(max_step=0.03, get_wrapper_attr=lambda name: lambda state: rows)
+    act = LastLayer(0.01).around(lambda _: goal - state, env, np.random.default_rng(0))
+    seen = {"observation": np.concatenate([state, np.zeros(3)]), "proximity": rows}
+    there = proximity(*[(NEAR,)] * 10)
+    taken = act(seen | {"desired_goal": goal, "goal_proximity": there})
+    assert taken == pytest.approx([brake * 0.005, 0, 0, 0, 0, 0, 0], abs=1e-6)

@@ -79,8 +79,12 @@ def test_what_is_run_again():
     assert unseen.is_done(seen_by | {"encoders": unseen.digests(seen_by)}, name, 200)
     replaced = seen_by | {"encoders": {"field": "0123456789ab"}}
     assert not unseen.is_done(replaced, name, 200) and "0.800† [" in unseen._cell(replaced)
-    without = layer | {"way_out": False, "version": VERSION - 1}  # the same in all versions
-    assert unseen.is_done(done | {"last_layer": without}, name, 200)
+    # The first version and the second differ in the way out only.
+    first, second = ({"keep": 0.01, "way_out": False, "version": version} for version in (1, 2))
+    marked = [unseen._cell(done | {"last_layer": layer}) for layer in (first, second)]
+    assert marked[0] == marked[1] and "0.800‡ [" in marked[0]
+    assert "0.800\\* [" in unseen._cell(done | {"last_layer": first | {"way_out": True}})
+    assert not unseen.is_done(done | {"last_layer": second}, name, 200)
 
 
 def test_a_runs_policy_is_kept_by_name_and_says_how_it_was_made(tmp_path, monkeypatch):
