@@ -34,7 +34,6 @@ from envs.last_layer import PATIENCE, PROGRESS, LastLayer
 from envs.queries import Query
 from envs.roadmap_paths import load_roadmap_paths
 from envs.tasks import task_name
-from envs.wrappers import link_proximity
 
 
 @dataclass
@@ -290,8 +289,8 @@ class Examples:
         examples = {
             "observation": observation,
             "desired_goal": goal,
-            "proximity": link_proximity(checker, states),
-            "goal_proximity": link_proximity(checker, ends)[which],
+            "proximity": checker.proximity(states),
+            "goal_proximity": checker.proximity(ends)[which],
             "direction": directions.astype(np.float32),
             "length": lengths.astype(np.float32),
             "scene": np.full(len(states), scene),

@@ -15,8 +15,9 @@ between two of those until something is within 1 cm, inside or outside, uniforml
 - deepest_mm: of these, the largest distance from contact, by whichever of the two says more.
 
 Speed: uniform configurations in 40 scenes of `random_boxes_hard`, processor time of one core, in
-turns, the median of `--rounds`. `proximity` is asked about one configuration, as a policy does at
-every step: of the true obstacles, and of the points that sensors see. PyBullet's check is what
+turns, the median of `--rounds`. `proximity` is asked about one configuration at a time, a free one,
+as at every step of a policy: of the true obstacles, of the points that sensors see, and of those
+that the encoder `field` tells of. PyBullet's check is what
 planners used before: set the joints, detect collisions, read the contacts; `in_collision` also
 clears old contacts first.
 
@@ -40,8 +41,8 @@ import envs
 from envs import panda
 from envs.collision import CollisionChecker
 from envs.datasets import load_queries
+from envs.encoders import told_checker
 from envs.seeing import seen_checker
-from envs.wrappers import link_proximity
 
 NEAR = 0.01  # m
 SCENES = 40  # of each distribution
@@ -127,17 +128,20 @@ def speed(rounds, rng):
     checkers[0].is_free(np.zeros(7))  # compiles
     checkers[0].nearest(np.zeros(7))
     seeing_checkers = [seen_checker(scene) for scene in scenes]
-    link_proximity(seeing_checkers[0], np.zeros(7))
-    names = "is_free", "nearest", "proximity", "proximity, points", "pybullet", "in_collision"
-    seconds = {name: [] for name in names}
+    told_checkers = [told_checker(scene, "field") for scene in scenes]
+    seeing_checkers[0].proximity(np.zeros(7))
+    near = {"proximity": checkers, "proximity, points": seeing_checkers}
+    near |= {"proximity, field": told_checkers}
+    seconds = {name: [] for name in ("is_free", "nearest", *near, "pybullet", "in_collision")}
     for _ in range(rounds):
         total = dict.fromkeys(seconds, 0.0)
-        for scene, checker, seeing in zip(scenes, checkers, seeing_checkers, strict=True):
+        for i, (scene, checker) in enumerate(zip(scenes, checkers, strict=True)):
             states = rng.uniform(-1.0, 1.0, (ours, 7))
             total["is_free"] += timed(checker.is_free, states) / ours
             total["nearest"] += timed(checker.nearest, states[:500]) / 500
-            for name, one in (("proximity", checker), ("proximity, points", seeing)):
-                total[name] += timed(ask, partial(link_proximity, one), states[:100]) / 100
+            free = states[:1000][checker.is_free(states[:1000])][:100]
+            for name, ones in near.items():
+                total[name] += timed(ask, ones[i].proximity, free) / len(free)
             env.set_scene(scene)
             configurations = panda.denormalise(states[:100]).tolist()
             total["pybullet"] += timed(ask, partial(pybullet_check, env), configurations) / 100
@@ -176,7 +180,7 @@ def main():
     micros = speed(args.rounds, rng)
     print()
     for name, value in micros.items():
-        print(f"{name:18}{value:10.2f} us")
+        print(f"{name:20}{value:10.2f} us")
     print()
     result = {
         "configurations": asked,
@@ -188,6 +192,7 @@ def main():
         "nearest_per_second": 1e6 / micros["nearest"],
         "proximity_us": micros["proximity"],
         "proximity_points_us": micros["proximity, points"],
+        "proximity_field_us": micros["proximity, field"],
         "python": platform.python_version(),
     }
     print(json.dumps(result))

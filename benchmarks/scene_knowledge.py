@@ -47,7 +47,6 @@ from envs.encoders import (
     told_points,
 )
 from envs.scenes import ROW, to_array
-from envs.wrappers import link_proximity
 
 TASK = "random_boxes_hard"
 CELL = 0.2  # m
@@ -86,7 +85,7 @@ def link_distances(scenes, seed):
     """
     states = np.random.default_rng(seed).uniform(-1.0, 1.0, (len(scenes), POSES, 7))
     distances = [
-        link_proximity(CollisionChecker(replace(scene, table=None, floor=None)), some, within=FAR)
+        CollisionChecker(replace(scene, table=None, floor=None)).proximity(some, within=FAR)
         for scene, some in zip(tqdm(scenes, desc="distances"), states, strict=True)
     ]
     frames = panda.joint_frames(panda.denormalise(states))
@@ -246,7 +245,7 @@ def decoded(name, training, cells, testing, test_cells, test_data):
         found.append(told_cells(nearer(scene, points, best)))
         bare = replace(scene, obstacles=(), table=None, floor=None)
         checker = CollisionChecker(bare, points, TOLD_RADIUS)
-        error = np.abs(link_proximity(checker, some, within=FAR)[..., 0] - truth)
+        error = np.abs(checker.proximity(some, within=FAR)[..., 0] - truth)
         errors.append(error[truth < NEAR])
     mean = 100 * float(np.concatenate(errors).mean())
     return {"decoded_iou": iou(np.stack(found), test_cells), "decoded_cm": mean}

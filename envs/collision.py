@@ -6,6 +6,7 @@
     checker.is_free(states)                  # normalised (n, 7) -> bool (n,)
     checker.is_motion_free(starts, ends)     # straight motions, checked every `RESOLUTION`
     checker.nearest(states)                  # per link: how far, which way is out, from what
+    checker.proximity(states)                # the same as observations have it, and quicker
 
 The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`, but no PyBullet
 world is moved. They are: the convex hulls of the links' collision meshes, `BULLET_MARGIN` thicker
@@ -42,6 +43,8 @@ BULLET_MARGIN = 0.001
 """m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
 MAX_MARGIN = 0.5
 """m. Larger margins are refused."""
+PROXIMITY_RANGE = 0.3
+"""m. In observations, things farther away than that are as good as none."""
 LINKS = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10)
 """PyBullet's indices of the links that may touch something, in the order of `Nearest`: the seven
 that the joints move, the hand, the two fingers."""
@@ -202,9 +205,27 @@ class CollisionChecker:
         )
         return Nearest(distance, direction, point, gradient, self._things[which])
 
+    def proximity(self, states, self_collisions=False, within=PROXIMITY_RANGE):
+        """`proximity` as `envs.wrappers.ProximityWrapper` has it: float32 (..., 10, 8).
 
-def _states(name, states):
-    """Normalised configurations as a contiguous float64 array. Raises ValueError."""
+        A row per one of `LINKS`: `Nearest.distance` in m, clipped to `within`, and
+        `Nearest.gradient`, in m per unit of normalised configuration.
+
+        Args:
+            states: (..., 7), normalised; beyond the limits, which an arm may be a little, it is
+                that of the limits.
+            self_collisions, within: as for `nearest`.
+        """
+        states = _numbers("states", states)
+        rows = np.empty((*states.shape[:-1], len(LINKS), 8), dtype=np.float32)
+        flat = states.reshape(-1, 7), rows.reshape(-1, len(LINKS), 8)
+        if not _proximity_batch(*flat, bool(self_collisions), float(within), _arm(), self._world):
+            raise ValueError("states must be normalised configurations, not NaN")
+        return rows
+
+
+def _numbers(name, states):
+    """Configurations as a contiguous float64 array. Raises ValueError."""
     try:
         states = np.asarray(states)
         if states.dtype.kind not in "fiu":
@@ -213,7 +234,12 @@ def _states(name, states):
         raise ValueError(f"{name} must be numbers of shape (..., 7)") from error
     if states.shape[-1:] != (panda.NUM_JOINTS,):
         raise ValueError(f"{name} must have shape (..., 7), got {states.shape}")
-    states = np.ascontiguousarray(states, dtype=np.float64)
+    return np.ascontiguousarray(states, dtype=np.float64)
+
+
+def _states(name, states):
+    """Normalised configurations as a contiguous float64 array. Raises ValueError."""
+    states = _numbers(name, states)
     # float32 may round a limit to just beyond it. NaN is not at most anything.
     if states.size and not np.abs(states).max() <= 1.0 + 1e-6:
         raise ValueError(f"{name} must be normalised configurations: finite, in [-1, 1]")
@@ -1123,3 +1149,26 @@ def _nearest_batch(
         for link in range(distance.shape[1]):
             if which[i, link] == of_arm + 2:
                 distance[i, link] = np.inf
+
+
+@compiled
+def _proximity_batch(states, rows, self_collisions, within, arm, world):
+    """Write what `CollisionChecker.proximity` returns, unless a state is NaN: whether none is."""
+    clipped = np.empty(states.shape)
+    for i in range(states.shape[0]):
+        for j in range(states.shape[1]):
+            if math.isnan(states[i, j]):
+                return False
+            clipped[i, j] = min(max(states[i, j], -1.0), 1.0)
+    batch = rows.shape[0], rows.shape[1]
+    distance, which = np.empty(batch), np.empty(batch, np.int64)
+    direction, point = np.empty((batch[0], batch[1], 3)), np.empty((batch[0], batch[1], 3))
+    gradient = np.empty((batch[0], batch[1], 7))
+    found = distance, direction, point, gradient, which
+    _nearest_batch(clipped, self_collisions, within, arm, world, *found)
+    for i in range(batch[0]):
+        for link in range(batch[1]):
+            rows[i, link, 0] = min(distance[i, link], within)
+            for j in range(7):
+                rows[i, link, 1 + j] = gradient[i, link, j]
+    return True

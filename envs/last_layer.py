@@ -24,7 +24,6 @@ from envs import panda
 from envs.collision import CollisionChecker, compiled
 from envs.scenes import Scene, is_number
 from envs.subgoals import MAX_STEP
-from envs.wrappers import link_proximity
 
 # Of what the layer does, in results: with 1 it left dead ends otherwise, and did not remember them;
 # with 2 it took slow arrivals for dead ends, and braked as much near a goal as elsewhere.
@@ -228,7 +227,7 @@ def _arm_alone():
 
 def _own_proximity(state):
     """How far each link is from the other ones, as `proximity` has it."""
-    return link_proximity(_arm_alone(), state, self_collisions=True, within=NEAR)
+    return _arm_alone().proximity(state, self_collisions=True, within=NEAR)
 
 
 @compiled

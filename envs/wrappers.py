@@ -6,9 +6,6 @@ import numpy as np
 from envs import panda
 from envs.sensors import SensorWorld, cardinal
 
-PROXIMITY_RANGE = 0.3
-"""m. Things farther away than that are as good as none."""
-
 
 class SensorWrapper(gym.Wrapper):
     """Adds `sensors` to the observation: a dict of sensor's name -> its observation (a dict).
@@ -118,27 +115,13 @@ class SceneEncodingWrapper(_ObservingWrapper):
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
 
-def link_proximity(checker, states, self_collisions=False, within=PROXIMITY_RANGE):
-    """`proximity` as `ProximityWrapper` has it, of normalised configurations: float32 (..., 10, 8).
-
-    Args:
-        checker: an `envs.collision.CollisionChecker`.
-        states: (..., 7); beyond the limits, which an arm may be a little, it is that of the limits.
-        self_collisions: whether other links are things, too.
-        within: m, to which distances are clipped.
-    """
-    nearest = checker.nearest(np.clip(states, -1.0, 1.0), self_collisions, within)
-    distance = np.minimum(nearest.distance, within)[..., None]
-    return np.concatenate([distance, nearest.gradient], axis=-1).astype(np.float32)
-
-
 class ProximityWrapper(_ObservingWrapper):
     """Adds `proximity` to the observation: how far each link is from the nearest thing.
 
     float32 (10, 8), a row per `envs.collision.LINKS`: the distance from obstacles, table and floor
-    in m, clipped to `PROXIMITY_RANGE`, and its gradient, m per unit of normalised configuration
-    (zeros beyond the range). If the goal is a configuration, `goal_proximity` is the same there.
-    Otherwise this is its `RoboArmEnv`, with all of its attributes.
+    in m, clipped to `envs.collision.PROXIMITY_RANGE`, and its gradient, m per unit of normalised
+    configuration (zeros beyond the range). If the goal is a configuration, `goal_proximity` is the
+    same there. Otherwise this is its `RoboArmEnv`, with all of its attributes.
 
     Args:
         env: a `RoboArmEnv`, possibly in a `SceneEncodingWrapper`.
@@ -166,7 +149,7 @@ class ProximityWrapper(_ObservingWrapper):
         `scene`: a `Scene`, by default that of the environment.
         """
         checker = self._checker_of(self.unwrapped.scene if scene is None else scene)
-        return link_proximity(checker, states)
+        return checker.proximity(states)
 
     def _with_more(self, observation):
         seen = observation["observation"]

@@ -592,6 +592,23 @@ def test_nothing_asked(wall):
     assert wall.is_free(np.empty((2, 0, 7))).shape == (2, 0)
     assert wall.is_motion_free(np.empty((0, 7)), np.empty((0, 7))).shape == (0,)
     assert wall.nearest(np.empty((0, 7))).direction.shape == (0, len(LINKS), 3)
+    assert wall.proximity(np.empty((2, 0, 7))).shape == (2, 0, len(LINKS), 8)
+
+
+@pytest.mark.parametrize("self_collisions", [False, True])
+def test_proximity_is_nearest_as_observations_have_it(wall, self_collisions):
+    states = np.random.default_rng(3).uniform(-1.1, 1.1, (4, 25, 7)).astype(np.float32)
+    states[0, 0, 0] = np.inf
+    found = wall.proximity(states, self_collisions, within=0.2)
+    near = wall.nearest(np.clip(states, -1.0, 1.0), self_collisions, within=0.2)
+    distances = np.minimum(near.distance, 0.2)[..., None]
+    assert 0.1 < (distances < 0.2).mean() < 0.9
+    wanted = np.concatenate([distances, near.gradient], axis=-1).astype(np.float32)
+    assert found.dtype == np.float32 and (found == wanted).all()
+    assert (wall.proximity(states[1, 2], self_collisions, within=0.2) == found[1, 2]).all()
+    for bad in (np.full(7, np.nan), np.zeros(6), "near"):
+        with pytest.raises(ValueError, match="states must"):
+            wall.proximity(bad)
 
 
 def test_limits_may_be_rounded(wall):

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 from envs import panda
-from envs.collision import CollisionChecker
+from envs.collision import PROXIMITY_RANGE, CollisionChecker
 from envs.datasets import load_queries
 from envs.last_layer import (
     ARRIVING,
@@ -26,7 +26,6 @@ from envs.last_layer import (
 )
 from envs.policies import PolicyError, make_policy
 from envs.seeing import seen_checker
-from envs.wrappers import PROXIMITY_RANGE
 
 # --- Gradients and proximity
 
