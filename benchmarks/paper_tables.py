@@ -79,7 +79,8 @@ IMITATED = {
     "dagger, vae": "64 numbers (VAE) and distances from seen points",
     "dagger, vqvae": "64 numbers (VQ-VAE) and distances from seen points",
     "dagger, pointnet2": "64 numbers (PointNet++) and distances from seen points",
-    "dagger, points told by field": "64 numbers (field) and nothing else",
+    "dagger, field": "64 numbers (field) and nothing else",
+    "dagger, points told by field": "64 numbers (field) and nothing else, trained with points",
     "dagger, points": "seen points",
     "dagger, oracle": "the obstacles themselves",
 }
