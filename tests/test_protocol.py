@@ -131,7 +131,7 @@ def test_a_memory_is_fresh_in_every_episode_and_the_same_by_name(tmp_path):
     assert result["mean_steps"] == pytest.approx(np.mean(reached))
 
 
-def test_in_a_detour_of_the_last_layer_nothing_is_remembered(tmp_path):
+def test_in_a_detour_of_the_last_layer_nothing_is_remembered():
     arguments = {"goal_type": "config", "proximity": "obstacles"}
     queries = load_queries("random_boxes_hard", "validation")[:3]
     several, asked = protocol.make_eval_envs("random_boxes_hard", 3, **arguments), []
