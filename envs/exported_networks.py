@@ -199,9 +199,13 @@ class ExportedNetwork:
                 slots[kind, name] = _Slot(len(slots))
         self._nodes = []
         for name, operation, args, kwargs in content["nodes"]:
-            args = tuple(_decode(value, slots, device) for value in args)
+            args = [_decode(value, slots, device) for value in args]
             kwargs = {key: _decode(value, slots, device) for key, value in kwargs.items()}
-            self._nodes.append((network_operations.find(operation), args, kwargs, operation))
+            # Most arguments stay as they are: the others are known by their place.
+            places = [i for i, value in enumerate(args) if _has_slots(value)]
+            filled = _has_slots(kwargs)
+            function = network_operations.find(operation)
+            self._nodes.append((function, args, places, kwargs, filled, operation))
             slots["node", name] = _Slot(len(slots))
         self._outputs = _decode(content["outputs"], slots, device)
 
@@ -254,9 +258,13 @@ class ExportedNetwork:
     def _run(self, inputs, rehearsal=None):
         values = self._tensors + inputs
         with torch.no_grad():
-            for function, args, kwargs, operation in self._nodes:
+            for function, args, places, kwargs, filled, operation in self._nodes:
                 try:
-                    args, kwargs = _fill(args, values), _fill(kwargs, values)
+                    args = args.copy()
+                    for i in places:
+                        args[i] = _fill(args[i], values)
+                    if filled:
+                        kwargs = _fill(kwargs, values)
                     if rehearsal is not None:
                         rehearsal.before(operation, args)
                     values.append(function(*args, **kwargs))
@@ -378,12 +386,19 @@ def _decode(value, slots, device):
     return slots[kind, content]
 
 
+def _has_slots(value):
+    """Whether there are any in a decoded argument."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    return any(map(_has_slots, value)) if isinstance(value, list) else isinstance(value, _Slot)
+
+
 def _fill(value, values):
     """A decoded argument or output, with the values its slots stand for."""
     kind = type(value)
     if kind is _Slot:
         return values[value]
-    if kind is list or kind is tuple:
+    if kind is list:
         return [_fill(one, values) for one in value]
     if kind is dict:
         return {key: _fill(one, values) for key, one in value.items()}
