@@ -13,7 +13,8 @@ collects paths of many scenes (read by `envs.roadmap_paths.load_roadmap_paths`).
 
 A probabilistic roadmap (Kavraki et al., 1996): random free configurations, each joined to its
 nearest neighbours where the straight motion is free, and shortest paths in that graph, which are
-then pruned and cut short.
+then pruned and cut short. Whether a motion is free is asked only when a shortest path would take it
+(Bohlin and Kavraki, 2000), which finds the same paths.
 
 Paths keep `margin` from everything where there is room. A node, a start or a goal that is nearer
 to something than that is not lost: around it, a path may come as near as it is itself, and has to
@@ -26,7 +27,6 @@ continued with more scenes.
 """
 
 import copy
-import functools
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,11 +38,13 @@ from scipy.sparse.csgraph import dijkstra
 
 import envs
 from envs import shards
-from envs.collision import CollisionChecker
+from envs.collision import RESOLUTION, CollisionChecker
 from envs.flags import PositiveFloat, PositiveInt, Seed, Workers
 from envs.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from envs.scenes import Scene
 
+# L2, normalised, between states of a motion that are looked at before a path wants to take it.
+COARSE = 8 * RESOLUTION
 # Around a configuration that is nearer to something than the margin, the margin grows by this much
 # (m) per unit of normalised distance from it.
 MARGIN_GROWTH = 0.05
@@ -93,14 +95,15 @@ class Roadmap:
             raise ValueError(f"margin must be at least {NODE_MARGIN} m, got {margin!r}")
         self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
         self._checker = CollisionChecker(scene)
-        self._kept = margin  # by the edges
         self.nodes, self._room = np.empty((0, 7)), np.empty(0)
-        self._edges, self._blocked = (np.empty((2, 0), np.int64) for _ in range(2))
-        self._edge_costs = np.empty(0)
+        # Motions between neighbours: each keeps the margin (0), or no more than `NODE_MARGIN` (1),
+        # or is not free (2). The first is believed until it is looked at; and so is the second.
+        self._edges, self._edge_costs = np.empty((2, 0), np.int64), np.empty((2, 0))
+        self._kept, self._is_known = np.empty(0, np.int64), np.empty(0, bool)
         self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
 
     def _add_nodes(self, nodes):
-        """Join free configurations (n, 7) to the nearest nodes."""
+        """Let motions lead from free configurations (n, 7) to the nearest nodes."""
         first = len(self.nodes)
         self.nodes = np.concatenate([self.nodes, nodes])
         self._room = np.concatenate([self._room, self._rooms(nodes)])
@@ -108,23 +111,17 @@ class Roadmap:
         one = np.repeat(np.arange(first, len(self.nodes)), near.shape[1])
         edges = np.stack([one, near.ravel()])
         edges = np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
-        motions = *self.nodes[edges], *self._room[edges]
-        free = self._joined(*motions)
-        self._blocked = np.concatenate([self._blocked, edges[:, ~free]], axis=1)
-        self._edges = np.concatenate([self._edges, edges[:, free]], axis=1)
-        self._edge_costs = np.concatenate([self._edge_costs, self._costs(*motions)[free]])
-
-    @functools.cached_property
-    def _narrow(self):
-        """This roadmap with the edges, too, that keep no more than `NODE_MARGIN`."""
-        roadmap = copy.copy(self)
-        roadmap._kept = NODE_MARGIN
-        edges = self._blocked
-        edges = edges[:, roadmap._joined(*self.nodes[edges], *self._room[edges])]
-        costs = self._costs(*self.nodes[edges], np.zeros(edges.shape[1]), 0.0)
-        roadmap._edges = np.concatenate([self._edges, edges], axis=1)
-        roadmap._edge_costs = np.concatenate([self._edge_costs, costs])
-        return roadmap
+        self._edges = np.concatenate([self._edges, edges], axis=1)
+        ends = self.nodes[edges]
+        costs = np.stack([self._costs(*ends, *self._room[edges]), self._costs(*ends, 0.0, 0.0)])
+        self._edge_costs = np.concatenate([self._edge_costs, costs], axis=1)
+        kept = np.zeros(edges.shape[1], np.int64)
+        for i, margin in enumerate((self.margin, NODE_MARGIN)):
+            asked = np.flatnonzero(kept == i)
+            motions = *self.nodes[edges[:, asked]], *self._room[edges[:, asked]]
+            kept[asked] += ~self._joined(*motions, margin, COARSE)
+        self._kept = np.concatenate([self._kept, kept])
+        self._is_known = np.concatenate([self._is_known, np.zeros(len(kept), bool)])
 
     def _grown(self, around, rng):
         """This roadmap with more nodes, near configurations that could not be joined to it."""
@@ -186,8 +183,9 @@ class Roadmap:
             # Through narrow places, where the margin is not kept. Away from them it is.
             begins[lost] = self._moved_out(begins[lost], NODE_MARGIN)
             ends = np.unique(np.concatenate([begins[lost], goals[lost]]), axis=0)
-            roadmap = self._narrow._grown(ends, rng)
-            points, _, found = roadmap._search(begins[lost], goals[lost])
+            points, _, found = self._grown(ends, rng)._search(
+                begins[lost], goals[lost], narrow=True
+            )
             states = _dense(points[found])
             room = self._rooms(states.reshape(-1, 7)).reshape(states.shape[:2])
             ways = self._smooth(points[found], states, room, rng)
@@ -234,20 +232,21 @@ class Roadmap:
         room[near] = np.minimum(self._distances(states[near]), self.margin)
         return room
 
-    def _free(self, starts, ends, states, room):
+    def _free(self, starts, ends, states, room, margin, **options):
         """Whether motions (n, 7) are free, each as near as its own states (n, k, 7) allow."""
         relaxed = (states, room - _HAIR, MARGIN_GROWTH)
-        return self._checker.is_motion_free(starts, ends, self._kept, relaxed=relaxed)
+        return self._checker.is_motion_free(starts, ends, margin, relaxed=relaxed, **options)
 
     def _costs(self, starts, ends, start_room, end_room):
         """Of straight motions (..., 7), if they are free."""
         tightness = 1.0 - np.clip(np.minimum(start_room, end_room) / self.margin, 0.0, 1.0)
         return np.linalg.norm(ends - starts, axis=-1) * (1.0 + NARROW * tightness)
 
-    def _joined(self, starts, ends, start_room, end_room):
+    def _joined(self, starts, ends, start_room, end_room, margin, resolution=RESOLUTION):
         """Whether straight motions (n, 7) are free, as near as both of their ends allow."""
         states, room = np.stack([starts, ends], axis=1), np.stack([start_room, end_room], axis=1)
-        return self._free(starts, ends, states, room)
+        options = {"resolution": resolution, "ends_known": True}
+        return self._free(starts, ends, states, room, margin, **options)
 
     def _nearest_nodes(self, states, number):
         """(n, number), in any order."""
@@ -260,46 +259,105 @@ class Roadmap:
         """
         return self._cut_short(self._prune(points, states, room), states, room, rng)
 
-    def _search(self, starts, goals):
-        """Shortest paths: points (n, k, 7), padded with the goal, their room (n, k), found (n,)."""
+    def _search(self, starts, goals, narrow=False):
+        """Shortest paths: points (n, k, 7), padded with the goal, their room (n, k), found (n,).
+
+        Where they are `narrow`, their motions need not keep more than `NODE_MARGIN`.
+        """
+        margin = NODE_MARGIN if narrow else self.margin
         goals, which = np.unique(goals, axis=0, return_inverse=True)
         start_room, goal_room = self._rooms(starts), self._rooms(goals)
         states, room = np.concatenate([self.nodes, goals]), np.concatenate([self._room, goal_room])
+        count = len(self.nodes)
         # Edges lead from goals to nodes and not back: no path goes through another query's goal.
         goal = np.repeat(np.arange(len(goals)), JOINED)
         node = self._nearest_nodes(goals, JOINED).ravel()
         ways = goals[goal], self.nodes[node], goal_room[goal], self._room[node]
-        free = self._joined(*ways)
-        count, (one, other), costs = len(self.nodes), self._edges, self._edge_costs
-        tails = np.concatenate([one, other, count + goal[free]])
-        heads = np.concatenate([other, one, node[free]])
-        costs = np.concatenate([costs, costs, self._costs(*ways)[free]])
-        graph = csr_array((costs, (tails, heads)), shape=(len(states), len(states)))
-        indices = count + np.arange(len(goals))
-        rest, before = dijkstra(graph, indices=indices, return_predecessors=True)
-        # From or to the inside of something there is no way.
-        rest[goal_room < -INSIDE] = np.inf
-        # The first step is to the goal itself or to a node: the best one that is free.
+        goal_costs = self._costs(*ways)
+        goal_costs[~self._joined(*ways, margin)] = np.inf
+        # The first step is to the goal itself or to a node.
         first = np.c_[count + which, self._nearest_nodes(starts, JOINED)]
-        costs = self._costs(starts[:, None], states[first], start_room[:, None], room[first])
-        costs += rest[which[:, None], first]
-        costs[start_room < -INSIDE] = np.inf
-        order = np.argsort(costs, axis=1, kind="stable")
-        node, found = count + which, np.zeros(len(starts), bool)
+        first_costs = self._costs(starts[:, None], states[first], start_room[:, None], room[first])
+        first_costs[start_room < -INSIDE] = np.inf
+        is_known = np.zeros(first.shape, bool)
+        found, routes = np.zeros(len(starts), bool), {}
         waiting = np.arange(len(starts))
-        for choice in order.T:
-            waiting = waiting[np.isfinite(costs[waiting, choice[waiting]])]
-            tried = first[waiting, choice[waiting]]
-            free = self._joined(starts[waiting], states[tried], start_room[waiting], room[tried])
-            node[waiting[free]], found[waiting[free]] = tried[free], True
+        while len(waiting):
+            asked, row = np.unique(which[waiting], return_inverse=True)
+            rest, before = self._shortest(asked, goal, node, goal_costs, narrow)
+            # From or to the inside of something there is no way.
+            rest[goal_room[asked] < -INSIDE] = np.inf
+            while True:  # the best first step of those that are free
+                costs = first_costs[waiting] + rest[row[:, None], first[waiting]]
+                best = costs.argmin(1)
+                possible = np.isfinite(costs.min(1))
+                asked = possible & ~is_known[waiting, best]
+                if not asked.any():
+                    break
+                query, step = waiting[asked], best[asked]
+                tried = first[query, step]
+                ends = starts[query], states[tried]
+                free = self._joined(*ends, start_room[query], room[tried], margin)
+                is_known[query, step] = True
+                first_costs[query[~free], step[~free]] = np.inf
+            waiting, best, row = waiting[possible], best[possible], row[possible]
+            at = first[waiting, best]
+            route = [at]
+            while (at < count).any():
+                at = np.where(at < count, before[row, at], at)
+                route.append(at)
+            route = np.stack(route, axis=1)
+            free = self._look(route, narrow)
+            found[waiting[free]] = True
+            routes |= dict(zip(waiting[free], route[free], strict=True))
             waiting = waiting[~free]
-        route = [node]
-        while (node < count).any():
-            node = np.where(node < count, before[which, node], node)
-            route.append(node)
-        route = np.stack(route, axis=1)
+        size = max(map(len, routes.values()), default=1)
+        route = np.repeat(count + which[:, None], size, axis=1)
+        for i, nodes in routes.items():
+            route[i, : len(nodes)] = nodes
         points = np.concatenate([starts[:, None], states[route]], axis=1)
         return points, np.concatenate([start_room[:, None], room[route]], axis=1), found
+
+    def _shortest(self, asked, goal, node, goal_costs, narrow):
+        """Dijkstra's algorithm from the goals that are asked, by what is not known to be blocked.
+
+        `goal[i]` is joined to `node[i]`, where that costs less than infinity.
+
+        Returns lengths and predecessors, (asked, nodes + goals).
+        """
+        count, usable = len(self.nodes), np.flatnonzero(self._kept <= narrow)
+        one, other = self._edges[:, usable]
+        costs = self._edge_costs[self._kept[usable], usable]
+        joined = np.isfinite(goal_costs)
+        tails = np.concatenate([one, other, count + goal[joined]])
+        heads = np.concatenate([other, one, node[joined]])
+        costs = np.concatenate([costs, costs, goal_costs[joined]])
+        size = count + goal[-1] + 1
+        graph = csr_array((costs, (tails, heads)), shape=(size, size))
+        return dijkstra(graph, indices=count + asked, return_predecessors=True)
+
+    def _look(self, route, narrow):
+        """Whether all motions between nodes of each route (n, k) are what they were believed to be.
+
+        Those that nobody has looked at are looked at.
+        """
+        count = len(self.nodes)
+        path, step = np.nonzero((route[:, 1:] < count) & (route[:, :-1] != route[:, 1:]))
+        ends = np.sort([route[path, step], route[path, step + 1]], axis=0)
+        names, wanted = self._edges[0] * count + self._edges[1], ends[0] * count + ends[1]
+        order = np.argsort(names)
+        used = order[np.searchsorted(names, wanted, sorter=order)]
+        unknown = np.unique(used[~self._is_known[used]])
+        for kept, margin in enumerate((self.margin, NODE_MARGIN)):
+            edges = unknown[self._kept[unknown] == kept]
+            ends = self._edges[:, edges]
+            free = self._joined(*self.nodes[ends], *self._room[ends], margin)
+            self._is_known[edges[free]] = True
+            self._kept[edges[~free]] += 1
+            unknown = np.setdiff1d(unknown, edges)
+        free = np.ones(len(route), bool)
+        free[path[~self._is_known[used] | (self._kept[used] > narrow)]] = False
+        return free
 
     def _prune(self, points, states, room):
         """Paths (n, k, 7), padded, without the vertices that straight motions can leave out."""
@@ -311,7 +369,8 @@ class Roadmap:
         first, last = np.triu_indices(size, 2)
         path, pair = np.nonzero(moves[:, last - 1, last] > 0.0)  # not to where the goal is repeated
         first, last = first[pair], last[pair]
-        free = self._free(points[path, first], points[path, last], states[path], room[path])
+        ends = points[path, first], points[path, last]
+        free = self._free(*ends, states[path], room[path], self.margin)
         path, first, last = path[free], first[free], last[free]
         moves[path, first, last] = lengths[path, first, last]
         # The shortest way through what is left, by dynamic programming.
@@ -344,7 +403,9 @@ class Roadmap:
             chord = head - (head - tail) * rest[:, :, None]
             gain = along[:, 1] - along[:, 0] - np.linalg.norm(chord[:, 1] - chord[:, 0], axis=1)
             tried = np.flatnonzero(gain > LEAST_GAIN * total)
-            free = self._free(chord[tried, 0], chord[tried, 1], states[tried], room[tried])
+            free = self._free(
+                *np.moveaxis(chord[tried], 1, 0), states[tried], room[tried], self.margin
+            )
             cut = tried[free]
             points = np.concatenate([points, points[:, -1:]], axis=1)
             # Vertices up to the chord, its two ends, vertices from there on.

@@ -144,7 +144,14 @@ class CollisionChecker:
         return free
 
     def is_motion_free(
-        self, starts, ends, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION
+        self,
+        starts,
+        ends,
+        margin=0.0,
+        clearance=0.0,
+        relaxed=None,
+        resolution=RESOLUTION,
+        ends_known=False,
     ):
         """Whether straight motions are free: bool (...).
 
@@ -155,18 +162,27 @@ class CollisionChecker:
             starts, ends: (..., 7), normalised; one may be broadcast to the other.
             margin, clearance, relaxed: as for `is_free`.
             resolution: L2, normalised, > 0.
+            ends_known: both ends are known to be free, and not looked at.
         """
-        return self.motion_checks(starts, ends, margin, clearance, relaxed, resolution) > 0
+        arguments = starts, ends, margin, clearance, relaxed, resolution, ends_known
+        return self.motion_checks(*arguments) >= 0
 
     def motion_checks(
-        self, starts, ends, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION
+        self,
+        starts,
+        ends,
+        margin=0.0,
+        clearance=0.0,
+        relaxed=None,
+        resolution=RESOLUTION,
+        ends_known=False,
     ):
         """How many configurations `is_motion_free` looks at, int64 (...); negative: not free."""
         starts, ends = np.broadcast_arrays(_states("starts", starts), _states("ends", ends))
         rule = _rule(margin, clearance, relaxed, resolution, batch=starts.shape[:-1])
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
         flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
-        _motion_batch(*flat, *rule, _arm(), self._world, checks.reshape(-1))
+        _motion_batch(*flat, *rule, _arm(), self._world, ends_known, checks.reshape(-1))
         return checks
 
     def motion_checker(self, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION):
@@ -176,7 +192,7 @@ class CollisionChecker:
         looked at again; and it does not look at its arguments.
         """
         rule, relaxed = _rule(margin, clearance, relaxed, resolution)
-        return functools.partial(_motion, rule, relaxed[0], _arm(), self._world)
+        return functools.partial(_motion, rule, relaxed[0], _arm(), self._world, False)
 
     def nearest(self, states, self_collisions=True, within=math.inf):
         """How far each of `LINKS` is from the nearest thing, and which way is out: a `Nearest`.
@@ -810,7 +826,7 @@ def _free_batch(states, rule, relaxed, arm, world, free):
 
 
 @compiled
-def _motion(rule, relaxed, arm, world, start, end):
+def _motion(rule, relaxed, arm, world, end_known, start, end):
     """How many states of a motion were looked at, not counting its start; negative: not free."""
     memory, q = _memory(), np.empty(7)
     squared = 0.0
@@ -818,6 +834,10 @@ def _motion(rule, relaxed, arm, world, start, end):
         squared += (end[j] - start[j]) ** 2
     pieces = int(math.ceil(math.sqrt(squared) / rule[3]))
     looked_at, parts, part = 0, 1, 1
+    if end_known:
+        parts = 2
+        if pieces < 2:
+            return 0
     while True:
         i = part * pieces // parts  # of `pieces`: first the end, then the middle, ...
         # Unless an earlier, coarser round has looked at that.
@@ -837,14 +857,17 @@ def _motion(rule, relaxed, arm, world, start, end):
 
 
 @compiled
-def _motion_batch(starts, stops, rule, relaxed, arm, world, checks):
+def _motion_batch(starts, stops, rule, relaxed, arm, world, ends_known, checks):
     memory = _memory()
     for i in range(starts.shape[0]):
         near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        if ends_known:
+            checks[i] = _motion(rule, near, arm, world, True, starts[i], stops[i])
+            continue
         if not _is_free(starts[i], rule, near, arm, world, memory):
             checks[i] = -1
             continue
-        more = _motion(rule, near, arm, world, starts[i], stops[i])
+        more = _motion(rule, near, arm, world, False, starts[i], stops[i])
         checks[i] = more + 1 if more > 0 else more - 1
 
 
