@@ -33,7 +33,7 @@ import matplotlib.pyplot as plt
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "scaling.json"
 PICTURE = ROOT / "docs" / "pictures" / "unseen_scaling.png"
-UPDATES = 6000
+UPDATES = 4000
 # Scenes, of 300 paths each; updates between rounds of DAgger, of 40 queries each (0: none).
 RUNS = ((50, 2000), (200, 2000), (800, 2000), (800, 0), (800, 500))
 SHARD = 50  # scenes of a shard: demo_generation.roadmaps' default
