@@ -394,8 +394,23 @@ def test_how_many_configurations_a_motion_has():
         pieces = math.ceil(length / collision.RESOLUTION)
         assert checker.motion_checks(STATE, end) == max(1, pieces) + 1
         assert checker.motion_checks(STATE, end, resolution=1.0) == 2
+        between = max(0, pieces - 1)
+        assert checker.motion_checks(STATE, end, ends_known=True) == between
+        assert checker.is_motion_free(STATE, end, ends_known=True)
     one = checker.motion_checker()
     assert one(tuple(STATE), tuple(STATE)) == 1
+
+
+def test_ends_that_are_known_are_not_looked_at():
+    checker = CollisionChecker(BOARD)
+    assert checker.motion_checks(LEFT, RIGHT, ends_known=True) == -1  # the middle
+    into = (LEFT + RIGHT) / 2
+    pieces = math.ceil(np.linalg.norm(into - LEFT) / collision.RESOLUTION)
+    steps = LEFT + (into - LEFT) * np.arange(pieces + 1)[:, None] / pieces
+    inside = np.flatnonzero(~checker.is_free(steps))
+    before = steps[inside[0] - 1], steps[inside[0]]
+    assert not checker.is_motion_free(*before)
+    assert checker.is_motion_free(*before, ends_known=True)
 
 
 def test_every_point_of_a_motion_is_looked_at():

@@ -79,6 +79,31 @@ def test_paths_are_short(roadmap):
             np.testing.assert_array_equal(path[-1], goal.astype(np.float32))
 
 
+@pytest.mark.parametrize("narrow", [False, True])
+def test_paths_are_those_of_a_roadmap_of_which_all_is_known(narrow):
+    """Where every motion has been looked at before anything is asked."""
+    roadmap, known = (Roadmap(hard_scene(4), np.random.default_rng(0), 300) for _ in range(2))
+    for _ in range(2):  # with the margin, and then with what nodes keep
+        known._look(known._edges.T, narrow=True)
+    usable = known._kept <= 1
+    assert known._is_known[usable].all() and 0.2 < usable.mean() < 0.9
+    ends, room = known.nodes[known._edges], known._room[known._edges]
+    free = known._joined(*ends, *room, roadmap.margin)
+    # The first look is not at the same states of a motion.
+    assert (free == (known._kept == 0)).mean() > 0.99
+    rng = np.random.default_rng(5)
+    starts, goals = roadmap.sample(40, rng), np.repeat(roadmap.sample(8, rng), 5, axis=0)
+    both = [one._search(starts, goals, narrow) for one in (roadmap, known)]
+    assert both[0][2].sum() > 15
+    for ours, theirs in zip(*both, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert roadmap._is_known.sum() < 0.5 * known._is_known.sum()
+
+
+def test_no_paths_are_asked_for(roadmap):
+    assert roadmap.paths(np.empty((0, 7)), np.empty((0, 7)), np.random.default_rng(0)) == []
+
+
 def test_a_free_straight_motion_is_the_path():
     roadmap = Roadmap(Scene(), np.random.default_rng(0), num_nodes=100)
     start, goal = np.array([[0.1] * 7, [-0.1] * 7])
