@@ -96,8 +96,9 @@ class Roadmap:
         self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
         self._checker = CollisionChecker(scene)
         self.nodes, self._room = np.empty((0, 7)), np.empty(0)
-        # Motions between neighbours: each keeps the margin (0), or no more than `NODE_MARGIN` (1),
-        # or is not free (2). The first is believed until it is looked at; and so is the second.
+        # Motions between neighbours: which of these margins each keeps, 2 if none; and whether all
+        # of it has been looked at, or it is only believed.
+        self._margins = margin, NODE_MARGIN
         self._edges, self._edge_costs = np.empty((2, 0), np.int64), np.empty((2, 0))
         self._kept, self._is_known = np.empty(0, np.int64), np.empty(0, bool)
         self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
@@ -116,7 +117,7 @@ class Roadmap:
         costs = np.stack([self._costs(*ends, *self._room[edges]), self._costs(*ends, 0.0, 0.0)])
         self._edge_costs = np.concatenate([self._edge_costs, costs], axis=1)
         kept = np.zeros(edges.shape[1], np.int64)
-        for i, margin in enumerate((self.margin, NODE_MARGIN)):
+        for i, margin in enumerate(self._margins):
             asked = np.flatnonzero(kept == i)
             motions = *self.nodes[edges[:, asked]], *self._room[edges[:, asked]]
             kept[asked] += ~self._joined(*motions, margin, COARSE)
@@ -264,11 +265,10 @@ class Roadmap:
 
         Where they are `narrow`, their motions need not keep more than `NODE_MARGIN`.
         """
-        margin = NODE_MARGIN if narrow else self.margin
+        margin, count = self._margins[narrow], len(self.nodes)
         goals, which = np.unique(goals, axis=0, return_inverse=True)
         start_room, goal_room = self._rooms(starts), self._rooms(goals)
         states, room = np.concatenate([self.nodes, goals]), np.concatenate([self._room, goal_room])
-        count = len(self.nodes)
         # Edges lead from goals to nodes and not back: no path goes through another query's goal.
         goal = np.repeat(np.arange(len(goals)), JOINED)
         node = self._nearest_nodes(goals, JOINED).ravel()
@@ -339,7 +339,7 @@ class Roadmap:
     def _look(self, route, narrow):
         """Whether all motions between nodes of each route (n, k) are what they were believed to be.
 
-        Those that nobody has looked at are looked at.
+        Those that were only believed are looked at.
         """
         count = len(self.nodes)
         path, step = np.nonzero((route[:, 1:] < count) & (route[:, :-1] != route[:, 1:]))
@@ -348,13 +348,12 @@ class Roadmap:
         order = np.argsort(names)
         used = order[np.searchsorted(names, wanted, sorter=order)]
         unknown = np.unique(used[~self._is_known[used]])
-        for kept, margin in enumerate((self.margin, NODE_MARGIN)):
+        for kept in (1, 0):
             edges = unknown[self._kept[unknown] == kept]
             ends = self._edges[:, edges]
-            free = self._joined(*self.nodes[ends], *self._room[ends], margin)
+            free = self._joined(*self.nodes[ends], *self._room[ends], self._margins[kept])
             self._is_known[edges[free]] = True
             self._kept[edges[~free]] += 1
-            unknown = np.setdiff1d(unknown, edges)
         free = np.ones(len(route), bool)
         free[path[~self._is_known[used] | (self._kept[used] > narrow)]] = False
         return free
@@ -370,7 +369,7 @@ class Roadmap:
         path, pair = np.nonzero(moves[:, last - 1, last] > 0.0)  # not to where the goal is repeated
         first, last = first[pair], last[pair]
         ends = points[path, first], points[path, last]
-        free = self._free(*ends, states[path], room[path], self.margin)
+        free = self._free(*ends, states[path], room[path], self.margin, ends_known=True)
         path, first, last = path[free], first[free], last[free]
         moves[path, first, last] = lengths[path, first, last]
         # The shortest way through what is left, by dynamic programming.
