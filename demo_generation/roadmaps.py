@@ -13,8 +13,8 @@ collects paths of many scenes (read by `envs.roadmap_paths.load_roadmap_paths`).
 
 A probabilistic roadmap (Kavraki et al., 1996): random free configurations, each joined to its
 nearest neighbours where the straight motion is free, and shortest paths in that graph, which are
-then pruned and cut short. Whether a motion is free is asked only when a shortest path would take it
-(Bohlin and Kavraki, 2000), which finds the same paths.
+then pruned and cut short. Of a motion only some states are looked at beforehand, and the others when
+a shortest path would take it (Bohlin and Kavraki, 2000), which finds the same paths.
 
 Paths keep `margin` from everything where there is room. A node, a start or a goal that is nearer
 to something than that is not lost: around it, a path may come as near as it is itself, and has to
@@ -291,10 +291,10 @@ class Roadmap:
                 costs = first_costs[waiting] + rest[row[:, None], first[waiting]]
                 best = costs.argmin(1)
                 possible = np.isfinite(costs.min(1))
-                asked = possible & ~is_known[waiting, best]
-                if not asked.any():
+                unknown = possible & ~is_known[waiting, best]
+                if not unknown.any():
                     break
-                query, step = waiting[asked], best[asked]
+                query, step = waiting[unknown], best[unknown]
                 tried = first[query, step]
                 ends = starts[query], states[tried]
                 free = self._joined(*ends, start_room[query], room[tried], margin)
