@@ -13,8 +13,8 @@ collects paths of many scenes (read by `envs.roadmap_paths.load_roadmap_paths`).
 
 A probabilistic roadmap (Kavraki et al., 1996): random free configurations, each joined to its
 nearest neighbours where the straight motion is free, and shortest paths in that graph, which are
-then pruned and cut short. Of a motion only some states are looked at beforehand, and the others when
-a shortest path would take it (Bohlin and Kavraki, 2000), which finds the same paths.
+then pruned and cut short. Of a motion only some states are looked at beforehand, and the others
+when a shortest path would take it (Bohlin and Kavraki, 2000), which finds the same paths.
 
 Paths keep `margin` from everything where there is room. A node, a start or a goal that is nearer
 to something than that is not lost: around it, a path may come as near as it is itself, and has to
