@@ -300,20 +300,28 @@ def in_small(found):
     """How many steps and seeds a cell's results have."""
     steps = sorted({result["steps"] for result in found})
     steps = " to ".join(f"{n:,}" for n in (steps[0], steps[-1])[: len(steps)])
-    return f"<sub>{steps} steps, {len(found)} seed{'s' * (len(found) > 1)}</sub>"
+    return f"<sub>{steps} steps, {_seeds(found)}</sub>"
+
+
+def _seeds(found):
+    return f"{len(found)} seed{'s' * (len(found) > 1)}"
 
 
 def imitated_rows(unseen, tasks):
-    """Of `IMITATED`: dict of a row's name -> dict of column's name -> text."""
+    """Of `IMITATED`: dict of a row's name -> dict of column's name -> text.
+
+    Other seeds of a policy are cells named like its own, with `, seed 2` and so on.
+    """
     rows = {}
     for name, knows in IMITATED.items():
         texts = rows[f"DAgger with a last layer: {knows}"] = {}
         for task in tasks:
-            if result := unseen.get(task, {}).get(name):
-                low, high = result["success_rate_interval"]
-                rate, number = result["success_rate"], result["num_queries"]
-                small = f"<sub>{number:,} queries, 1 seed</sub>"
-                texts[f"`{task}`"] = f"**{rate:.3f} [{low:.3f}, {high:.3f}]**<br>{small}"
+            cells = unseen.get(task, {})
+            found = [cells[key] for key in cells if key == name or key.startswith(f"{name}, seed ")]
+            if found:
+                number = sum(result["num_queries"] for result in found)
+                small = f"<sub>{number:,} queries, {_seeds(found)}</sub>"
+                texts[f"`{task}`"] = f"**{ours(found)}**<br>{small}"
     return {name: texts for name, texts in rows.items() if texts}
 
 

@@ -17,6 +17,7 @@ import datetime
 import hashlib
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -62,13 +63,17 @@ for _encoder, _layer in BC_LAYERS.items():
         f"bc, {_encoder}": [*_flags, *_layer],
     }
 TOLD = "dagger, points told by field"  # trained with points that are seen
+SEES = "dagger, points"
+# The same training with other seeds, on the same roadmaps: in `HARD` only.
+SEEDS = {f"{SEES}, seed {_seed}": f"dagger-combined-points-{HARD}-s{_seed}" for _seed in (2, 3)}
+CELLS |= {_name: ["--policy", _policy] for _name, _policy in SEEDS.items()}
 for _name, _policy, _layer, _encoder in (
     ("dagger, vae", f"vae-{HARD}", POINTS[:2], []),
     ("dagger, vqvae", f"vqvae-{HARD}", POINTS[:2], []),
     ("dagger, pointnet2", f"pointnet2-{HARD}", POINTS[:2], []),
     ("dagger, field", f"field-{HARD}", POINTS[:2], []),
     (TOLD, f"points-{HARD}", POINTS[:2], ["--encoder", "field"]),
-    ("dagger, points", f"points-{HARD}", POINTS[:2], []),
+    (SEES, f"points-{HARD}", POINTS[:2], []),
     ("dagger, points, mixed scenes", "points-mixed_scenes", POINTS[:2], []),
     ("dagger, oracle", f"oracle-{HARD}", OBSTACLES, []),
 ):
@@ -292,12 +297,26 @@ def tables(results, others):
         for task in tasks:
             paper = f"{best[task]:.3f}" if task in best else "none given"
             lines += _row(f"`{task}`", paper, *(_cell(results[task].get(name)) for name in names))
+    if any(name in hard for name in SEEDS):
+        lines += ["", _of_seeds([hard[name] for name in (SEES, *SEEDS) if name in hard])]
     dates = sorted({result["date"] for cells in results.values() for result in cells.values()})
     lines += ["", f"In brackets, test queries and the 95 % interval of success. To {dates[-1]}."]
     lines += ["\\*: with the way out of dead ends as it was before 2026-11-24, without a memory."]
     lines += ["‡: with the last layer as it was when it took slow arrivals for dead ends."]
     lines += ["†: with an encoder that has been replaced since."]
     return "\n".join(lines) + "\n"
+
+
+def _of_seeds(results):
+    """A sentence: what policies with points have that differ in the seed of their training."""
+    text = f"`dagger.py` with points, {len(results)} seeds, `{HARD}`:"
+    for words, key in (("success", "success_rate"), ("clean", "clean_success_rate")):
+        rates = [result[key] for result in results]
+        each = ", ".join(f"{rate:.3f}" for rate in rates)
+        text += f" {words} {each}, so {statistics.mean(rates):.3f}"
+        text += f" ± {statistics.stdev(rates):.3f};"
+    counts = ", ".join(f"{result['num_queries']:,}" for result in results)
+    return f"{text} of {counts} test queries."
 
 
 def _row(*cells, is_head=False):

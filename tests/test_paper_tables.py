@@ -130,12 +130,16 @@ def test_an_algorithm_of_ones_own(results, tmp_path):
 
 
 def test_imitation_stands_beside_the_papers_encoders(results):
-    found = {"success_rate": 0.9, "success_rate_interval": [0.88, 0.92], "num_queries": 1000}
+    found = {"success_rate": 0.9, "num_queries": 1000}
+    more = {"success_rate": 0.8, "num_queries": 1000}
+    seeds = {"dagger, points": found, "dagger, points, seed 2": more, "dagger, points, alone": more}
     unseen = {"narrow_shelves": {"dagger, points": found}, "wall": {"dagger, oracle": found}}
+    unseen["pole_shelves"] = seeds
     page = paper_tables.page(list(CELLS.values()), results, BASELINES, unseen)
     (row,) = (line for line in page.splitlines() if line.startswith("| DAgger"))
     assert row.startswith("| DAgger with a last layer: seen points |  |  |")
-    assert row.endswith("|  | **0.900 [0.880, 0.920]**<br><sub>1,000 queries, 1 seed</sub> |")
+    assert row.endswith("| **0.900 [0.880, 0.917]**<br><sub>1,000 queries, 1 seed</sub> |")
+    assert "| **0.850 ± 0.071 [0.834, 0.865]**<br><sub>2,000 queries, 2 seeds</sub> |" in row
     for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
         assert len({line.count("|") for line in table.splitlines()}) == 1
 

@@ -56,9 +56,17 @@ def test_the_tables_between_the_marks_are_of_the_results(tmp_path, monkeypatch):
     assert "| 0.700, 0.600\\* [200" in wall  # an older way out
     assert text.count("\\*") == 2
     assert all(f"| `{task}` |" in text for task in envs.TASKS)
+    assert "seeds" not in text
     # Again, the same.
     unseen.main()
     assert page.read_text() == text
+    # With another seed.
+    hard["dagger, points, seed 3"] = result(0.91, 0.85)
+    results.write_text(json.dumps(found))
+    unseen.main()
+    sentence = "`dagger.py` with points, 2 seeds, `random_boxes_hard`: success 0.930, 0.910, so "
+    sentence += "0.920 ± 0.014; clean 0.910, 0.850, so 0.880 ± 0.042; of 3,000, 200 test queries."
+    assert sentence in page.read_text().splitlines()
 
 
 def test_what_is_run_again():
