@@ -64,7 +64,7 @@ for _encoder, _layer in BC_LAYERS.items():
     }
 TOLD = "dagger, points told by field"  # trained with points that are seen
 SEES = "dagger, points"
-# The same training with other seeds, on the same roadmaps: in `HARD` only.
+# The same training with other seeds (the first learned from older roadmaps): in `HARD` only.
 SEEDS = {f"{SEES}, seed {_seed}": f"dagger-combined-points-{HARD}-s{_seed}" for _seed in (2, 3)}
 CELLS |= {_name: ["--policy", _policy] for _name, _policy in SEEDS.items()}
 for _name, _policy, _layer, _encoder in (
