@@ -39,7 +39,7 @@ BASELINES = ROOT / "docs" / "baselines.json"
 PAPER_CELLS = ROOT / "benchmarks" / "paper_cells.csv"
 POLICIES = ROOT / "bc_script" / "policies"
 HARD = "random_boxes_hard"
-# What a last layer around any policy keeps: see docs/last_layer.md.
+# What a last layer around any policy keeps: see docs/experiments.md.
 OBSTACLES = ["--keep-distance", "0.01"]
 POINTS = ["--keep-distance", "0.01", "--encoder", "points"]
 STRAIGHT = ["--policy", "go-to-goal", "--goal-type", "combined"]

@@ -29,7 +29,7 @@ from envs.subgoals import MAX_STEP
 # with 2 it took slow arrivals for dead ends, and braked as much near a goal as elsewhere.
 VERSION = 3
 
-# The numbers below were chosen on validation and fresh queries: docs/last_layer.md.
+# The numbers below were chosen on validation and fresh queries: docs/experiments.md.
 NEAR = 0.15  # m, from where on a link is looked at
 # Share of the way that is left that one step may take: the arm does not stop at once.
 BRAKE = 0.2
