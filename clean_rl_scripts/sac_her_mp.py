@@ -72,7 +72,7 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     """entropy that the tuning aims at, of the unscaled action (CleanRL: minus its dimensions)"""
     policy_frequency: flags.PositiveInt = 2
     """updates of the critics per update of the policy (CleanRL: as often as the critics)"""
-    policy_average: flags.PositiveShare = 0.001
+    policy_average: flags.PositiveShare = 0.0003
     """share of the policy that moves into its running average per update of the policy; the average
     is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
     hidden_size: flags.Width = 256

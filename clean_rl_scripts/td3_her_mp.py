@@ -73,7 +73,7 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     """bound of the noise that smooths the critics' target, in units of action_scale"""
     policy_frequency: flags.PositiveInt = 2
     """updates of the critics per update of the policy and of all target networks"""
-    policy_average: flags.PositiveShare = 0.001
+    policy_average: flags.PositiveShare = 0.0003
     """share of the policy that moves into its running average per update of the policy; the average
     is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
     preactivation_penalty: flags.NonNegativeFloat = 0.1
