@@ -162,6 +162,7 @@ def policies_of(algorithm):
 def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
     """Train, evaluate and keep one cell's policy with one seed; what was done is not done again."""
     script, name = SCRIPTS[cell.algorithm], f"{cell.name}-s{seed}"
+    runs_dir.mkdir(parents=True, exist_ok=True)
     kept = policies_of(cell.algorithm) / f"{name}.json"
     if kept.exists():
         result = json.loads(kept.read_text())
@@ -170,7 +171,6 @@ def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
         elif result["steps"] >= steps:
             evaluate_on_more(kept, result, cell.task, num_queries, runs_dir)
             return
-    runs_dir.mkdir(parents=True, exist_ok=True)
     if cell.task != cell.trained_on:  # a policy of another cell
         trained = replace(cell, task=cell.trained_on)
         run(trained, seed, steps, num_queries, runs_dir, keep_policies)

@@ -187,7 +187,8 @@ def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
     capfd.readouterr()
     paper_tables.run(cell, 5, 60, 4, tmp_path / "runs")
     assert capfd.readouterr().out == "bc-config-wall-s5: done before\n"
-    paper_tables.run(cell, 5, 60, 6, tmp_path / "runs")  # more queries: no training
+    # More queries: no training, and none of its files are needed.
+    paper_tables.run(cell, 5, 60, 6, tmp_path / "not_there")
     assert "--total-updates" not in capfd.readouterr().out
     more = json.loads((tmp_path / "policies" / "bc-config-wall-s5.json").read_text())
     evaluated = ("success_rate", "success_rate_interval", "clean_success_rate", "num_queries")
