@@ -502,17 +502,22 @@ def draw_story(cells, results, baselines, unseen, path):
 
 
 def draw_curves(cells, results, path):
-    """Validation success over steps, one line per run."""
-    figure, axes = plt.subplots(figsize=(9, 5), layout="constrained")
-    axes.set_prop_cycle(color=plt.colormaps["tab20"].colors)
-    for cell in (cell for cell in cells if cell.task == cell.trained_on):
-        for result in results.get(cell.name, []):
-            name = f"{cell.name}-s{result['seed']}"
-            style = {"marker": ".", "linestyle": LINES.get(cell.algorithm, "-."), "label": name}
-            axes.plot(*zip(*result["curve"], strict=True), **style)
-    axes.set(xlabel="environment steps (BC: batches)", ylabel="validation success", ylim=(0, 1))
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
+    """Validation success over steps: a panel per task, a line per run, a colour per cell."""
+    done = [cell for cell in cells if cell.task == cell.trained_on and cell.name in results]
+    tasks = list(dict.fromkeys(cell.task for cell in done))
+    figure, all_axes = plt.subplots(
+        len(tasks), figsize=(9, 2.4 * len(tasks)), squeeze=False, sharex=True, layout="constrained"
+    )
+    for task, axes in zip(tasks, all_axes[:, 0], strict=True):
+        for i, cell in enumerate(cell for cell in done if cell.task == task):
+            style = {"marker": ".", "linestyle": LINES.get(cell.algorithm, "-."), "color": f"C{i}"}
+            for result in results[cell.name]:
+                (line,) = axes.plot(*zip(*result["curve"], strict=True), **style)
+            line.set_label(_label(cell))  # once for all seeds
+        axes.set(title=task, ylabel="validation success", ylim=(0, 1))
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
+    all_axes[-1, 0].set_xlabel("environment steps (BC: batches)")
     _save(figure, path)
 
 
@@ -531,7 +536,7 @@ def draw_bars(cells, results, path):
             axes.barh(i + 0.2, mean, 0.4, color="tab:blue", label="ours")
             if cell.mean is not None:
                 axes.barh(i - 0.2, cell.mean, 0.4, xerr=cell.std, color="tab:gray", label="paper")
-        axes.set_yticks(range(len(chosen)), [_bar_label(cell) for cell in chosen])
+        axes.set_yticks(range(len(chosen)), [_label(cell) for cell in chosen])
         axes.set(title=task, xlim=(0, 1))
     handles, labels = all_axes[0, 0].get_legend_handles_labels()
     figure.legend(handles[:2], labels[:2], loc="outside lower center", ncols=2)
@@ -547,7 +552,7 @@ def _save(figure, path):
     picture.save(path, optimize=True)
 
 
-def _bar_label(cell):
+def _label(cell):
     encoder = f", {ENCODERS[cell.encoder]}" if cell.encoder else ""
     return f"{cell.label}, {cell.goal_type}{encoder}" + ", no hindsight" * (cell.hindsight == "no")
 
