@@ -149,7 +149,13 @@ KEPT = (
     *("num_queries", "ms_per_action", "planning_seconds", "mean_steps", "path_length"),
     *("env", "encoder", "last_layer", "seed"),
 )
-LAYER_MARKS = {1: "\\*", 2: "‡"}
+LAYER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the last layer that a result had
+ENCODER_MARK = "†"
+MARKS = {
+    LAYER_MARKS[1]: "with the way out of dead ends as it was before 2026-11-24, without a memory",
+    LAYER_MARKS[2]: "with the last layer as it was when it took slow arrivals for dead ends",
+    ENCODER_MARK: "with an encoder that has been replaced since",
+}
 BEGIN, END = "<!-- written by benchmarks/unseen_obstacles.py -->\n", "<!-- until here -->\n"
 
 
@@ -301,9 +307,8 @@ def tables(results, others):
         lines += ["", _of_seeds([hard[name] for name in (SEES, *SEEDS) if name in hard])]
     dates = sorted({result["date"] for cells in results.values() for result in cells.values()})
     lines += ["", f"In brackets, test queries and the 95 % interval of success. To {dates[-1]}."]
-    lines += ["\\*: with the way out of dead ends as it was before 2026-11-24, without a memory."]
-    lines += ["‡: with the last layer as it was when it took slow arrivals for dead ends."]
-    lines += ["†: with an encoder that has been replaced since."]
+    shown = "".join(lines)
+    lines += [f"{mark}: {meaning}." for mark, meaning in MARKS.items() if mark in shown]
     return "\n".join(lines) + "\n"
 
 
@@ -329,7 +334,7 @@ def _cell(result):
         return "not run"
     low, high = result["success_rate_interval"]
     rates = f"{result['success_rate']:.3f}, {result['clean_success_rate']:.3f}"
-    mark = LAYER_MARKS.get(version_of_layer(result), "") + "†" * had_other_encoder(result)
+    mark = LAYER_MARKS.get(version_of_layer(result), "") + ENCODER_MARK * had_other_encoder(result)
     return f"{rates}{mark} [{result['num_queries']:,}: {low:.3f}, {high:.3f}]"
 
 
