@@ -62,6 +62,8 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
     """number of hidden layers"""
     relative_goal: bool = True
     """add goal minus end-effector position, times 5, to the network's inputs"""
+    relative_configuration: bool = False
+    """add goal minus configuration, times 5, to the network's inputs, where goals have one"""
     trigonometric: bool = True
     """add the joint angles' sines and cosines to the network's inputs"""
     bf16: bool = False
@@ -90,7 +92,8 @@ class Features(nn.Module):
 
     def __init__(self, args, observation_size):
         super().__init__()
-        self.goal_type, self.relative_goal = args.goal_type, args.relative_goal
+        self.relative_goal = args.relative_goal and args.goal_type != "config"
+        self.relative_configuration = args.relative_configuration and args.goal_type != "ee"
         self.trigonometric = args.trigonometric
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
@@ -99,7 +102,7 @@ class Features(nn.Module):
         self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
         self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.proximity else None
         self.size = observation_size + goal_size + 14 * args.trigonometric + 10 * bool(self.near)
-        self.size += 3 * (args.relative_goal and args.goal_type != "config")
+        self.size += 3 * self.relative_goal + 7 * self.relative_configuration
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""
@@ -107,8 +110,10 @@ class Features(nn.Module):
         if self.trigonometric:
             angles = observation[:, :7] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
-        if self.relative_goal and self.goal_type != "config":
+        if self.relative_goal:
             inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
+        if self.relative_configuration:
+            inputs.append(5.0 * (desired_goal[:, :7] - observation[:, :7]))
         if self.near is not None:
             inputs.append(10.0 * observation[:, self.near])  # the links' distances, which are small
         return torch.cat(inputs, dim=1)

@@ -86,6 +86,8 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     so with the full range of 1 every step is a longest step, which overshoots the goal"""
     relative_goal: bool = True
     """add goal minus end-effector position, times 5, to the networks' inputs"""
+    relative_configuration: bool = True
+    """add goal minus configuration, times 5, to the networks' inputs, where goals have one"""
     trigonometric: bool = True
     """add the joint angles' sines and cosines to the networks' inputs"""
     bf16: bool | None = None
@@ -112,7 +114,8 @@ class Features(nn.Module):
 
     def __init__(self, args, observation_size):
         super().__init__()
-        self.goal_type, self.relative_goal = args.goal_type, args.relative_goal
+        self.relative_goal = args.relative_goal and args.goal_type != "config"
+        self.relative_configuration = args.relative_configuration and args.goal_type != "ee"
         self.trigonometric = args.trigonometric
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
@@ -121,7 +124,7 @@ class Features(nn.Module):
         self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
         self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.proximity else None
         self.size = observation_size + goal_size + 14 * args.trigonometric + 10 * bool(self.near)
-        self.size += 3 * (args.relative_goal and args.goal_type != "config")
+        self.size += 3 * self.relative_goal + 7 * self.relative_configuration
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""
@@ -129,8 +132,10 @@ class Features(nn.Module):
         if self.trigonometric:
             angles = observation[:, :7] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
-        if self.relative_goal and self.goal_type != "config":
+        if self.relative_goal:
             inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
+        if self.relative_configuration:
+            inputs.append(5.0 * (desired_goal[:, :7] - observation[:, :7]))
         if self.near is not None:
             inputs.append(10.0 * observation[:, self.near])  # the links' distances, which are small
         return torch.cat(inputs, dim=1)
@@ -280,19 +285,15 @@ class HerReplayBuffer:
 
     def load_state_dict(self, state):
         self.size, self.position = len(state["rows"]), state["position"]
-        self.rows[: self.size] = state["rows"].numpy()
-        self.remaining[: self.size] = state["remaining"].numpy()
-        self.latent_row[: self.size] = state["latent_row"].numpy()
+        for name in ("rows", "remaining", "latent_row"):
+            getattr(self, name)[: self.size] = state[name].numpy()
         for latent in state["latents"].numpy():
             self.latents.row_of(latent)
 
 
 # ALGO LOGIC: demonstrations
 def inject_demonstration(is_success, demo_prob, rng):
-    """Whether the demonstration of its query enters the buffer after an episode.
-
-    Only failures are shown how to do it, and only with probability `demo_prob`.
-    """
+    """Whether a demonstration enters the buffer: after a failure, with probability `demo_prob`."""
     return not is_success and rng.random() < demo_prob
 
 
@@ -322,8 +323,7 @@ def polyak_update(target_parameters, parameters, tau):
 def updates_due(step, buffer, args):
     """Number of updates that fall due in the environment steps that led to `step`.
 
-    None before `learning_starts`, and none for steps in which nothing was there to learn from:
-    episodes enter the buffer when they end.
+    None before `learning_starts`, and none before the first episode has ended.
     """
     if buffer.size == 0:
         return 0

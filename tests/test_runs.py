@@ -163,6 +163,8 @@ def test_a_checkpoint_brings_every_part_back(parse, tmp_path):
     ):
         with pytest.raises(SystemExit, match=f"of another version: it has no {name}"):
             runs.load_checkpoint(args, after | newer)
+    with pytest.raises(SystemExit, match=r"of another version: (.|\n)*size mismatch for weight"):
+        runs.load_checkpoint(args, after | {"model": torch.nn.Linear(4, 2)})
 
 
 def test_the_random_numbers_of_the_runs_own_gpu(parse, tmp_path, monkeypatch):

@@ -58,18 +58,25 @@ def test_log_probability_is_the_squashed_gaussians():
     torch.testing.assert_close(deterministic, 0.06 * torch.tanh(mean))
 
 
-def test_network_inputs():
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+def test_network_inputs(goal_type):
     from envs import panda
 
     rng = np.random.default_rng(0)
     c = rng.uniform(panda.LOWER, panda.UPPER, (5, 7))
-    position, goal = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
-    observation = torch.tensor(np.hstack([panda.normalise(c), position]), dtype=torch.float32)
-    features = sac.Features(sac.Args(), 10)
-    inputs = features(observation, torch.tensor(goal, dtype=torch.float32)).numpy()
+    state, goal_state = panda.normalise(c), rng.uniform(-1, 1, (5, 7))
+    position, goal_position = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
+    goal = {"ee": goal_position, "config": goal_state}.get(
+        goal_type, np.hstack([goal_state, goal_position])
+    )
+    expected = [state, position, goal, np.sin(c), np.cos(c)]
+    expected += [5 * (goal_position - position)] * (goal_type != "config")
+    expected += [5 * (goal_state - state)] * (goal_type != "ee")
+    observation = np.hstack([state, position])
+    features = sac.Features(sac.Args(goal_type=goal_type), 10)
+    inputs = features(torch.tensor(observation).float(), torch.tensor(goal).float()).numpy()
     assert inputs.shape == (5, features.size)
-    expected = np.hstack([observation, goal, np.sin(c), np.cos(c), 5 * (goal - position)])
-    np.testing.assert_allclose(inputs, expected, atol=1e-5)
+    np.testing.assert_allclose(inputs, np.hstack(expected), atol=1e-5)
 
 
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
