@@ -134,6 +134,9 @@ class Cell:
 
     def is_recipe_of(self, args):
         """Whether a run with the flags `args`, a dict from its JSON, is one of this cell."""
+        has_configuration = self.algorithm in ("sac", "td3") and self.goal_type != "ee"
+        if has_configuration and not args.get("relative_configuration"):
+            return False  # from before it was an input by default
         given = self.flags()
         for flag, value in dict(zip(given[::2], given[1::2], strict=True)).items():
             had = args.get(flag.removeprefix("--").replace("-", "_"))
@@ -448,11 +451,10 @@ def page(cells, results, baselines, unseen):
     lines[-1] += "; ".join(
         f"{name}: `{' '.join(flags)}`" for name, flags in RECIPES.items() if flags
     )
-    lines[-1] += (
-        ". Each kept policy's JSON has all of its flags, also where it says `other flags` (TD3's"
-    )
-    lines[-1] += " are older than its penalty). (The paper's networks have two hidden"
-    lines[-1] += " layers, with encoders four.)"
+    lines[-1] += ". Each kept policy's JSON has all of its flags, also where it says `other flags`"
+    lines[-1] += ": TD3 with goal `ee` is older than its penalty, others than goal minus"
+    lines[-1] += " configuration ([experiments.md](experiments.md#goal-minus-configuration)). (The"
+    lines[-1] += " paper's networks have two hidden layers, with encoders four.)"
     below = []
     for cell in done:
         mean = statistics.mean(result["success_rate"] for result in results[cell.name])

@@ -92,6 +92,16 @@ def test_a_cell_is_a_command():
     assert flags[-4:] == ["--encoder", "vae", "--num-hidden-layers", "4"]
 
 
+def test_runs_from_before_goal_minus_configuration_are_others():
+    recipe = {"gamma": 0.98, "target_entropy": -14.0, "num_hidden_layers": 3, "demo_prob": 1.0}
+    for goal_type, fits in (("ee", True), ("config", False), ("combined", False)):
+        cell = CELLS[f"sac-{goal_type}-wall-p1"]
+        args = recipe | {"task": "wall", "goal_type": goal_type}
+        assert cell.is_recipe_of(args) is fits
+        assert cell.is_recipe_of(args | {"relative_configuration": True})
+        assert cell.is_recipe_of(args | {"relative_configuration": False}) is fits
+
+
 def test_the_page_shows_what_was_run_and_what_was_not(results):
     page = paper_tables.page(list(CELLS.values()), results, BASELINES, {})
     in_small = "<sub>300,000 steps, 1 seed</sub><br>0.971 ± 0.003"
