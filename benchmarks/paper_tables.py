@@ -440,7 +440,7 @@ def page(cells, results, baselines, unseen):
             "[unseen_obstacles.md](unseen_obstacles.md).",
         ]
     lines += long_runs(cells, results)
-    lines += ["", "Why behavioural cloning with z_E gets lost in scenes of other kinds:"]
+    lines += ["", "Why policies that know z_E get lost in scenes of other kinds:"]
     lines += ["[experiments.md](experiments.md#behavioural-cloning-in-scenes-of-other-kinds)."]
     lines += ["", "## The runs", ""]
     done = [cell for cell in cells if cell.name in results]
