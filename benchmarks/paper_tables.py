@@ -427,7 +427,7 @@ def page(cells, results, baselines, unseen):
     lines += ["", "## Hindsight: `no_obstacles`, goal `combined`", ""]
     names = {"yes": "hindsight", "no": "no hindsight"}
     lines += table(hindsight, results, lambda cell: names[cell.hindsight], {})
-    lines += ["", "How learning without hindsight goes on, and why ours stopped early:"]
+    lines += ["", "How far learning without hindsight had come when ours stopped:"]
     lines += ["[experiments.md](experiments.md#demonstrations)."]
     lines += ["", "## Encoders: trained on `random_boxes_hard`, goal `combined`", ""]
     encoded = [cell for cell in cells if cell.encoder]
