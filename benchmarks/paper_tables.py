@@ -454,7 +454,7 @@ def page(cells, results, baselines, unseen):
         f"{name}: `{' '.join(flags)}`" for name, flags in RECIPES.items() if flags
     )
     lines[-1] += ". Each kept policy's JSON has all of its flags, also where it says `other flags`"
-    lines[-1] += ": TD3 with goal `ee` is older than its penalty, others than goal minus"
+    lines[-1] += ": TD3 with goal `ee` there is older than its penalty, others than goal minus"
     lines[-1] += " configuration ([experiments.md](experiments.md#goal-minus-configuration)). (The"
     lines[-1] += " paper's networks have two hidden layers, with encoders four.)"
     below = []
