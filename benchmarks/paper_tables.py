@@ -464,6 +464,9 @@ def page(cells, results, baselines, unseen):
             below.append(f"`{cell.name}` ({mean:.3f}, paper {cell.mean:.3f})")
     lines += ["", f"Below the paper by more than {FAR_BELOW}: {', '.join(below) or 'none'}"]
     lines[-1] += " of these runs."
+    if below:
+        lines[-1] += " What was found: [experiments.md](experiments.md#demonstrations);"
+        lines[-1] += " with encoders, see below their table."
     lines += ["", "![success over steps](pictures/results_curves.png)"]
     lines += ["", "![success per task](pictures/results_bars.png)", ""]
     return "\n".join(lines)
