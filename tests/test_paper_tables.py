@@ -116,7 +116,7 @@ def test_the_page_shows_what_was_run_and_what_was_not(results):
     assert page.count("<sub>") == 4
     assert page.count("| *floor: go-to-goal* |  | 0.700 |") == 3
     assert page.count("| *ceiling: RRT-Connect, 5 s* |  | 1.000 |") == 3
-    below = "`sac-ee-double_walls-p1` (0.830, paper 0.916) of these runs."
+    below = "`sac-ee-double_walls-p1` (0.830, paper 0.916) of these runs. What was found: "
     assert f"Below the paper by more than 0.05: {below}" in page
     assert (
         "| `bc-combined-no_obstacles-s2`, not kept, other flags | 0.982 [0.979, 0.984] | 0.491 |"
