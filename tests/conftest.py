@@ -1,9 +1,12 @@
+import contextlib
 import random
 import signal
 
+import meta_device
 import numpy as np
 import pytest
 import torch
+from trainers import GPU
 
 from envs import protocol
 
@@ -30,6 +33,14 @@ def seeded():
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)
+
+
+@pytest.fixture(params=["meta", GPU])
+def another_device(request):
+    """`--device` for a trainer: a GPU, and `meta`, which stands in for one where there is none."""
+    is_meta = request.param == "meta"
+    with meta_device.in_cudas_place() if is_meta else contextlib.nullcontext():
+        yield request.param
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ import sys
 import time
 from pathlib import Path
 
-import meta_device
 import numpy as np
 import pytest
 import torch
@@ -268,24 +267,22 @@ def test_a_run_killed_and_resumed_its_policy_by_name(tmp_path, folder):
     assert bare["collision_rate"] >= result["collision_rate"]
 
 
-def test_nothing_of_a_run_needs_the_cpu(tmp_path, folder, short_episodes):
-    """Updates, a round, an evaluation and a resume, with the `meta` device in CUDA's place."""
+def test_nothing_of_a_run_needs_the_cpu(tmp_path, folder, another_device, short_episodes):
+    """Updates, a round, an evaluation and a resume, on another device."""
     few = ["--total-updates", "4", "--eval-every", "4", "--round-every", "2", "--eval-queries", "1"]
-    flags = ["--paths", str(folder), "--encoder", "oracle", "--device", "meta", *few]
-    with meta_device.in_cudas_place():
-        run = run_script("dagger", tmp_path, *flags)
+    flags = ["--paths", str(folder), "--encoder", "oracle", *few]
+    run = run_script("dagger", tmp_path, *flags, "--device", another_device)
     assert load_network(run / "policy.pt").metadata["step"] == 4
     assert json.loads((run / "result.json").read_text())["steps"] == 4
     args = json.loads((run / "args.json").read_text())
     assert args["bf16"] is True
     (run / "args.json").write_text(json.dumps(args | {"total_updates": 6}))
-    with meta_device.in_cudas_place():
-        run_here(PATHS["dagger"], "--resume", run)
+    run_here(PATHS["dagger"], "--resume", run)
     assert json.loads((run / "result.json").read_text())["steps"] == 6
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     assert state["progress"]["updates"] == 6
     for name in ("actor", "visited"):  # a round came after the resume, too
-        assert state[name] and all(tensor.is_meta for tensor in state[name].values())
+        assert {tensor.device.type for tensor in state[name].values()} == {another_device}
 
 
 def test_no_kernel_gets_two_types(tmp_path, folder, short_episodes):

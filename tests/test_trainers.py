@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import PATHS, TRAINERS, command, load, refusal, run_here, run_script
+from trainers import GPU, PATHS, TRAINERS, command, load, refusal, run_here, run_script
 
 import envs
 from envs.datasets import demo_path
@@ -135,10 +135,13 @@ def same(a, b):
         assert a == b
 
 
-def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer):
-    whole = run_script(trainer, tmp_path / "whole")
+@pytest.mark.parametrize("device", ["cpu", GPU])
+def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer, device):
+    whole = run_script(trainer, tmp_path / "whole", "--device", device)
     process = subprocess.Popen(
-        command(trainer, tmp_path / "killed"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        command(trainer, tmp_path / "killed", "--device", device),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     deadline = time.time() + 120
     while not list((tmp_path / "killed").glob("*/checkpoint.pt")) and time.time() < deadline:

@@ -18,6 +18,8 @@ PATHS = {
 }
 # Those that need nothing but a task; dagger.py needs roadmap paths.
 TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
+NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
+GPU = pytest.param("cuda", marks=NO_GPU)  # a `--device`
 TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
 TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1200"
 TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --eval-queries 3"
