@@ -395,7 +395,7 @@ def _prepare(
         if last_layer is None:
             last_layer = own_layer(policy)
         if last_layer:
-            own = env.get("proximity", encoder or "obstacles")
+            own = env.get("proximity") or encoder or "obstacles"
             if encoder not in (None, own):
                 raise EvaluationError(f"{policy} is told its distances from {own}, not {encoder}")
             env["proximity"] = own

@@ -20,7 +20,7 @@ from demo_generation.planning import Planner
 from envs import panda
 from envs.datasets import load_queries, write_queries
 from envs.exported_networks import save_network
-from envs.last_layer import VERSION
+from envs.last_layer import VERSION, LastLayer
 from envs.policies import make_policy
 from envs.scene_files import save_scene
 from envs.scenes import Box, Scene
@@ -303,6 +303,20 @@ def test_a_last_layer_around_a_policy(tmp_path):
     layer = json.loads((tmp_path / "result.json").read_text())["last_layer"]
     assert not layer["way_out"] and layer["keep"] > 0
     assert found["points"]["seed"] == 0 and found["bare"]["seed"] is None
+
+
+@pytest.mark.parametrize("noted", [{}, {"proximity": None}])  # before and since SAC and TD3 had it
+def test_a_last_layer_around_a_network_that_has_no_distances(tmp_path, noted):
+    path = _save(tmp_path / "policy.pt", env={"goal_type": "config"} | noted)
+    bare = evaluate(path, "boxes", split="validation", num_queries=5)
+    assert bare["env"].get("proximity") is None and bare["collision_rate"] > 0
+    for encoder, knows in ((None, "obstacles"), ("points", "points")):
+        layer = LastLayer(keep=0.01)
+        result = evaluate(
+            path, "boxes", split="validation", num_queries=5, last_layer=layer, encoder=encoder
+        )
+        assert result["env"]["proximity"] == knows
+        assert result["collision_rate"] < bare["collision_rate"]
 
 
 def test_a_planner_that_looks():
