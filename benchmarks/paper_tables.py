@@ -134,6 +134,8 @@ class Cell:
 
     def is_recipe_of(self, args):
         """Whether a run with the flags `args`, a dict from its JSON, is one of this cell."""
+        if self.algorithm not in RECIPES:
+            return True  # an algorithm of one's own
         has_configuration = self.algorithm in ("sac", "td3") and self.goal_type != "ee"
         if has_configuration and not args.get("relative_configuration"):
             return False  # from before it was an input by default
@@ -299,11 +301,18 @@ def ours(found):
     return f"{rate:.3f}{deviation} [{low:.3f}, {high:.3f}]"
 
 
-def in_small(found):
-    """How many steps and seeds a cell's results have."""
+def of_recipe(cell, results):
+    """A cell's results: those with its flags; where there are none, those with others."""
+    found = results.get(cell.name, [])
+    return [result for result in found if cell.is_recipe_of(result["args"])] or found
+
+
+def in_small(cell, found):
+    """How many steps and seeds a cell's results have, and whether they had other flags."""
     steps = sorted({result["steps"] for result in found})
     steps = " to ".join(f"{n:,}" for n in (steps[0], steps[-1])[: len(steps)])
-    return f"<sub>{steps} steps, {_seeds(found)}</sub>"
+    others = "" if cell.is_recipe_of(found[0]["args"]) else ", other flags"
+    return f"<sub>{steps} steps, {_seeds(found)}{others}</sub>"
 
 
 def _seeds(found):
@@ -338,8 +347,8 @@ def table(cells, results, column, baselines, more=()):
     rows, columns = {}, {}
     for cell in cells:
         columns[column(cell)] = cell.task
-        found = results.get(cell.name)
-        text = f"**{ours(found)}**<br>{in_small(found)}" if found else "not run"
+        found = of_recipe(cell, results)
+        text = f"**{ours(found)}**<br>{in_small(cell, found)}" if found else "not run"
         label = cell.label + (f", {ENCODERS[cell.encoder]}" if cell.encoder else "")
         rows.setdefault(label, {})[column(cell)] = f"{text}<br>{cell.paper}"
     rows |= dict(more)
@@ -383,7 +392,7 @@ def runs_table(cells, results):
             clean = result["clean_success_rate"]
             clean = "not known" if clean is None else f"{clean:.3f}"
             name = f"`{cell.name}-s{result['seed']}`" + ("" if result["kept"] else ", not kept")
-            if cell.algorithm in RECIPES and not cell.is_recipe_of(result["args"]):
+            if not cell.is_recipe_of(result["args"]):
                 name += ", other flags"
             lines.append(
                 f"| {name} | {ours([result])} | {clean} "
@@ -402,7 +411,8 @@ def page(cells, results, baselines, unseen):
         "![floor, paper, ours, ceiling](pictures/results_story.png)",
         "",
         "Success on test queries: in bold ours with its 95 % interval (of several seeds: over",
-        "all their queries, and the seeds' deviation), in small the steps (BC: batches) and seeds;",
+        "all their queries, and the seeds' deviation), in small the steps (BC: batches) and seeds",
+        "([other flags](#the-runs): only where there is no run with today's);",
         "below it the paper's, mean ± standard deviation of four seeds, after 1,000,000 steps",
         f"({LONG_RUN:,} for random boxes). The last rows do not learn, and know a goal",
         "configuration (measured with goal `ee`: [baselines.md](baselines.md)). `reactive, points`",
@@ -459,7 +469,7 @@ def page(cells, results, baselines, unseen):
     lines[-1] += " paper's networks have two hidden layers, with encoders four.)"
     below = []
     for cell in done:
-        mean = statistics.mean(result["success_rate"] for result in results[cell.name])
+        mean = statistics.mean(result["success_rate"] for result in of_recipe(cell, results))
         if cell.mean is not None and mean < cell.mean - FAR_BELOW:
             below.append(f"`{cell.name}` ({mean:.3f}, paper {cell.mean:.3f})")
     lines += ["", f"Below the paper by more than {FAR_BELOW}: {', '.join(below) or 'none'}"]
@@ -539,7 +549,7 @@ def draw_bars(cells, results, path):
     for task, axes in zip(tasks, all_axes[:, 0], strict=True):
         chosen = [cell for cell in done if cell.task == task][::-1]
         for i, cell in enumerate(chosen):
-            mean = statistics.mean(result["success_rate"] for result in results[cell.name])
+            mean = statistics.mean(result["success_rate"] for result in of_recipe(cell, results))
             axes.barh(i + 0.2, mean, 0.4, color="tab:blue", label="ours")
             if cell.mean is not None:
                 axes.barh(i - 0.2, cell.mean, 0.4, xerr=cell.std, color="tab:gray", label="paper")
@@ -611,7 +621,7 @@ def main():
     if args.list:
         results = load_results(folders)
         for cell in cells:
-            found = results.get(cell.name)
+            found = of_recipe(cell, results)
             print(f"{cell.name:60} {cell.paper}   {ours(found) if found else 'not run'}")
         return
     # `kill` ends the trainer too: `subprocess.run` does that for whatever is raised.

@@ -47,13 +47,19 @@ def result(name, seed, success, **more):
     return made_up | more
 
 
+def args_of(name, **more):
+    """What a run of the cell's own recipe has in its JSON."""
+    given = CELLS[name].flags()
+    return {f[2:].replace("-", "_"): v for f, v in zip(given[::2], given[1::2], strict=True)} | more
+
+
 BASELINES = {"wall": {"go-to-goal": {"success_rate": 0.7}, "RRT-Connect, 5 s": {"success_rate": 1}}}
 
 
 @pytest.fixture
 def results(tmp_path):
     made_up = [
-        result("sac-ee-wall-p1", 1, 0.95),
+        result("sac-ee-wall-p1", 1, 0.95, args=args_of("sac-ee-wall-p1")),
         result("sac-ee-double_walls-p1", 1, 0.83),
         *(result("bc-combined-no_obstacles", seed, 0.98 + seed / 1000) for seed in (1, 2, 3)),
         result("sac-combined-no_obstacles-p0-no_hindsight", 1, 0.002),
@@ -107,7 +113,7 @@ def test_the_page_shows_what_was_run_and_what_was_not(results):
     in_small = "<sub>300,000 steps, 1 seed</sub><br>0.971 ± 0.003"
     assert f"**0.950 [0.946, 0.954]**<br>{in_small}" in page
     deviation = statistics.stdev([0.981, 0.982, 0.983])  # the interval is that of 30,000 queries
-    in_small = "<sub>300,000 steps, 3 seeds</sub><br>0.986 ± 0.002"
+    in_small = "<sub>300,000 steps, 3 seeds, other flags</sub><br>0.986 ± 0.002"
     assert f"**0.982 ± {deviation:.3f} [0.980, 0.983]**<br>{in_small}" in page
     assert "not run<br>0.848 ± 0.027" in page
     # The `combined` cells on `no_obstacles` with p stand in two tables.
@@ -125,6 +131,16 @@ def test_the_page_shows_what_was_run_and_what_was_not(results):
     assert "300,000 (275,000) | 10,000 | 10 min | 2026-01-02, abc1234 |" in page
     for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
         assert len({line.count("|") for line in table.splitlines()}) == 1
+
+
+def test_runs_with_other_flags_do_not_count_beside_the_cells_own(results):
+    name = "sac-ee-double_walls-p1"  # so far with other flags, and far below the paper
+    results[name] += [result(name, 2, 0.9, args=args_of(name), kept=False)]
+    page = paper_tables.page(list(CELLS.values()), results, BASELINES, {})
+    assert "**0.900 [0.894, 0.906]**<br><sub>300,000 steps, 1 seed</sub><br>0.916" in page
+    assert "Below the paper by more than 0.05: none" in page
+    assert f"| `{name}-s1`, not kept, other flags | 0.830" in page
+    assert f"| `{name}-s2`, not kept | 0.900" in page
 
 
 def test_an_algorithm_of_ones_own(results, tmp_path):
