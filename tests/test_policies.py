@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import envs
+from envs.exported_networks import halve_network
 from envs.last_layer import LastLayer
 from envs.policies import (
     PolicyError,
@@ -38,6 +39,13 @@ def test_shipped_policies_are_found_from_anywhere(tmp_path, monkeypatch):
         policy_file("sac-ee-wall-p1-s2")
     (tmp_path / "sac-ee-wall-p1-s1" / "policy.pt").write_bytes(b"")
     assert policy_file("sac-ee-wall-p1-s1") == Path("sac-ee-wall-p1-s1/policy.pt")
+
+
+@pytest.mark.parametrize("name", shipped_policies())
+def test_shipped_policies_are_in_half_precision(name, tmp_path):
+    path = shipped_policies()[name]
+    halve_network(path, tmp_path / "policy.pt")
+    assert (tmp_path / "policy.pt").read_bytes() == path.read_bytes()
 
 
 def test_a_policy_in_an_environment_without_what_it_sees():
