@@ -307,6 +307,11 @@ def of_recipe(cell, results):
     return [result for result in found if cell.is_recipe_of(result["args"])] or found
 
 
+def mean_success(cell, results):
+    """Over the seeds of a cell that was run."""
+    return statistics.mean(result["success_rate"] for result in of_recipe(cell, results))
+
+
 def in_small(cell, found):
     """How many steps and seeds a cell's results have, and whether they had other flags."""
     steps = sorted({result["steps"] for result in found})
@@ -469,7 +474,7 @@ def page(cells, results, baselines, unseen):
     lines[-1] += " paper's networks have two hidden layers, with encoders four.)"
     below = []
     for cell in done:
-        mean = statistics.mean(result["success_rate"] for result in of_recipe(cell, results))
+        mean = mean_success(cell, results)
         if cell.mean is not None and mean < cell.mean - FAR_BELOW:
             below.append(f"`{cell.name}` ({mean:.3f}, paper {cell.mean:.3f})")
     lines += ["", f"Below the paper by more than {FAR_BELOW}: {', '.join(below) or 'none'}"]
@@ -500,9 +505,9 @@ def draw_story(cells, results, baselines, unseen, path):
         if all(known):
             low, high = (one["success_rate"] for one in known)
             axes.bar(x, high - low, 0.7, low, color="0.9", label="floor to ceiling")
-        papers = [cell.mean for cell in cells if cell.task == task and cell.mean is not None]
-        own = [r for cell in cells if cell.task == task for r in results.get(cell.name, [])]
-        rates = (papers, [r["success_rate"] for r in own])
+        of_task = [cell for cell in cells if cell.task == task]
+        papers = [cell.mean for cell in of_task if cell.mean is not None]
+        rates = (papers, [mean_success(c, results) for c in of_task if c.name in results])
         sees = unseen.get(task, {}).get("dagger, points")
         rates += ([sees["success_rate"]] if sees else [],)
         for name, found in zip(marks, rates, strict=True):
@@ -528,7 +533,7 @@ def draw_curves(cells, results, path):
     for task, axes in zip(tasks, all_axes[:, 0], strict=True):
         for i, cell in enumerate(cell for cell in done if cell.task == task):
             style = {"marker": ".", "linestyle": LINES.get(cell.algorithm, "-."), "color": f"C{i}"}
-            for result in results[cell.name]:
+            for result in of_recipe(cell, results):
                 (line,) = axes.plot(*zip(*result["curve"], strict=True), **style)
             line.set_label(_label(cell))  # once for all seeds
         axes.set(title=task, ylabel="validation success", ylim=(0, 1))
@@ -549,7 +554,7 @@ def draw_bars(cells, results, path):
     for task, axes in zip(tasks, all_axes[:, 0], strict=True):
         chosen = [cell for cell in done if cell.task == task][::-1]
         for i, cell in enumerate(chosen):
-            mean = statistics.mean(result["success_rate"] for result in of_recipe(cell, results))
+            mean = mean_success(cell, results)
             axes.barh(i + 0.2, mean, 0.4, color="tab:blue", label="ours")
             if cell.mean is not None:
                 axes.barh(i - 0.2, cell.mean, 0.4, xerr=cell.std, color="tab:gray", label="paper")
