@@ -47,10 +47,10 @@ def result(name, seed, success, **more):
     return made_up | more
 
 
-def args_of(name, **more):
+def args_of(name):
     """What a run of the cell's own recipe has in its JSON."""
     given = CELLS[name].flags()
-    return {f[2:].replace("-", "_"): v for f, v in zip(given[::2], given[1::2], strict=True)} | more
+    return {f[2:].replace("-", "_"): v for f, v in zip(given[::2], given[1::2], strict=True)}
 
 
 BASELINES = {"wall": {"go-to-goal": {"success_rate": 0.7}, "RRT-Connect, 5 s": {"success_rate": 1}}}
