@@ -184,6 +184,15 @@ def test_the_pictures(results, tmp_path):
             assert len(picture.convert("RGB").getcolors(1_000_000)) > 10
 
 
+def test_the_picture_of_tasks_shows_means_over_seeds(results, monkeypatch):
+    figures = []
+    monkeypatch.setattr(paper_tables, "_save", lambda figure, path: figures.append(figure))
+    paper_tables.draw_story(list(CELLS.values()), results, BASELINES, {}, None)
+    drawn = {points.get_label(): points for points in figures[0].axes[0].collections}
+    heights = drawn["ours, the best of the same cells"].get_offsets()[:, 1]
+    assert sorted(heights) == pytest.approx([0.83, 0.95, 0.982])  # seeds: 0.981, 0.982, 0.983
+
+
 def test_a_trainer_does_not_outlive_the_command(tmp_path):
     script = ROOT / "benchmarks" / "paper_tables.py"
     flags = ["--only", "bc-ee-boxes", "--steps", "1000000", "--runs-dir", str(tmp_path)]
