@@ -20,14 +20,17 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from envs import flags, panda, protocol, runs
-from envs.datasets import MAX_STEP, DatasetError, load_demos
-from envs.demo_episodes import observed
-from envs.tasks import task_name
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.demonstrations import load_demos
+from roboarm_nmp.envs.datasets.episodes import observed
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.tasks import task_name
+from roboarm_nmp.envs.training import flags, protocol, runs
 
 
 @dataclass
-class Args(runs.RunFlags):  # those of the run's folder are in `envs/runs.py`
+class Args(runs.RunFlags):  # those of the run's folder are in `envs/training/runs.py`
     exp_name: str = "bc"
     """name of the experiment, part of the run's folder"""
 

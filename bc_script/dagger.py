@@ -1,13 +1,13 @@
 """Imitation of a roadmap planner, with rounds of DAgger. One file: read it top to bottom.
 
-    python -m demo_generation.roadmaps --task random_boxes_hard --scenes 800 --output roadmaps
+    python -m roboarm_nmp.demo_generation.roadmaps --task random_boxes_hard --scenes 800 --output roadmaps
     python bc_script/dagger.py --paths roadmaps --encoder oracle
 
 A policy for scenes that it never saw. It learns the direction in which a roadmap's smoothed path
 goes on, from configurations anywhere on such paths, and from those that it came to by itself
 (DAgger: Ross et al., 2011). It is told what is there (`--encoder`), and how far each link is from
 the nearest thing, here and at the goal (`envs.wrappers.ProximityWrapper`). Part of it is a last
-layer that keeps links away from things (`envs.last_layer`). To make an algorithm of your own, copy
+layer that keeps links away from things (`envs.policies.safety_filter`). To make an algorithm of your own, copy
 this file and change the parts under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are
 those of `bc_script/bc.py`.
 """
@@ -24,21 +24,24 @@ import torch.nn as nn
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from demo_generation.roadmaps import Roadmap
-from envs import flags, panda, protocol, runs, seeing
-from envs.datasets import MAX_STEP, DatasetError
-from envs.demo_episodes import observed
-from envs.encoders import scene_encoder
-from envs.exported_networks import NetworkError
-from envs.last_layer import PATIENCE, PROGRESS, LastLayer
-from envs.queries import Query
-from envs.roadmap_paths import load_roadmap_paths
-from envs.tasks import task_name
+from roboarm_nmp.demo_generation.roadmaps import Roadmap
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.episodes import observed
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.datasets.queries import Query
+from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
+from roboarm_nmp.envs.networks.operations import NetworkError
+from roboarm_nmp.envs.perception import point_clouds as seeing
+from roboarm_nmp.envs.perception.encoders import scene_encoder
+from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, LastLayer
+from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.tasks import task_name
+from roboarm_nmp.envs.training import flags, protocol, runs
 
 
 @dataclass
 class Args(runs.RunFlags):
-    # Those of the run's folder are in `envs/runs.py`.
+    # Those of the run's folder are in `envs/training/runs.py`.
     exp_name: str = "dagger"
     """name of the experiment, part of the run's folder"""
 
@@ -206,7 +209,7 @@ class Examples:
     number of the `scene` (n,), int64.
 
     Args:
-        paths: `envs.roadmap_paths.RoadmapPaths`.
+        paths: `envs.datasets.roadmap_paths.RoadmapPaths`.
         args: the flags.
         device: of the tensors.
     """

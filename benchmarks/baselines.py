@@ -21,9 +21,9 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import envs
-from envs.datasets import load_queries, query_path
-from envs.files import write_atomically
+from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets.queries import load_queries, query_path
+from roboarm_nmp.envs.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, TABLE = ROOT / "docs" / "baselines.json", ROOT / "docs" / "baselines.md"

@@ -1,6 +1,6 @@
 """Compiled collision checks against PyBullet's: do they agree, and how fast are they?
 
-Ours are those of `envs.collision`.
+Ours are those of `envs.collision.checker`.
 
     pip install -c constraints.txt -e .
     python benchmarks/collision.py                # 2 minutes
@@ -37,12 +37,12 @@ import numpy as np
 import pybullet as p
 from tqdm import tqdm
 
-import envs
-from envs import panda
-from envs.collision import CollisionChecker
-from envs.datasets import load_queries
-from envs.encoders import told_checker
-from envs.seeing import seen_checker
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.perception.encoders import told_checker
+from roboarm_nmp.envs.perception.point_clouds import seen_checker
 
 NEAR = 0.01  # m
 SCENES = 40  # of each distribution

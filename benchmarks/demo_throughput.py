@@ -46,11 +46,12 @@ from ompl import geometric as og
 from ompl import util as ou
 from tqdm import tqdm
 
-import envs
-from demo_generation import collect
-from envs import datasets, panda
-from envs.collision import RESOLUTION
-from envs.scenes import Box, Scene
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation import collect
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.checker import RESOLUTION
+from roboarm_nmp.envs.datasets import files as datasets
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
 # The tasks that the plain way can do: with a fixed scene, and a table and a floor.
 FIXED = [

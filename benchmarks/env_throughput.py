@@ -31,8 +31,8 @@ import panda_gym  # noqa: F401  (registers PandaReachJoints-v3)
 import pybullet as p
 from tqdm import trange
 
-import envs
-from envs import arm_env, panda
+from roboarm_nmp import envs
+from roboarm_nmp.envs import arm_env, panda
 
 EPISODE = 100  # steps
 

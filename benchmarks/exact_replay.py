@@ -16,7 +16,7 @@ import sys
 import numpy as np
 from tqdm import tqdm
 
-import envs
+from roboarm_nmp import envs
 
 
 def run_episode(env, seed, steps):

@@ -23,12 +23,13 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-import envs
-from envs import encoders, seeing
-from envs.datasets import load_queries
-from envs.encoders import scene_encoder, with_told
-from envs.policies import find_policy, make_policy
-from envs.seeing import checker_of, seen_points
+from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.perception import encoders
+from roboarm_nmp.envs.perception import point_clouds as seeing
+from roboarm_nmp.envs.perception.encoders import scene_encoder, with_told
+from roboarm_nmp.envs.perception.point_clouds import checker_of, seen_points
+from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 
 TASK = "random_boxes_hard"
 SHOWN = ("rendering", "encoding", "planning", "action", "total")
@@ -79,7 +80,7 @@ def times(policy, queries, encoder=None, time_limit=5.0):
     """Means (s) of what is `SHOWN`, and `success_rate`.
 
     Args:
-        policy: as `envs.policies.find_policy` takes it.
+        policy: as `envs.policies.registry.find_policy` takes it.
         queries: list of `Query`.
         encoder: what tells a policy of points; what a planner knows instead of the true obstacles.
         time_limit: s, of a planner.

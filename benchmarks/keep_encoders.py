@@ -22,11 +22,12 @@ from pathlib import Path
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from envs.datasets import attribute
-from envs.encoders import DECODER, PACKAGED
-from envs.exported_networks import halve_network
-from envs.files import write_atomically
-from envs.observations import open_shard, shard_path
+from roboarm_nmp.envs.datasets.format import attribute
+from roboarm_nmp.envs.datasets.observations import open_shard
+from roboarm_nmp.envs.datasets.shards import shard_path
+from roboarm_nmp.envs.networks.exported_networks import halve_network
+from roboarm_nmp.envs.perception.encoders import DECODER, PACKAGED
+from roboarm_nmp.envs.utils.files import write_atomically
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from paper_tables import PICTURES, commit

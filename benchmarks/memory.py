@@ -20,11 +20,11 @@ import time
 import psutil
 from tqdm import tqdm, trange
 
-import envs
-from envs.scenes import Scene
-from envs.sensors import Camera, PointCloud, cardinal
-from envs.world import MAX_BODIES_MADE
-from envs.wrappers import SensorWrapper
+from roboarm_nmp import envs
+from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, cardinal
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.world import MAX_BODIES_MADE
+from roboarm_nmp.envs.wrappers import SensorWrapper
 
 EPISODES_PER_TURN, FIRST_TURNS = 20, 20
 

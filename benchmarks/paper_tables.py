@@ -39,14 +39,15 @@ import tyro
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from clean_rl_scripts.evaluate import wilson_interval
-from envs.datasets import load_queries
-from envs.exported_networks import halve_network
-from envs.files import check_folder, write_atomically
-from envs.flags import PositiveInt, Seed, check
+from roboarm_nmp.clean_rl_scripts.evaluate import wilson_interval
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.networks.exported_networks import halve_network
+from roboarm_nmp.envs.training.flags import PositiveInt, Seed, check
+from roboarm_nmp.envs.utils.files import check_folder, write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = Path(__file__).with_name("paper_cells.csv")
+POLICIES = ROOT / "envs" / "policies" / "pretrained"
 BASELINES = ROOT / "docs" / "baselines.json"
 UNSEEN = ROOT / "docs" / "unseen_obstacles.json"
 PAGE, PICTURES = ROOT / "docs" / "results.md", ROOT / "docs" / "pictures"
@@ -159,16 +160,11 @@ def read_cells(path=CELLS):
 # --- Running
 
 
-def policies_of(algorithm):
-    """The folder of an algorithm's policies and results."""
-    return SCRIPTS[algorithm].parent / "policies"
-
-
 def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
     """Train, evaluate and keep one cell's policy with one seed; what was done is not done again."""
     script, name = SCRIPTS[cell.algorithm], f"{cell.name}-s{seed}"
     runs_dir.mkdir(parents=True, exist_ok=True)
-    kept = policies_of(cell.algorithm) / f"{name}.json"
+    kept = POLICIES / f"{name}.json"
     if kept.exists():
         result = json.loads(kept.read_text())
         if not cell.is_recipe_of(result["args"]):
@@ -622,7 +618,7 @@ def main():
         chosen = _check(args, cells)
     except ValueError as error:
         sys.exit(f"error: {error}")
-    folders = sorted({policies_of(algorithm) for algorithm in SCRIPTS})
+    folders = [POLICIES]
     if args.list:
         results = load_results(folders)
         for cell in cells:

@@ -7,7 +7,7 @@
 Ours is `demo_generation.planning.Planner.plan_within`: RRT-Connect with one round of shortening,
 which keeps less and less distance. Two others check one configuration at a time in PyBullet's
 world, asked from Python, and make three searches of less and less distance, as it was before
-`envs.collision`: one with today's range and shortening, and one with OMPL's own range and three
+`envs.collision.checker`: one with today's range and shortening, and one with OMPL's own range and three
 rounds of shortening, as `evaluate.py --policy planner` had them then (`pybullet_checked`).
 
 The others plan the first `--peer` queries, in turns with ours. A mean is over all queries of a
@@ -31,13 +31,13 @@ import pybullet as p
 from ompl import base as ob
 from tqdm import tqdm
 
-import envs
-from demo_generation import planning
-from demo_generation.planning import MARGIN, MARGIN_GROWTH, Planner, PlanningError
-from envs import panda
-from envs.collision import RESOLUTION
-from envs.datasets import load_queries
-from envs.scenes import Box, Cylinder, Scene
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation import planning
+from roboarm_nmp.demo_generation.planning import MARGIN, MARGIN_GROWTH, Planner, PlanningError
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.checker import RESOLUTION
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 
 
 class PyBulletValidity:

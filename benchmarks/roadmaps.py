@@ -25,12 +25,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from tqdm import tqdm
 
-import envs
-from demo_generation.following import follow
-from demo_generation.planning import Planner, PlanningError
-from demo_generation.roadmaps import OPTIONS, Args, Roadmap, random_paths_of_scene
-from envs import panda
-from envs.collision import CollisionChecker
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.following import follow
+from roboarm_nmp.demo_generation.planning import Planner, PlanningError
+from roboarm_nmp.demo_generation.roadmaps import OPTIONS, Args, Roadmap, random_paths_of_scene
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.checker import CollisionChecker
 
 SEED = 2**32 - 1  # the highest: hardly anybody's collection
 

@@ -1,8 +1,8 @@
 """How the success of `dagger.py` grows with the number of scenes, and with rounds of DAgger.
 
-    python -m demo_generation.roadmaps --task random_boxes_hard --scenes 800 --seed 1 \\
+    python -m roboarm_nmp.demo_generation.roadmaps --task random_boxes_hard --scenes 800 --seed 1 \\
         --output roadmaps
-    python -m demo_generation.make_queries --task random_boxes_hard --solvable \\
+    python -m roboarm_nmp.demo_generation.make_queries --task random_boxes_hard --solvable \\
         --queries-per-scene 5 --seed 78 --num-test 1 --num-validation 1000 --output fresh.h5
     python benchmarks/scaling.py --paths roadmaps --queries fresh.h5 --runs-dir runs/scaling
     python benchmarks/scaling.py --picture      # only draws what docs/scaling.json has
@@ -24,8 +24,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import matplotlib
 
-from envs.files import write_atomically
-from envs.shards import shard_paths
+from roboarm_nmp.envs.datasets.shards import shard_paths
+from roboarm_nmp.envs.utils.files import write_atomically
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

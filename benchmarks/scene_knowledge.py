@@ -19,7 +19,7 @@ What a policy needs is how far its links are from obstacles (m, clipped to 0.4).
 as large, learns that from z_E and where the links are, at `POSES` random configurations per scene:
 
 - links: mean error in cm for links that are within 10 cm of an obstacle;
-- decoded: the same by the points that a decoder tells of (`envs.encoders.told_checker`).
+- decoded: the same by the points that a decoder tells of (`envs.perception.encoders.told_checker`).
 """
 
 import argparse
@@ -33,10 +33,11 @@ import torch.nn as nn
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from envs import panda
-from envs.collision import CollisionChecker
-from envs.datasets import load_demos, load_queries
-from envs.encoders import (
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.datasets.demonstrations import load_demos
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.perception.encoders import (
     MAX_OBSTACLES,
     ORACLE,
     TOLD_RADIUS,
@@ -46,7 +47,7 @@ from envs.encoders import (
     scene_encoder,
     told_points,
 )
-from envs.scenes import ROW, to_array
+from roboarm_nmp.envs.scenes.primitives import ROW, to_array
 
 TASK = "random_boxes_hard"
 CELL = 0.2  # m

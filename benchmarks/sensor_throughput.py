@@ -11,9 +11,9 @@ import time
 import numpy as np
 import psutil
 
-import envs
-from envs.sensors import OUTPUTS, PointCloud, SensorWorld, cardinal
-from envs.wrappers import SensorWrapper
+from roboarm_nmp import envs
+from roboarm_nmp.envs.perception.sensors import OUTPUTS, PointCloud, SensorWorld, cardinal
+from roboarm_nmp.envs.wrappers import SensorWrapper
 
 TASK = "random_boxes_hard"
 

@@ -50,7 +50,7 @@ def stable_baselines3(num_envs, steps):
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
 
-    import envs
+    from roboarm_nmp import envs
 
     torch.set_num_threads(1)
 

@@ -25,19 +25,19 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import envs
-from envs.encoders import PACKAGED
-from envs.exported_networks import halve_network
-from envs.files import write_atomically
-from envs.last_layer import VERSION
-from envs.policies import PolicyError, find_policy
-from envs.roadmap_paths import load_roadmap_paths
+from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
+from roboarm_nmp.envs.networks.exported_networks import halve_network
+from roboarm_nmp.envs.perception.encoders import PACKAGED
+from roboarm_nmp.envs.policies.registry import PolicyError, find_policy
+from roboarm_nmp.envs.policies.safety_filter import VERSION
+from roboarm_nmp.envs.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, PAGE = (ROOT / "docs" / f"unseen_obstacles.{ending}" for ending in ("json", "md"))
 BASELINES = ROOT / "docs" / "baselines.json"
 PAPER_CELLS = ROOT / "benchmarks" / "paper_cells.csv"
-POLICIES = ROOT / "bc_script" / "policies"
+POLICIES = ROOT / "envs" / "policies" / "pretrained"
 HARD = "random_boxes_hard"
 # What a last layer around any policy keeps: see docs/experiments.md.
 OBSTACLES = ["--keep-distance", "0.01"]

@@ -16,11 +16,11 @@ import numpy as np
 from PIL import Image
 from unseen_obstacles import BASELINES, HARD, load_results, others_results
 
-import envs
-from envs.datasets import load_queries
-from envs.files import write_atomically
-from envs.policies import find_policy, make_policy
-from envs.show import film, rollout
+from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.policies.registry import find_policy, make_policy
+from roboarm_nmp.envs.show import film, rollout
+from roboarm_nmp.envs.utils.files import write_atomically
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

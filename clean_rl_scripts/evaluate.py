@@ -24,11 +24,11 @@ Policies to compare a trained one with:
   steps. As the limit is wall-clock time, the numbers may depend on the machine, and on what else it
   is doing.
 
-The last two check collisions with the true obstacles (`envs.collision`), which a trained policy
+The last two check collisions with the true obstacles (`envs.collision.checker`), which a trained policy
 does not see; with `--encoder points`, with what four point clouds see of them: look, then plan;
 with the name of an encoder that has a decoder (`--encoder field`), with what its 64 numbers tell.
 
-Around any policy, `--keep-distance` puts a last layer (`envs.last_layer`): links stay that far (m)
+Around any policy, `--keep-distance` puts a last layer (`envs.policies.safety_filter`): links stay that far (m)
 from everything, as far as it can, and the arm leaves dead ends. It knows the true obstacles, too,
 or with `--encoder points` what is seen. A policy that was trained with points and distances from
 them may get those that an encoder tells of: `--encoder field`.
@@ -70,17 +70,33 @@ import tyro
 from PIL import Image
 from tqdm import tqdm
 
-import envs
-from envs import flags, panda, workers
-from envs.arm_env import STANDARD_RULES, deviations
-from envs.datasets import Query, QueryScenes, load_queries, validate
-from envs.encoders import with_told
-from envs.files import check_writable, write_atomically
-from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Workers
-from envs.last_layer import VERSION, LastLayer
-from envs.policies import PLANNING, TIME_LIMIT, TRIES, find_policy, make_policy, own_layer
-from envs.scenes import Scene
-from envs.tasks import get_task, task_name
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.arm_env import STANDARD_RULES, deviations
+from roboarm_nmp.envs.datasets.format import QueryScenes
+from roboarm_nmp.envs.datasets.queries import Query, load_queries, validate
+from roboarm_nmp.envs.perception.encoders import with_told
+from roboarm_nmp.envs.policies.registry import (
+    PLANNING,
+    TIME_LIMIT,
+    TRIES,
+    find_policy,
+    make_policy,
+    own_layer,
+)
+from roboarm_nmp.envs.policies.safety_filter import VERSION, LastLayer
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.tasks import get_task, task_name
+from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.training.flags import (
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Seed,
+    Workers,
+)
+from roboarm_nmp.envs.utils import workers
+from roboarm_nmp.envs.utils.files import check_writable, write_atomically
 
 CHUNK = 10  # queries a worker takes at a time
 FRAMES = 8  # of a picture
@@ -328,10 +344,10 @@ def evaluate(
         seed: of what is random; each query has its own generator.
         tries: random configurations that `via-points` tries per query, >= 1.
         time_limit: seconds that `planner` may search per query, > 0.
-        encoder: what `planner`, `via-points` and the last layer know (`envs.seeing.checker_of`):
+        encoder: what `planner`, `via-points` and the last layer know (`envs.perception.point_clouds.checker_of`):
             `points`, or an encoder's name, which tells a policy of points what it knows, too; None:
             the true obstacles.
-        last_layer: an `envs.last_layer.LastLayer` around the policy; None: the one that is part of
+        last_layer: an `envs.policies.safety_filter.LastLayer` around the policy; None: the one that is part of
             it, if it has one; False: none.
         workers: processes. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.

@@ -31,9 +31,9 @@ from pathlib import Path
 import tyro
 from torch.utils.tensorboard import SummaryWriter
 
-from envs.files import check_folder, write_atomically
-from envs.flags import PositiveInt, Seed, Workers, check
-from envs.workers import check_ray
+from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers, check
+from roboarm_nmp.envs.utils.files import check_folder, write_atomically
+from roboarm_nmp.envs.utils.workers import check_ray
 
 try:
     import optuna

@@ -20,15 +20,16 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from envs import flags, panda, protocol, runs
-from envs.demo_episodes import demo_transitions, transition
-from envs.encoders import LatentTable
-from envs.tasks import task_name
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
+from roboarm_nmp.envs.perception.encoders import LatentTable
+from roboarm_nmp.envs.tasks import task_name
+from roboarm_nmp.envs.training import flags, protocol, runs
 
 
 @dataclass
 class Args(runs.RunFlags, protocol.EnvFlags):
-    # Those of the run's folder are in `envs/runs.py`, those of the MDP in `envs/protocol.py`.
+    # Those of the run's folder are in `envs/training/runs.py`, those of the MDP in `envs/training/protocol.py`.
     exp_name: str = "td3_her_mp"
     """name of the experiment, part of the run's folder"""
     # SHARED: the task

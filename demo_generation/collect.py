@@ -1,6 +1,6 @@
 """Collect demonstrations: sample a query, plan, follow the plan in the simulator, verify, keep.
 
-    python -m demo_generation.collect --task double_walls --num 10000
+    python -m roboarm_nmp.demo_generation.collect --task double_walls --num 10000
 
 Paper: appendix "Collection of demonstrations". Demonstration i depends on the seed, i and the
 options only, so the file is the same whatever the number of workers. Every verified demonstration
@@ -19,18 +19,15 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-import envs
-from demo_generation.following import follow
-from demo_generation.planning import Planner, PlanningError
-from envs import flags, workers
-from envs.datasets import (
-    check_writable,
-    demo_path,
-    query_path,
-    validate,
-    write_demos,
-)
-from envs.flags import (
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.following import follow
+from roboarm_nmp.demo_generation.planning import Planner, PlanningError
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, write_demos
+from roboarm_nmp.envs.datasets.journal import Journal, journal_of
+from roboarm_nmp.envs.datasets.queries import query_path, validate
+from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
+from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.training.flags import (
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
@@ -38,8 +35,8 @@ from envs.flags import (
     Seed,
     Workers,
 )
-from envs.journal import Journal, journal_of
-from envs.scenes import Scene, from_array, to_array
+from roboarm_nmp.envs.utils import workers
+from roboarm_nmp.envs.utils.files import check_writable
 
 # Streams 1 and 2 of random numbers are those of the test and validation queries.
 STREAM = 3
@@ -246,7 +243,7 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             [_decode(demo["plan"]) for demo in demos],
             [_decode(demo["states"]) for demo in demos],
             {name: [demo[name] for demo in demos] for name in ("plan_seed", "digest", "collided")},
-            made_by=f"python -m demo_generation.collect --num {num} {flags}",
+            made_by=f"python -m roboarm_nmp.demo_generation.collect --num {num} {flags}",
             parameters={"options": options, "counts": counts},
             scenes_of=scenes_of,
         )
@@ -294,4 +291,4 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m demo_generation.collect", description=__doc__))
+    main(tyro.cli(Args, prog="python -m roboarm_nmp.demo_generation.collect", description=__doc__))

@@ -1,7 +1,7 @@
 """Export demonstrations as a Minari dataset, the format of many offline-learning libraries.
 
     pip install -e ".[minari]"
-    python -m demo_generation.export_minari --task double_walls --goal-type ee
+    python -m roboarm_nmp.demo_generation.export_minari --task double_walls --goal-type ee
 
 Then `minari.load_dataset("roboarm-nmp/double_walls/ee-v0")` has the demonstrations as episodes of
 the task's environment, each up to the first time that it reaches its goal. The dataset is in
@@ -31,10 +31,11 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-import envs
-from demo_generation.following import follow
-from envs.datasets import MAX_STEP, demo_path, load_demos, subgoals
-from envs.demo_episodes import demo_episode
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.following import follow
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.envs.datasets.episodes import demo_episode
+from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
 
 PREFIX = ".exporting-"  # of folders that are not whole yet; Minari does not look into hidden ones
 
@@ -63,7 +64,7 @@ def unrounded(demo, env):
     execution = follow(env, demo.plan)
     if execution.digest != demo.digest:
         raise ValueError(
-            "the demonstrations do not repeat exactly here: `python -m demo_generation.verify "
+            "the demonstrations do not repeat exactly here: `python -m roboarm_nmp.demo_generation.verify "
             "FILE --mend` first"
         )
     states, points = execution.states, subgoals(demo.plan)
@@ -227,4 +228,8 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m demo_generation.export_minari", description=__doc__))
+    main(
+        tyro.cli(
+            Args, prog="python -m roboarm_nmp.demo_generation.export_minari", description=__doc__
+        )
+    )

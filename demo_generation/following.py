@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.datasets import subgoals
+from roboarm_nmp.envs.subgoals import subgoals
 
 # The goal is reached well inside the tolerances of every goal type, so that rounding the stored
 # configurations cannot take it out again.

@@ -1,7 +1,7 @@
 """Make the query files of tasks, `envs/data/<task>.h5`: random feasible starts and goals.
 
-    python -m demo_generation.make_queries --task wall
-    python -m demo_generation.make_queries --task random_boxes_hard --solvable
+    python -m roboarm_nmp.demo_generation.make_queries --task wall
+    python -m roboarm_nmp.demo_generation.make_queries --task random_boxes_hard --solvable
 
 With `--solvable` a query is kept only if a planner solved it: one of `SOLVE_ATTEMPTS` plans of
 RRT-Connect, at most `SOLVE_CHECKS` collision checks each (together a few seconds), reached the goal
@@ -24,16 +24,19 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-import envs
-from demo_generation.collect import MAX_QUERIES, demonstrate
-from demo_generation.motionbenchmaker import read_problems
-from demo_generation.planning import Planner
-from envs import flags, workers
-from envs.datasets import ORIGINAL, check_writable, query_path, write_queries
-from envs.flags import PositiveInt, Seed, Workers
-from envs.journal import Journal, journal_of
-from envs.scenes import Scene, from_array, to_array
-from envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
+from roboarm_nmp.demo_generation.motionbenchmaker import read_problems
+from roboarm_nmp.demo_generation.planning import Planner
+from roboarm_nmp.envs.datasets.format import ORIGINAL
+from roboarm_nmp.envs.datasets.journal import Journal, journal_of
+from roboarm_nmp.envs.datasets.queries import query_path, write_queries
+from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
+from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
+from roboarm_nmp.envs.utils import workers
+from roboarm_nmp.envs.utils.files import check_writable
+from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
 HOLD_STEPS = 24
@@ -185,7 +188,7 @@ def make_queries(
         if solvable:
             parameters |= {"unsolved": rejected["unsolved"], "solve_checks": SOLVE_CHECKS}
             parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
-        made_by = f"python -m demo_generation.make_queries --task {task} --seed {seed} "
+        made_by = f"python -m roboarm_nmp.demo_generation.make_queries --task {task} --seed {seed} "
         made_by += f"--num-test {num_test} --num-validation {num_validation}"
         made_by += " --solvable" * solvable
         if queries_per_scene > 1:
@@ -247,4 +250,8 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m demo_generation.make_queries", description=__doc__))
+    main(
+        tyro.cli(
+            Args, prog="python -m roboarm_nmp.demo_generation.make_queries", description=__doc__
+        )
+    )

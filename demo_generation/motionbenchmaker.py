@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from envs.scenes import Box, Cylinder, Scene
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 
 
 def read_problems(path):

@@ -1,14 +1,14 @@
 """Planning: a query in, a joint path out, by one of OMPL's planners or by one of your own.
 
-    import envs
-    from demo_generation.planning import Planner
-    from envs.datasets import load_queries
+    import roboarm_nmp
+    from roboarm_nmp.demo_generation.planning import Planner
+    from roboarm_nmp.envs.datasets.queries import load_queries
 
-    env = envs.make("double_walls")
+    env = roboarm_nmp.make("double_walls")
     query = load_queries("double_walls")[0]  # start, goal, scene
     path = Planner(env).plan(*query, seed=1)  # float32 (n, 7), rad
 
-Collisions are checked by `envs.collision`, which agrees with the environment's PyBullet world to
+Collisions are checked by `envs.collision.checker`, which agrees with the environment's PyBullet world to
 within a fraction of a millimetre and is some twenty times faster; the environment itself has the
 last word on start and goal. Planning happens in the normalised configuration space [-1, 1]^7.
 """
@@ -21,9 +21,9 @@ from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 
-from envs import panda
-from envs.collision import RESOLUTION, CollisionChecker
-from envs.datasets import subgoals
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
+from roboarm_nmp.envs.subgoals import subgoals
 
 # OMPL writes to the console; what a user should know is raised here.
 ou.setLogLevel(ou.LogLevel.LOG_NONE)
@@ -181,7 +181,7 @@ class Planner:
             RRTConnect, docs/benchmarks.md.)
         simplify: rounds of removing vertices and cutting corners; 0 for none.
         checker_of: from a `Scene` to the `CollisionChecker` that is asked, by default that of the
-            true obstacles; `envs.seeing.seen_checker` knows only what sensors see.
+            true obstacles; `envs.perception.point_clouds.seen_checker` knows only what sensors see.
 
     Raises:
         ValueError: unknown planner, a limit that is not positive, or another number out of range.

@@ -1,10 +1,10 @@
 """Roadmaps: many short paths in one scene, and how to go on from any configuration in it.
 
-    python -m demo_generation.roadmaps --task random_boxes_hard --scenes 6000 --output roadmaps
+    python -m roboarm_nmp.demo_generation.roadmaps --task random_boxes_hard --scenes 6000 --output roadmaps
 
-collects paths of many scenes (read by `envs.roadmap_paths.load_roadmap_paths`). In Python:
+collects paths of many scenes (read by `envs.datasets.roadmap_paths.load_roadmap_paths`). In Python:
 
-    from demo_generation.roadmaps import Roadmap
+    from roboarm_nmp.demo_generation.roadmaps import Roadmap
 
     roadmap = Roadmap(scene, rng)
     roadmap.random_paths(300, rng)           # so many paths, each (k, 7), normalised
@@ -36,12 +36,12 @@ import tyro
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-import envs
-from envs import shards
-from envs.collision import RESOLUTION, CollisionChecker
-from envs.flags import PositiveFloat, PositiveInt, Seed, Workers
-from envs.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
-from envs.scenes import Scene
+from roboarm_nmp import envs
+from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
+from roboarm_nmp.envs.datasets import shards
+from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Seed, Workers
 
 # L2, normalised, between states of a motion that are looked at before a path wants to take it.
 COARSE = 8 * RESOLUTION
@@ -535,7 +535,7 @@ def collect(args, progress=True):
     shards.check_collection(args)
     options = {name: getattr(args, name) for name in OPTIONS}
     given = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
-    made_by = " ".join(["python -m demo_generation.roadmaps", *given])
+    made_by = " ".join(["python -m roboarm_nmp.demo_generation.roadmaps", *given])
     shards.collect(
         args,
         args.scenes,
@@ -565,4 +565,4 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m demo_generation.roadmaps", description=__doc__))
+    main(tyro.cli(Args, prog="python -m roboarm_nmp.demo_generation.roadmaps", description=__doc__))

@@ -1,6 +1,6 @@
 """Verify demonstration files: follow every plan again in the simulator; mend what fails.
 
-    python -m demo_generation.verify envs/demos/double_walls.h5 --mend
+    python -m roboarm_nmp.demo_generation.verify envs/demos/double_walls.h5 --mend
 
 Paper: appendix "Software package description" ("verification, and correction"). A demonstration
 is good if its plan, followed, gives exactly the execution that is stored, reaches its goal, and
@@ -16,13 +16,15 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from demo_generation.collect import demonstrate, make_planner
-from demo_generation.following import follow
-from envs import flags, workers
-from envs.arm_env import RoboArmEnv
-from envs.datasets import DatasetError, demo_path, load_demos, write_demos
-from envs.flags import Workers
-from envs.tasks import is_task
+from roboarm_nmp.demo_generation.collect import demonstrate, make_planner
+from roboarm_nmp.demo_generation.following import follow
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos, write_demos
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.tasks import is_task
+from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.training.flags import Workers
+from roboarm_nmp.envs.utils import workers
 
 VERDICTS = ("good", "changed", "missed", "collided", "refused")
 MEND_ATTEMPTS = 10
@@ -180,4 +182,4 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m demo_generation.verify", description=__doc__))
+    main(tyro.cli(Args, prog="python -m roboarm_nmp.demo_generation.verify", description=__doc__))

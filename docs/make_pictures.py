@@ -14,11 +14,12 @@ import pybullet as p
 from PIL import Image
 from tqdm import tqdm
 
-import envs
-from envs import panda
-from envs.datasets import Query, demo_path, load_demos, load_queries
-from envs.scenes import Scene
-from envs.show import picture
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.envs.datasets.queries import Query, load_queries
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.show import picture
 
 SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls

@@ -13,9 +13,9 @@ import numpy as np
 import pybullet as p
 from PIL import Image
 
-import envs
-from envs.datasets import load_queries
-from envs.sensors import (
+from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.perception.sensors import (
     NOTHING,
     OUTPUTS,
     Camera,

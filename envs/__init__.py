@@ -4,8 +4,8 @@ from pathlib import Path
 
 import gymnasium
 
-from envs.arm_env import RoboArmEnv
-from envs.tasks import TASKS, get_task
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.tasks import TASKS, get_task
 
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
 
@@ -16,7 +16,7 @@ def make(task, encoder=None, proximity=None, append_proximity=False, **kwargs):
     Args:
         task: name of a task (`TASKS`), or path of a scene file (docs/your_own_scene.md).
         encoder: what is appended to `observation` about the scene: name or path of an encoder's
-            network, `oracle` or `points` (`envs.encoders`); None for nothing.
+            network, `oracle` or `points` (`envs.perception.encoders`); None for nothing.
         proximity: add `proximity` to observations, how far each link is from the nearest thing
             (`envs.wrappers.ProximityWrapper`): of the true `obstacles`, of the `points` that four
             sensors saw of them, or what z_E of an encoder tells; None for nothing.
@@ -35,13 +35,13 @@ def make(task, encoder=None, proximity=None, append_proximity=False, **kwargs):
     env = RoboArmEnv(get_task(task).scene, **kwargs)
     # What takes long to import is imported only where it is needed.
     if encoder is not None:
-        from envs.encoders import scene_encoder
-        from envs.wrappers import SceneEncodingWrapper
+        from roboarm_nmp.envs.perception.encoders import scene_encoder
+        from roboarm_nmp.envs.wrappers import SceneEncodingWrapper
 
         env = SceneEncodingWrapper(env, scene_encoder(encoder))
     if proximity is not None:
-        from envs.seeing import checker_of
-        from envs.wrappers import ProximityWrapper
+        from roboarm_nmp.envs.perception.point_clouds import checker_of
+        from roboarm_nmp.envs.wrappers import ProximityWrapper
 
         env = ProximityWrapper(env, checker_of(proximity), append_proximity)
     return env
@@ -55,7 +55,7 @@ def gymnasium_id(task):
 for _name in TASKS:
     gymnasium.register(
         gymnasium_id(_name),
-        entry_point="envs:make",
+        entry_point="roboarm_nmp.envs:make",
         kwargs={"task": _name},
         disable_env_checker=True,  # it would warn each time that observations have no bounds
     )

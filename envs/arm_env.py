@@ -10,15 +10,12 @@ import gymnasium as gym
 import numpy as np
 import pybullet as p
 
-from envs import panda
-from envs.scenes import is_number
-from envs.subgoals import MAX_STEP
-from envs.world import (  # some of them only for those who import them from here
-    HOLD_DRIFT,  # noqa: F401
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.scenes.primitives import is_number
+from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.world import (
     HOLD_STEPS,
-    MAX_BODIES_MADE,  # noqa: F401
     MAX_EDGE,
-    POSITION_GAINS,  # noqa: F401
     SUBSTEPS,
     TIME_STEP,
     World,
@@ -61,7 +58,7 @@ class RoboArmEnv(gym.Env):
     Args:
         scene: a `Scene`, or a distribution of scenes: an object with `base`, the `Scene` without
             the obstacles that vary, and `sample(rng)`, which draws a `Scene` with a NumPy
-            Generator (`envs.random_boxes.RandomBoxes` is one). `reset` then draws a new one.
+            Generator (`envs.scenes.random_boxes.RandomBoxes` is one). `reset` then draws a new one.
         episodes_per_scene: resets in which a drawn scene stays; a reset with a seed always draws.
         goal_type: `ee`, `config` or `combined` (reached like `ee`).
         ee_tolerance: goal radius in metres (paper: 0.02).

@@ -22,6 +22,9 @@ _RANGE = UPPER - LOWER
 ARM_JOINTS = (0, 1, 2, 3, 4, 5, 6)
 FINGER_JOINTS = (9, 10)
 EE_LINK = 11  # panda_grasptarget, the point between the fingertips
+COLLISION_LINKS = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10)
+"""PyBullet's indices of the links that may collide with something: the seven that the joints move,
+the hand, the two fingers. In this order wherever there is a row per link."""
 FINGER_OPENING = 0.04  # m, each finger; constant
 
 # The pairs of links that may collide, by PyBullet link index (-1 is the base, 8 the hand, 9 and 10

@@ -1,10 +1,10 @@
 """Look at a task: in PyBullet's window, as a picture, or as an animation of a policy.
 
-    python -m envs.show double_walls
-    python -m envs.show double_walls --output picture.png
-    python -m envs.show my_scene.yaml --output pictures.png --draws 9
-    python -m envs.show wall --output episode.gif --policy runs/my_run
-    python -m envs.show double_walls --output episode.gif --policy planner
+    python -m roboarm_nmp.envs.show double_walls
+    python -m roboarm_nmp.envs.show double_walls --output picture.png
+    python -m roboarm_nmp.envs.show my_scene.yaml --output pictures.png --draws 9
+    python -m roboarm_nmp.envs.show wall --output episode.gif --policy runs/my_run
+    python -m roboarm_nmp.envs.show double_walls --output episode.gif --policy planner
 
 The arm is white where it is, transparent green where it has to go; the green ball is the goal
 position of its end-effector. A picture shows the start. The window shows the policy's episodes one
@@ -27,22 +27,16 @@ import tyro
 from PIL import Image
 from tqdm import tqdm
 
-import envs
-from envs import flags, panda
-from envs.datasets import (
-    Demos,
-    Query,
-    check_writable,
-    demo_path,
-    load_demos,
-    load_queries,
-    query_path,
-)
-from envs.files import write_atomically
-from envs.flags import NonNegativeInt, Pixels, PositiveInt, Seed
-from envs.policies import find_policy, make_policy
-from envs.scenes import to_array
-from envs.world import why_no_window
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.demonstrations import Demos, demo_path, load_demos
+from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
+from roboarm_nmp.envs.policies.registry import find_policy, make_policy
+from roboarm_nmp.envs.scenes.primitives import to_array
+from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.training.flags import NonNegativeInt, Pixels, PositiveInt, Seed
+from roboarm_nmp.envs.utils.files import check_writable, write_atomically
+from roboarm_nmp.envs.world import why_no_window
 
 SIZE = (640, 480)
 OVERSAMPLING = 2  # the software renderer has jagged edges
@@ -448,7 +442,9 @@ def _save(image, path, kind, **options):
 
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 for something that cannot be shown."""
-    args = tyro.cli(Args, args=arguments, prog="python -m envs.show", description=__doc__)
+    args = tyro.cli(
+        Args, args=arguments, prog="python -m roboarm_nmp.envs.show", description=__doc__
+    )
     try:
         _show(args)
     except (OSError, ValueError) as error:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from envs import panda
+from roboarm_nmp.envs import panda
 
 # A plan is followed by commanding one sub-goal per step. This far apart, the controller's lag
 # seldom makes a step longer than the paper's 0.03, to which it is clipped.

@@ -8,10 +8,10 @@ say, then calibrated so that the go-to-goal policy succeeds as often as in the p
 from dataclasses import dataclass
 from pathlib import Path
 
-from envs.mixed_scenes import MixedScenes
-from envs.random_boxes import RandomBoxes
-from envs.scene_files import load_scene
-from envs.scenes import TABLE, Box, Cylinder, Scene
+from roboarm_nmp.envs.scenes.files import load_scene
+from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
+from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
+from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 
 SCENE_FILES = (".yaml", ".yml")
 

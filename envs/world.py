@@ -1,7 +1,7 @@
 """The simulated world: the physics engine, the arm, the scene's bodies, contacts, feasibility.
 
 Everything that moves an arm or looks at one stands on this; `envs.arm_env.RoboArmEnv` makes a
-goal-conditioned MDP of it, `envs.sensors.SensorWorld` something to be looked at.
+goal-conditioned MDP of it, `envs.perception.sensors.SensorWorld` something to be looked at.
 """
 
 import contextlib
@@ -13,8 +13,8 @@ import sys
 import numpy as np
 import pybullet as p
 
-from envs import panda
-from envs.scenes import FRICTION, Box, Cylinder, Scene, floor_box
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.scenes.primitives import FRICTION, Box, Cylinder, Scene, floor_box
 
 # One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
 # controller; docs/environment.md has the measured tracking error.
@@ -332,4 +332,6 @@ class World:
 
 def _check_scene(scene):
     if not isinstance(scene, Scene):
-        raise TypeError(f"a scene must be an envs.scenes.Scene, got {scene!r}")
+        raise TypeError(
+            f"a scene must be an roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
+        )

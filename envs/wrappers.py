@@ -3,8 +3,8 @@
 import gymnasium as gym
 import numpy as np
 
-from envs import panda
-from envs.sensors import SensorWorld, cardinal
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.perception.sensors import SensorWorld, cardinal
 
 
 class SensorWrapper(gym.Wrapper):
@@ -12,7 +12,7 @@ class SensorWrapper(gym.Wrapper):
 
     Args:
         env: a `RoboArmEnv`, possibly wrapped.
-        sensors: dict of name -> `envs.sensors.Camera`, `PointCloud` or anything with their `space`
+        sensors: dict of name -> `envs.perception.sensors.Camera`, `PointCloud` or anything with their `space`
             and `observe`; by default four cameras (`cardinal()`).
         every_step: look in every step; otherwise once per episode, at its start, with the arm in
             the start configuration (paper, appendix "Prediction times investigation").
@@ -99,7 +99,7 @@ class SceneEncodingWrapper(_ObservingWrapper):
 
     Args:
         env: a `RoboArmEnv`.
-        encoder: an `envs.encoders.SceneEncoder`; several environments may share it.
+        encoder: an `envs.perception.encoders.SceneEncoder`; several environments may share it.
     """
 
     def __init__(self, env, encoder):
@@ -118,14 +118,14 @@ class SceneEncodingWrapper(_ObservingWrapper):
 class ProximityWrapper(_ObservingWrapper):
     """Adds `proximity` to the observation: how far each link is from the nearest thing.
 
-    float32 (10, 8), a row per `envs.collision.LINKS`: the distance from obstacles, table and floor
-    in m, clipped to `envs.collision.PROXIMITY_RANGE`, and its gradient, m per unit of normalised
+    float32 (10, 8), a row per `envs.collision.checker.LINKS`: the distance from obstacles, table and floor
+    in m, clipped to `envs.collision.checker.PROXIMITY_RANGE`, and its gradient, m per unit of normalised
     configuration (zeros beyond the range). If the goal is a configuration, `goal_proximity` is the
     same there. Otherwise this is its `RoboArmEnv`, with all of its attributes.
 
     Args:
         env: a `RoboArmEnv`, possibly in a `SceneEncodingWrapper`.
-        checker_of: from a `Scene` to the `CollisionChecker` that tells: `envs.seeing.true_checker`
+        checker_of: from a `Scene` to the `CollisionChecker` that tells: `envs.perception.point_clouds.true_checker`
             or `seen_checker`.
         append: whether `observation` has `proximity`, too: 80 numbers, before an encoded scene.
     """

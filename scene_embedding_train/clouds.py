@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from envs.sensors import NOTHING, OBSTACLE, PointCloud, deproject
-from scene_embedding_train.training_data import unpacked
+from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE, PointCloud, deproject
+from roboarm_nmp.scene_embedding_train.training_data import unpacked
 
 WITHIN = 1.1  # m from the robot's axis: what is further away it does not reach
 TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
@@ -126,7 +126,7 @@ def batch_of(clouds, rows, device):
 
 
 def whole_clouds(observations, shard, name):
-    """All that a sensor saw in the scenes of a shard, as `envs.sensors.PointCloud.points` has it.
+    """All that a sensor saw in the scenes of a shard, as `envs.perception.sensors.PointCloud.points` has it.
 
     Points, float32 (n, samples, 3), and labels, uint8 (n, samples).
     """

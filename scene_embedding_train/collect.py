@@ -1,7 +1,7 @@
 """Collect what sensors see of random scenes, to train encoders on.
 
-    python -m scene_embedding_train.collect --num 20000 --image-size 128 --output observations
-    python -m scene_embedding_train.collect --num 200000 --ray-address auto   # the paper's number
+    python -m roboarm_nmp.scene_embedding_train.collect --num 20000 --image-size 128 --output observations
+    python -m roboarm_nmp.scene_embedding_train.collect --num 200000 --ray-address auto   # the paper's number
 
 Paper: appendix "Training and verifying the encoders": four sensors around the robot, images and
 point clouds of 200,000 environments. Scene i, with the arm in a feasible configuration, depends on
@@ -18,11 +18,11 @@ from typing import Literal
 import numpy as np
 import tyro
 
-import envs
-from envs import shards
-from envs.flags import PositiveInt, Seed, Workers
-from envs.observations import Observations, observe, open_shard, shard_bytes
-from envs.sensors import Camera, PointCloud, SensorWorld, cardinal
+from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets import shards
+from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
+from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
+from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
 
 # Streams 1 to 3 of random numbers are those of the queries and demonstrations.
 STREAM = 4
@@ -96,7 +96,7 @@ def collect(args, progress=True):
     shards.check_collection(args)
     names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
     given = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
-    made_by = " ".join(["python -m scene_embedding_train.collect", *given])
+    made_by = " ".join(["python -m roboarm_nmp.scene_embedding_train.collect", *given])
     arguments = (args.task, args.seed, sensors_of(args), made_by)
     shards.collect(
         args,
@@ -125,4 +125,8 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m scene_embedding_train.collect", description=__doc__))
+    main(
+        tyro.cli(
+            Args, prog="python -m roboarm_nmp.scene_embedding_train.collect", description=__doc__
+        )
+    )

@@ -1,6 +1,6 @@
 """A distance field in 64 numbers: z_E of what four sensors see. Read it from the top.
 
-    python -m scene_embedding_train.collect --task mixed_scenes --sensors clouds --num 40000
+    python -m roboarm_nmp.scene_embedding_train.collect --task mixed_scenes --sensors clouds --num 40000
     python scene_embedding_train/field.py --observations observations
 
 What a policy needs to know of a scene is where the arm would touch something. So z_E is trained to
@@ -32,10 +32,16 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from envs.exported_networks import save_network
-from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Share, Width
-from envs.observations import sensors_to_json
-from envs.runs import (
+from roboarm_nmp.envs.datasets.observations import sensors_to_json
+from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.training.flags import (
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Share,
+    Width,
+)
+from roboarm_nmp.envs.training.runs import (
     RunFlags,
     check_finite,
     elapsed,
@@ -50,10 +56,14 @@ from envs.runs import (
     summary_writer,
     write_json,
 )
-from scene_embedding_train.clouds import load_obstacle_points, on_obstacles, whole_clouds
-from scene_embedding_train.pictures import averaged, load_pictures
-from scene_embedding_train.pictures import batch_of as pictures_of
-from scene_embedding_train.training_data import load_obstacles, open_observations, split
+from roboarm_nmp.scene_embedding_train.clouds import (
+    load_obstacle_points,
+    on_obstacles,
+    whole_clouds,
+)
+from roboarm_nmp.scene_embedding_train.pictures import averaged, load_pictures
+from roboarm_nmp.scene_embedding_train.pictures import batch_of as pictures_of
+from roboarm_nmp.scene_embedding_train.training_data import load_obstacles, open_observations, split
 
 # The field: around the robot's axis, m. Distances are clipped at both ends.
 REACH, HEIGHT = 1.0, 1.5
@@ -65,7 +75,7 @@ SECTORS = 8
 
 
 @dataclass
-class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
+class Args(RunFlags):  # those of the run's folder are in `envs/training/runs.py`
     exp_name: str = "field"
     """name of the experiment, part of the run's folder"""
 

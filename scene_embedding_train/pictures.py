@@ -10,8 +10,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from envs.sensors import Camera
-from scene_embedding_train.training_data import unpacked
+from roboarm_nmp.envs.perception.sensors import Camera
+from roboarm_nmp.scene_embedding_train.training_data import unpacked
 
 
 def load_pictures(observations, size):

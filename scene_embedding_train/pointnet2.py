@@ -1,6 +1,6 @@
 """PointNet++ of four point clouds: a scene latent z_E of 64 numbers. Read it from the top.
 
-    python -m scene_embedding_train.collect --sensors clouds --num 20000
+    python -m roboarm_nmp.scene_embedding_train.collect --sensors clouds --num 20000
     python scene_embedding_train/pointnet2.py --observations observations
 
 PointNet++ (Qi et al., 2017) as in the paper's appendix "Training and verifying the encoders": a
@@ -26,10 +26,11 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from envs.exported_networks import save_network
-from envs.flags import PositiveFloat, PositiveInt, Share, Width
-from envs.observations import sensors_to_json
-from envs.runs import (
+from roboarm_nmp.envs.datasets.observations import sensors_to_json
+from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE
+from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Share, Width
+from roboarm_nmp.envs.training.runs import (
     RunFlags,
     check_finite,
     elapsed,
@@ -43,8 +44,7 @@ from envs.runs import (
     summary_writer,
     write_json,
 )
-from envs.sensors import NOTHING, OBSTACLE
-from scene_embedding_train.clouds import (
+from roboarm_nmp.scene_embedding_train.clouds import (
     batch_of,
     comparison,
     gather,
@@ -53,14 +53,14 @@ from scene_embedding_train.clouds import (
     thin_out,
     whole_clouds,
 )
-from scene_embedding_train.training_data import open_observations, split
+from roboarm_nmp.scene_embedding_train.training_data import open_observations, split
 
 APART = 0.05  # m between a cloud and what counts as not being in it
 IGNORED = -100  # label of points that have no class
 
 
 @dataclass
-class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
+class Args(RunFlags):  # those of the run's folder are in `envs/training/runs.py`
     exp_name: str = "pointnet2"
     """name of the experiment, part of the run's folder"""
 

@@ -10,10 +10,11 @@ import sys
 import numpy as np
 from tqdm import tqdm
 
-from envs.datasets import DatasetError
-from envs.files import new_contents
-from envs.observations import Observations, shard_path
-from envs.scenes import padded_rows
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.envs.datasets.shards import shard_path
+from roboarm_nmp.envs.scenes.primitives import padded_rows
+from roboarm_nmp.envs.utils.files import new_contents
 
 
 def open_observations(folder):

@@ -1,6 +1,6 @@
 """VAE of what four cameras see: a scene latent z_E of 64 numbers. Read it from the top.
 
-    python -m scene_embedding_train.collect --sensors images --image-size 128 --num 20000
+    python -m roboarm_nmp.scene_embedding_train.collect --sensors images --image-size 128 --num 20000
     python scene_embedding_train/vae.py --observations observations
 
 A variational autoencoder (Kingma and Welling, 2013) as in the paper's appendix "Training and
@@ -19,10 +19,16 @@ import numpy as np
 import torch
 import torch.nn as nn
 
-from envs.exported_networks import save_network
-from envs.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Share, Width
-from envs.observations import sensors_to_json
-from envs.runs import (
+from roboarm_nmp.envs.datasets.observations import sensors_to_json
+from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.training.flags import (
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Share,
+    Width,
+)
+from roboarm_nmp.envs.training.runs import (
     RunFlags,
     elapsed,
     load_checkpoint,
@@ -35,7 +41,7 @@ from envs.runs import (
     summary_writer,
     write_json,
 )
-from scene_embedding_train.pictures import (
+from roboarm_nmp.scene_embedding_train.pictures import (
     averaged,
     batch_of,
     comparison,
@@ -44,11 +50,11 @@ from scene_embedding_train.pictures import (
     mean_picture,
     reconstruction_errors,
 )
-from scene_embedding_train.training_data import open_observations, split
+from roboarm_nmp.scene_embedding_train.training_data import open_observations, split
 
 
 @dataclass
-class Args(RunFlags):  # those of the run's folder are in `envs/runs.py`
+class Args(RunFlags):  # those of the run's folder are in `envs/training/runs.py`
     exp_name: str = "vae"
     """name of the experiment, part of the run's folder"""
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from trainers import GPU
 
-from envs import protocol
+from roboarm_nmp.envs.training import protocol
 
 # Ctrl-C can be tested also where it is ignored, as in the background of a shell.
 signal.signal(signal.SIGINT, signal.default_int_handler)

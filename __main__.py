@@ -1,0 +1,62 @@
+"""The command `roboarm`: every script of the project under one name.
+
+Each subcommand runs its script as `python -m` does. So a trainer stays a file that is read from top
+to bottom, and the processes that it spawns find it under its module's name.
+"""
+
+import difflib
+import runpy
+import sys
+
+TRAINERS = {
+    "sac": ("clean_rl_scripts.sac_her_mp", "SAC with HER and demonstrations"),
+    "td3": ("clean_rl_scripts.td3_her_mp", "TD3 with HER and demonstrations"),
+    "bc": ("bc_script.bc", "behavioural cloning of demonstrations"),
+    "dagger": ("bc_script.dagger", "imitation of a roadmap planner (DAgger)"),
+    "vae": ("scene_embedding_train.vae", "scene encoder: VAE of camera images"),
+    "vqvae": ("scene_embedding_train.vqvae", "scene encoder: VQ-VAE of camera images"),
+    "pointnet2": ("scene_embedding_train.pointnet2", "scene encoder: PointNet++ of point clouds"),
+    "field": ("scene_embedding_train.field", "scene encoder: distance field of point clouds"),
+}
+COMMANDS = {
+    "train": (None, "train a policy or a scene encoder: roboarm train --help"),
+    "evaluate": ("clean_rl_scripts.evaluate", "evaluate a policy on the queries of a task"),
+    "show": ("envs.show", "window, image or animation of a task and of a policy"),
+    "sweep": ("clean_rl_scripts.sweep", "search a trainer's flags with Optuna"),
+    "queries": ("demo_generation.make_queries", "make a query file"),
+    "collect": ("demo_generation.collect", "collect demonstrations"),
+    "verify": ("demo_generation.verify", "replay demonstrations in the simulator"),
+    "minari": ("demo_generation.export_minari", "export demonstrations as a Minari dataset"),
+    "roadmaps": ("demo_generation.roadmaps", "make roadmap paths, for `roboarm train dagger`"),
+    "observations": ("scene_embedding_train.collect", "collect observations, for scene encoders"),
+    "data": ("envs.datasets", "validate or describe files of queries and demonstrations"),
+}
+
+
+def _usage(prog, commands):
+    rows = [f"  {name:<14}{summary}" for name, (_, summary) in commands.items()]
+    return "\n".join([f"usage: {prog} COMMAND [--help] ...", "", *rows])
+
+
+def main(arguments=None):
+    """Run a subcommand. Returns the exit code: 0, or 2 for an unknown command."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    prog, commands = "roboarm", COMMANDS
+    if arguments[:1] == ["train"]:
+        prog, commands, arguments = "roboarm train", TRAINERS, arguments[1:]
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_usage(prog, commands))
+        return 0 if arguments else 2
+    name = arguments[0]
+    if name not in commands:
+        close = difflib.get_close_matches(name, commands, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(commands)}"
+        print(f"{prog}: unknown command {name!r}: {hint}", file=sys.stderr)
+        return 2
+    sys.argv = [f"{prog} {name}", *arguments[1:]]
+    runpy.run_module(f"roboarm_nmp.{commands[name][0]}", run_name="__main__", alter_sys=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Exact collision checks and signed distances, compiled."""

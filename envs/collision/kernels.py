@@ -1,0 +1,845 @@
+"""Everything that Numba compiles: collision checks, signed distances, the projection of the safety filter.
+
+All of it stands in one file, because Numba's cache on disk does not notice changes in other files.
+All functions compute in float64. Working memory is float64: `frames` (8, 12), a rotation (row-major) and a position
+each; `centres` (11, 3), of the bodies; `pose` (12,), of a shape in a body's frame; `simplex`, see
+`_gjk`; `other` (1, `ROW`), a link as the shape that another link may hit.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from roboarm_nmp.envs import panda
+
+BULLET_MARGIN = 0.001
+"""m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
+FAR = 1e9  # m: farther than anything
+# A row describes a convex shape: kind, centre 3, rotation 9 (row-major), half edges of its core 3,
+# rounding, and of a link which one. The shape is all that is within `rounding` of the core, which
+# is a box or a cylinder less its rounding, a sphere's centre, or a link's hull.
+# Kinds are those of `envs.scenes.primitives.to_array`, and one more.
+CYLINDER, SPHERE, LINK = 1, 2, 3
+ROW = 18
+# Directions fall into this many cells squared on each face of a cube, see `_cells`.
+CELLS = 8
+# GJK stops at this precision (m), after 3 to 10 iterations in nearly all cases; EPA at its own.
+_TOLERANCE, _MAX_ITERATIONS = 1e-8, 64
+_EPA_TOLERANCE, _EPA_VERTICES, _EPA_FACES = 1e-7, 128, 768
+
+
+def compiled(function):
+    """Numba's `njit`, cached on disk if there is a folder for that which can be written to."""
+    options = {"nogil": True, "error_model": "numpy"}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # neither beside this file nor in the user's own cache
+        return numba.njit(**options)(function)
+
+
+_LOWER, _SPAN = tuple(panda.LOWER.tolist()), tuple((panda.UPPER - panda.LOWER).tolist())
+_JOINTS = tuple(
+    (x, y, z, float(round(math.sin(roll))), float(round(math.cos(roll))))
+    for x, y, z, roll in panda.JOINT_FRAMES
+)
+
+
+@compiled
+def _memory():
+    """(frames, centres, pose, simplex, other)"""
+    return (
+        np.zeros((8, 12)),
+        np.empty((11, 3)),
+        np.zeros(12),
+        np.empty(32),
+        np.zeros((1, ROW)),
+    )
+
+
+@compiled
+def _place(q, bodies, frames, centres):
+    """Write the frames and the bodies' centres of a normalised configuration."""
+    frames[0, 0] = frames[0, 4] = frames[0, 8] = 1.0
+    for joint in range(7):
+        x, y, z, sr, cr = _JOINTS[joint]
+        angle = _LOWER[joint] + (q[joint] + 1.0) * 0.5 * _SPAN[joint]
+        c, s = math.cos(angle), math.sin(angle)
+        here, there = frames[joint], frames[joint + 1]
+        for i in range(0, 9, 3):
+            rx, ry, rz = here[i], here[i + 1], here[i + 2]
+            there[9 + i // 3] = here[9 + i // 3] + rx * x + ry * y + rz * z
+            # Turned by the roll about x, then by the joint about its z.
+            ty, tz = cr * ry + sr * rz, cr * rz - sr * ry
+            there[i] = c * rx + s * ty
+            there[i + 1] = c * ty - s * rx
+            there[i + 2] = tz
+    for body in range(bodies.shape[0]):
+        f = frames[int(bodies[body, 0])]
+        x, y, z = bodies[body, 1], bodies[body, 2], bodies[body, 3]
+        for i in range(3):
+            centres[body, i] = f[9 + i] + f[3 * i] * x + f[3 * i + 1] * y + f[3 * i + 2] * z
+
+
+@compiled
+def _sphere_gap(rows, j, centres, k):
+    """Squared distance (m^2) of a body's centre from the box around a shape's core."""
+    x, y, z = centres[k, 0] - rows[j, 1], centres[k, 1] - rows[j, 2], centres[k, 2] - rows[j, 3]
+    u = max(abs(rows[j, 4] * x + rows[j, 7] * y + rows[j, 10] * z) - rows[j, 13], 0.0)
+    v = max(abs(rows[j, 5] * x + rows[j, 8] * y + rows[j, 11] * z) - rows[j, 14], 0.0)
+    w = max(abs(rows[j, 6] * x + rows[j, 9] * y + rows[j, 12] * z) - rows[j, 15], 0.0)
+    return u * u + v * v + w * w
+
+
+@compiled
+def _box_gap(bodies, k, frames, centres, points, j, pose):
+    """Distance (m) of a point from the box around a body. Writes its place to `pose`."""
+    f = frames[int(bodies[k, 0])]
+    x, y, z = (
+        points[j, 0] - centres[k, 0],
+        points[j, 1] - centres[k, 1],
+        points[j, 2] - centres[k, 2],
+    )
+    pose[9] = f[0] * x + f[3] * y + f[6] * z
+    pose[10] = f[1] * x + f[4] * y + f[7] * z
+    pose[11] = f[2] * x + f[5] * y + f[8] * z
+    u = max(abs(pose[9]) - bodies[k, 5], 0.0)
+    v = max(abs(pose[10]) - bodies[k, 6], 0.0)
+    w = max(abs(pose[11]) - bodies[k, 7], 0.0)
+    return math.sqrt(u * u + v * v + w * w)
+
+
+@compiled
+def _box_gaps(bodies, k, frames, centres, points, begin, end, gaps):
+    """Write distances (m) of points from the box around a body."""
+    f = frames[int(bodies[k, 0])]
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    cx, cy, cz = centres[k, 0], centres[k, 1], centres[k, 2]
+    half_x, half_y, half_z = bodies[k, 5], bodies[k, 6], bodies[k, 7]
+    for j in range(begin, end):
+        x, y, z = points[j, 0] - cx, points[j, 1] - cy, points[j, 2] - cz
+        u = max(abs(xx * x + yx * y + zx * z) - half_x, 0.0)
+        v = max(abs(xy * x + yy * y + zy * z) - half_y, 0.0)
+        w = max(abs(xz * x + yz * y + zz * z) - half_z, 0.0)
+        gaps[j] = math.sqrt(u * u + v * v + w * w)
+
+
+@compiled
+def _relative(rows, j, frames, f, centres, k, pose):
+    """Write the pose of a shape as a body sees it: rotation (row-major) and place."""
+    x, y, z = rows[j, 1] - centres[k, 0], rows[j, 2] - centres[k, 1], rows[j, 3] - centres[k, 2]
+    for i in range(3):
+        a, b, c = frames[f, i], frames[f, 3 + i], frames[f, 6 + i]
+        pose[9 + i] = a * x + b * y + c * z
+        for n in range(3):
+            pose[3 * i + n] = a * rows[j, 4 + n] + b * rows[j, 7 + n] + c * rows[j, 10 + n]
+
+
+@compiled
+def _boxes_apart(bodies, k, rows, j, pose, gap):
+    """Whether a face of the body's box, or of that around the core, lies between them by `gap`."""
+    for i in range(3):
+        reach = bodies[k, 5 + i]
+        for n in range(3):
+            reach += abs(pose[3 * i + n]) * rows[j, 13 + n]
+        if abs(pose[9 + i]) > reach + gap:
+            return True
+    for n in range(3):
+        reach, along = rows[j, 13 + n], 0.0
+        for i in range(3):
+            reach += abs(pose[3 * i + n]) * bodies[k, 5 + i]
+            along += pose[3 * i + n] * pose[9 + i]
+        if abs(along) > reach + gap:
+            return True
+    return False
+
+
+@compiled
+def _begin(rows, j, pose, s):
+    """Write to s[28:31] a vector from a core towards a body, for `_gjk` to begin with."""
+    # From the nearest point of the box around the core to the body's centre, in the core's axes.
+    u = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
+    v = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
+    w = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
+    u = math.copysign(max(abs(u) - rows[j, 13], 0.0), u)
+    v = math.copysign(max(abs(v) - rows[j, 14], 0.0), v)
+    w = math.copysign(max(abs(w) - rows[j, 15], 0.0), w)
+    if u * u + v * v + w * w > 1e-12:
+        for i in range(3):
+            s[28 + i] = pose[3 * i] * u + pose[3 * i + 1] * v + pose[3 * i + 2] * w
+        return
+    s[28], s[29], s[30] = -pose[9], -pose[10], -pose[11]
+    if pose[9] * pose[9] + pose[10] * pose[10] + pose[11] * pose[11] < 1e-12:
+        s[28] = 1.0
+
+
+@compiled
+def _farthest(vertices, cells, k, x, y, z):
+    """Index of the vertex of a body that is farthest along (x, y, z)."""
+    u, v, w = abs(x), abs(y), abs(z)
+    if u >= v and u >= w:
+        face, size, u, v = 0 if x > 0.0 else 1, u, y, z
+    elif v >= w:
+        face, size, u, v = 2 if y > 0.0 else 3, v, z, x
+    else:
+        face, size, u, v = 4 if z > 0.0 else 5, w, x, y
+    cell = 0
+    if size > 0.0:
+        i = min(int((u / size + 1.0) * (0.5 * CELLS)), CELLS - 1)
+        j = min(int((v / size + 1.0) * (0.5 * CELLS)), CELLS - 1)
+        cell = ((k * 6 + face) * CELLS + i) * CELLS + j
+    best, found = -FAR, 0
+    for n in range(cells[cell], cells[cell + 1]):
+        i = cells[n]
+        value = vertices[i, 0] * x + vertices[i, 1] * y + vertices[i, 2] * z
+        if value > best:
+            best, found = value, i
+    return found
+
+
+@compiled
+def _support(vertices, cells, k, rows, j, pose, x, y, z):
+    """The point of body minus core that is farthest along (x, y, z), and the body's vertex."""
+    i = _farthest(vertices, cells, k, x, y, z)
+    # The core's point that is farthest the other way, in its own axes.
+    u = -(pose[0] * x + pose[3] * y + pose[6] * z)
+    v = -(pose[1] * x + pose[4] * y + pose[7] * z)
+    w = -(pose[2] * x + pose[5] * y + pose[8] * z)
+    if rows[j, 0] == LINK:
+        n = _farthest(vertices, cells, int(rows[j, 17]), u, v, w)
+        u, v, w = vertices[n, 0], vertices[n, 1], vertices[n, 2]
+    elif rows[j, 0] == CYLINDER:
+        across = math.sqrt(u * u + v * v)
+        scale = rows[j, 13] / across if across > 0.0 else 0.0
+        u, v, w = u * scale, v * scale, math.copysign(rows[j, 15], w)
+    else:  # a box, or a sphere, whose core has no size
+        u = math.copysign(rows[j, 13], u)
+        v = math.copysign(rows[j, 14], v)
+        w = math.copysign(rows[j, 15], w)
+    ax, ay, az = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+    return (
+        ax - (pose[9] + pose[0] * u + pose[1] * v + pose[2] * w),
+        ay - (pose[10] + pose[3] * u + pose[4] * v + pose[5] * w),
+        az - (pose[11] + pose[6] * u + pose[7] * v + pose[8] * w),
+        ax,
+        ay,
+        az,
+    )
+
+
+@compiled
+def _triangle(s, a, b, c):
+    """The triangle of the points at s[a], s[b], s[c]: its point nearest to the origin.
+
+    Returns its squared distance and its barycentric coordinates (Ericson, Real-Time Collision
+    Detection, 2005, section 5.1.5).
+    """
+    abx, aby, abz = s[b] - s[a], s[b + 1] - s[a + 1], s[b + 2] - s[a + 2]
+    acx, acy, acz = s[c] - s[a], s[c + 1] - s[a + 1], s[c + 2] - s[a + 2]
+    d1 = -(abx * s[a] + aby * s[a + 1] + abz * s[a + 2])
+    d2 = -(acx * s[a] + acy * s[a + 1] + acz * s[a + 2])
+    d3 = -(abx * s[b] + aby * s[b + 1] + abz * s[b + 2])
+    d4 = -(acx * s[b] + acy * s[b + 1] + acz * s[b + 2])
+    d5 = -(abx * s[c] + aby * s[c + 1] + abz * s[c + 2])
+    d6 = -(acx * s[c] + acy * s[c + 1] + acz * s[c + 2])
+    in_a, in_b, in_c = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    if d1 <= 0.0 and d2 <= 0.0:
+        u, v, w = 1.0, 0.0, 0.0
+    elif d3 >= 0.0 and d4 <= d3:
+        u, v, w = 0.0, 1.0, 0.0
+    elif in_c <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        u, w = 1.0 - v, 0.0
+    elif d6 >= 0.0 and d5 <= d6:
+        u, v, w = 0.0, 0.0, 1.0
+    elif in_b <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        u, v = 1.0 - w, 0.0
+    elif in_a <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w = (d4 - d3) / (d4 - d3 + d5 - d6)
+        u, v = 0.0, 1.0 - w
+    else:
+        total = in_a + in_b + in_c
+        v, w = in_b / total, in_c / total
+        u = 1.0 - v - w
+    squared = 0.0
+    for i in range(3):
+        x = u * s[a + i] + v * s[b + i] + w * s[c + i]
+        squared += x * x
+    return squared, u, v, w
+
+
+@compiled
+def _reduce(s, n):
+    """Keep of a simplex of `n` points those that span its point nearest to the origin.
+
+    Their weights go to s[24:28]. Returns how many are left; 4 if the origin is inside.
+    """
+    if n == 4:
+        best, without = FAR, -1
+        u = v = w = 0.0
+        for face in range(4):  # the one without point `face`
+            a, b, c, d = 3 * ((face + 1) % 4), 3 * ((face + 2) % 4), 3 * ((face + 3) % 4), 3 * face
+            origin, point = 0.0, 0.0
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                normal = (s[b + j] - s[a + j]) * (s[c + k] - s[a + k])
+                normal -= (s[b + k] - s[a + k]) * (s[c + j] - s[a + j])
+                origin -= normal * s[a + i]
+                point += normal * (s[d + i] - s[a + i])
+            if origin * point > 0.0:
+                continue  # both are on one side
+            squared, x, y, z = _triangle(s, a, b, c)
+            if squared < best:
+                best, without, u, v, w = squared, face, x, y, z
+        if without < 0:
+            return 4
+        # In the order of `_triangle`: a, b, c are the points after `without`, around and around.
+        if without == 0:
+            s[24], s[25], s[26], s[27] = 0.0, u, v, w
+        elif without == 1:
+            s[24], s[25], s[26], s[27] = w, 0.0, u, v
+        elif without == 2:
+            s[24], s[25], s[26], s[27] = v, w, 0.0, u
+        else:
+            s[24], s[25], s[26], s[27] = u, v, w, 0.0
+    elif n == 3:
+        _, s[24], s[25], s[26] = _triangle(s, 0, 3, 6)
+    elif n == 2:
+        along = squared = 0.0
+        for i in range(3):
+            edge = s[3 + i] - s[i]
+            along -= edge * s[i]
+            squared += edge * edge
+        s[25] = min(max(along / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+        s[24] = 1.0 - s[25]
+    else:
+        s[24] = 1.0
+    left = 0
+    for i in range(n):
+        if s[24 + i] > 0.0:
+            for k in range(3):
+                s[3 * left + k], s[12 + 3 * left + k] = s[3 * i + k], s[12 + 3 * i + k]
+            s[24 + left] = s[24 + i]
+            left += 1
+    return left
+
+
+@compiled
+def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
+    """Distance (m) of a body's hull from a shape's core; 0 where they overlap.
+
+    It may stop early: at a lower bound of the distance that is at least `far`, or at an upper bound
+    that is below `near`, which it then returns. Writes to `s`: the simplex's points (3 x 4) of body
+    minus core, the body's vertices they come from (3 x 4), weights (4), and at the end the vector
+    from the core to the hull (3) and how far away the hull is at least along it (or -`FAR`). On
+    entry, the vector is any one to begin with. `pose` is the core's.
+
+    Returns the distance and the number of points in the simplex.
+    """
+    x, y, z = s[28], s[29], s[30]
+    distance, bound, n, s[31] = math.sqrt(x * x + y * y + z * z), FAR, 0, -FAR
+    for _ in range(_MAX_ITERATIONS):
+        px, py, pz, ax, ay, az = _support(vertices, cells, k, rows, j, pose, -x, -y, -z)
+        lower = (px * x + py * y + pz * z) / distance
+        if lower >= far or bound - lower <= _TOLERANCE:
+            s[31] = lower
+            return lower if lower >= far else bound, n
+        i = 3 * n
+        s[i], s[i + 1], s[i + 2], s[12 + i], s[13 + i], s[14 + i] = px, py, pz, ax, ay, az
+        n = _reduce(s, n + 1)
+        if n == 4:
+            return 0.0, n
+        x = y = z = 0.0
+        for i in range(n):
+            x += s[24 + i] * s[3 * i]
+            y += s[24 + i] * s[3 * i + 1]
+            z += s[24 + i] * s[3 * i + 2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if distance < 1e-9:  # they touch, in a way that tells no direction
+            return 0.0, n
+        s[28], s[29], s[30] = x, y, z
+        if distance < near or distance >= bound:
+            return min(distance, bound), n
+        bound = distance
+    return bound, n
+
+
+@compiled
+def _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
+    """Whether a body's hull is at least `gap` (m) away from a shape's core."""
+    _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
+    if _boxes_apart(bodies, k, rows, j, pose, gap):
+        return True
+    _begin(rows, j, pose, s)
+    return _gjk(vertices, cells, k, rows, j, pose, s, gap, gap)[0] >= gap
+
+
+@compiled
+def _as_row(bodies, k, frames, centres, row):
+    """Write a body as a shape."""
+    row[0, 0], row[0, 16], row[0, 17] = LINK, BULLET_MARGIN, k
+    for i in range(3):
+        row[0, 1 + i], row[0, 13 + i] = centres[k, i], bodies[k, 5 + i]
+    for i in range(9):
+        row[0, 4 + i] = frames[int(bodies[k, 0]), i]
+
+
+@compiled
+def _is_free(q, rule, relaxed, arm, world, memory):
+    """`CollisionChecker.is_free` of one state."""
+    bodies, pairs, vertices, cells = arm
+    rows, points, groups, ball = world
+    frames, centres, pose, s, other = memory
+    margin, clearance, growth = rule[0], rule[1], rule[2]
+    for i in range(relaxed.shape[0]):
+        squared = 0.0
+        for j in range(7):
+            squared += (q[j] - relaxed[i, j]) ** 2
+        margin = min(margin, relaxed[i, 7] + growth * math.sqrt(squared))
+    _place(q, bodies, frames, centres)
+    for k in range(bodies.shape[0] - 1, 0, -1):  # the hand first: it moves most
+        for j in range(rows.shape[0]):
+            gap = margin + clearance + rows[j, 16] + BULLET_MARGIN
+            reach = bodies[k, 4] + gap
+            if reach > 0.0 and _sphere_gap(rows, j, centres, k) >= reach * reach:
+                continue
+            if not _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
+                return False
+        for g in range(groups.shape[0]):
+            gap = margin + clearance + ball[0, 16] + BULLET_MARGIN
+            if _box_gap(bodies, k, frames, centres, groups, g, pose) >= groups[g, 3] + gap:
+                continue
+            for j in range(int(groups[g, 4]), int(groups[g, 5])):
+                if _box_gap(bodies, k, frames, centres, points, j, pose) >= gap:
+                    continue
+                _begin(ball, 0, pose, s)
+                if _gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
+                    return False
+    gap = margin + 2 * BULLET_MARGIN
+    for i in range(pairs.shape[0]):
+        a, b = pairs[i, 0], pairs[i, 1]
+        reach = bodies[a, 4] + bodies[b, 4] + gap
+        x, y = centres[a, 0] - centres[b, 0], centres[a, 1] - centres[b, 1]
+        z = centres[a, 2] - centres[b, 2]
+        if reach > 0.0 and x * x + y * y + z * z >= reach * reach:
+            continue
+        _as_row(bodies, b, frames, centres, other)
+        if not _is_apart(bodies, vertices, cells, a, other, 0, frames, centres, pose, s, gap):
+            return False
+    return True
+
+
+@compiled
+def free_batch(states, rule, relaxed, arm, world, free):
+    memory = _memory()
+    for i in range(states.shape[0]):
+        near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        free[i] = _is_free(states[i], rule, near, arm, world, memory)
+
+
+@compiled
+def motion(rule, relaxed, arm, world, end_known, start, end):
+    """How many states of a motion were looked at, not counting its start; negative: not free."""
+    memory, q = _memory(), np.empty(7)
+    squared = 0.0
+    for j in range(7):
+        squared += (end[j] - start[j]) ** 2
+    pieces = int(math.ceil(math.sqrt(squared) / rule[3]))
+    looked_at, parts, part = 0, 1, 1
+    if end_known:
+        parts = 2
+        if pieces < 2:
+            return 0
+    while True:
+        i = part * pieces // parts  # of `pieces`: first the end, then the middle, ...
+        # Unless an earlier, coarser round has looked at that.
+        before, after = (part - 1) * pieces // parts, (part + 1) * pieces // parts
+        if parts == 1 or (i != before and i != after):
+            share = i / pieces if pieces > 0 else 1.0
+            for j in range(7):
+                q[j] = start[j] + (end[j] - start[j]) * share
+            looked_at += 1
+            if not _is_free(q, rule, relaxed, arm, world, memory):
+                return -looked_at
+        part += 2
+        if part > parts:
+            if parts >= pieces:
+                return looked_at
+            parts, part = 2 * parts, 1
+
+
+@compiled
+def motion_batch(starts, stops, rule, relaxed, arm, world, ends_known, checks):
+    memory = _memory()
+    for i in range(starts.shape[0]):
+        near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        if ends_known:
+            checks[i] = motion(rule, near, arm, world, True, starts[i], stops[i])
+            continue
+        if not _is_free(starts[i], rule, near, arm, world, memory):
+            checks[i] = -1
+            continue
+        more = motion(rule, near, arm, world, False, starts[i], stops[i])
+        checks[i] = more + 1 if more > 0 else more - 1
+
+
+# --- Compiled: distances
+
+
+@compiled
+def _add_face(s, faces, n, a, b, c):
+    """Append a face of EPA's polytope: its points, unit normal, distance from the origin."""
+    f = faces[n]
+    f[0], f[1], f[2] = a, b, c
+    squared = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        f[3 + i] = (s[b, j] - s[a, j]) * (s[c, k] - s[a, k])
+        f[3 + i] -= (s[b, k] - s[a, k]) * (s[c, j] - s[a, j])
+        squared += f[3 + i] * f[3 + i]
+    f[6] = FAR  # of a face without an area, which is never the nearest
+    if squared > 1e-30:
+        f[3:6] /= math.sqrt(squared)
+        f[6] = f[3] * s[a, 0] + f[4] * s[a, 1] + f[5] * s[a, 2]
+    return n + 1
+
+
+@compiled
+def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
+    """Depth (m) of a body's hull in a shape's core, from a simplex of `_gjk` around the origin.
+
+    Writes the way out to s[28:31], and the body's deepest point to s[24:27]. `points`:
+    (`_EPA_VERTICES`, 6), `faces`: (`_EPA_FACES`, 7), `edges`: (`_EPA_FACES`, 2).
+    """
+    for i in range(4):
+        for n in range(3):
+            points[i, n], points[i, 3 + n] = s[3 * i + n], s[12 + 3 * i + n]
+    num_points, num_faces = 4, 0
+    for face in range(4):
+        a, b, c = (face + 1) % 4, (face + 2) % 4, (face + 3) % 4
+        num_faces = _add_face(points, faces, num_faces, a, b, c)
+        if faces[num_faces - 1, 6] < 0.0:  # it looked inwards
+            num_faces = _add_face(points, faces, num_faces - 1, a, c, b)
+    while True:
+        nearest = 0
+        for f in range(1, num_faces):
+            if faces[f, 6] < faces[nearest, 6]:
+                nearest = f
+        face = faces[nearest]
+        x, y, z = face[3], face[4], face[5]
+        px, py, pz, ax, ay, az = _support(vertices, cells, k, rows, j, pose, x, y, z)
+        further = x * px + y * py + z * pz - face[6]
+        # (At most three times as many faces come out of the next round.)
+        full = num_points == points.shape[0] or 3 * num_faces > faces.shape[0]
+        if further <= _EPA_TOLERANCE or full:
+            break
+        new = points[num_points]
+        new[0], new[1], new[2], new[3], new[4], new[5] = px, py, pz, ax, ay, az
+        # Faces that the new point sees make room for those between it and their outline.
+        num_edges, f = 0, 0
+        while f < num_faces:
+            seen = faces[f, 3] * px + faces[f, 4] * py + faces[f, 5] * pz - faces[f, 6]
+            if seen <= 1e-12:
+                f += 1
+                continue
+            for i in range(3):
+                a, b = int(faces[f, i]), int(faces[f, (i + 1) % 3])
+                for e in range(num_edges):
+                    if edges[e, 0] == b and edges[e, 1] == a:  # between two that are seen
+                        num_edges -= 1
+                        edges[e, 0], edges[e, 1] = edges[num_edges, 0], edges[num_edges, 1]
+                        break
+                else:
+                    edges[num_edges, 0], edges[num_edges, 1] = a, b
+                    num_edges += 1
+            num_faces -= 1
+            faces[f, :] = faces[num_faces, :]
+        for e in range(num_edges):
+            num_faces = _add_face(points, faces, num_faces, edges[e, 0], edges[e, 1], num_points)
+        num_points += 1
+    depth = face[6]
+    # The origin's shadow on that face, as a mean of its corners, and so of the body's vertices.
+    triangle = np.empty(9)
+    for i in range(3):
+        for n in range(3):
+            triangle[3 * i + n] = points[int(face[i]), n] - depth * face[3 + n]
+    _, u, v, w = _triangle(triangle, 0, 3, 6)
+    for n in range(3):
+        s[24 + n] = (
+            u * points[int(face[0]), 3 + n]
+            + v * points[int(face[1]), 3 + n]
+            + w * points[int(face[2]), 3 + n]
+        )
+        s[28 + n] = -face[3 + n]
+    return depth
+
+
+@compiled
+def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope):
+    """Distance (m) of a body's hull from a shape's core, minus the depth where they overlap.
+
+    `FAR` if that is not less than `far`. Else s[28:31] is the way out and s[24:27] the hull's
+    nearest or deepest point, both in the body's axes and the latter from its centre.
+    """
+    squared = _sphere_gap(rows, j, centres, k)
+    reach = bodies[k, 4] + far
+    # From outside, no way out is longer than the radius less the distance.
+    if squared > 0.0 and (reach <= 0.0 or squared >= reach * reach):
+        return FAR
+    _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
+    if _boxes_apart(bodies, k, rows, j, pose, far):
+        return FAR
+    return _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope)
+
+
+@compiled
+def _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope):
+    """`_signed_distance` of a shape that may be near; `pose` is the core's."""
+    _begin(rows, j, pose, s)
+    distance, n = _gjk(vertices, cells, k, rows, j, pose, s, -1.0, far)
+    if distance != 0.0 and distance >= far:  # (where they overlap, only the depth tells)
+        return FAR
+    if distance == 0.0:
+        if n < 4:  # the origin is on a face or an edge of the simplex: move it off, by 0.1 um
+            pose[9] += 3e-8
+            pose[10] += 5e-8
+            pose[11] += 7e-8
+            n = _gjk(vertices, cells, k, rows, j, pose, s, -1.0, FAR)[1]
+        if n == 4:
+            points, faces, edges = polytope
+            return -_epa(vertices, cells, k, rows, j, pose, s, points, faces, edges)
+    u, v, w = s[24], s[25] if n > 1 else 0.0, s[26] if n > 2 else 0.0
+    norm = math.sqrt(s[28] * s[28] + s[29] * s[29] + s[30] * s[30])
+    for i in range(3):
+        s[24 + i] = u * s[12 + i]
+        if n > 1:
+            s[24 + i] += v * s[15 + i]
+        if n > 2:
+            s[24 + i] += w * s[18 + i]
+        s[28 + i] /= norm
+    return distance
+
+
+@compiled
+def _gradient(frames, first, last, direction, point, gradient):
+    """Write how fast a point moves along a direction with each joint, from `first` to `last`."""
+    gradient[:] = 0.0
+    for joint in range(first, last):
+        f = frames[joint + 1]  # it turns about its z
+        x, y, z = point[0] - f[9], point[1] - f[10], point[2] - f[11]
+        gradient[joint] = (
+            direction[0] * (f[5] * z - f[8] * y)
+            + direction[1] * (f[8] * x - f[2] * z)
+            + direction[2] * (f[2] * y - f[5] * x)
+        ) * (0.5 * _SPAN[joint])
+
+
+@compiled
+def _write(frames, f, centres, k, s, sign, back, direction, point):
+    """Direction and point of `_signed_distance`, in the base's frame; `back` (m) from the point."""
+    for i in range(3):
+        out = at = 0.0
+        for n in range(3):
+            out += frames[f, 3 * i + n] * s[28 + n]
+            at += frames[f, 3 * i + n] * s[24 + n]
+        direction[i], point[i] = sign * out, centres[k, i] + at - back * out
+
+
+@compiled
+def _cloud_distance(
+    bodies, vertices, cells, k, world, frames, centres, pose, s, far, polytope, gaps
+):
+    """`_signed_distance` from the nearest point of the cloud.
+
+    `gaps`: two arrays to write to, for all groups and for all points: how far (m) they are from the
+    box around the body; so they are at least that far from its hull.
+    """
+    _, points, groups, ball = world
+    of_groups, of_points = gaps
+    _box_gaps(bodies, k, frames, centres, groups, 0, groups.shape[0], of_groups)
+    middle = -1
+    for g in range(groups.shape[0]):
+        of_groups[g] -= groups[g, 3]
+        if middle < 0 or of_groups[g] < of_groups[middle]:
+            middle = g
+    # What is probably nearest goes first: it rules out the others.
+    first, least = -1, far
+    for n in range(groups.shape[0]):
+        g = middle if n == 0 else n - 1 if n <= middle else n
+        begin, end = int(groups[g, 4]), int(groups[g, 5])
+        of_points[begin] = -1.0  # not known
+        if of_groups[g] < least:
+            _box_gaps(bodies, k, frames, centres, points, begin, end, of_points)
+            for j in range(begin, end):
+                if of_points[j] < least:
+                    first, least = j, of_points[j]
+    nearest = FAR
+    # Planes that all of the hull is behind, seen from points that were looked at: through the
+    # hull's point that is nearest to the nearest one, and of the last one that is farther away.
+    ax = ay = az = bx = by = bz = 0.0
+    a = b = -FAR
+    x = y = z = 0.0  # the hull's point
+    for g in range(-1 if first >= 0 else groups.shape[0], groups.shape[0]):
+        begin, end = first, first + 1
+        if g >= 0:
+            begin, end = int(groups[g, 4]), int(groups[g, 5])
+            # (From inside of the box, no length is known to be a way out.)
+            if of_groups[g] + groups[g, 3] > 0.0 and of_groups[g] >= far:
+                continue
+            if of_points[begin] < 0.0:
+                _box_gaps(bodies, k, frames, centres, points, begin, end, of_points)
+        for j in range(begin, end):
+            if (g >= 0 and j == first) or (of_points[j] > 0.0 and of_points[j] >= far):
+                continue
+            _box_gap(bodies, k, frames, centres, points, j, pose)
+            u, v, w = pose[9], pose[10], pose[11]
+            if max(a - (ax * u + ay * v + az * w), b - (bx * u + by * v + bz * w)) >= far:
+                continue
+            core = _core_distance(vertices, cells, k, ball, 0, pose, s, far, polytope)
+            if core < far:
+                nearest = far = core
+                x, y, z, ax, ay, az = s[24], s[25], s[26], s[28], s[29], s[30]
+                a = ax * x + ay * y + az * z + _TOLERANCE if core > 0.0 else -FAR
+            else:
+                norm = math.sqrt(s[28] * s[28] + s[29] * s[29] + s[30] * s[30])
+                bx, by, bz = s[28] / norm, s[29] / norm, s[30] / norm
+                b = s[31] + bx * u + by * v + bz * w
+    s[24], s[25], s[26], s[28], s[29], s[30] = x, y, z, ax, ay, az
+    return nearest
+
+
+@compiled
+def nearest_batch(
+    states,
+    self_collisions,
+    within,
+    arm,
+    world,
+    distance,
+    direction,
+    point,
+    gradient,
+    which,
+):
+    bodies, pairs, vertices, cells = arm
+    rows, points, groups, ball = world
+    frames, centres, pose, s, other = _memory()
+    polytope = (
+        np.empty((_EPA_VERTICES, 6)),
+        np.empty((_EPA_FACES, 7)),
+        np.empty((_EPA_FACES, 2), np.int64),
+    )
+    gaps = np.empty(groups.shape[0]), np.empty(points.shape[0])
+    of_arm = rows.shape[0]
+    distance[:], direction[:], point[:], which[:] = within, 0.0, 0.0, of_arm + 2
+    for i in range(states.shape[0]):
+        _place(states[i], bodies, frames, centres)
+        for k in range(1, bodies.shape[0]):
+            f, link = int(bodies[k, 0]), k - 1
+            first, least = 0, FAR  # what is probably nearest goes first: it rules out the others
+            for j in range(rows.shape[0]):
+                squared = _sphere_gap(rows, j, centres, k)
+                if squared < least:
+                    first, least = j, squared
+            for n in range(rows.shape[0]):
+                j = first if n == 0 else n - 1 if n <= first else n
+                rounding = rows[j, 16] + BULLET_MARGIN
+                far = min(distance[i, link] + rounding, FAR)
+                core = _signed_distance(
+                    bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope
+                )
+                if core < far:
+                    distance[i, link], which[i, link] = core - rounding, j
+                    _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
+            rounding = ball[0, 16] + BULLET_MARGIN
+            far = min(distance[i, link] + rounding, FAR)
+            core = _cloud_distance(
+                bodies, vertices, cells, k, world, frames, centres, pose, s, far, polytope, gaps
+            )
+            if core < far:
+                distance[i, link], which[i, link] = core - rounding, of_arm + 1
+                _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
+            _gradient(frames, 0, f, direction[i, link], point[i, link], gradient[i, link])
+        rounding = 2 * BULLET_MARGIN
+        for j in range(pairs.shape[0] if self_collisions else 0):
+            a, b = pairs[j, 0], pairs[j, 1]
+            far = distance[i, b - 1] if a == 0 else max(distance[i, a - 1], distance[i, b - 1])
+            far = min(far + rounding, FAR)
+            _as_row(bodies, b, frames, centres, other)
+            core = _signed_distance(
+                bodies, vertices, cells, a, other, 0, frames, centres, pose, s, far, polytope
+            )
+            fa, fb = int(bodies[a, 0]), int(bodies[b, 0])
+            for body, sign, back in ((a, 1.0, 0.0), (b, -1.0, core)):
+                link = body - 1
+                if link >= 0 and core < FAR and core - rounding < distance[i, link]:
+                    distance[i, link], which[i, link] = core - rounding, of_arm
+                    there, at = direction[i, link], point[i, link]
+                    _write(frames, fa, centres, a, s, sign, back, there, at)
+                    # Joints that move both change nothing. What those between them move is one of
+                    # the two: the other way round for the one that they do not move.
+                    _gradient(frames, min(fa, fb), max(fa, fb), there, at, gradient[i, link])
+                    if bodies[body, 0] < max(fa, fb):
+                        gradient[i, link] *= -1.0
+        for link in range(distance.shape[1]):
+            if which[i, link] == of_arm + 2:
+                distance[i, link] = np.inf
+
+
+@compiled
+def proximity_batch(states, rows, self_collisions, within, arm, world):
+    """Write what `CollisionChecker.proximity` returns, unless a state is NaN: whether none is."""
+    clipped = np.empty(states.shape)
+    for i in range(states.shape[0]):
+        for j in range(states.shape[1]):
+            if math.isnan(states[i, j]):
+                return False
+            clipped[i, j] = min(max(states[i, j], -1.0), 1.0)
+    batch = rows.shape[0], rows.shape[1]
+    distance, which = np.empty(batch), np.empty(batch, np.int64)
+    direction, point = np.empty((batch[0], batch[1], 3)), np.empty((batch[0], batch[1], 3))
+    gradient = np.empty((batch[0], batch[1], 7))
+    found = distance, direction, point, gradient, which
+    nearest_batch(clipped, self_collisions, within, arm, world, *found)
+    for i in range(batch[0]):
+        for link in range(batch[1]):
+            rows[i, link, 0] = min(distance[i, link], within)
+            for j in range(7):
+                rows[i, link, 1 + j] = gradient[i, link, j]
+    return True
+
+
+# --- The safety filter
+
+
+@compiled
+def project(actions, proximity, keep, max_step, brake, near, push, sweeps):
+    """Change actions (n, 7) in place."""
+    for i in range(actions.shape[0]):
+        action = actions[i]
+        _shorten(action, max_step)
+        for _ in range(sweeps):
+            for link in range(proximity.shape[1]):
+                row = proximity[i, link]
+                if row[0] >= near:
+                    continue
+                squared = along = 0.0
+                for j in range(7):
+                    squared += row[1 + j] * row[1 + j]
+                    along += row[1 + j] * action[j]
+                short = min(brake * (keep[i, link] - row[0]), push) - along
+                if short > 0.0 and squared > 1e-12:
+                    for j in range(7):
+                        action[j] += row[1 + j] * short / squared
+        _shorten(action, max_step)
+
+
+@compiled
+def _shorten(action, max_step):
+    squared = 0.0
+    for j in range(7):
+        squared += action[j] * action[j]
+    if squared > max_step * max_step:
+        for j in range(7):
+            action[j] *= max_step / np.sqrt(squared)

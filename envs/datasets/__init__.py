@@ -1,0 +1,1 @@
+"""Files of queries, demonstrations, observations and roadmap paths."""

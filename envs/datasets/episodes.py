@@ -1,0 +1,148 @@
+"""Demonstrations as episodes of a goal type: what an environment would have recorded on the way.
+
+A demonstration (`envs.datasets.Demo`) is a motion between two configurations. What is observed and
+achieved on it, and when its goal counts as reached, depends on what the goal is: `ee`, `config` or
+`combined`. Learning from demonstrations and exporting them begin here.
+"""
+
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.demonstrations import load_demos
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.subgoals import MAX_STEP
+
+
+class Episode(NamedTuple):
+    """One episode of T steps, float32.
+
+    `observation` (T + 1, o), `achieved_goal` (T + 1, g), `desired_goal` (g,), `action` (T, 7), and
+    `reached` (T + 1,), bool: whether the goal counts as reached there.
+    """
+
+    observation: np.ndarray
+    achieved_goal: np.ndarray
+    desired_goal: np.ndarray
+    action: np.ndarray
+    reached: np.ndarray
+
+
+def goal_of(goal_type, state, position):
+    """What a goal of this type says of an arm: (..., 3) `ee`, (..., 7) `config`, (..., 10) both.
+
+    `state` (..., 7) is its normalised configuration, `position` (..., 3) its end-effector's, m.
+    """
+    if goal_type == "ee":
+        return position
+    if goal_type == "config":
+        return state
+    return np.concatenate([state, position], axis=-1)
+
+
+def observed(states, goal, goal_type):
+    """What is observed on the way through `states`, without velocities, to `goal`.
+
+    Args:
+        states: normalised configurations (n, 7).
+        goal: joint angles (..., 7), rad.
+        goal_type: `ee`, `config` or `combined`.
+
+    Returns:
+        float32 `observation` (n, 10), `achieved_goal` (n, g), `desired_goal` (..., g).
+    """
+    positions = panda.forward_kinematics(panda.denormalise(states))
+    goal = goal_of(goal_type, panda.normalise(goal), panda.forward_kinematics(goal))
+    arrays = np.hstack([states, positions]), goal_of(goal_type, states, positions), goal
+    return tuple(array.astype(np.float32) for array in arrays)
+
+
+def demo_episode(demo, env):
+    """A `Demo` as `env` would have recorded it, up to reaching its goal: an `Episode`.
+
+    Args:
+        demo: an `envs.datasets.Demo`.
+        env: an environment of `envs.make` without velocities; its goal type, action mode, goal
+            tolerances, encoder and appended proximity are those of the episode.
+    """
+    observation, achieved_goal, desired_goal = observed(demo.states, demo.goal, env.goal_type)
+    action = demo.actions
+    if env.action_mode == "subgoal":
+        action = demo.states[:-1] + demo.actions
+    if getattr(env, "appends_proximity", False):
+        near = env.proximity_at(demo.states, demo.scene)
+        observation = np.hstack([observation, near.reshape(len(near), -1)])
+    encoder = getattr(env, "encoder", None)
+    if encoder is not None:
+        latent = np.tile(encoder(demo.scene), (len(observation), 1))
+        observation = np.hstack([observation, latent])
+    reached = env.compute_terminated(achieved_goal, desired_goal, {})
+    length = int(np.argmax(reached[1:])) + 1 if reached[1:].any() else len(action)
+    until = slice(length + 1)
+    return Episode(
+        observation[until], achieved_goal[until], desired_goal, action[:length], reached[until]
+    )
+
+
+def transition(before, action, after, collision):
+    """As a replay buffer keeps it: `action` led from observation `before` (a dict) to `after`."""
+    return {
+        "observation": before["observation"],
+        "action": action,
+        "next_observation": after["observation"],
+        "next_achieved_goal": after["achieved_goal"],
+        "desired_goal": before["desired_goal"],
+        "collision": collision,
+    }
+
+
+def demo_transitions(demo, env):
+    """The same as a list of such transitions."""
+    episode = demo_episode(demo, env)
+    seen = [
+        {"observation": one, "achieved_goal": achieved, "desired_goal": episode.desired_goal}
+        for one, achieved in zip(episode.observation, episode.achieved_goal, strict=True)
+    ]
+    steps = zip(seen[:-1], episode.action, seen[1:], strict=True)
+    return [transition(before, action, after, False) for before, action, after in steps]
+
+
+class DemoQueriesWrapper(gym.Wrapper):
+    """Episodes on the queries of demonstrations: `reset` draws one of them, `demo` is it.
+
+    Args:
+        env: an environment of `envs.make`.
+        demos: `envs.datasets.Demos`.
+    """
+
+    def __init__(self, env, demos):
+        super().__init__(env)
+        self.demos, self.demo = demos, None
+
+    def reset(self, *, seed=None, options=None):
+        """As `RoboArmEnv.reset`."""
+        if seed is not None:
+            self.env.reset(seed=seed)
+        self.demo = self.demos[int(self.np_random.integers(len(self.demos)))]
+        return self.env.reset_specific(self.demo.start, self.demo.goal, self.demo.scene)
+
+
+def load_demos_for(env, file, task):
+    """The demonstrations in a file, or of a task, if they can be episodes of `env`.
+
+    Args:
+        env: an environment of `envs.make`.
+        file: a task's name, or the path of a scene file or a demonstration file.
+        task: the task that they must be for.
+
+    Raises:
+        DatasetError: they cannot; or as `load_demos`.
+    """
+    if env.velocities or env.max_step < MAX_STEP:
+        raise DatasetError(f"demonstrations have no velocities, and steps up to {MAX_STEP}")
+    demos = load_demos(file, task)
+    if env.stop_on_collision and demos.collided.any():
+        raise DatasetError("--stop-on-collision, but some of these demonstrations touch something")
+    return demos

@@ -1,0 +1,376 @@
+"""The HDF5 format that query and demonstration files share: written, read, and checked.
+
+A query file, `envs/data/<task>.h5`, has the groups `test` and `validation`, and `original` where a
+task has queries from elsewhere, each with
+
+- `start`, `goal`: float32 (n, 7), joint angles in rad, exactly those the simulator was asked about;
+- `goal_position`: float32 (n, 3), the end-effector position at the goal in metres,
+- where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
+  uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
+  scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`.
+
+A demonstration file, `envs/demos/<task>.h5`, has the arrays
+
+- `plan`: float32 (p, 7), joint angles in rad: the waypoints of all plans, one plan after another,
+  the first one of each the start, the last one the goal; `plan_length`: uint32 (n,);
+- `residual`: int16 (m, 7), the executed configurations (see `envs.datasets.demonstrations.write_demos`), one
+  execution after another; `length`: uint32 (n,), configurations in each;
+- `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
+- `collided`: uint8 (n,), whether the execution touched something;
+- where scenes vary, `scene`, `obstacle_count` and `obstacles`, as above.
+
+Both have the attributes `schema`, `schema_version`, `task`, `seed`, `scene` (JSON: the scene,
+without the obstacles that vary), `made_by` (the command that makes the file again), `parameters`
+(JSON) and `checksum` (SHA-256 of all the others and the arrays). Files are written to a temporary
+name and then renamed: there is never half a file.
+"""
+
+import hashlib
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.scenes.primitives import (
+    MAX_LENGTH,
+    ROW,
+    from_array,
+    scene_from_json,
+    scene_to_json,
+    to_array,
+)
+from roboarm_nmp.envs.tasks import TASKS, TRAINING_SCENES, get_task, has_name, is_task, task_name
+from roboarm_nmp.envs.utils.files import write_atomically
+
+SPLITS = ("test", "validation")
+ORIGINAL = "original"  # split of queries that were not sampled; few tasks have it
+QUERY_SCHEMA, DEMO_SCHEMA = "roboarm-nmp queries", "roboarm-nmp demonstrations"
+SCHEMA_VERSION = 1
+MAX_ARRAY_BYTES = 2**30
+"""Of an array in memory: 100,000 demonstrations have a fifth of that."""
+# Of each array: dtype, numbers per row (None: one dimension), and the array of the same length.
+SCENE_ARRAYS = {
+    "scene": ("<u4", None, None),
+    "obstacle_count": ("<u4", None, "obstacle_count"),
+    "obstacles": ("<f8", ROW, "obstacles"),
+}
+QUERY_ARRAYS = {
+    "start": ("<f4", 7, "start"),
+    "goal": ("<f4", 7, "start"),
+    "goal_position": ("<f4", 3, "start"),
+}
+DEMO_ARRAYS = {
+    "plan": ("<f4", 7, "plan"),
+    "plan_length": ("<u4", None, "plan_length"),
+    "residual": ("<i2", 7, "residual"),
+    "length": ("<u4", None, "plan_length"),
+    "plan_seed": ("<u4", None, "plan_length"),
+    "digest": ("<u4", None, "plan_length"),
+    "collided": ("<u1", None, "plan_length"),
+}
+
+
+def array_formats(schema, names):
+    """The formats of a file's arrays: required ones, and optional ones if `names` has the first."""
+
+    def with_scenes(arrays, rows_of, prefix=""):
+        if f"{prefix}scene" in names:
+            arrays = {**arrays, **SCENE_ARRAYS, "scene": ("<u4", None, rows_of)}
+        return {
+            prefix + name: (dtype, width, prefix + sibling)
+            for name, (dtype, width, sibling) in arrays.items()
+        }
+
+    if schema == DEMO_SCHEMA:
+        return with_scenes(DEMO_ARRAYS, "plan_length")
+    arrays = {}
+    for split in (*SPLITS, *(ORIGINAL,) * (f"{ORIGINAL}/start" in names)):
+        arrays |= with_scenes(QUERY_ARRAYS, "start", f"{split}/")
+    return arrays
+
+
+_ATTRIBUTES = {
+    "schema": str,
+    "schema_version": int,
+    "task": str,
+    "seed": int,
+    "scene": str,
+    "made_by": str,
+    "parameters": str,
+}
+# Scenes may differ by a rounding error between machines.
+_SCENE_TOLERANCE = 1e-9
+
+
+class DatasetError(ValueError):
+    """A file that cannot be used. The message names the file and says what is wrong with it."""
+
+
+class QueryScenes:
+    """The scenes of n queries: `scenes[i]` is the `Scene` of query i, made when asked for.
+
+    Attributes:
+        base: the `Scene` without the obstacles that vary; the scene itself, if none do.
+        index: int64 (n,), the number of each query's scene; None if all have the same scene.
+        offsets: int64 (s + 1,): the obstacles of scene j are `rows[offsets[j] : offsets[j + 1]]`.
+        rows: float64 (k, 11), as of `envs.scenes.primitives.to_array`.
+    """
+
+    def __init__(self, base, index=None, offsets=None, rows=None):
+        self.base, self.index, self.offsets, self.rows = base, index, offsets, rows
+
+    def __getitem__(self, i):
+        if self.index is None:
+            return self.base
+        first, last = self.offsets[self.index[i] :][:2]
+        return replace(self.base, obstacles=from_array(self.rows[first:last]))
+
+    def take(self, which):
+        """The scenes of fewer queries, by slice or index array."""
+        index = None if self.index is None else self.index[which]
+        return QueryScenes(self.base, index, self.offsets, self.rows)
+
+
+def task_file(task, folder, suffix):
+    """The path of a task's file in a folder of `envs`, or beside a scene file.
+
+    Raises:
+        ValueError: there is no such task.
+        DatasetError: no files are made for this one.
+    """
+    get_task(task)  # refuses an unknown task
+    if task in TRAINING_SCENES:
+        raise DatasetError(f"{task} are to learn from: no queries or demonstrations are in them")
+    if has_name(task):
+        return Path(__file__).parents[1] / folder / f"{task}.h5"
+    return Path(task).with_name(task_name(task) + suffix)
+
+
+def locate(task_or_path, path_of_task):
+    """(path, task it must be for): `task_or_path` is a task, or the path of any file.
+
+    Raises DatasetError: no files are made for this task.
+    """
+    if is_task(task_or_path):
+        return path_of_task(task_or_path), task_or_path
+    return Path(task_or_path), None
+
+
+def write_file(path, schema, task, seed, arrays, made_by, parameters):
+    """Write checked arrays, by name, as a file of a schema. For the rest, see `write_queries`."""
+    formats = array_formats(schema, arrays)
+    arrays = {name: arrays[name].astype(dtype) for name, (dtype, *_) in formats.items()}
+    attributes = {
+        "schema": schema,
+        "schema_version": SCHEMA_VERSION,
+        "task": task_name(task),
+        "seed": int(seed),
+        "scene": scene_to_json(get_task(task).base_scene),
+        "made_by": made_by,
+        "parameters": json.dumps(parameters, sort_keys=True),
+    }
+    # HDF5 crashes the process on damaged metadata in its oldest format and in strings of variable
+    # length (h5py's default); newer formats have checksums over metadata, fixed lengths included.
+    # It is made in memory because HDF5 also crashes when the disk is full.
+    contents = io.BytesIO()
+    with h5py.File(contents, "w", libver=("v110", "v110")) as file:
+        for name, value in {**attributes, "checksum": _checksum(attributes, arrays)}.items():
+            file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+        for name, array in arrays.items():
+            # Shuffled in one chunk, sign and exponent bytes compress: 13% off a query file.
+            packing = {"shuffle": True, "compression": "gzip", "compression_opts": 9}
+            packing |= {"chunks": array.shape}
+            # Neighbours in a column are alike: 37% off obstacles, a quarter off executions.
+            if name.endswith("obstacles") or name == "residual":
+                packing |= {"shuffle": False, "chunks": (len(array), 1)}
+            file.create_dataset(
+                name, data=array, track_times=False, **(packing if array.size else {})
+            )
+    write_atomically(path, contents.getbuffer())
+
+
+def scene_arrays(path, scenes_of, base, prefix=""):
+    """Arrays for a sequence of `Scene`s, equal ones stored once; none for None."""
+    if scenes_of is None:
+        return {}
+    numbers = {}  # scene -> its number, in the order of their first use
+    index = [numbers.setdefault(scene, len(numbers)) for scene in scenes_of]
+    for scene in numbers:
+        if replace(scene, obstacles=()) != replace(base, obstacles=()):
+            raise DatasetError(
+                f"{path}: {prefix}scene differs from the task's in more than its obstacles"
+            )
+    return {
+        f"{prefix}scene": np.array(index, np.uint32),
+        f"{prefix}obstacle_count": np.array([len(s.obstacles) for s in numbers], np.uint32),
+        f"{prefix}obstacles": to_array([o for s in numbers for o in s.obstacles]),
+    }
+
+
+def read_scenes(path, attributes, arrays, prefix=""):
+    """The inverse of `scene_arrays`: `QueryScenes`. Raises DatasetError for nonsense."""
+    base = scene_from_json(attributes["scene"])
+    if f"{prefix}scene" not in arrays:
+        return QueryScenes(base)
+    index, counts, rows = (arrays[f"{prefix}{name}"] for name in SCENE_ARRAYS)
+    offsets = np.concatenate([[0], np.cumsum(counts.astype(np.int64))])
+    if offsets[-1] != len(rows) or index.max() >= len(counts):
+        raise DatasetError(f"{path}: {prefix}scene does not fit the number of scenes or obstacles")
+    try:
+        from_array(rows)
+    except ValueError as error:
+        raise DatasetError(f"{path}: {prefix}obstacles: {error}") from error
+    if not np.isfinite(rows).all():
+        raise DatasetError(f"{path}: {prefix}obstacles has numbers that are not finite")
+    if len(rows) and not (rows[:, 8:].min() > 0 and np.abs(rows).max() <= MAX_LENGTH):
+        raise DatasetError(f"{path}: {prefix}obstacles has sizes that make no sense")
+    return QueryScenes(base, index.astype(np.int64), offsets, rows)
+
+
+def _same_scene(one, other):
+    """Whether two scenes (JSON) are equal up to rounding."""
+    one, other = json.loads(one), json.loads(other)
+    for field in ("obstacles", "table", "floor", "friction"):
+        here, there = one.get(field), other.get(field)
+        if here is None or there is None:
+            if here is not there:
+                return False
+            continue
+        a, b = np.array(here, dtype=float), np.array(there, dtype=float)
+        if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SCENE_TOLERANCE):
+            return False
+    return True
+
+
+def _checksum(attributes, arrays):
+    """SHA-256 of the attributes, and of the names, shapes and contents of the arrays."""
+    digest = hashlib.sha256(json.dumps(attributes, sort_keys=True).encode())
+    for name, (dtype, *_) in array_formats(attributes["schema"], arrays).items():
+        digest.update(f"{name} {arrays[name].shape}".encode())
+        digest.update(arrays[name].astype(dtype).tobytes())
+    return digest.hexdigest()
+
+
+def check_format(path, schema, arrays):
+    """Shapes and dtypes; `arrays` are NumPy arrays or HDF5 datasets, by name."""
+    formats = array_formats(schema, arrays)
+    for name, array in arrays.items():
+        dtype, width, sibling = formats[name]
+        if array.dtype != np.dtype(dtype):
+            raise DatasetError(f"{path}: {name} must be {np.dtype(dtype)}, is {array.dtype}")
+        empty = array.size == 0 and name.rpartition("/")[2] != "obstacles"  # of scenes without any
+        if array.shape[1:] != (() if width is None else (width,)) or empty:
+            expected = "(n,)" if width is None else f"(n, {width})"
+            raise DatasetError(
+                f"{path}: {name} must have shape {expected} with n > 0, has {array.shape}"
+            )
+        if len(array) != len(arrays[sibling]):
+            raise DatasetError(f"{path}: {name} has {len(array)} rows, not {len(arrays[sibling])}")
+
+
+def read_file(path, schema, task):
+    """(attributes, arrays) of a file, after the checks that both kinds share."""
+    try:
+        with open(path, "rb"):
+            pass
+    except OSError as error:
+        missing = "no such file" if task else "no such file or task"
+        what = missing if isinstance(error, FileNotFoundError) else error.strerror
+        raise DatasetError(f"{path}: {what}") from error
+    if not h5py.is_hdf5(path):
+        raise DatasetError(f"{path}: not an HDF5 file")
+    try:
+        with h5py.File(path, "r") as file:
+            return _read_open(path, file, schema, task)
+    except DatasetError:
+        raise
+    except Exception as error:  # damaged HDF5 raises all kinds of exceptions
+        raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
+
+
+def check_plain(path, group):
+    """Raise DatasetError for links, arrays that lie elsewhere or nowhere, and too large ones.
+
+    A file of some kB can name other files, or promise arrays that no memory has room for.
+    """
+    for name in group:
+        where = f"{path}: {group.name.rstrip('/')}/{name}"
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise DatasetError(f"{where} is a link, which is never followed")
+        found = group[name]
+        if isinstance(found, h5py.Group):
+            check_plain(path, found)
+            continue
+        if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+            raise DatasetError(f"{where} is no array of this file")
+        if found.size * found.dtype.itemsize > MAX_ARRAY_BYTES:
+            raise DatasetError(f"{where} has {found.shape} numbers: too many")
+        if found.size and not found.id.get_storage_size():
+            raise DatasetError(f"{where} was never written")
+
+
+def attribute(file, name):
+    """An attribute of the file as a Python object; None if there is none."""
+    value = file.attrs.get(name)
+    value = value.item() if isinstance(value, np.generic) else value
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def _read_open(path, file, schema, task):
+    attributes = {}
+    for name, kind in _ATTRIBUTES.items():
+        value = attribute(file, name)
+        if name == "schema" and value != schema:
+            kind_of_file = {QUERY_SCHEMA: "query", DEMO_SCHEMA: "demonstration"}[schema]
+            raise DatasetError(
+                f"{path}: not a {kind_of_file} file (schema {value!r}, not {schema!r})"
+            )
+        if not isinstance(value, kind):
+            raise DatasetError(f"{path}: attribute {name} is {value!r}, must be {kind.__name__}")
+        if name == "schema_version" and value != SCHEMA_VERSION:
+            raise DatasetError(f"{path}: schema version {value}, this code reads {SCHEMA_VERSION}")
+        attributes[name] = value
+
+    check_plain(path, file)
+    datasets = {name: file.get(name) for name in array_formats(schema, file)}
+    for name, dataset in datasets.items():
+        if not isinstance(dataset, h5py.Dataset):
+            raise DatasetError(f"{path}: array {name} is missing or damaged")
+    check_format(path, schema, datasets)
+    arrays = {name: dataset[()] for name, dataset in datasets.items()}
+    if attribute(file, "checksum") != _checksum(attributes, arrays):
+        raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
+
+    scene_from_json(attributes["scene"])  # or it is damaged
+    if not isinstance(json.loads(attributes["parameters"]), dict):
+        raise DatasetError(f"{path}: attribute parameters is not a dict")
+    made_for = attributes["task"]
+    if task is not None and made_for != task_name(task):
+        raise DatasetError(
+            f"{path}: this file is for the task {made_for!r}, not {task_name(task)!r}"
+        )
+    if task is None and made_for in TASKS:
+        task = made_for
+    # Of a scene file that is not at hand, the file itself says what the scene is.
+    wanted = scene_to_json(get_task(task).base_scene) if task else attributes["scene"]
+    if not _same_scene(attributes["scene"], wanted):
+        replacing = " --overwrite" * (schema == DEMO_SCHEMA)
+        raise DatasetError(
+            f"{path}: out of date: made for another version of the scene of {made_for!r}; "
+            f"make it again with: {attributes['made_by']}{replacing}"
+        )
+    return attributes, arrays
+
+
+def check_configurations(path, name, configurations):
+    """Raise DatasetError unless configurations (n, 7), rad, are finite and inside the limits."""
+    if not np.isfinite(configurations).all():
+        raise DatasetError(f"{path}: {name} has numbers that are not finite")
+    outside = (configurations < panda.LOWER) | (configurations > panda.UPPER)
+    if outside.any():
+        row = int(np.argmax(outside.any(axis=1)))
+        raise DatasetError(f"{path}: {name}[{row}] is outside the joint limits")

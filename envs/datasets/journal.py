@@ -1,0 +1,111 @@
+"""What long jobs have made so far, kept beside the file that they will write."""
+
+import fcntl
+import json
+import os
+import sys
+import zlib
+
+from roboarm_nmp.envs.scenes.primitives import scene_to_json
+from roboarm_nmp.envs.tasks import get_task
+
+VERSION = 3
+
+
+def journal_of(path):
+    """Where what was made for a file is kept until the file is written."""
+    return path.with_name(path.name + ".journal")
+
+
+def line_of(entry):
+    """A line of a journal, bytes: a JSON-ready dict, after its checksum."""
+    content = json.dumps(entry).encode()
+    return b"%08x %s\n" % (zlib.crc32(content), content)
+
+
+def _entry_of(line):
+    """The inverse, of a line without its end; None: it is damaged."""
+    checksum, _, content = line.partition(b" ")
+    return json.loads(content) if checksum == b"%08x" % zlib.crc32(content) else None
+
+
+class Journal:
+    """What was made so far: lines of JSON with a checksum, the first one saying of what.
+
+    Lines are appended and flushed one at a time, so a kill can damage the last one only; it is
+    dropped when the journal is opened again. So is any other that does not fit its checksum, which
+    is said on stderr. One process at a time holds the journal.
+
+    Args:
+        path: file to go on with, or to begin.
+        options: JSON-ready dict of what the results depend on, `task` among them. The task's scene
+            is added to it.
+
+    Raises:
+        ValueError: the file is the journal of something else, no journal, or in use.
+        OSError: it cannot be written.
+    """
+
+    def __init__(self, path, options):
+        self.path = path
+        self.entries = {}
+        """Index -> entry."""
+        scene = scene_to_json(get_task(options["task"]).base_scene)
+        header = {"journal": VERSION, **options, "scene": scene}
+        self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ValueError(f"{path}: another process is writing to it") from error
+        if not path.exists() or not os.path.samestat(os.fstat(self._file.fileno()), path.stat()):
+            raise ValueError(f"{path}: another process has just finished with it")
+        self._file.seek(0)
+        contents = self._file.read()
+        lines = contents.split(b"\n")
+        entries = [_entry_of(line) for line in lines[:-1]]  # the rest is torn
+        if entries and entries[0] != header:
+            raise ValueError(_difference(path, entries[0], header))
+        if not entries and not line_of(header).startswith(contents):
+            raise ValueError(_difference(path, None, header))  # and not a torn first line either
+        self.entries = {entry["index"]: entry for entry in entries[1:] if entry is not None}
+        if damaged := entries.count(None):
+            print(f"{path}: damaged, {damaged} of its lines are made again", file=sys.stderr)
+        good = len(contents) - len(lines[-1])
+        self._file.truncate(good)
+        if good == 0:
+            self._write(header)
+
+    def append(self, entry):
+        """Keep a JSON-ready dict under its `index`, safely when this returns."""
+        self._write(entry)
+        self.entries[entry["index"]] = entry
+
+    def _write(self, entry):
+        line = line_of(entry)
+        end = self._file.seek(0, 2)
+        try:
+            if self._file.write(line) != len(line):  # the disk is full
+                raise OSError("No space left on device")
+        except OSError:
+            self._file.truncate(end)
+            raise
+
+    def close(self):
+        """Let others have it. If nothing was made, there is no journal."""
+        if not self.entries:
+            self.path.unlink(missing_ok=True)
+        self._file.close()
+
+
+def _difference(path, found, wanted):
+    if not isinstance(found, dict) or found.get("journal") != VERSION:
+        return f"{path}: not a journal that this version can continue; move it away"
+    names = [name for name in wanted if found.get(name) != wanted[name]]
+    differences = ", ".join(
+        "another scene" if name == "scene" else f"{name} {found.get(name)!r}, not {wanted[name]!r}"
+        for name in names
+    )
+    return (
+        f"{path}: the journal of something else ({differences}): use its flags to continue it, or "
+        f"delete it"
+    )

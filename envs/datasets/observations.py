@@ -1,0 +1,172 @@
+"""Files of what sensors saw: a folder of shards, each an HDF5 file of some hundred scenes.
+
+A shard, `shard_00012.h5`, has the arrays (n scenes)
+
+- `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
+  rows of `envs.scenes.primitives.to_array`; `configuration` float32 (n, 7), the arm's joint angles in rad;
+- of each `Camera`, by its name, the outputs: `front/rgb` uint8 (n, height, width, 3),
+  `front/segmentation` uint8 (n, height, width), `front/depth` uint16 (n, height, width) in units of
+  `far` / 65,535;
+- of each `PointCloud`, `depth` and `segmentation` of its grid: the points follow from them.
+
+and the attributes `schema`, `schema_version`, `task`, `seed`, `first` (number of the first scene),
+`scene` (JSON: the scene without the obstacles that vary), `sensors` (JSON), `made_by`. Images are
+compressed one by one, with a checksum each, so that any of them can be read alone.
+"""
+
+import io
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from roboarm_nmp.envs.datasets import shards
+from roboarm_nmp.envs.datasets.format import DatasetError, attribute
+from roboarm_nmp.envs.datasets.shards import read_array, shard_path, shard_paths, write_attributes
+from roboarm_nmp.envs.perception.sensors import Camera, PointCloud
+from roboarm_nmp.envs.scenes.primitives import from_array, scene_from_json, scene_to_json, to_array
+from roboarm_nmp.envs.tasks import get_task, task_name
+
+SCHEMA, SCHEMA_VERSION = "roboarm-nmp observations", 1
+_KINDS = {"camera": Camera, "point_cloud": PointCloud}
+
+
+def sensors_to_json(sensors):
+    """A dict of name -> `Camera` or `PointCloud` as text."""
+    kinds = {kind: name for name, kind in _KINDS.items()}
+    return json.dumps(
+        {name: {"kind": kinds[type(sensor)], **asdict(sensor)} for name, sensor in sensors.items()}
+    )
+
+
+def sensors_from_json(text):
+    """The inverse of `sensors_to_json`."""
+    sensors = {}
+    for name, fields in json.loads(text).items():
+        kind = _KINDS[fields.pop("kind")]
+        values = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+        sensors[name] = kind(**values)
+    return sensors
+
+
+def observe(world, sensors):
+    """What each sensor sees of a `SensorWorld`, in the form in which it is stored.
+
+    Returns:
+        A dict of `<sensor>/<output>` -> array, as a shard has them but for the first dimension.
+    """
+    arrays = {}
+    for name, sensor in sensors.items():
+        if isinstance(sensor, PointCloud):
+            sensor = sensor.camera
+        for output, array in sensor.observe(world).items():
+            if output == "depth":
+                array = np.round(array * (65_535 / sensor.far)).astype(np.uint16)
+            arrays[f"{name}/{output}"] = array
+    return arrays
+
+
+def shard_bytes(task, seed, first, sensors, scenes_seen, configurations, observations, made_by):
+    """The contents of a shard's file.
+
+    Args:
+        task: name of the task, or path of a scene file.
+        seed: of the collection, an int.
+        first: number of the first scene.
+        sensors: dict of name -> sensor.
+        scenes_seen: list of n `Scene`s.
+        configurations: float32 (n, 7), rad.
+        observations: list of n dicts, those of `observe`.
+        made_by: the command line that makes the shards.
+    """
+    rows = to_array([o for scene in scenes_seen for o in scene.obstacles])
+    arrays = {
+        "obstacle_count": np.array([len(scene.obstacles) for scene in scenes_seen], np.uint32),
+        "obstacles": rows,
+        "configuration": np.asarray(configurations, np.float32),
+    }
+    attributes = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "task": task_name(task),
+        "seed": int(seed),
+        "first": int(first),
+        "scene": scene_to_json(get_task(task).base_scene),
+        "sensors": sensors_to_json(sensors),
+        "made_by": made_by,
+    }
+    contents = io.BytesIO()
+    with h5py.File(contents, "w", libver=("v110", "v110")) as file:
+        write_attributes(file, attributes)
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array, track_times=False, fletcher32=array.size > 0)
+        for name in observations[0]:
+            array = np.stack([one[name] for one in observations])
+            file.create_dataset(
+                name,
+                data=array,
+                chunks=(1, *array.shape[1:]),
+                compression="gzip",
+                compression_opts=4,
+                shuffle=array.dtype == np.uint16,
+                fletcher32=True,
+                track_times=False,
+            )
+    return contents.getvalue()
+
+
+def open_shard(path):
+    """An `h5py.File` of a shard. Raises DatasetError: damaged, or something else."""
+    return shards.open_shard(path, "observations", SCHEMA, SCHEMA_VERSION)
+
+
+class Observations:
+    """A folder of shards, checked; scenes are numbered through all of them.
+
+    Args:
+        folder: path.
+
+    Raises:
+        DatasetError: there are no shards, or one is missing, damaged, or not of the same collection
+            as the others.
+    """
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+        paths = shard_paths(folder, "observations")
+        self.offsets = np.zeros(len(paths) + 1, np.int64)
+        """Number of the first scene of each shard, and of all scenes."""
+        first = None
+        for number, path in enumerate(paths):
+            with open_shard(path) as file:
+                found = {name: attribute(file, name) for name in ("task", "seed", "sensors")}
+                found["scene"] = attribute(file, "scene")
+                self.offsets[number + 1] = self.offsets[number] + len(file["configuration"])
+            first = first or found
+            for name, value in found.items():
+                if value != first[name]:
+                    raise DatasetError(f"{path}: another {name} than that of the first shard")
+        self.task, self.seed = first["task"], first["seed"]
+        self.sensors = sensors_from_json(first["sensors"])
+        """Dict of name -> sensor."""
+        self.base_scene = scene_from_json(first["scene"])
+
+    def __len__(self):
+        return int(self.offsets[-1])
+
+    def read(self, number, name):
+        """One array of a shard, e.g. `read(3, "front/rgb")`. Raises DatasetError if it is bad."""
+        path = shard_path(self.folder, number)
+        with open_shard(path) as file:
+            return read_array(file, path, name)
+
+    def scenes(self, number):
+        """The `Scene`s of a shard, a list."""
+        counts, rows = self.read(number, "obstacle_count"), self.read(number, "obstacles")
+        ends = np.cumsum(counts.astype(np.int64))
+        return [
+            replace(self.base_scene, obstacles=from_array(rows[end - count : end]))
+            for end, count in zip(ends, counts, strict=True)
+        ]

@@ -1,0 +1,226 @@
+"""Queries: a start, a goal and a scene each; a task's files of them, read, written, validated.
+
+    for start, goal, scene in load_queries("wall", "validation"): ...
+
+The format of the files: `envs.datasets.format`.
+"""
+
+import contextlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.format import (
+    ORIGINAL,
+    QUERY_ARRAYS,
+    QUERY_SCHEMA,
+    SPLITS,
+    DatasetError,
+    QueryScenes,
+    check_configurations,
+    check_format,
+    locate,
+    read_file,
+    read_scenes,
+    scene_arrays,
+    task_file,
+    write_file,
+)
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.tasks import get_task
+from roboarm_nmp.envs.world import HOLD_STEPS, World
+
+# Positions may differ by a rounding error between machines.
+_POSITION_TOLERANCE = 1e-6  # m
+
+
+class Query(NamedTuple):
+    """Joint angles at start and goal, float32 (7,), rad, and the `Scene`.
+
+    `env.reset_specific(*query)` begins an episode on it.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    scene: Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Queries:
+    """Queries of one split. `queries[i]` is a `Query`; a slice or index array, fewer queries.
+
+    Attributes:
+        task: name of the task they are for.
+        split: `test`, `validation` or `original`.
+        seed: of the command that made them.
+        start: float32 (n, 7), rad.
+        goal: float32 (n, 7), rad.
+        goal_position: float32 (n, 3), end-effector position at the goal, m.
+        scenes: `QueryScenes`; `scenes[i]` is that of query i.
+    """
+
+    task: str
+    split: str
+    seed: int
+    start: np.ndarray
+    goal: np.ndarray
+    goal_position: np.ndarray
+    scenes: QueryScenes
+
+    def __len__(self):
+        return len(self.start)
+
+    def __getitem__(self, index):
+        start, goal, position = self.start[index], self.goal[index], self.goal_position[index]
+        if start.ndim == 1:
+            return Query(start, goal, self.scenes[index])
+        scenes_of = self.scenes.take(index)
+        return Queries(self.task, self.split, self.seed, start, goal, position, scenes_of)
+
+
+def query_path(task):
+    """Where the queries of a task are, or belong: of a scene file, `<name>_queries.h5` beside.
+
+    Raises ValueError for a task that is neither.
+    """
+    return task_file(task, "data", "_queries.h5")
+
+
+def load_queries(task_or_path, split="test"):
+    """The `Queries` of a task's packaged file, or of any query file.
+
+    Args:
+        task_or_path: name of a task, path of a scene file, or path of a query file.
+        split: `test`, `validation`, or, where a task has it, `original`.
+
+    Raises:
+        DatasetError: the file is missing, corrupt, not a query file, or made for another task or
+            for another version of the task's scene.
+        ValueError: unknown split; a malformed scene file.
+    """
+    if split not in (*SPLITS, ORIGINAL):
+        known = ", ".join((*SPLITS, ORIGINAL))
+        raise ValueError(f"split must be one of {known}, got {split!r}")
+    path, task = locate(task_or_path, query_path)
+    queries = _read_queries(path, task)[0]
+    if split not in queries:
+        raise DatasetError(f"{path}: has no {split} queries")
+    return queries[split]
+
+
+def write_queries(path, task, seed, splits, made_by, parameters):
+    """Write a query file, atomically: at every moment `path` is the old file or the whole new one.
+
+    The same arguments give the same bytes (same build of h5py; before 3.15 it adds time stamps).
+
+    Args:
+        path: file to write; an existing one is replaced.
+        task: name of the task, or path of a scene file.
+        seed: the seed the queries were made with, an int.
+        splits: `{"test": (start, goal, scenes), "validation": (start, goal, scenes)}`, and
+            `original` where there are some; start and goal float32 (n, 7), rad; scenes a sequence
+            of n `Scene`s, left out where all of them are the task's.
+        made_by: the command line that makes this file.
+        parameters: dict of whatever else determined the queries; must fit into JSON.
+
+    Raises:
+        DatasetError: arrays that a query file must not have; nothing is written then.
+        ValueError: unknown task, or other splits.
+        OSError: the file cannot be written; an old file is left as it was.
+    """
+    path = Path(path)
+    base = get_task(task).base_scene  # refuses an unknown task
+    if set(splits) - {ORIGINAL} != set(SPLITS):
+        raise ValueError(f"splits must be {', '.join(SPLITS)}, got {', '.join(splits)}")
+    arrays = {}
+    for split, (start, goal, *scenes_of) in splits.items():
+        start, goal = np.asarray(start), np.asarray(goal)
+        arrays |= scene_arrays(path, scenes_of[0] if scenes_of else None, base, f"{split}/")
+        arrays |= {f"{split}/start": start, f"{split}/goal": goal}
+        if goal.ndim == 2 and goal.shape[1] == panda.NUM_JOINTS:
+            position = panda.forward_kinematics(goal).astype(np.float32)
+            arrays[f"{split}/goal_position"] = position
+    check_format(path, QUERY_SCHEMA, arrays)
+    _check_queries(path, arrays)
+    write_file(path, QUERY_SCHEMA, task, seed, arrays, made_by, parameters)
+
+
+def validate(path, task=None, simulate=False, progress=False):
+    """Check a query file; returns its splits, a dict of split -> `Queries`.
+
+    Args:
+        path: the file.
+        task: the task it should be for; None allows any.
+        simulate: also put the arm at every start and goal (minutes for 10,000 queries): feasible,
+            held as long as when the file was made, and `goal_position` where the goal is.
+        progress: show a progress bar while simulating.
+
+    Raises:
+        DatasetError: the first thing found wrong.
+    """
+    queries, parameters = _read_queries(path, task)
+    if simulate:
+        _simulate(path, queries, parameters.get("hold_steps", HOLD_STEPS), progress)
+    return queries
+
+
+def _read_queries(path, task):
+    """({split: Queries}, parameters) of a file, after every check that needs no simulator."""
+    attributes, arrays = read_file(path, QUERY_SCHEMA, task)
+    _check_queries(path, arrays)
+    queries = {}
+    for split in (*SPLITS, ORIGINAL):
+        if f"{split}/start" not in arrays:
+            continue
+        columns = {name: arrays[f"{split}/{name}"] for name in QUERY_ARRAYS}
+        columns["scenes"] = read_scenes(path, attributes, arrays, f"{split}/")
+        queries[split] = Queries(attributes["task"], split, attributes["seed"], **columns)
+    return queries, json.loads(attributes["parameters"])
+
+
+def query_keys(start, goal):
+    """The set of queries as bytes: start and goal, each float32 (n, 7), exactly."""
+    return {row.tobytes() for row in np.hstack([start, goal])}
+
+
+def _check_queries(path, arrays):
+    """Joint limits, finite numbers, and no query in both splits."""
+    for split in (*SPLITS, ORIGINAL):
+        if f"{split}/start" not in arrays:
+            continue
+        for name in ("start", "goal"):
+            check_configurations(path, f"{split}/{name}", arrays[f"{split}/{name}"])
+        if not np.isfinite(arrays[f"{split}/goal_position"]).all():
+            raise DatasetError(f"{path}: {split}/goal_position has numbers that are not finite")
+    test, validation = (
+        query_keys(arrays[f"{split}/start"], arrays[f"{split}/goal"]) for split in SPLITS
+    )
+    if test & validation:
+        raise DatasetError(f"{path}: {len(test & validation)} queries are in both splits")
+
+
+def _simulate(path, queries, hold_steps, progress):
+    for split in queries:
+        position = panda.forward_kinematics(queries[split].goal)
+        off = np.linalg.norm(position - queries[split].goal_position, axis=1) > _POSITION_TOLERANCE
+        if off.any():
+            row = int(np.argmax(off))
+            raise DatasetError(f"{path}: {split}/goal_position[{row}] is not where the goal is")
+    world = World(queries["test"].scenes.base)
+    total = sum(len(queries[split]) for split in queries)
+    with (
+        contextlib.closing(world),
+        tqdm(total=total, unit=" queries", desc=Path(path).name, disable=not progress) as bar,
+    ):
+        for split in queries:
+            for row, (start, goal, scene) in enumerate(queries[split]):
+                world.set_scene(scene)
+                for name, configuration in (("start", start), ("goal", goal)):
+                    if not world.is_feasible(configuration, hold_steps):
+                        raise DatasetError(f"{path}: {split}/{name}[{row}] is not feasible")
+                bar.update()

@@ -1,0 +1,132 @@
+"""Files of roadmap paths (`demo_generation.roadmaps`): a folder of shards of some scenes each.
+
+    paths = load_roadmap_paths("roadmaps/hard")   # of thousands of scenes, in a second or so
+    paths.scenes[i]                               # the Scene of number i
+    paths.of_scene(i)                             # its paths: list of float32 (k, 7), normalised
+    paths.points, paths.offsets                   # the same, flat, for a whole folder
+
+A shard, `shard_00012.h5`, has the arrays
+
+- `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
+  rows of `envs.scenes.primitives.to_array`;
+- `path_count` uint32 (n,): paths in each scene; `length` uint16 (m,): points of each path;
+- `points` float32 (p, 7): normalised configurations, one path after another, the first point of
+  each the start, the last one the goal
+
+and the attributes `schema`, `schema_version`, `task`, `seed`, `first` (number of the first scene),
+`scene` (JSON: the scene without the obstacles that vary), `made_by`.
+"""
+
+import io
+from dataclasses import dataclass
+
+import h5py
+import numpy as np
+
+from roboarm_nmp.envs.datasets import shards
+from roboarm_nmp.envs.datasets.format import DatasetError, QueryScenes, attribute
+from roboarm_nmp.envs.datasets.shards import read_array, shard_paths, write_attributes
+from roboarm_nmp.envs.scenes.primitives import scene_from_json, scene_to_json, to_array
+from roboarm_nmp.envs.tasks import get_task, task_name
+
+SCHEMA, SCHEMA_VERSION = "roboarm-nmp roadmap paths", 1
+_ARRAYS = ("obstacle_count", "obstacles", "path_count", "length", "points")
+
+
+@dataclass(frozen=True)
+class RoadmapPaths:
+    """The paths of s scenes, n in all.
+
+    Attributes:
+        task: name of the task that the scenes are of.
+        seed: of the collection, int.
+        scenes: `scenes[i]` is the `Scene` of number i, made when asked for.
+        path_offsets: int64 (s + 1,): scene i has the paths from `path_offsets[i]` on.
+        points: float32 (p, 7), normalised configurations.
+        offsets: int64 (n + 1,): path j is `points[offsets[j] : offsets[j + 1]]`.
+    """
+
+    task: str
+    seed: int
+    scenes: QueryScenes
+    path_offsets: np.ndarray
+    points: np.ndarray
+    offsets: np.ndarray
+
+    def __len__(self):
+        """The number of scenes."""
+        return len(self.path_offsets) - 1
+
+    def of_scene(self, i):
+        """The paths of scene i: a list of float32 (k, 7)."""
+        first, last = self.path_offsets[i : i + 2]
+        ends = self.offsets[first : last + 1]
+        return [self.points[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def shard_bytes(task, seed, first, scenes, paths, made_by):
+    """The contents of a shard's file.
+
+    Args:
+        task: name of the task, or path of a scene file.
+        seed: of the collection, an int.
+        first: number of the first scene.
+        scenes: list of n `Scene`s.
+        paths: list of n lists of float32 (k, 7), normalised.
+        made_by: the command line that makes the shards.
+    """
+    flat = [path for of_scene in paths for path in of_scene]
+    arrays = {
+        "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
+        "obstacles": to_array([o for scene in scenes for o in scene.obstacles]),
+        "path_count": np.array([len(of_scene) for of_scene in paths], np.uint32),
+        "length": np.array([len(path) for path in flat], np.uint16),
+        "points": np.concatenate([np.empty((0, 7), np.float32), *flat]),
+    }
+    attributes = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "task": task_name(task),
+        "seed": int(seed),
+        "first": int(first),
+        "scene": scene_to_json(get_task(task).base_scene),
+        "made_by": made_by,
+    }
+    contents = io.BytesIO()
+    with h5py.File(contents, "w", libver=("v110", "v110")) as file:
+        write_attributes(file, attributes)
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array, track_times=False, fletcher32=array.size > 0)
+    return contents.getvalue()
+
+
+def open_shard(path):
+    """An `h5py.File` of a shard. Raises DatasetError: damaged, or something else."""
+    return shards.open_shard(path, "roadmap paths", SCHEMA, SCHEMA_VERSION)
+
+
+def load_roadmap_paths(folder):
+    """All of a folder's `RoadmapPaths`.
+
+    Raises:
+        DatasetError: there are no shards, or one is missing, damaged, or not of the same collection
+            as the others.
+    """
+    parts, first = {name: [] for name in _ARRAYS}, None
+    for path in shard_paths(folder, "roadmap paths"):
+        with open_shard(path) as file:
+            found = {name: attribute(file, name) for name in ("task", "seed", "scene")}
+            for name, part in parts.items():
+                part.append(read_array(file, path, name))
+        first = first or found
+        for name, value in found.items():
+            if value != first[name]:
+                raise DatasetError(f"{path}: another {name} than that of the first shard")
+    arrays = {name: np.concatenate(part) for name, part in parts.items()}
+    obstacles, paths, offsets = (
+        np.concatenate([[0], np.cumsum(arrays[name], dtype=np.int64)])
+        for name in ("obstacle_count", "path_count", "length")
+    )
+    base, count = scene_from_json(first["scene"]), len(arrays["path_count"])
+    scenes = QueryScenes(base, np.arange(count), obstacles, arrays["obstacles"])
+    return RoadmapPaths(first["task"], first["seed"], scenes, paths, arrays["points"], offsets)

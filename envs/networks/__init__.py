@@ -1,0 +1,1 @@
+"""Networks that run without the script that made them."""

@@ -1,0 +1,1 @@
+"""Sensors, point clouds, and encoders of scenes."""

@@ -1,0 +1,264 @@
+"""What can be seen of a scene: cameras and point clouds (paper, section 4).
+
+A sensor is plain data: where it is, where it looks, what it puts out. A `SensorWorld` is where
+sensors look: the scene and the arm once more, in a physics engine of its own, so that looking never
+touches an episode, and the goal's marker is not seen. `envs.wrappers` puts the two together.
+"""
+
+import math
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import pybullet as p
+
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
+from roboarm_nmp.envs.world import MAX_EDGE, World
+
+# Classes (paper, appendix "Training and verifying the encoders").
+ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
+CLASSES = ("robot", "table and floor", "obstacle", "nothing")
+ROBOT_COLOUR = (0.90, 0.45, 0.15, 1)
+OUTPUTS = ("rgb", "depth", "segmentation")
+LEAST_NEAR = 0.001  # m, of `near`; with far less, no number is left for the other distances
+# Cardinal directions as seen by the robot: x is forward, y left.
+CARDINAL = {"front": (1, 0), "left": (0, 1), "back": (-1, 0), "right": (0, -1)}
+DISTANCE, HEIGHT = 1.6, 0.8  # of the default sensors' places, m
+# Of the arm when a scene is looked at, rad: always the same, so that what is seen depends on the
+# scene alone.
+POSE = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Attributes:
+        eye: where it is (x, y, z), m, in the frame of the robot's base.
+        target: the point in the middle of its picture.
+        up: the direction that points up in its picture.
+        field_of_view: angle from the picture's lower to its upper edge, degrees.
+        size: (width, height) in pixels (paper: 224 by 224).
+        near, far: nearest and farthest distance seen, m, along the viewing direction.
+        outputs: some of `rgb`, uint8 (height, width, 3); `depth`, float32 (height, width), m along
+            the viewing direction, `far` where there is nothing; `segmentation`, uint8 (height,
+            width), the class of what is there: `ROBOT`, `STATIC`, `OBSTACLE` or `NOTHING`.
+
+    Raises:
+        ValueError: for an attribute that makes no sense.
+    """
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float] = (0.0, 0.0, 0.4)
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    field_of_view: float = 60.0
+    size: tuple[int, int] = (224, 224)
+    near: float = 0.1
+    far: float = 5.0
+    outputs: tuple[str, ...] = ("rgb",)
+
+    def __post_init__(self):
+        _check_view(self)
+        if not (
+            isinstance(self.outputs, (tuple, list))
+            and self.outputs
+            and all(isinstance(one, str) and one in OUTPUTS for one in self.outputs)
+        ):
+            raise ValueError(f"outputs must be some of {', '.join(OUTPUTS)}, got {self.outputs!r}")
+        if (
+            len(self.size) != 2
+            or not all(isinstance(edge, (int, np.integer)) for edge in self.size)
+            or not 1 <= min(self.size) <= max(self.size) <= MAX_EDGE
+        ):
+            raise ValueError(f"size must be two numbers from 1 to {MAX_EDGE}, got {self.size!r}")
+
+    @property
+    def space(self):
+        """Gymnasium space of an observation, a dict of the outputs."""
+        width, height = self.size
+        spaces = {
+            "rgb": gym.spaces.Box(0, 255, (height, width, 3), np.uint8),
+            "depth": gym.spaces.Box(0.0, self.far, (height, width), np.float32),
+            "segmentation": gym.spaces.Box(0, NOTHING, (height, width), np.uint8),
+        }
+        return gym.spaces.Dict({name: spaces[name] for name in self.outputs})
+
+    def observe(self, world):
+        """What it sees of a `SensorWorld`: a dict of the outputs."""
+        rgb, depth, segmentation = world.picture(self, self.size)
+        everything = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
+        return {name: everything[name] for name in self.outputs}
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """A depth sensor that returns points: a square grid of rays through a pinhole.
+
+    Attributes:
+        eye, target, up, field_of_view, near, far: as of a `Camera`.
+        num_samples: number of rays, a square number (paper: 10,000).
+
+    Raises:
+        ValueError: for an attribute that makes no sense.
+    """
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float] = (0.0, 0.0, 0.4)
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    field_of_view: float = 60.0
+    num_samples: int = 10_000
+    near: float = 0.1
+    far: float = 5.0
+
+    def __post_init__(self):
+        _check_view(self)
+        number = self.num_samples
+        if (
+            not (isinstance(number, (int, np.integer)) and not isinstance(number, bool))
+            or not 1 <= number <= MAX_EDGE**2
+            or math.isqrt(number) ** 2 != number
+        ):
+            raise ValueError(f"num_samples must be a square number to {MAX_EDGE}², got {number!r}")
+
+    @property
+    def space(self):
+        """Gymnasium space of an observation: a dict of `points` and `labels`."""
+        shape = (self.num_samples, 3)
+        return gym.spaces.Dict(
+            {
+                "points": gym.spaces.Box(-np.inf, np.inf, shape, np.float32),
+                "labels": gym.spaces.Box(0, NOTHING, shape[:1], np.uint8),
+            }
+        )
+
+    @property
+    def camera(self):
+        """The camera whose pixels are the rays."""
+        edge = math.isqrt(self.num_samples)
+        fields = (self.eye, self.target, self.up, self.field_of_view, (edge, edge))
+        return Camera(*fields, self.near, self.far, outputs=("depth", "segmentation"))
+
+    def points(self, depth, segmentation):
+        """An observation, from the camera's `depth` (m) and `segmentation`: a dict of
+
+        - `points`: float32 (num_samples, 3), m, in the frame of the robot's base: those that hit
+          something, row by row of the grid from its upper left; then zeros;
+        - `labels`: uint8 (num_samples,): what they hit, `ROBOT`, `STATIC` or `OBSTACLE`; then
+          `NOTHING`.
+        """
+        hit = segmentation != NOTHING
+        points = np.zeros((self.num_samples, 3), np.float32)
+        labels = np.full(self.num_samples, NOTHING, np.uint8)
+        points[: hit.sum()] = deproject(self, depth)[hit]
+        labels[: hit.sum()] = segmentation[hit]
+        return {"points": points, "labels": labels}
+
+    def observe(self, world):
+        """What it sees of a `SensorWorld`: `points` and `labels`, see `points`."""
+        return self.points(**self.camera.observe(world))
+
+
+def cardinal(kind=Camera, **options):
+    """Four sensors of a kind around the robot, looking at it: a dict of name -> sensor.
+
+    (Paper, section 4: "four sensors located in cardinal directions".) `options` go to each.
+    """
+    return {
+        name: kind(eye=(DISTANCE * x, DISTANCE * y, HEIGHT), **options)
+        for name, (x, y) in CARDINAL.items()
+    }
+
+
+def deproject(sensor, depth):
+    """The points (height, width, 3), m, in the frame of the robot's base, of a picture of depths.
+
+    Args:
+        sensor: a `Camera` or `PointCloud`.
+        depth: (height, width), m along the viewing direction.
+    """
+    right, up, forward = _axes(sensor)
+    height, width = depth.shape
+    half = math.tan(math.radians(sensor.field_of_view) / 2)
+    # At distance 1. PyBullet's TinyRenderer looks through the lower left corners of the pixels.
+    across = (2 * np.arange(width) / width - 1) * half * width / height
+    upward = (1 - 2 * (np.arange(height) + 1) / height) * half
+    rays = across[None, :, None] * right + upward[:, None, None] * up + forward
+    return np.array(sensor.eye) + depth[..., None] * rays
+
+
+def _axes(sensor):
+    """Unit vectors (right, up, forward) of a sensor's picture."""
+    forward = np.subtract(sensor.target, sensor.eye).astype(np.float64)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, sensor.up)
+    right /= np.linalg.norm(right)
+    return right, np.cross(right, forward), forward
+
+
+def _check_view(sensor):
+    for name in ("eye", "target", "up"):
+        vector = getattr(sensor, name)
+        if len(vector) != 3 or not all(is_number(x) and abs(x) <= MAX_LENGTH for x in vector):
+            raise ValueError(
+                f"{name} must be three numbers, up to {MAX_LENGTH:.0f} m, got {vector!r}"
+            )
+    looks = np.subtract(sensor.target, sensor.eye)
+    if np.linalg.norm(np.cross(looks, sensor.up)) < 1e-9:
+        raise ValueError("a sensor cannot look along its own up direction, or from its target")
+    for name in ("field_of_view", "near", "far"):
+        if not is_number(getattr(sensor, name)):
+            raise ValueError(f"{name} must be a number, got {getattr(sensor, name)!r}")
+    if not 0 < sensor.field_of_view < 180:
+        raise ValueError(f"field_of_view must be between 0 and 180, got {sensor.field_of_view!r}")
+    if not LEAST_NEAR <= sensor.near < sensor.far <= MAX_LENGTH:
+        raise ValueError(
+            f"near and far must be {LEAST_NEAR} <= near < far <= {MAX_LENGTH:.0f} m, "
+            f"got {sensor.near!r}, {sensor.far!r}"
+        )
+
+
+class SensorWorld(World):
+    """A scene with the arm in it, to be looked at.
+
+    The arm looks like its collision meshes. Spheres and cylinders are drawn as polyhedra, up to a
+    tenth of their radius off the true surface.
+    """
+
+    def _load_robot(self):
+        return panda.load_coarse(self.client, ROBOT_COLOUR)
+
+    def show(self, scene, configuration):
+        """Change to a `Scene` with the arm at joint angles (7, rad)."""
+        self.set_scene(scene)
+        panda.set_configuration(self.client, self.robot, configuration)
+
+    def picture(self, sensor, size):
+        """What is seen from a sensor's place, with `size` (width, height) in pixels.
+
+        Returns:
+            `rgb`, `depth` and `segmentation`, as `Camera` describes them.
+        """
+        width, height = size
+        _, _, rgb, depth, bodies = p.getCameraImage(
+            width,
+            height,
+            p.computeViewMatrix(sensor.eye, sensor.target, sensor.up),
+            p.computeProjectionMatrixFOV(
+                sensor.field_of_view, width / height, sensor.near, sensor.far
+            ),
+            shadow=0,
+            renderer=p.ER_TINY_RENDERER,
+            physicsClientId=self.client,
+        )
+        rgb = np.reshape(rgb, (height, width, 4))[..., :3].astype(np.uint8)
+        # From OpenGL's depth in [0, 1] to m.
+        depth = np.reshape(depth, (height, width)).astype(np.float64)
+        depth = sensor.far * sensor.near / (sensor.far - (sensor.far - sensor.near) * depth)
+        bodies = np.reshape(bodies, (height, width))
+        num_static = (self.scene.floor is not None) + (self.scene.table is not None)
+        segmentation = np.full((height, width), OBSTACLE, np.uint8)
+        segmentation[bodies == self.robot] = ROBOT
+        segmentation[np.isin(bodies, self._bodies[:num_static])] = STATIC
+        segmentation[bodies < 0], depth[bodies < 0] = NOTHING, sensor.far
+        return rgb, depth.astype(np.float32), segmentation

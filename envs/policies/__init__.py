@@ -1,0 +1,1 @@
+"""Pretrained policies, non-learning baselines, and the safety filter."""

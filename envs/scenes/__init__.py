@@ -1,0 +1,1 @@
+"""Obstacles and scenes as values, distributions of scenes, and scene files."""

@@ -1,0 +1,344 @@
+"""Scenes as YAML files, for people to write: read, written, and refused with the line at fault.
+
+All lengths in metres, in the frame of the robot's base (x forward, y left, z up):
+
+    table: true     # true (as if left out): the standard table; false: none; or one of your own,
+                    # {position: [x, y, z], size: [x, y, z]}, turned like a box
+    floor: -0.6     # height of the floor's surface (-0.6 if left out); false: none
+    friction: 0.5   # the obstacles' friction coefficient (0.5 if left out)
+    obstacles:      # positions are centres
+      - box: {position: [0.5, 0.0, 0.3], size: [0.3, 0.04, 0.6]}            # full edges
+      - box: {position: [0.5, 0.3, 0.3], size: [0.3, 0.04, 0.6], yaw: 45}   # degrees about z
+      - cylinder: {position: [0.4, 0.4, 0.25], radius: 0.05, length: 0.5,   # around its own z axis
+                   orientation: [0, 0, 0, 1]}                               # quaternion x, y, z, w
+      - sphere: {position: [0.3, -0.4, 0.5], radius: 0.1}
+
+A box and a cylinder may have `yaw` or `orientation`, not both. A number is whatever Python's
+`float` reads and is finite, without quotes: `1e-2` too, which YAML 1.1 takes for text. YAML's
+anchors and aliases (`&a`, `*a`) work; tags (`!a`) and merge keys (`<<`) are refused. Where things
+are is not checked here: the simulator says whether the arm touches them.
+"""
+
+import math
+from pathlib import Path
+
+import yaml
+
+from roboarm_nmp.envs.scenes.primitives import (
+    FLOOR,
+    FRICTION,
+    IDENTITY,
+    MAX_LENGTH,
+    MAX_SCENE_OBSTACLES,
+    TABLE,
+    Box,
+    Cylinder,
+    Scene,
+    Sphere,
+)
+from roboarm_nmp.envs.utils.files import write_atomically
+
+_NORM_TOLERANCE = 1e-6
+_MAX_DEPTH = 10  # a scene needs 6
+_HEADER = """\
+# A scene for RoboArm-NMP. Lengths in metres, in the frame of the robot's base: x forward, y left,
+# z up. The format is described in envs/scenes/files.py.
+"""
+
+
+class SceneFileError(ValueError):
+    """A scene file that cannot be used. The message: `PATH:LINE: reason`, lines from 1.
+
+    `PATH: reason` where no line is at fault: the file cannot be read, or a scene cannot be written.
+    """
+
+
+def load_scene(path):
+    """The `Scene` in a YAML file (format: see the module). Nothing in the file is executed.
+
+    Raises:
+        SceneFileError: the file is missing or is not a scene, down to a misspelt key.
+    """
+    try:
+        contents = Path(path).read_bytes()
+    except OSError as error:
+        raise SceneFileError(f"{path}: {error.strerror}") from error
+    try:
+        return _parse(contents)
+    except _Mistake as mistake:
+        raise SceneFileError(f"{path}:{mistake.line}: {mistake.reason}") from mistake.__cause__
+
+
+def save_scene(scene, path):
+    """Write a scene so that `load_scene` gives an equal one: every float exactly.
+
+    Atomic: at every moment `path` is the old file or the whole new one.
+
+    Raises:
+        SceneFileError: `load_scene` would refuse the file (a size that is not positive, say);
+            nothing is written then.
+        OSError: the file cannot be written; an old file is left as it was.
+    """
+    path = Path(path)
+    text = _format_scene(scene)
+    try:
+        _parse(text.encode())
+    except _Mistake as mistake:
+        line = text.splitlines()[mistake.line - 1].strip()
+        raise SceneFileError(f"{path}: cannot be written, {mistake.reason}: {line}") from None
+    write_atomically(path, text.encode())
+
+
+# --- Writing
+
+
+def _format_scene(scene):
+    table = "false" if scene.table is None else _format_fields(scene.table)
+    lines = [
+        f"table: {'true' if scene.table == TABLE else table}",
+        f"floor: {'false' if scene.floor is None else repr(float(scene.floor))}",
+        *[f"friction: {float(scene.friction)!r}"] * (scene.friction != FRICTION),
+        "obstacles:" if scene.obstacles else "obstacles: []",
+    ]
+    for obstacle in scene.obstacles:
+        lines.append(f"  - {type(obstacle).__name__.lower()}: {_format_fields(obstacle)}")
+    return _HEADER + "\n".join(lines) + "\n"
+
+
+def _format_fields(obstacle):
+    """The dataclass's fields as a YAML mapping on one line."""
+    fields = []
+    for name, value in vars(obstacle).items():
+        if name in ("position", "size", "orientation"):
+            if name == "orientation" and tuple(value) == IDENTITY:
+                continue
+            fields.append(f"{name}: [{', '.join(repr(float(number)) for number in value)}]")
+        else:
+            fields.append(f"{name}: {float(value)!r}")
+    return "{" + ", ".join(fields) + "}"
+
+
+# --- Reading. PyYAML only composes nodes, which know their lines; the rest is done here, by walking
+# down the format. So neither aliases that contain themselves nor deep ones need any care.
+
+
+class _Mistake(Exception):
+    def __init__(self, line, reason):
+        super().__init__(line, reason)
+        self.line, self.reason = line, reason
+
+
+def _mistake(node, reason):
+    return _Mistake(node.start_mark.line + 1, reason)
+
+
+class _Loader(yaml.SafeLoader):
+    """Composes nodes, except tagged or deeply nested ones (PyYAML would recurse without limit)."""
+
+    depth = 0
+
+    def compose_node(self, parent, index):
+        event = self.peek_event()
+        if getattr(event, "tag", None) is not None:
+            raise _mistake(event, "tags (words that start with !) are not allowed")
+        if self.depth == _MAX_DEPTH:
+            raise _mistake(event, "nested too deeply")
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
+def _parse(contents):
+    """bytes -> `Scene`. Raises `_Mistake`."""
+    try:
+        text = contents.decode()
+    except UnicodeDecodeError as error:
+        line = contents.count(b"\n", 0, error.start) + 1
+        raise _Mistake(line, f"byte {contents[error.start]:#04x} is not UTF-8 text") from error
+    node = _compose(text)
+    if node is None or _is_plain(node) and node.value == "":
+        raise _Mistake(1, "the file is empty (a scene with nothing of its own is {})")
+    return _scene(node)
+
+
+def _compose(text):
+    """The root node of the only document; None if there is no document."""
+    try:
+        loader = _Loader(text)
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise _Mistake(line, f"character {error.character:#x} is not allowed") from error
+    try:
+        return loader.get_single_node()
+    except yaml.MarkedYAMLError as error:
+        reason, mark = error.problem, error.problem_mark
+        if error.context and error.context_mark:
+            reason = f"{error.context} from line {error.context_mark.line + 1} on, {reason}"
+        raise _Mistake(mark.line + 1, reason) from error
+    except (ValueError, OverflowError) as error:  # PyYAML's, of an escape such as "\UFFFFFFFF"
+        raise _Mistake(loader.line + 1, f"not valid YAML ({error})") from error
+    finally:
+        loader.dispose()
+
+
+def _scene(node):
+    fields = _mapping(node, "a scene", optional=("table", "floor", "friction", "obstacles"))
+    table, floor, friction, obstacles = TABLE, FLOOR, FRICTION, ()
+    if "table" in fields:
+        table = _table(fields["table"])
+    if "floor" in fields:
+        switch = _switch(fields["floor"])
+        if switch is True:
+            raise _mistake(fields["floor"], "floor must be a height in metres or false, got true")
+        floor = None if switch is False else _number(fields["floor"], "floor")
+    if "friction" in fields:
+        friction = _number(fields["friction"], "friction")
+        if friction < 0:
+            raise _mistake(fields["friction"], f"friction must not be negative, got {friction}")
+    if "obstacles" in fields:
+        node = fields["obstacles"]
+        if not isinstance(node, yaml.SequenceNode):
+            reason = f"obstacles must be a list ([] if there are none), got {_describe(node)}"
+            raise _mistake(node, reason)
+        if len(node.value) > MAX_SCENE_OBSTACLES:
+            raise _mistake(node, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
+        obstacles = tuple(_obstacle(entry) for entry in node.value)
+    return Scene(obstacles, table, floor, friction)
+
+
+def _table(node):
+    switch = _switch(node)
+    if switch is not None:
+        return TABLE if switch else None
+    if not isinstance(node, yaml.MappingNode):
+        expected = "true, false or {position: [x, y, z], size: [x, y, z]}"
+        raise _mistake(node, f"table must be {expected}, got {_describe(node)}")
+    return _box(node, "table")
+
+
+def _obstacle(node):
+    kinds = ", ".join(_KINDS)
+    if not isinstance(node, yaml.MappingNode):
+        expected = f"a mapping of its kind ({kinds}) to its fields"
+        raise _mistake(node, f"an obstacle must be {expected}, got {_describe(node)}")
+    if len(node.value) != 1:
+        keys = ", ".join(_describe(key) for key, _ in node.value[:5]) or "none"
+        raise _mistake(node, f"an obstacle must have exactly one key, its kind ({kinds}): {keys}")
+    [(key, fields)] = node.value
+    if not isinstance(key, yaml.ScalarNode) or key.value not in _KINDS:
+        raise _mistake(key, f"unknown kind of obstacle {_describe(key)}: one of {kinds}")
+    return _KINDS[key.value](fields, key.value)
+
+
+def _box(node, what):
+    fields = _mapping(node, what, ("position", "size"), ("orientation", "yaw"))
+    return Box(
+        _vector(fields["position"], f"position of {what}", 3),
+        _vector(fields["size"], f"size of {what}", 3, positive=True),
+        _orientation(fields, what),
+    )
+
+
+def _cylinder(node, what):
+    fields = _mapping(node, what, ("position", "radius", "length"), ("orientation", "yaw"))
+    return Cylinder(
+        _vector(fields["position"], f"position of {what}", 3),
+        _number(fields["radius"], f"radius of {what}", positive=True),
+        _number(fields["length"], f"length of {what}", positive=True),
+        _orientation(fields, what),
+    )
+
+
+def _sphere(node, what):
+    fields = _mapping(node, what, ("position", "radius"))
+    return Sphere(
+        _vector(fields["position"], f"position of {what}", 3),
+        _number(fields["radius"], f"radius of {what}", positive=True),
+    )
+
+
+_KINDS = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
+
+
+def _orientation(fields, what):
+    """Quaternion (x, y, z, w) from `orientation` or `yaw`; neither: not turned."""
+    if "yaw" in fields and "orientation" in fields:
+        raise _mistake(fields["yaw"], f"{what} has both yaw and orientation, only one is allowed")
+    if "yaw" in fields:
+        half = math.radians(_number(fields["yaw"], f"yaw of {what}")) / 2
+        return (0.0, 0.0, math.sin(half), math.cos(half))
+    if "orientation" not in fields:
+        return IDENTITY
+    node = fields["orientation"]
+    orientation = _vector(node, f"orientation of {what}", 4)
+    norm = math.hypot(*orientation)
+    if abs(norm - 1) > _NORM_TOLERANCE:
+        expected = "a quaternion x, y, z, w of norm 1"
+        raise _mistake(node, f"orientation of {what} must be {expected}, its norm is {norm:.9g}")
+    return orientation
+
+
+def _mapping(node, what, required=(), optional=()):
+    """The values (nodes) of a mapping by key, with all the required keys and no unknown one."""
+    known = ", ".join((*required, *optional))
+    if not isinstance(node, yaml.MappingNode):
+        raise _mistake(node, f"{what} must be a mapping with keys {known}, got {_describe(node)}")
+    fields = {}
+    for key, value in node.value:
+        if not isinstance(key, yaml.ScalarNode) or key.value not in (*required, *optional):
+            raise _mistake(key, f"unknown key {_describe(key)} in {what}: known are {known}")
+        if key.value in fields:
+            raise _mistake(key, f"{key.value} is in {what} twice")
+        fields[key.value] = value
+    missing = [key for key in required if key not in fields]
+    if missing:
+        raise _mistake(node, f"{what} lacks {', '.join(missing)}")
+    return fields
+
+
+def _vector(node, what, length, positive=False):
+    if not isinstance(node, yaml.SequenceNode):
+        raise _mistake(node, f"{what} must be a list of {length} numbers, got {_describe(node)}")
+    if len(node.value) != length:
+        raise _mistake(node, f"{what} must be a list of {length} numbers, got {len(node.value)}")
+    return tuple(_number(number, what, positive) for number in node.value)
+
+
+def _number(node, what, positive=False):
+    try:
+        number = float(node.value) if _is_plain(node) else math.nan
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise _mistake(node, f"{what} must be a finite number, got {_describe(node)}")
+    if abs(number) > MAX_LENGTH:
+        limit = f"{MAX_LENGTH:.0f}"
+        raise _mistake(node, f"{what} must be at most {limit}, got {_describe(node)}")
+    if positive and number <= 0:
+        raise _mistake(node, f"{what} must be positive, got {_describe(node)}")
+    return number
+
+
+def _switch(node):
+    """True, False, or None if the node is neither `true` nor `false`."""
+    return {"true": True, "false": False}.get(node.value) if _is_plain(node) else None
+
+
+def _is_plain(node):
+    """Whether a node is a scalar without quotes; a quoted one is text, whatever it looks like."""
+    return isinstance(node, yaml.ScalarNode) and node.style is None
+
+
+def _describe(node):
+    if isinstance(node, yaml.MappingNode):
+        return "a mapping"
+    if isinstance(node, yaml.SequenceNode):
+        return "a list"
+    if _is_plain(node):
+        return _shorten(" ".join(node.value.split())) or "nothing"  # it may have line breaks
+    return f"the text {_shorten(node.value)!r}"
+
+
+def _shorten(text):
+    return text if len(text) <= 40 else text[:40] + "..."

@@ -1,0 +1,92 @@
+"""Random scenes: shelves, poles and walls around the arm (paper, section 4).
+
+The paper names the kinds of obstacles and how many there are. The distribution is ours, calibrated
+to go-to-goal's success in the paper (docs/tasks.md).
+"""
+
+import math
+from dataclasses import dataclass
+
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+
+# Positions and sizes are multiples of this (m), about a millimetre, and yaws of a turn's 256th
+# part: few digits make small files.
+GRID = 2.0**-10
+TURN = 2 * math.pi / 256
+# Ranges, all uniform, in m: distance of the near side from the robot's axis (of the centre, for
+# poles), and sizes. A shelf is a board, wider than deep; walls and poles stand on the table.
+SHELVES, POLES = 0.33, 0.57  # shares of the obstacles; the rest are walls
+SHELF = {"near": (0.28, 0.42), "depth": (0.15, 0.3), "width": (0.3, 0.5), "thickness": (0.02, 0.04)}
+SHELF_HEIGHT = (0.3, 0.9)
+POLE = {"centre": (0.26, 0.45), "thickness": (0.02, 0.04), "height": (1.2, 1.5)}
+WALL = {
+    "near": (0.26, 0.4),
+    "length": (0.1, 0.25),
+    "thickness": (0.01, 0.03),
+    "height": (1.2, 1.5),
+}
+# Rough obstacles: along smooth ones the arm slides to its goal, however many there are.
+FRICTION = 2.45
+# Nothing comes nearer than this (m) to the robot's axis below the shoulder's top (m).
+KEEP_CLEAR, SHOULDER = 0.14, 0.45
+
+
+@dataclass(frozen=True)
+class RandomBoxes:
+    """Scenes with `fewest` to `most` obstacles, each one box, all numbers equally likely."""
+
+    fewest: int
+    most: int
+    base: Scene = Scene(friction=FRICTION)
+
+    def sample(self, rng):
+        """A `Scene` drawn with a NumPy Generator."""
+        count = int(rng.integers(self.fewest, self.most + 1))
+        first = rng.uniform(-math.pi, math.pi)
+        sector = 2 * math.pi / count
+        boxes = []
+        while len(boxes) < count:
+            # Each in a sector of its own, so that they stand all around the robot.
+            azimuth = first + sector * (len(boxes) + rng.uniform(-0.5, 0.5))
+            box = _sample_box(rng, azimuth)
+            if _distance_to_robot(box) >= KEEP_CLEAR:
+                boxes.append(box)
+        return Scene(tuple(boxes), self.base.table, self.base.floor, self.base.friction)
+
+
+def _sample_box(rng, azimuth):
+    kind = rng.random()
+    if kind < SHELVES:
+        shape = {name: rng.uniform(*limits) for name, limits in SHELF.items()}
+        size = (shape["depth"], shape["width"], shape["thickness"])
+        distance, height = shape["near"] + shape["depth"] / 2, rng.uniform(*SHELF_HEIGHT)
+    elif kind < SHELVES + POLES:
+        shape = {name: rng.uniform(*limits) for name, limits in POLE.items()}
+        size = (shape["thickness"], rng.uniform(*POLE["thickness"]), shape["height"])
+        distance, height = shape["centre"], shape["height"] / 2
+    else:
+        shape = {name: rng.uniform(*limits) for name, limits in WALL.items()}
+        size = (shape["length"], shape["thickness"], shape["height"])
+        distance, height = shape["near"] + shape["length"] / 2, shape["height"] / 2
+    yaw = azimuth + rng.uniform(-math.pi / 2, math.pi / 2)
+    half = round(yaw / TURN) * TURN / 2
+    return Box(
+        rounded(distance * math.cos(azimuth), distance * math.sin(azimuth), height),
+        rounded(*size),
+        (0.0, 0.0, math.sin(half), math.cos(half)),
+    )
+
+
+def rounded(*lengths):
+    """Lengths (m), as multiples of `GRID`."""
+    return tuple(round(length / GRID) * GRID for length in lengths)
+
+
+def _distance_to_robot(box):
+    """Distance (m) of an upright box from the part of the robot's axis below its shoulder's top."""
+    sin, cos = 2 * box.orientation[2] * box.orientation[3], 1 - 2 * box.orientation[2] ** 2
+    x, y, z = box.position
+    # The axis in the box's frame.
+    across = (abs(cos * x + sin * y) - box.size[0] / 2, abs(cos * y - sin * x) - box.size[1] / 2)
+    below, above = z - box.size[2] / 2 - SHOULDER, -(z + box.size[2] / 2)
+    return math.hypot(max(across[0], 0.0), max(across[1], 0.0), max(below, above, 0.0))

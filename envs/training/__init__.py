@@ -1,0 +1,1 @@
+"""What trainers share that is no algorithm: run folders, validation, evaluation, flags."""

@@ -1,0 +1,374 @@
+"""The benchmark's protocol, as every trainer of a policy follows it.
+
+Validation queries say which policy of a run is the best; that one is saved, `policy.pt`, and at the
+end it is tested on test queries, with the result in `result.json`. (The evaluation on all queries,
+with more numbers, is `clean_rl_scripts/evaluate.py`.)
+
+The functions that take flags of the command line are for scripts: where the user is wrong, they end
+the program with a message.
+"""
+
+import sys
+from dataclasses import asdict, dataclass, fields
+from typing import Literal
+
+import numpy as np
+import torch
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.arm_env import HORIZON, STANDARD_RULES, deviations
+from roboarm_nmp.envs.datasets.episodes import DemoQueriesWrapper, load_demos_for
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
+from roboarm_nmp.envs.policies.registry import memory_size
+from roboarm_nmp.envs.policies.safety_filter import layer_of
+from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
+from roboarm_nmp.envs.training.runs import check_finite, write_json
+
+NUM_ENVS = 8  # that an evaluation runs together at most; the first of them takes the pictures
+PICTURE_SIZE = (240, 180)
+# The rules that every test is run under; how long its steps are is a policy's own.
+RULES = [name for name in STANDARD_RULES if name != "max_step"]
+
+
+@dataclass
+class EnvFlags:
+    """The arguments of `envs.make` among a trainer's flags: the paper's MDP and what is seen."""
+
+    goal_type: Literal["ee", "config", "combined"] = "ee"
+    """what the goal is: end-effector position, configuration, or both"""
+    action_mode: Literal["relative", "subgoal"] = "relative"
+    """action: a displacement of the normalised configuration, or the next one itself"""
+    max_step: PositiveFloat = MAX_STEP
+    """longest displacement per step (L2, normalised configuration)"""
+    horizon: PositiveInt = HORIZON
+    """steps after which an episode is cut off"""
+    stop_on_collision: bool = False
+    """end an episode at the first touch"""
+    velocities: bool = False
+    """joint velocities in the observation"""
+    encoder: str | None = None
+    """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
+    `vqvae`, `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `points`
+    of what sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default
+    nothing"""
+    proximity: str | None = None
+    """append to the observation, too, how far each link is from the nearest thing, and in which
+    direction that grows: of the true `obstacles`, of `points` that sensors see, or as z_E of an
+    encoder tells (`field`, or a path); by default nothing"""
+
+
+def env_arguments_of(args):
+    """The `EnvFlags` in a trainer's flags as a dict, for `envs.make`."""
+    arguments = {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
+    return arguments | {"append_proximity": args.proximity is not None}
+
+
+def load_task(args):
+    """The first validation queries and test queries, as many as the flags say, of `args.task`.
+
+    Raises:
+        SystemExit: unknown task, a task for testing only, or its query file cannot be used.
+    """
+    try:
+        if not envs.get_task(args.task).trainable:
+            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
+        return tuple(
+            _first(load_queries(args.task, split), f"--{flag}-queries", number)
+            for split, flag, number in (
+                ("validation", "eval", args.eval_queries),
+                ("test", "test", args.test_queries),
+            )
+        )
+    except ValueError as error:
+        sys.exit(f"--task: {error}")
+
+
+def _first(queries, flag, number):
+    if number > len(queries):
+        print(f"{flag} {number}: there are {len(queries)}, all of them are used", file=sys.stderr)
+    return queries[:number]
+
+
+def make_envs(task, number, **kwargs):
+    """A list of environments of a task; `kwargs` as for `envs.make`.
+
+    Raises:
+        SystemExit: an argument is refused.
+    """
+    try:
+        return [envs.make(task, **kwargs) for _ in range(number)]
+    except ValueError as error:
+        given = [name for name in ("encoder", "proximity") if kwargs.get(name) is not None]
+        sys.exit(f"--{' or --'.join(given)}: {error}" if given else str(error))
+
+
+def make_eval_envs(task, num_queries, **kwargs):
+    """The environments of `validate` and `final_test` for so many queries, as `make_envs`.
+
+    At least two, as `save_policy` wants.
+    """
+    pictured = make_envs(task, 1, render_mode="rgb_array", render_size=PICTURE_SIZE, **kwargs)
+    return pictured + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
+
+
+def make_training_envs(args, demo_prob=None, demos=None):
+    """`args.num_envs` environments, on random queries, or with `demo_prob` on demonstrations'.
+
+    Args:
+        args: the flags, with `EnvFlags` among them.
+        demo_prob: value of the flag, if the trainer has it.
+        demos: demonstration file, as well; by default the task's own.
+
+    Raises:
+        SystemExit: an argument is refused, or the demonstrations do not fit.
+    """
+    if demo_prob is None and demos is not None:
+        sys.exit("--demos goes with --demo-prob")
+    made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
+    if demo_prob is None:
+        return made
+    try:
+        demos = load_demos_for(made[0], demos or args.task, args.task)
+    except ValueError as error:
+        sys.exit(f"--demo-prob: {error}")
+    if args.encoder is not None:
+        made[0].encoder.encode_demos(demos)  # once, not in the loop
+    return [DemoQueriesWrapper(env, demos) for env in made]
+
+
+def begin_episodes(envs, seed, step):
+    """First observations of fresh episodes, from random numbers that depend on seed and step alone.
+
+    Whoever begins new ones at every checkpoint needs no simulator state to go on exactly like an
+    uninterrupted run.
+    """
+    seeds = np.random.SeedSequence([seed, step]).generate_state(len(envs)).tolist()
+    return [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+
+
+def stack(observations, device):
+    """List of observation dicts -> dict of float32 tensors (N, ...)."""
+    return {
+        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
+        for name in observations[0]
+    }
+
+
+def log_episode(writer, step, episode_return, info, recent_success):
+    """Write a finished training episode to TensorBoard.
+
+    Args:
+        writer: TensorBoard's.
+        step: of the training.
+        episode_return: sum of its rewards.
+        info: of its last step.
+        recent_success: list of the outcomes of the last 100 episodes, which gets this one too.
+    """
+    recent_success[:] = [*recent_success[-99:], info["is_success"]]
+    writer.add_scalar("charts/episodic_return", episode_return, step)
+    writer.add_scalar("charts/episodic_length", info["elapsed_steps"], step)
+    writer.add_scalar("charts/success", np.mean(recent_success), step)
+
+
+@torch.no_grad()
+def evaluate(policy, envs, queries, device, last_layer=None, seed=0):
+    """Run a deterministic policy on every query, each env one at a time; mean results.
+
+    Args:
+        policy: from `observation`, `achieved_goal`, `desired_goal` and what else is observed,
+            tensors (N, ...), to actions (N, 7); a module or an exported network. One with a memory
+            (`envs.policies.registry.memory_size`) is given that, too, and returns it beside the actions.
+        envs: the environments to do it in.
+        queries: `envs.datasets.Queries`, or a list of `Query`.
+        device: of the policy.
+        last_layer: an `envs.policies.safety_filter.LastLayer` around the policy, or None.
+        seed: of the layer's ways out, >= 0.
+
+    Returns:
+        A dict of floats: `success_rate`, `clean_success_rate` (without a touch), `collision_rate`
+        and `episode_length` in steps.
+
+    Raises:
+        FloatingPointError: the policy's actions are not finite, or its memory.
+    """
+    waiting, size = iter(range(len(queries))), memory_size(policy)
+    running, memories, proposed = {}, {}, {}  # env -> observation, memory, action and next memory
+    acts, results = {}, []  # env -> function
+
+    def start(env):
+        i = next(waiting, None)
+        running.pop(env, None)
+
+        def act(observation):  # (In a detour the last layer does not ask: nothing is remembered.)
+            action, memories[env] = proposed[env]
+            return action
+
+        if i is not None:
+            running[env] = env.reset_specific(*queries[i])[0]
+            acts[env], memories[env] = act, np.zeros(size, np.float32)
+            if last_layer is not None:
+                acts[env] = last_layer.around(acts[env], env, np.random.default_rng([seed, i]))
+
+    for env in envs:
+        start(env)
+    while running:
+        before = [memories[env] for env in running]
+        actions, after = _actions(policy, list(running.values()), before, device)
+        for env, action, memory in zip(list(running), actions, after, strict=True):
+            proposed[env] = action, memory
+            action = acts[env](running[env])
+            running[env], _, terminated, truncated, info = env.step(action)
+            if terminated or truncated:
+                results.append(
+                    (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
+                )
+                start(env)
+    success, touched, steps = np.array(results, dtype=np.float64).T
+    return {
+        "success_rate": float(success.mean()),
+        "clean_success_rate": float((success * (1 - touched)).mean()),
+        "collision_rate": float(touched.mean()),
+        "episode_length": float(steps.mean()),
+    }
+
+
+def _actions(policy, observations, memories, device):
+    """Actions (n, 7) for n observations, and the policy's memories after them, n arrays."""
+    if not len(memories[0]):
+        actions = policy(**stack(observations, device)).cpu().numpy()
+    else:
+        known = [o | {"memory": memory} for o, memory in zip(observations, memories, strict=True)]
+        actions, memories = (x.cpu().numpy() for x in policy(**stack(known, device)))
+        check_finite("the policy's memory", memories)
+    check_finite("the policy's actions", actions)
+    return actions, memories
+
+
+@torch.no_grad()
+def picture_of_rollout(policy, env, query, device, last_layer=None, frames=8):
+    """An image strip (height, frames * width, 3), uint8, of the policy on one query.
+
+    `env`: one that renders.
+    """
+
+    memories = [np.zeros(memory_size(policy), np.float32)]
+
+    def act(observation):
+        nonlocal memories
+        actions, memories = _actions(policy, [observation], memories, device)
+        return actions[0]
+
+    if last_layer is not None:
+        act = last_layer.around(act, env, np.random.default_rng([0, 0]))
+    observation, _ = env.reset_specific(*query)
+    pictures, done = [env.render()], False
+    while not done:
+        action = act(observation)
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        if info["elapsed_steps"] % 10 == 0 or done:
+            pictures.append(env.render())
+    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
+    return np.concatenate([pictures[i] for i in chosen], axis=1)
+
+
+def validate(policy, envs, queries, device, writer, step, progress, last_layer=None):
+    """`evaluate` on validation queries, with results and a picture of the first in TensorBoard.
+
+    A policy with a last layer is evaluated without it, too (`eval/..._without_layer`).
+
+    Args:
+        policy, queries, device, last_layer: as for `evaluate`.
+        envs: of `make_eval_envs`.
+        writer: TensorBoard's.
+        step: of the training.
+        progress: dict with `best_success` and `best_step`, which are set if none was better.
+
+    Returns:
+        The success rate.
+    """
+    result = evaluate(policy, envs, queries, device, last_layer)
+    for name, value in result.items():
+        writer.add_scalar(f"eval/{name}", value, step)
+    if last_layer is not None:
+        for name, value in evaluate(policy, envs, queries, device).items():
+            writer.add_scalar(f"eval/{name}_without_layer", value, step)
+    picture = picture_of_rollout(policy, envs[0], queries[0], device, last_layer)
+    writer.add_image("eval/rollout", picture, step, dataformats="HWC")
+    success = result["success_rate"]
+    if success >= progress["best_success"]:
+        progress |= {"best_success": success, "best_step": step}
+    return success
+
+
+def save_policy(run, policy, envs, device, args, env_arguments, step, last_layer=None):
+    """Write `policy.pt` for `evaluate.py` and others.
+
+    Args:
+        run: the run's folder.
+        policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else is
+            observed; with a `memory_size`, its `memory`, too.
+        envs: some of its environments, for examples of observations.
+        device: of the policy.
+        args: the flags; `task`, `exp_name` and `seed` are noted in the file.
+        env_arguments: of `envs.make`, noted too: the policy is evaluated with them.
+        step: of the training.
+        last_layer: an `envs.policies.safety_filter.LastLayer` that is part of the policy, or None.
+    """
+    metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
+    if last_layer is not None:
+        metadata["last_layer"] = {"keep": last_layer.keep, "way_out": last_layer.way_out}
+    metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
+    example = stack([env.reset(seed=0)[0] for env in envs[:2]], device)
+    if size := memory_size(policy):
+        metadata["memory"] = size
+        example["memory"] = torch.zeros(len(envs[:2]), size, device=device)
+    save_network(run / "policy.pt", policy, example, metadata)
+
+
+def final_test(run, args, env_arguments, queries, device, progress, steps):
+    """Test `policy.pt` on test queries: `result.json`, and a line on the console.
+
+    Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed, also
+    where the policy was trained under others: results are to be compared. File and line say so,
+    and that they cannot be where its steps are longer or shorter (`deviations`).
+
+    Args:
+        run: the run's folder.
+        args: the flags, written into the file.
+        env_arguments: of `envs.make`, in training.
+        queries: the test queries.
+        device: where to run the policy.
+        progress: dict with the run's `seconds`, `best_success` on validation queries, and
+            `best_step`, at which the policy was saved.
+        steps: of the run.
+    """
+    policy = load_network(run / "policy.pt").to(device)
+    own = {name: value for name, value in env_arguments.items() if name not in RULES}
+    test_envs = make_eval_envs(args.task, len(queries), **own)
+    last_layer = layer_of(policy.metadata)
+    result = evaluate(policy, test_envs, queries, device, last_layer)
+    rules = {name: getattr(test_envs[0], name) for name in RULES}
+    trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}
+    result |= {"rules": rules, "rules_in_training": trained, "deviations": deviations(own)}
+    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
+    result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
+    result |= {"validation_success_rate": progress["best_success"]}
+    result |= {"steps": steps, "seconds": round(progress["seconds"])}
+    write_json(run / "result.json", result | {"args": asdict(args)})
+    if rules != trained:
+        print(f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:")
+    for name, value in result["deviations"].items():
+        print(f"not comparable: {name} is {value}, not {STANDARD_RULES[name]}")
+    print(
+        f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
+        f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
+        f"{steps} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
+    )
+
+
+def _words(rules):
+    contacts = "ended by a touch" if rules["stop_on_collision"] else "contacts allowed"
+    return f"{rules['horizon']} steps, {contacts}"

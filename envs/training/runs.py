@@ -1,0 +1,333 @@
+"""Run folders: what a training run leaves, and how it goes on after it was stopped.
+
+    args = parse_args(Args, may_change={"total_updates"})   # with --resume, those of the run
+    run, device = run_folder(args, "wall"), seed_torch(args)
+    progress = {"updates": 0, "seconds": 0.0}
+    saved_parts = {"model": model, "optimizer": optimizer, "progress": progress}
+    load_checkpoint(args, saved_parts)
+    writer = summary_writer(run, args, progress["updates"])
+    bar = progress_bar(args.total_updates, progress["updates"], "update")
+    ...
+    save_checkpoint(run, saved_parts, device)
+
+Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `exp_name` at least.
+These functions are for scripts: where the user is wrong, they end the program with a message.
+"""
+
+import contextlib
+import errno
+import functools
+import importlib.util
+import itertools
+import json
+import os
+import sys
+import time
+import typing
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from roboarm_nmp.envs.tasks import SCENE_FILES
+from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.training.flags import Seed, Threads
+from roboarm_nmp.envs.utils.files import (
+    check_archive,
+    check_folder,
+    clear_leftovers,
+    new_contents,
+    write_atomically,
+)
+
+
+@dataclass
+class RunFlags:
+    """The flags of every trainer's run."""
+
+    seed: Seed = 1
+    """seed of everything random; the same seed gives the same run on the same machine and device"""
+    runs_dir: Path = Path("runs")
+    """the run's folder is made in here: TensorBoard events, checkpoint, the best network
+    (`policy.pt` or `encoder.pt`), result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint; its own flags are used"""
+    device: str = "cpu"
+    """`cpu`, `cuda` or one of several, `cuda:1`"""
+    threads: Threads = 1
+    """torch threads; one is fastest for small networks, and leaves the other cores alone"""
+    track: bool = False
+    """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
+
+
+MAY_CHANGE = {"resume", "runs_dir", "threads", "track"}  # they do not change what is computed
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+
+
+def parse_args(Args, may_change=()):
+    """The flags of the command line; with --resume those of the run, which it must not contradict.
+
+    Args:
+        Args: the dataclass of the flags.
+        may_change: names of further flags with which a run may be resumed at another value.
+
+    Raises:
+        SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
+    """
+    args = tyro.cli(Args)
+    if args.resume is not None:
+        args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
+    try:
+        flags.check(args)
+    except ValueError as error:
+        sys.exit(str(error))
+    try:
+        if args.resume is None:
+            check_folder(args.runs_dir)
+    except ValueError as error:
+        sys.exit(f"--runs-dir {error}")
+    if Path(args.exp_name).name != args.exp_name:
+        sys.exit(f"--exp-name must be part of a folder's name, got {args.exp_name!r}")
+    try:
+        device = torch.device(args.device)
+    except RuntimeError:
+        sys.exit(f"--device must be `cpu` or `cuda`, got {args.device!r}")
+    if device.type == "cuda":
+        number = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (device.index or 0) >= number:
+            sys.exit(f"--device {args.device}: PyTorch sees {number or 'no'} CUDA device(s) here")
+    if args.track and importlib.util.find_spec("wandb") is None:
+        sys.exit("--track: wandb is not installed (pip install wandb)")
+    return args
+
+
+def _args_of_run(Args, run, may_change):
+    if not (run / "args.json").exists():
+        sys.exit(f"--resume: {run} is no run's folder (it has no args.json)")
+    saved = json.loads((run / "args.json").read_text())
+    kinds = typing.get_type_hints(Args)
+    known = [field.name for field in fields(Args) if field.name in saved]
+    begun_in = Path(saved.get("begun_in", "."))
+    defaults = Args(**{name: _from_json(saved[name], kinds[name], begun_in) for name in known})
+    defaults.resume = run
+    args = tyro.cli(Args, default=defaults)
+    had, given = (json.loads(_to_json(asdict(one))) for one in (defaults, args))
+    contradicted = [
+        f"--{name.replace('_', '-')} is {given[name]!r} now, the run had {had[name]!r}"
+        for name in given
+        if name not in may_change and given[name] != had[name]
+    ]
+    if contradicted:
+        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
+    return args
+
+
+def _from_json(value, kind, begun_in):
+    """A flag's value as the dataclass has it: JSON knows neither tuples nor paths.
+
+    A file that is not to be found from here is that from the folder where the run was begun.
+    """
+    if isinstance(value, list):
+        return tuple(_from_json(one, kind, begun_in) for one in value)
+    is_path = Path in (kind, *typing.get_args(kind))
+    if not isinstance(value, str) or not (is_path or value.endswith(SCENE_FILES)):
+        return value
+    there = begun_in / value
+    value = there if there.exists() and not Path(value).exists() else value
+    return Path(value) if is_path else str(value)
+
+
+def _to_json(content):
+    return json.dumps(content, indent=2, default=str)
+
+
+def write_json(path, content):
+    """Write a file with a dict, atomically; paths in it become strings."""
+    write_atomically(path, _to_json(content).encode())
+
+
+def run_folder(args, task):
+    """The run's folder: that of --resume, or else a new one, with the flags in its `args.json`.
+
+    Args:
+        args: the flags.
+        task: the name of what is learned, the first part of the folder's name.
+    """
+    if args.resume is not None:
+        clear_leftovers(args.resume)
+        sys.excepthook = functools.partial(_say_plainly, args.resume)
+        return args.resume
+    name = f"{task}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    for again in itertools.count(1):  # another run may have begun in the same second
+        run = args.runs_dir / (name if again == 1 else f"{name}_{again}")
+        with contextlib.suppress(FileExistsError):
+            run.mkdir(parents=True)
+            break
+    write_json(run / "args.json", asdict(args) | {"begun_in": Path.cwd()})
+    sys.excepthook = functools.partial(_say_plainly, run)
+    return run
+
+
+def _say_plainly(run, kind, error, trace):
+    """Python's `excepthook`: what is no mistake of the program's is said in a line or two."""
+    if isinstance(error, KeyboardInterrupt):
+        text = "interrupted"
+    elif isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
+        text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()
+    elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
+        text = f"error: {error}"
+    elif isinstance(error, FloatingPointError):
+        text = f"error: training has diverged: {error}; what was made before is in {run}"
+    else:
+        return sys.__excepthook__(kind, error, trace)
+    if (run / "checkpoint.pt").exists() and not isinstance(error, FloatingPointError):
+        text += f"\nwhat the last checkpoint has is safe: --resume {run} goes on from there"
+    print(f"\n{text}", file=sys.stderr)
+
+
+def seed_torch(args):
+    """Make torch repeat itself: seed, threads, deterministic kernels. Returns the device."""
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
+    torch.use_deterministic_algorithms(True)
+    # Else every new tensor is filled with NaN first, to show who reads what was never written.
+    torch.utils.deterministic.fill_uninitialized_memory = False
+    return torch.device(args.device)
+
+
+def resolve_bf16(args):
+    """Decide `args.bf16` where it is None: in bfloat16 where the hardware has it.
+
+    To be called before `run_folder`, whose `args.json` says what was decided: a run that goes on
+    elsewhere stays as it is.
+    """
+    if args.bf16 is None:
+        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
+
+
+def check_finite(name, values):
+    """Raise FloatingPointError, which ends a run with a line, where training has diverged.
+
+    `values`: tensor or array of numbers, which the line calls `name`.
+    """
+    if not torch.as_tensor(values).isfinite().all():
+        raise FloatingPointError(f"{name} are no longer finite")
+
+
+def save_checkpoint(run, parts, device):
+    """Write `checkpoint.pt`: the states of the run's parts, and of torch's random numbers.
+
+    Args:
+        run: the run's folder.
+        parts: dict from a name to what changes in the run: anything with `state_dict` and
+            `load_state_dict` (modules, optimisers), a tensor, a dict of plain values, or a NumPy
+            generator.
+        device: of the run. If it is a GPU, its random numbers are saved, too.
+
+    Raises:
+        FloatingPointError: a module's parameters are not finite. The checkpoint stays what it was.
+    """
+    for name, part in parts.items():
+        if isinstance(part, torch.nn.Module):
+            for parameter in part.parameters():
+                check_finite(f"the parameters of `{name}`", parameter)
+    state = {name: _state_of(part) for name, part in parts.items()}
+    state["torch_rng"] = torch.get_rng_state()
+    if torch.device(device).type == "cuda":
+        state["cuda_rng"] = torch.cuda.get_rng_state(device)
+    try:
+        with new_contents(run / "checkpoint.pt") as temporary:
+            torch.save(state, temporary)
+    except RuntimeError as error:  # PyTorch's words for a disk that is full
+        raise OSError(errno.ENOSPC, str(error).splitlines()[0], "checkpoint.pt") from error
+
+
+def load_checkpoint(args, parts):
+    """Give the parts the states they had in the checkpoint of --resume, if there is one.
+
+    Args:
+        args: the flags.
+        parts: as given to `save_checkpoint`, with the same names. They stay on their devices.
+
+    Raises:
+        SystemExit: the checkpoint is damaged, or of other parts.
+    """
+    if args.resume is None or not (args.resume / "checkpoint.pt").exists():
+        return
+    path = args.resume / "checkpoint.pt"
+    try:  # on the CPU first: what is not a network belongs there
+        check_archive(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever a damaged file leads to
+        sys.exit(f"--resume: {path} is damaged: {error}")
+    try:
+        for name, part in parts.items():
+            _restore(part, state[name])
+    except KeyError as error:
+        sys.exit(f"--resume: {path} is of another version: it has no {error.args[0]}")
+    except RuntimeError as error:  # networks of other sizes
+        sys.exit(f"--resume: {path} is of another version: {error}")
+    torch.set_rng_state(state["torch_rng"])
+    if "cuda_rng" in state:
+        torch.cuda.set_rng_state(state["cuda_rng"], args.device)
+
+
+def _state_of(part):
+    if isinstance(part, np.random.Generator):
+        return json.dumps(part.bit_generator.state)  # its integers are too large for torch.save
+    if isinstance(part, torch.Tensor):
+        return part.detach()
+    return part if isinstance(part, dict) else part.state_dict()
+
+
+def _restore(part, state):
+    if isinstance(part, np.random.Generator):
+        part.bit_generator.state = json.loads(state)
+    elif isinstance(part, torch.Tensor):
+        part.data.copy_(state)
+    elif isinstance(part, dict):
+        if missing := part.keys() - state.keys():
+            raise KeyError(min(missing))
+        part.update(state)
+    else:
+        part.load_state_dict(state)
+
+
+def summary_writer(run, args, step):
+    """TensorBoard's writer for a run that is at `step`, with a table of the flags.
+
+    What an earlier process wrote after its last checkpoint is hidden. With `args.track`, what is
+    written goes to Weights & Biases too.
+    """
+    if args.track:
+        import wandb
+
+        config = json.loads(_to_json(asdict(args)))
+        # Under the run's name, so that a resumed run goes on there as well.
+        names = {"project": "roboarm-nmp", "name": run.name, "id": run.name, "dir": str(run)}
+        wandb.init(**names, config=config, resume="allow", sync_tensorboard=True)
+    writer = SummaryWriter(run, purge_step=step + 1)
+    rows = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
+    writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
+    return writer
+
+
+def progress_bar(total, done, unit):
+    """A bar of `total` steps, of which `done` were done by earlier processes."""
+    quiet = 0.2 if sys.stderr.isatty() else 30  # seconds; a log file needs fewer lines
+    return tqdm(total=total, initial=done, unit=unit, smoothing=0.05, mininterval=quiet)
+
+
+def elapsed(bar):
+    """Seconds since the bar began."""
+    return bar.format_dict["elapsed"]
+
+
+def rate(bar):
+    """Mean steps per second since the bar began."""
+    return (bar.n - bar.initial) / elapsed(bar)

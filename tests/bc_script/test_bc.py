@@ -1,0 +1,121 @@
+"""bc.py: its likelihood against torch.distributions, its data by hand, and that it can overfit."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
+from trainers import PATHS, load, refusal, run_here, run_script
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.training.protocol import stack
+
+bc = load("bc")
+
+
+@pytest.mark.parametrize("num_modes", [1, 3])
+def test_log_likelihood_is_that_of_torch_distributions(num_modes):
+    torch.manual_seed(0)
+    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=num_modes), 10).eval()
+    observation, goal, action = torch.randn(32, 10), torch.randn(32, 3), torch.randn(32, 7)
+    outputs = actor.mlp(actor.features(observation, goal)).reshape(32, num_modes, 15).double()
+    std = (-5 + 3.5 * (torch.tanh(outputs[..., 7:14]) + 1)).exp()
+    components = Independent(Normal(outputs[..., :7], std), 1)
+    if num_modes == 1:
+        expected = Independent(Normal(outputs[:, 0, :7], std[:, 0]), 1).log_prob(action.double())
+    else:
+        mixture = MixtureSameFamily(Categorical(logits=outputs[..., 14]), components)
+        expected = mixture.log_prob(action.double())
+    found = actor.log_likelihood(observation, goal, action)
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_action_is_the_likeliest_modes_mean():
+    torch.manual_seed(0)
+    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=3), 10).eval()
+    observation, goal = torch.randn(64, 10), torch.randn(64, 3)
+    mean, _, log_weight = actor.modes(observation, goal)
+    chosen = [mean[i, int(log_weight[i].argmax())] for i in range(64)]
+    assert len(set(log_weight.argmax(1).tolist())) > 1
+    torch.testing.assert_close(actor(observation, None, goal), 0.03 * torch.stack(chosen))
+
+
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+def test_transitions_are_those_of_the_demonstrations(goal_type):
+    demos = load_demos("wall")
+    observations, goals, actions, demo_index = bc.transitions(demos, goal_type, num_demos=3)
+    assert demo_index.tolist() == [i for i in range(3) for _ in range(len(demos[i].actions))]
+    expected = []
+    for i in range(3):
+        demo = demos[i]
+        goal_position, goal_state = panda.forward_kinematics(demo.goal), panda.normalise(demo.goal)
+        goal = {"ee": [goal_position], "config": [goal_state]}.get(
+            goal_type, [goal_state, goal_position]
+        )
+        for state, action in zip(demo.states[:-1], demo.actions, strict=True):
+            position = panda.forward_kinematics(panda.denormalise(state))
+            expected.append(np.concatenate([state, position, *goal, action / 0.03]))
+    found = np.hstack([observations, goals, actions])
+    np.testing.assert_allclose(found, np.array(expected), atol=1e-5)
+
+
+def test_it_overfits_five_demonstrations_and_follows_them(tmp_path, short_episodes):
+    flags = (
+        "--num-demos 5 --hidden-size 128 --batch-size 128 --total-updates 4000 --eval-every 4000"
+    )
+    flags += " --task no_obstacles --goal-type combined --learning-rate 3e-3 --policy-average 0.01"
+    run = run_script("bc", tmp_path, *flags.split())
+    policy = load_network(run / "policy.pt")
+    env, demos = envs.make("no_obstacles", goal_type="combined"), load_demos("no_obstacles")
+    for i in range(5):
+        observation, _ = env.reset_specific(demos.start[i], demos.goal[i])
+        over = False
+        while not over:
+            action = policy(**stack([observation], "cpu"))[0].numpy()
+            observation, _, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+        assert info["is_success"]
+        assert info["elapsed_steps"] < 1.3 * len(demos[i].states)
+    env.close()
+
+
+def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path, short_episodes):
+    path = str(demo_path("no_obstacles"))
+    flags = ["--num-modes", "2", "--goal-type", "config", "--demos", path, path]
+    run = run_script("bc", tmp_path, *flags)
+    events = EventAccumulator(str(run))
+    events.Reload()
+    losses = [event.value for event in events.Scalars("losses/negative_log_likelihood")]
+    assert len(losses) == 1 and np.isfinite(losses).all()
+    assert json.loads((run / "args.json").read_text())["demos"] == [path, path]
+    (run / "result.json").unlink()
+    run_here(PATHS["bc"], "--resume", run)
+    updates = json.loads((run / "result.json").read_text())["steps"]
+    run_here(PATHS["bc"], "--resume", run, "--total-updates", 2 * updates)
+    assert json.loads((run / "result.json").read_text())["steps"] == 2 * updates
+    rates = EventAccumulator(str(run)).Reload().Scalars("charts/learning_rate")
+    assert [event.step for event in rates] == [1000, 2000]
+    assert rates[-1].value == pytest.approx(1e-3 * (1 - 1999 / (2 * updates)))
+
+
+@pytest.mark.parametrize(
+    "flags, message",
+    [
+        (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
+        (["--demos", "nowhere.h5"], "nowhere.h5: no such file"),
+        (
+            ["--demos", str(demo_path("wall"))],
+            "this file is for the task 'wall', not 'no_obstacles'",
+        ),
+        (["--num-modes", "0"], "--num-modes must be in [1, 65536]"),
+        (["--num-demos", "0"], "--num-demos must be at least 1"),
+        (["--resume", "nowhere"], "nowhere is no run's folder"),
+    ],
+)
+def test_bad_flags(tmp_path, flags, message, capsys):
+    assert message in refusal("bc", capsys, tmp_path, *flags)

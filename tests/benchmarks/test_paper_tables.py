@@ -1,0 +1,255 @@
+"""The results page: from the paper's cells and a folder of results, and from a run."""
+
+import functools
+import importlib.util
+import json
+import re
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import psutil
+import pytest
+from paths import ROOT
+from PIL import Image
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.networks.exported_networks import load_network
+
+spec = importlib.util.spec_from_file_location(
+    "paper_tables", ROOT / "benchmarks" / "paper_tables.py"
+)
+paper_tables = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(paper_tables)
+
+CELLS = {cell.name: cell for cell in paper_tables.read_cells()}
+
+
+def result(name, seed, success, **more):
+    made_up = {
+        "cell": name,
+        "seed": seed,
+        "success_rate": success,
+        "success_rate_interval": [success - 0.01, success + 0.01],
+        "clean_success_rate": success / 2,
+        "num_queries": 10_000,
+        "steps": 300_000,
+        "policy_step": 275_000,
+        "training_seconds": 600,
+        "date": "2026-01-02",
+        "commit": "abc1234",
+        "curve": [[100_000, success / 2], [300_000, success]],
+        "args": {},
+    }
+    return made_up | more
+
+
+def args_of(name):
+    """What a run of the cell's own recipe has in its JSON."""
+    given = CELLS[name].flags()
+    return {f[2:].replace("-", "_"): v for f, v in zip(given[::2], given[1::2], strict=True)}
+
+
+BASELINES = {"wall": {"go-to-goal": {"success_rate": 0.7}, "RRT-Connect, 5 s": {"success_rate": 1}}}
+
+
+@pytest.fixture
+def results(tmp_path):
+    made_up = [
+        result("sac-ee-wall-p1", 1, 0.95, args=args_of("sac-ee-wall-p1")),
+        result("sac-ee-double_walls-p1", 1, 0.83),
+        *(result("bc-combined-no_obstacles", seed, 0.98 + seed / 1000) for seed in (1, 2, 3)),
+        result("sac-combined-no_obstacles-p0-no_hindsight", 1, 0.002),
+    ]
+    for number, one in enumerate(made_up):
+        (tmp_path / f"{number}.json").write_text(json.dumps(one))
+    return paper_tables.load_results([tmp_path, tmp_path / "missing"])
+
+
+def test_the_papers_cells():
+    papers = [cell for cell in CELLS.values() if cell.mean is not None]
+    assert len(papers) == 3 * 9 * 5 + 4 + 3 + 9 * 6  # goals, hindsight, encoders with BC and SAC
+    others = {cell.name for cell in CELLS.values() if cell.mean is None}
+    assert all("oracle" in name or re.match("bc-.*-on-|td3-", name) for name in others)
+    assert {cell.task for cell in CELLS.values()} <= set(envs.TASKS)
+    for name, mean, std in [  # as in the issue's table, and the ends of each of the paper's
+        ("bc-ee-no_obstacles", 0.073, 0.036),
+        ("bc-config-double_walls", 0.500, 0.009),
+        ("td3-ee-double_walls-p1", 0.848, 0.027),
+        ("td3-config-boxes-p1", 0.822, 0.014),
+        ("sac-combined-no_obstacles-p0", 0.990, 0.002),
+        ("sac-combined-no_obstacles-p0-no_hindsight", 0.001, 0.0),
+        ("bc-combined-vqvae-random_boxes_hard", 0.150, 0.045),
+        ("sac-combined-pointnet2-random_boxes_hard-p1-on-narrow_shelves", 0.441, 0.019),
+    ]:
+        assert (CELLS[name].mean, CELLS[name].std) == (mean, std)
+
+
+def test_a_cell_is_a_command():
+    flags = CELLS["sac-combined-no_obstacles-p0-no_hindsight"].flags()
+    assert flags[:4] == ["--task", "no_obstacles", "--goal-type", "combined"]
+    assert flags[-4:] == ["--demo-prob", "0", "--her-probability", "0"]
+    assert "--demo-prob" not in CELLS["bc-ee-wall"].flags()
+    flags = CELLS["sac-combined-vae-random_boxes_hard-p1-on-three_shelves"].flags()
+    assert flags[:2] == ["--task", "random_boxes_hard"]
+    assert flags[-4:] == ["--encoder", "vae", "--num-hidden-layers", "4"]
+
+
+def test_runs_from_before_goal_minus_configuration_are_others():
+    recipe = {"gamma": 0.98, "target_entropy": -14.0, "num_hidden_layers": 3, "demo_prob": 1.0}
+    for goal_type, fits in (("ee", True), ("config", False), ("combined", False)):
+        cell = CELLS[f"sac-{goal_type}-wall-p1"]
+        args = recipe | {"task": "wall", "goal_type": goal_type}
+        assert cell.is_recipe_of(args) is fits
+        assert cell.is_recipe_of(args | {"relative_configuration": True})
+        assert cell.is_recipe_of(args | {"relative_configuration": False}) is fits
+
+
+def test_the_page_shows_what_was_run_and_what_was_not(results):
+    page = paper_tables.page(list(CELLS.values()), results, BASELINES, {})
+    in_small = "<sub>300,000 steps, 1 seed</sub><br>0.971 ± 0.003"
+    assert f"**0.950 [0.946, 0.954]**<br>{in_small}" in page
+    deviation = statistics.stdev([0.981, 0.982, 0.983])  # the interval is that of 30,000 queries
+    in_small = "<sub>300,000 steps, 3 seeds, other flags</sub><br>0.986 ± 0.002"
+    assert f"**0.982 ± {deviation:.3f} [0.980, 0.983]**<br>{in_small}" in page
+    assert "not run<br>0.848 ± 0.027" in page
+    # The `combined` cells on `no_obstacles` with p stand in two tables.
+    assert page.count("<br>") - page.count("<sub>") == len(CELLS) + 4
+    assert page.count("not run<br>") == len(CELLS) + 4 - page.count("<sub>")
+    assert page.count("<sub>") == 4
+    assert page.count("| *floor: go-to-goal* |  | 0.700 |") == 3
+    assert page.count("| *ceiling: RRT-Connect, 5 s* |  | 1.000 |") == 3
+    below = "`sac-ee-double_walls-p1` (0.830, paper 0.916) of these runs. What was found: "
+    assert f"Below the paper by more than 0.05: {below}" in page
+    assert (
+        "| `bc-combined-no_obstacles-s2`, not kept, other flags | 0.982 [0.979, 0.984] | 0.491 |"
+        in page
+    )
+    assert "300,000 (275,000) | 10,000 | 10 min | 2026-01-02, abc1234 |" in page
+    for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
+        assert len({line.count("|") for line in table.splitlines()}) == 1
+
+
+def test_runs_with_other_flags_do_not_count_beside_the_cells_own(results):
+    name = "sac-ee-double_walls-p1"  # so far with other flags, and far below the paper
+    results[name] += [result(name, 2, 0.9, args=args_of(name), kept=False)]
+    page = paper_tables.page(list(CELLS.values()), results, BASELINES, {})
+    assert "**0.900 [0.894, 0.906]**<br><sub>300,000 steps, 1 seed</sub><br>0.916" in page
+    assert "Below the paper by more than 0.05: none" in page
+    assert f"| `{name}-s1`, not kept, other flags | 0.830" in page
+    assert f"| `{name}-s2`, not kept | 0.900" in page
+
+
+def test_an_algorithm_of_ones_own(results, tmp_path):
+    header, *rows = paper_tables.CELLS.read_text().splitlines()
+    (tmp_path / "cells.csv").write_text("\n".join([header, *rows, "mine,ee,wall,wall,1,yes,,,"]))
+    cells = paper_tables.read_cells(tmp_path / "cells.csv")
+    results["mine-ee-wall-p1"] = [result("mine-ee-wall-p1", 1, 0.5, kept=True)]
+    page = paper_tables.page(cells, results, {}, {})
+    found = "**0.500 [0.490, 0.510]**<br><sub>300,000 steps, 1 seed</sub>"
+    assert f"| MINE-MP (p = 1) |  | {found}<br>not in the paper |" in page
+    assert "`mine-ee-wall-p1` (" not in page
+    paper_tables.draw_bars(cells, results, tmp_path / "bars.png")
+
+
+def test_imitation_stands_beside_the_papers_encoders(results):
+    found = {"success_rate": 0.9, "num_queries": 1000}
+    more = {"success_rate": 0.8, "num_queries": 1000}
+    seeds = {"dagger, points": found, "dagger, points, seed 2": more, "dagger, points, alone": more}
+    unseen = {"narrow_shelves": {"dagger, points": found}, "wall": {"dagger, oracle": found}}
+    unseen["pole_shelves"] = seeds
+    page = paper_tables.page(list(CELLS.values()), results, BASELINES, unseen)
+    (row,) = (line for line in page.splitlines() if line.startswith("| DAgger"))
+    assert row.startswith("| DAgger with a last layer: seen points |  |  |")
+    assert row.endswith("| **0.900 [0.880, 0.917]**<br><sub>1,000 queries, 1 seed</sub> |")
+    assert "| **0.850 ± 0.071 [0.834, 0.865]**<br><sub>2,000 queries, 2 seeds</sub> |" in row
+    for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
+        assert len({line.count("|") for line in table.splitlines()}) == 1
+
+
+def test_the_page_without_any_result():
+    page = paper_tables.page(list(CELLS.values()), {}, {}, {})
+    assert "**" not in page and page.rstrip().endswith("None yet.")
+
+
+def test_the_pictures(results, tmp_path):
+    unseen = {"wall": {"dagger, points": {"success_rate": 0.99}}}
+    story = functools.partial(paper_tables.draw_story, baselines=BASELINES, unseen=unseen)
+    for draw in (paper_tables.draw_curves, paper_tables.draw_bars, story):
+        draw(list(CELLS.values()), results, path=tmp_path / "picture.png")
+        with Image.open(tmp_path / "picture.png") as picture:
+            assert len(picture.convert("RGB").getcolors(1_000_000)) > 10
+
+
+def test_the_picture_of_tasks_shows_means_over_seeds(results, monkeypatch):
+    figures = []
+    monkeypatch.setattr(paper_tables, "_save", lambda figure, path: figures.append(figure))
+    paper_tables.draw_story(list(CELLS.values()), results, BASELINES, {}, None)
+    drawn = {points.get_label(): points for points in figures[0].axes[0].collections}
+    heights = drawn["ours, the best of the same cells"].get_offsets()[:, 1]
+    assert sorted(heights) == pytest.approx([0.83, 0.95, 0.982])  # seeds: 0.981, 0.982, 0.983
+
+
+def test_a_trainer_does_not_outlive_the_command(tmp_path):
+    script = ROOT / "benchmarks" / "paper_tables.py"
+    flags = ["--only", "bc-ee-boxes", "--steps", "1000000", "--runs-dir", str(tmp_path)]
+    process = subprocess.Popen([sys.executable, str(script), *flags], stderr=subprocess.PIPE)
+    until = time.time() + 60
+    while not list(tmp_path.glob("*/*/args.json")):
+        assert time.time() < until
+        time.sleep(0.05)
+    (trainer,) = psutil.Process(process.pid).children()
+    process.terminate()
+    assert b"killed" in process.communicate(timeout=20)[1] and process.returncode == 1
+    assert not trainer.is_running()
+
+
+def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(paper_tables, "POLICIES", tmp_path / "policies")
+    few = ["--eval-queries", "2", "--num-demos", "20", "--eval-every", "30"]
+    monkeypatch.setitem(paper_tables.RECIPES, "bc", few)
+    cell = CELLS["bc-config-wall"]
+    paper_tables.run(cell, 5, 60, 4, tmp_path / "runs")
+    kept = json.loads((tmp_path / "policies" / "bc-config-wall-s5.json").read_text())
+    assert kept["cell"] == cell.name and kept["seed"] == kept["args"]["seed"] == 5
+    assert kept["steps"] == 60 and kept["num_queries"] == 4
+    assert [step for step, _ in kept["curve"]] == [30, 60]
+    assert re.fullmatch(r"[0-9a-f]{7,}\+?", kept["commit"])
+    load_network(tmp_path / "policies" / "bc-config-wall-s5.pt")
+    capfd.readouterr()
+    paper_tables.run(cell, 5, 60, 4, tmp_path / "runs")
+    assert capfd.readouterr().out == "bc-config-wall-s5: done before\n"
+    # More queries: no training, and none of its files are needed.
+    paper_tables.run(cell, 5, 60, 6, tmp_path / "not_there")
+    assert "--total-updates" not in capfd.readouterr().out
+    more = json.loads((tmp_path / "policies" / "bc-config-wall-s5.json").read_text())
+    evaluated = ("success_rate", "success_rate_interval", "clean_success_rate", "num_queries")
+    assert more["num_queries"] == 6
+    assert all(more[name] == kept[name] for name in kept if name not in evaluated)
+    elsewhere = replace(cell, task="double_walls")  # another task, the same policy
+    paper_tables.run(elsewhere, 5, 60, 3, tmp_path / "runs")
+    other = json.loads((tmp_path / "policies" / f"{elsewhere.name}-s5.json").read_text())
+    assert other["cell"] == "bc-config-wall-on-double_walls"
+    assert other["policy"] == "bc-config-wall-s5" and other["num_queries"] == 3
+    assert other["curve"] == kept["curve"]
+    assert "--total-updates" not in capfd.readouterr().out
+
+    # Other flags are another run. Its result may stand alone.
+    monkeypatch.setitem(paper_tables.RECIPES, "bc", [*few, "--hidden-size", "8"])
+    paper_tables.run(cell, 5, 30, 2, tmp_path / "runs", keep_policies=False)
+    assert "bc-config-wall-s5: the one that is kept had other flags\n" in capfd.readouterr().out
+    assert len(list((tmp_path / "runs" / "bc-config-wall-s5").glob("*/args.json"))) == 2
+    (found,) = paper_tables.load_results([tmp_path / "policies"])["bc-config-wall"]
+    assert found["args"]["hidden_size"] == 8 and found["steps"] == 30 and not found["kept"]
+    paper_tables.run(cell, 5, 30, 3, tmp_path / "runs", keep_policies=False)
+    (found,) = paper_tables.load_results([tmp_path / "policies"])["bc-config-wall"]
+    assert found["num_queries"] == 3
+    paper_tables.run(cell, 5, 30, 4, tmp_path / "elsewhere", keep_policies=False)
+    assert "done on 3 queries; its policy is gone" in capfd.readouterr().out
+    assert not (tmp_path / "policies" / "bc-config-wall-s5.pt").exists()
+    (tmp_path / "policies" / f"{elsewhere.name}-s5.json").unlink()
+    paper_tables.run(elsewhere, 5, 30, 2, tmp_path / "runs", keep_policies=False)
+    other = json.loads((tmp_path / "policies" / f"{elsewhere.name}-s5.json").read_text())
+    assert other["args"]["hidden_size"] == 8 and other["num_queries"] == 2

@@ -1,0 +1,48 @@
+"""SAC and TD3 learn to reach: the whole loop, with the environment, hindsight and bootstrapping."""
+
+import numpy as np
+import pytest
+from trainers import load, run_script
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.queries import Query
+from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.training import protocol
+
+READY = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)  # rad
+FLAGS = "--goal-type ee --total-timesteps 2000 --learning-starts 300 --horizon 30 --gamma 0.9"
+FLAGS += (
+    " --updates-per-step 1 --hidden-size 64 --batch-size 128 --policy-average 0.01 --num-envs 4"
+)
+FLAGS += " --bf16 False --eval-every 2000 --eval-queries 1 --test-queries 1"
+OF_SAC = " --alpha 0.02 --target-entropy -14"
+
+
+def query(_, rng):
+    """Where the end-effector is after some ten steps from `READY`, in any direction."""
+    goal = panda.normalise(READY) + rng.uniform(-0.3, 0.3, 7)
+    return READY, panda.denormalise(goal).astype(np.float32)
+
+
+@pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
+def test_it_learns_to_reach_what_is_near(trainer, tmp_path, monkeypatch):
+    make_envs = protocol.make_envs
+    easy = {"ee_tolerance": 0.05}  # m
+    monkeypatch.setattr(protocol, "make_envs", lambda *args, **kw: make_envs(*args, **kw | easy))
+    monkeypatch.setattr(envs.RoboArmEnv, "sample_query", query)
+    flags = FLAGS + OF_SAC * (trainer == "sac_her_mp")
+    run = run_script(trainer, tmp_path, *flags.split())
+
+    rng, scene = np.random.default_rng(7), envs.get_task("no_obstacles").base_scene
+    queries = [Query(*query(None, rng), scene) for _ in range(60)]
+    made = protocol.make_envs("no_obstacles", 4, horizon=30)
+    module = load(trainer)
+    untrained = module.Actor(module.Args(hidden_size=64, bf16=False), 10).eval()
+    before, after = (
+        protocol.evaluate(policy, made, queries, "cpu")["success_rate"]
+        for policy in (untrained, load_network(run / "policy.pt"))
+    )
+    # (With seeds 1 to 3 it was 0.8 and more; without bootstrapping, --gamma 0, below 0.5, and
+    # without hindsight below 0.1.)
+    assert before < 0.1 and after > 0.65

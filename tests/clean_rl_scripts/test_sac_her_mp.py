@@ -1,0 +1,346 @@
+"""sac_her_mp.py: its numbers against independent formulas, and what only it does in a run."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainers import load, run_script
+
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation import collect
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.demonstrations import Demos, load_demos
+from roboarm_nmp.envs.datasets.episodes import demo_transitions
+from roboarm_nmp.envs.datasets.format import QueryScenes
+from roboarm_nmp.envs.training.protocol import stack
+
+sac = load("sac_her_mp")
+
+
+# --- Numbers
+
+
+def test_td_target_by_hand():
+    target = sac.td_target(
+        torch.tensor([-1.0, 0.0]),
+        torch.tensor([0.0, 1.0]),
+        torch.tensor([[-3.0, -9.0], [-4.0, -8.0]]),
+        torch.tensor([2.0, 2.0]),
+        alpha=0.1,
+        gamma=0.5,
+    )
+    # -1 + 0.5 (min(-3, -4) - 0.1 * 2); a terminal state has no value
+    torch.testing.assert_close(target, torch.tensor([-3.1, 0.0]))
+
+
+def test_polyak_update_by_hand():
+    target, parameter = [torch.tensor([1.0, 2.0])], [torch.tensor([3.0, -2.0])]
+    sac.polyak_update(target, parameter, 0.25)
+    torch.testing.assert_close(target[0], torch.tensor([1.5, 1.0]))
+    torch.testing.assert_close(parameter[0], torch.tensor([3.0, -2.0]))
+
+
+def test_log_probability_is_the_squashed_gaussians():
+    torch.manual_seed(0)
+    actor = sac.Actor(sac.Args(bf16=False), 10).eval()
+    observation, goal = torch.randn(64, 10), torch.randn(64, 3)
+    action, log_prob = actor.sample(actor.features(observation, goal))
+    mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
+    std = (-5 + 3.5 * (torch.tanh(log_std) + 1)).exp()
+    squashed = torch.distributions.TransformedDistribution(
+        torch.distributions.Normal(mean.double(), std.double()),
+        torch.distributions.transforms.TanhTransform(),
+    )
+    expected = squashed.log_prob(action.double() / 0.06).sum(1)
+    torch.testing.assert_close(log_prob.double(), expected, rtol=1e-3, atol=1e-3)
+    deterministic = actor(observation, None, goal)
+    torch.testing.assert_close(deterministic, 0.06 * torch.tanh(mean))
+
+
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+def test_network_inputs(goal_type):
+    from roboarm_nmp.envs import panda
+
+    rng = np.random.default_rng(0)
+    c = rng.uniform(panda.LOWER, panda.UPPER, (5, 7))
+    state, goal_state = panda.normalise(c), rng.uniform(-1, 1, (5, 7))
+    position, goal_position = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
+    goal = {"ee": goal_position, "config": goal_state}.get(
+        goal_type, np.hstack([goal_state, goal_position])
+    )
+    expected = [state, position, goal, np.sin(c), np.cos(c)]
+    expected += [5 * (goal_position - position)] * (goal_type != "config")
+    expected += [5 * (goal_state - state)] * (goal_type != "ee")
+    observation = np.hstack([state, position])
+    features = sac.Features(sac.Args(goal_type=goal_type), 10)
+    inputs = features(torch.tensor(observation).float(), torch.tensor(goal).float()).numpy()
+    assert inputs.shape == (5, features.size)
+    np.testing.assert_allclose(inputs, np.hstack(expected), atol=1e-5)
+
+
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+@pytest.mark.parametrize("velocities", [False, True])
+@pytest.mark.parametrize("proximity", [None, "obstacles"])
+def test_networks_fit_every_observation(goal_type, velocities, proximity):
+    knows = {"goal_type": goal_type, "velocities": velocities, "proximity": proximity}
+    args = sac.Args(**knows, num_hidden_layers=4)
+    env = envs.make("wall", **knows, append_proximity=proximity is not None)
+    batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
+    actor = sac.Actor(args, env.observation_space["observation"].shape[0])
+    if proximity is not None:  # distances, ten times as large, are the last inputs
+        features = actor.features(batch["observation"], batch["desired_goal"])
+        torch.testing.assert_close(features[:, -10:], 10.0 * batch["proximity"][..., 0])
+    action = actor(**batch)
+    assert action.shape == (2, 7)
+    features = actor.features(batch["observation"], batch["desired_goal"])
+    assert sac.Critics(args, actor.features.size)(features, action).shape == (2, 2)
+
+
+def episode(length, offset, env):
+    """Transition t of a made-up episode arrives at the position (offset + t, 0, 0)."""
+    return [
+        {
+            "observation": np.full(10, offset + t, np.float32),
+            "action": np.full(7, 0.01 * t, np.float32),
+            "next_observation": np.full(10, offset + t + 1, np.float32),
+            "next_achieved_goal": np.array([offset + t, 0, 0], np.float32),
+            "desired_goal": np.array([-5, 0, 0], np.float32),
+            "collision": t == 1,
+        }
+        for t in range(length)
+    ]
+
+
+def test_relabelled_goals_are_reached_later_in_the_same_episode():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 100, 1.0, np.random.default_rng(0))
+    buffer.add_episode(episode(4, 0, env))
+    buffer.add_episode(episode(6, 100, env))
+    batch = buffer.sample(4000)
+    now, goal = batch["next_achieved_goal"][:, 0], batch["desired_goal"][:, 0]
+    assert set(zip(now.tolist(), goal.tolist(), strict=True)) == {
+        (start + t, start + k)
+        for start, n in ((0, 4), (100, 6))
+        for t in range(n)
+        for k in range(t, n)
+    }
+    # Positions are a metre apart: reached means the very same.
+    np.testing.assert_array_equal(batch["reward"], np.where(now == goal, 0.0, -1.0))
+    np.testing.assert_array_equal(batch["terminated"], now == goal)
+    # The rest of a transition stays together.
+    np.testing.assert_array_equal(batch["observation"][:, 0], now)
+    np.testing.assert_array_equal(batch["next_observation"][:, 3], now + 1)
+    # The future strategy: each later step of an episode is equally likely.
+    first = goal[now == 100]
+    counts = np.bincount((first - 100).astype(int), minlength=6)
+    assert abs(counts / len(first) - 1 / 6).max() < 0.06
+
+
+def test_share_of_relabelled_goals():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 100, 0.8, np.random.default_rng(0))
+    buffer.add_episode(episode(20, 0, env))
+    goals = buffer.sample(10_000)["desired_goal"][:, 0]
+    assert abs((goals != -5).mean() - 0.8) < 0.02
+
+
+def test_collisions_end_episodes_only_if_asked():
+    for stop in (False, True):
+        env = envs.make("no_obstacles", stop_on_collision=stop)
+        buffer = sac.HerReplayBuffer(env, 10, 0.0, np.random.default_rng(0))
+        buffer.add_episode(episode(3, 0, env))
+        batch = buffer.sample(100)
+        collided = batch["next_achieved_goal"][:, 0] == 1
+        np.testing.assert_array_equal(batch["terminated"], collided if stop else 0 * collided)
+        np.testing.assert_array_equal(batch["reward"], -1)
+
+
+def test_the_ring_overwrites_the_oldest_and_keeps_episodes_apart():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 10, 1.0, np.random.default_rng(0))
+    for offset in (0, 100, 200):
+        buffer.add_episode(episode(4, offset, env))  # the third wraps around over half the first
+    assert buffer.size == 10
+    batch = buffer.sample(5000)
+    now, goal = batch["next_achieved_goal"][:, 0], batch["desired_goal"][:, 0]
+    assert set(now.tolist()) == {2, 3, 100, 101, 102, 103, 200, 201, 202, 203}
+    assert (now // 100 == goal // 100).all() and (goal >= now).all()
+
+
+def test_a_million_transitions_fit_into_400_mb():
+    for arguments in ({}, {"goal_type": "combined", "velocities": True}):
+        env = envs.make("no_obstacles", **arguments)
+        buffer = sac.HerReplayBuffer(env, 1_000_000, 0.8, np.random.default_rng(0))
+        assert buffer.rows.nbytes + buffer.remaining.nbytes < 400e6
+
+
+def test_bfloat16_products_stay_close_to_float32():
+    torch.manual_seed(0)
+    args = sac.Args(bf16=True)
+    critics = sac.Critics(args, 30)
+    inputs = torch.randn(256, 30), torch.rand(256, 7) * 0.06
+    in_training, exact = critics.train()(*inputs), critics.eval()(*inputs)
+    assert 0 < (in_training - exact).abs().max() < 0.02
+    assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
+
+
+def test_updates_fall_due_from_the_first_stored_episode_on():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 1000, 0.8, np.random.default_rng(0))
+    args = sac.Args(learning_starts=200, updates_per_step=0.3, num_envs=7)
+    assert all(sac.updates_due(step, buffer, args) == 0 for step in range(0, 7000, 7))
+    buffer.add_episode(episode(4, 0, env))
+    due = {step: sac.updates_due(step, buffer, args) for step in range(7, 7001, 7)}
+    assert all(number == 0 for step, number in due.items() if step <= 200)
+    assert sum(due.values()) == int((7000 - 200) * 0.3)
+    assert set(list(due.values())[30:]) == {2, 3}  # 2.1 per seven steps; nothing is made up for
+
+
+def test_batches_are_drawn_some_at_a_time(monkeypatch):
+    env, drawn = envs.make("no_obstacles"), []
+    buffer = sac.HerReplayBuffer(env, 1000, 0.8, np.random.default_rng(0))
+    buffer.add_episode(episode(4, 0, env))
+    sample = buffer.sample
+    monkeypatch.setattr(buffer, "sample", lambda size: drawn.append(size) or sample(size))
+    found = list(sac.batches(buffer, 150, 8, "cpu"))
+    assert len(found) == 150 and sum(drawn) == 150 * 8 and max(drawn) <= 64 * 8
+    assert all(len(tensor) == 8 for batch in found for tensor in batch.values())
+    assert len({batch["observation"].numpy().tobytes() for batch in found}) > 140
+    assert list(sac.batches(buffer, 0, 8, "cpu")) == []
+
+
+# --- Demonstrations
+
+
+def hand_made_demos(number=3, steps=12, task="no_obstacles"):
+    """Straight motions of 0.02 per step, normalised; the arm would follow them without lag."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(number, 7))
+    direction *= 0.02 / np.linalg.norm(direction, axis=1, keepdims=True)
+    first = rng.uniform(-0.5, 0.5, (number, 7))
+    states = first[:, None] + np.arange(steps + 1)[:, None] * direction[:, None]
+    actions = np.repeat(direction[:, None], steps + 1, axis=1)
+    actions[:, -1] = 0.0
+    ends = panda.denormalise(states[:, [0, -1]]).astype(np.float32)
+    return Demos(
+        task=task,
+        seed=0,
+        start=ends[:, 0],
+        goal=ends[:, 1],
+        scenes=QueryScenes(envs.TASKS[task].scene),
+        states=states.reshape(-1, 7).astype(np.float32),
+        actions=actions.reshape(-1, 7).astype(np.float32),
+        offsets=np.arange(number + 1) * (steps + 1),
+        plan=ends.reshape(-1, 7),
+        plan_offsets=np.arange(number + 1) * 2,
+        plan_seed=np.arange(number),
+        digest=np.zeros(number, np.uint32),
+        collided=np.zeros(number, bool),
+        made_by="a test",
+        parameters={},
+    )
+
+
+def test_demonstrations_follow_failures_only_and_as_often_as_p():
+    rng = np.random.default_rng(0)
+    assert sac.inject_demonstration(False, 1.0, rng)
+    assert not sac.inject_demonstration(True, 1.0, rng)
+    assert not sac.inject_demonstration(False, 0.0, rng)
+    injected = [sac.inject_demonstration(False, 0.3, rng) for _ in range(10_000)]
+    assert abs(np.mean(injected) - 0.3) < 0.02
+
+
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+def test_a_demonstration_as_transitions_by_hand(goal_type):
+    demo = hand_made_demos()[1]
+    env = envs.make("no_obstacles", goal_type=goal_type)
+    episode = demo_transitions(demo, env)
+    angles = panda.denormalise(demo.states.astype(np.float64))
+    positions = panda.forward_kinematics(angles)
+    goal_position = panda.forward_kinematics(demo.goal)
+    if goal_type == "config":
+        reached = np.linalg.norm(demo.states - panda.normalise(demo.goal), axis=1) <= 0.05
+    else:
+        reached = np.linalg.norm(positions - goal_position, axis=1) <= 0.02
+    assert len(episode) == np.argmax(reached) < len(demo.actions)  # cut where the goal is reached
+    for t, transition in enumerate(episode):
+        observation = np.concatenate([demo.states[t], positions[t]])
+        np.testing.assert_allclose(transition["observation"], observation, atol=1e-6)
+        observation = np.concatenate([demo.states[t + 1], positions[t + 1]])
+        np.testing.assert_allclose(transition["next_observation"], observation, atol=1e-6)
+        np.testing.assert_array_equal(transition["action"], demo.actions[t])
+        assert not transition["collision"]
+        goal = {
+            "ee": goal_position,
+            "config": panda.normalise(demo.goal),
+            "combined": np.concatenate([panda.normalise(demo.goal), goal_position]),
+        }[goal_type]
+        np.testing.assert_allclose(transition["desired_goal"], goal, atol=1e-6)
+    env.action_mode = "subgoal"
+    sub_goals = demo_transitions(demo, env)
+    np.testing.assert_allclose(sub_goals[3]["action"], demo.states[4], atol=1e-6)
+    env.close()
+
+
+def test_rewards_and_hindsight_of_injected_demonstrations():
+    demo, env = hand_made_demos()[2], envs.make("no_obstacles")
+    episode = demo_transitions(demo, env)
+    for her_probability in (0.0, 1.0):
+        buffer = sac.HerReplayBuffer(env, 1000, her_probability, np.random.default_rng(0))
+        buffer.add_episode(episode)
+        batch = buffer.sample(2000)
+        arrived = (batch["next_observation"] == episode[-1]["next_observation"].astype("f4")).all(1)
+        own = np.abs(batch["desired_goal"] - episode[-1]["desired_goal"]).max(1) < 1e-6
+        if her_probability == 0.0:
+            assert own.all()
+            np.testing.assert_array_equal(batch["reward"], np.where(arrived, 0.0, -1.0))
+            np.testing.assert_array_equal(batch["terminated"], arrived)
+        else:
+            achieved = np.stack([t["next_achieved_goal"] for t in episode]).astype("f4")
+            assert all((goal == achieved).all(1).any() for goal in batch["desired_goal"])
+            assert 0 < (batch["reward"] == 0).mean() < 1
+    env.close()
+
+
+@pytest.mark.parametrize("prob", ["1", "0"])
+def test_a_run_trains_on_the_demonstrations_queries_and_injects(tmp_path, prob):
+    path = tmp_path / "demos.h5"
+    options = {name: getattr(collect.Args("no_obstacles"), name) for name in collect.OPTIONS}
+    collect.collect(path, 4, options, progress=False)
+    demos = load_demos(path)
+    run = run_script("sac_her_mp", tmp_path / "runs", "--demo-prob", prob, "--demos", str(path))
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    rows, remaining = state["buffer"]["rows"].numpy(), state["buffer"]["remaining"].numpy()
+    first = np.concatenate([[True], remaining[:-1] == 0])
+    starts = panda.normalise(demos.start)
+    query = np.array([np.abs(starts - row[:7]).max(1).argmin() for row in rows[first]])
+    assert np.abs(starts[query] - rows[first][:, :7]).max() < 1e-3  # all on the demos' queries
+    goals = panda.forward_kinematics(demos.goal)[query]
+    np.testing.assert_allclose(rows[first][:, -4:-1], goals, atol=1e-6)
+    injected = [
+        np.abs(rows[first][i, 10:17] - demos[q].actions[0]).max() < 1e-6
+        for i, q in enumerate(query)
+    ]
+    events = EventAccumulator(str(run))
+    events.Reload()
+    failures = len(events.Scalars("charts/episodic_length"))  # so short a run never succeeds
+    assert events.Scalars("charts/success")[-1].value == 0
+    assert failures > 10
+    expected = failures if prob == "1" else 0
+    assert sum(injected) == expected == events.Scalars("charts/demos_injected")[-1].value
+
+
+# --- Real runs
+
+
+def test_losses_are_logged_subgoal_actions_train_and_alpha_can_stay(tmp_path):
+    flags = "--action-mode subgoal --updates-per-step 1 --goal-type config --no-autotune"
+    run = run_script("sac_her_mp", tmp_path, *flags.split())
+    events = EventAccumulator(str(run))
+    events.Reload()
+    for tag in ("qf1_values", "qf1_loss", "qf2_loss", "qf_loss", "actor_loss", "alpha"):
+        assert np.isfinite([event.value for event in events.Scalars(f"losses/{tag}")]).all()
+    assert events.Scalars("losses/alpha")[-1].value == pytest.approx(0.2)
+    assert events.Scalars("charts/SPS")[-1].value > 0

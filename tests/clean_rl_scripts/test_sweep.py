@@ -1,0 +1,205 @@
+"""The search over a trainer's flags, with a trainer that takes no time."""
+
+import csv
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from paths import ROOT
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+SCRIPT = ROOT / "clean_rl_scripts" / "sweep.py"
+spec = importlib.util.spec_from_file_location("sweep", SCRIPT)
+sweep = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(sweep)
+
+# Best at a learning rate of 0.3 with `--on`; fails beyond 0.9.
+TRAINER = """
+import argparse, json, os, pathlib, sys, time
+
+parser = argparse.ArgumentParser()
+parser.add_argument("--runs-dir", type=pathlib.Path)
+parser.add_argument("--resume", type=pathlib.Path)
+parser.add_argument("--lr", type=float)
+parser.add_argument("--on", action=argparse.BooleanOptionalAction)
+parser.add_argument("--other", type=int)
+args = parser.parse_args()
+run = args.resume or args.runs_dir / "run"
+if args.resume:
+    saved = json.loads((run / "checkpoint.pt").read_text())
+    args.lr, args.on = saved["lr"], saved["on"]
+else:
+    run.mkdir()
+    (run / "checkpoint.pt").write_text(json.dumps({"lr": args.lr, "on": args.on}))
+    time.sleep(float(os.environ.get("SECONDS", 0)))
+if args.lr > 0.9:
+    sys.exit("it diverged")
+value = 1 - (args.lr - 0.3) ** 2 - 0.1 * (not args.on)
+result = {"validation_success_rate": value, "lr": args.lr, "resumed": args.resume is not None}
+(run / "result.json").write_text(json.dumps(result))
+"""
+
+
+@pytest.fixture
+def trainer(tmp_path):
+    path = tmp_path / "trainer.py"
+    path.write_text(TRAINER)
+    return path
+
+
+def arguments(trainer, *more):
+    folder = trainer.parent / "sweep"
+    return [str(a) for a in (trainer, "--folder", folder, "--search", "lr=0.0..1.0", *more)]
+
+
+def rows(trainer):
+    with open(trainer.parent / "sweep" / "trials.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "distribution"),
+    [
+        ("policy-lr=1e-6..5e-3:log", "policy-lr", FloatDistribution(1e-6, 5e-3, log=True)),
+        ("--gamma=0.9..1", "gamma", FloatDistribution(0.9, 1.0)),
+        ("hidden_size=64..512:log", "hidden-size", IntDistribution(64, 512, log=True)),
+        ("target-entropy=-14..-7", "target-entropy", IntDistribution(-14, -7)),
+        ("autotune=true,false", "autotune", CategoricalDistribution(("true", "false"))),
+    ],
+)
+def test_what_is_searched_over(text, name, distribution):
+    assert sweep.parse_search(text) == (name, distribution)
+
+
+@pytest.mark.parametrize(
+    "text", ["lr", "=1..2", "lr=", "lr=1..2:logarithmic", "lr=a..b", "lr=2.0..1.0", "lr=0..1:log"]
+)
+def test_what_cannot_be_searched_over_is_refused(trainer, text, capsys):
+    with pytest.raises(SystemExit) as exit:
+        sweep.main([str(trainer), "--search", text])
+    assert str(exit.value).startswith("error: ") and text in str(exit.value)
+    assert not list(trainer.parent.glob("sweep*"))
+
+
+def test_a_search_finds_what_is_best(trainer, capsys):
+    sweep.main(arguments(trainer, "on=true,false", "--trials", "25"))
+    found = rows(trainer)
+    assert len(found) == 25 and {row["state"] for row in found} == {"complete", "fail"}
+    for row in found:
+        if row["state"] == "fail":
+            assert float(row["lr"]) > 0.9 and "it diverged" in row["error"]
+        else:
+            value = 1 - (float(row["lr"]) - 0.3) ** 2 - 0.1 * (row["on"] == "false")
+            assert float(row["validation_success_rate"]) == pytest.approx(value)
+    best = max(found, key=lambda row: float(row["validation_success_rate"] or 0))
+    assert best["on"] == "true" and abs(float(best["lr"]) - 0.3) < 0.15
+    value = float(best["validation_success_rate"])
+    assert f": {value:.3f};" in capsys.readouterr().out.splitlines()[-1]
+    events = EventAccumulator(str(trainer.parent / "sweep" / best["trial"] / "hparams")).Reload()
+    scalar = events.Scalars("sweep/validation_success_rate")[0]
+    assert scalar.value == pytest.approx(value)
+    assert "_hparams_/session_start_info" in events.Tags()["tensors"] or "_hparams_" in str(
+        events.summary_metadata
+    )
+
+
+def test_a_search_repeats_itself_and_goes_on(trainer, tmp_path, capsys):
+    sweep.main(arguments(trainer, "--trials", "4"))
+    first = [row["lr"] for row in rows(trainer)]
+    sweep.main(arguments(trainer, "--trials", "6", "--folder", tmp_path / "again"))
+    (tmp_path / "sweep").rename(tmp_path / "first")
+    (tmp_path / "again").rename(tmp_path / "sweep")
+    more = [row["lr"] for row in rows(trainer)]
+    assert more[:4] == first and len(set(more)) == 6
+    sweep.main(arguments(trainer, "--trials", "8"))
+    assert [row["lr"] for row in rows(trainer)][:6] == more and len(rows(trainer)) == 8
+    assert len({row["lr"] for row in rows(trainer)}) == 8
+    with pytest.raises(SystemExit, match="holds another search"):
+        sweep.main(arguments(trainer, "--trials", "8", "--seed", "3"))
+    with pytest.raises(SystemExit, match="holds another search"):
+        sweep.main(arguments(trainer, "--trials", "8", "--", "--other", "1"))
+    with pytest.raises(SystemExit, match="has no flag --seconds"):
+        sweep.main(arguments(trainer, "--trials", "8", "--", "--seconds", "1"))
+
+
+def start(trainer, seconds):
+    """A search of 4 trials, two at a time, as a process with the first two running; its command."""
+    command = [sys.executable, SCRIPT, *arguments(trainer, "--trials", "4", "--workers", "2")]
+    process = subprocess.Popen(
+        command, start_new_session=True, env=os.environ | {"SECONDS": str(seconds)}
+    )
+    until = time.time() + 60
+    while len(list(trainer.parent.glob("sweep/*/*/checkpoint.pt"))) < 2:
+        assert time.time() < until and process.poll() is None
+        time.sleep(0.05)
+    return process, command
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_killed_it_goes_on_with_the_trials_that_were_running(trainer, number):
+    process, command = start(trainer, 1000)
+    begun = {
+        path.parent.parent.name: json.loads(path.read_text())["lr"]
+        for path in trainer.parent.glob("sweep/*/*/checkpoint.pt")
+    }
+    os.killpg(process.pid, number)
+    assert process.wait(30) == (-9 if number == signal.SIGKILL else 130)
+    subprocess.run(command, check=True)
+    found = {row["trial"]: row for row in rows(trainer)}
+    assert len(found) == 4 and set(begun) < set(found)
+    for path in trainer.parent.glob("sweep/*/*/result.json"):
+        result, trial = json.loads(path.read_text()), path.parent.parent.name
+        assert result["resumed"] == (trial in begun)
+        assert float(found[trial]["lr"]) == result["lr"] == begun.get(trial, result["lr"])
+
+
+def test_a_trainer_that_outlived_its_search_is_waited_for(trainer):
+    process, command = start(trainer, 4)
+    trainers = psutil.Process(process.pid).children()
+    process.kill()
+    assert len(trainers) == 2 and all(child.is_running() for child in trainers)
+    subprocess.run(command, check=True)
+    results = [
+        json.loads(path.read_text()) for path in trainer.parent.glob("sweep/*/*/result.json")
+    ]
+    assert len(rows(trainer)) == 4 and not any(result["resumed"] for result in results)
+
+
+@pytest.mark.slow
+def test_on_ray(trainer):
+    cluster_utils = pytest.importorskip("ray.cluster_utils")
+    pytest.importorskip("pyarrow")
+    cluster = cluster_utils.Cluster(head_node_args={"num_cpus": 2}, initialize_head=True)
+    try:
+        more = ["--trials", "4", "--ray-address", cluster.address]
+        sweep.main(arguments(trainer, "on=true,false", *more))
+        found = rows(trainer)
+        assert len(found) == 4
+        sweep.main(arguments(trainer, "on=true,false", *more))  # finds that it is done
+        assert {row["trial"] for row in rows(trainer)} == {row["trial"] for row in found}
+        for row in found:
+            value = 1 - (float(row["lr"]) - 0.3) ** 2 - 0.1 * (row["on"] == "false")
+            if float(row["lr"]) <= 0.9:
+                assert float(row["validation_success_rate"]) == pytest.approx(value)
+            else:
+                assert "it diverged" in row["error"]
+    finally:
+        cluster.shutdown()
+
+
+def test_a_trainer_of_no_policy_is_a_failure(trainer):
+    trainer.write_text(TRAINER.replace("validation_success_rate", "error_near"))
+    with pytest.raises(SystemExit, match="every trial failed"):
+        sweep.main(arguments(trainer, "--trials", "1"))
+
+
+def test_every_trial_failed(trainer):
+    with pytest.raises(SystemExit, match="every trial failed"):
+        sweep.main(arguments(trainer, "--trials", "2", "--", "--other", "no number"))

@@ -1,0 +1,232 @@
+"""What all trainers share: runs, what they leave, kill and resume, bad flags."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainers import GPU, PATHS, TRAINERS, command, load, refusal, run_here, run_script
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets.demonstrations import demo_path
+from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.training.protocol import stack
+
+
+@pytest.fixture(params=TRAINERS)
+def trainer(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def finished_runs(tmp_path_factory):
+    flags = dict.fromkeys(("sac_her_mp", "td3_her_mp"), ["--velocities"]) | {"bc": []}
+    return {
+        name: run_script(name, tmp_path_factory.mktemp(name), "--goal-type", "combined", *more)
+        for name, more in flags.items()
+    }
+
+
+@pytest.fixture
+def finished_run(finished_runs, trainer):
+    return finished_runs[trainer]
+
+
+# --- Shared blocks
+
+
+def shared_blocks(trainer):
+    """Name -> lines of a trainer's blocks from `# SHARED: name` to `# END SHARED`."""
+    blocks, name = {}, None
+    for line in PATHS[trainer].read_text().splitlines():
+        if line.strip().startswith("# SHARED: "):
+            assert name is None, f"{line} inside {name}"
+            name = line.strip().removeprefix("# SHARED: ")
+            assert name not in blocks
+            blocks[name] = []
+        elif line.strip() == "# END SHARED":
+            assert name is not None
+            name = None
+        elif name is not None:
+            blocks[name].append(line)
+    assert name is None
+    return blocks
+
+
+def test_shared_blocks_have_not_drifted_apart():
+    trainers = {}  # block -> trainer -> lines
+    for trainer in PATHS:
+        for name, lines in shared_blocks(trainer).items():
+            trainers.setdefault(name, {})[trainer] = lines
+    assert trainers
+    for name, versions in trainers.items():
+        assert len(versions) > 1, f"{name} is only in {list(versions)}"
+        first, *others = versions.values()
+        assert all(lines == first for lines in others), f"{name} of {list(versions)}"
+
+
+# --- Real runs
+
+
+def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run, trainer):
+    result = json.loads((finished_run / "result.json").read_text())
+    assert result["steps"] == 1200 and result["num_queries"] == 4
+    assert 0 <= result["clean_success_rate"] <= result["success_rate"] <= 1
+    assert result["args"]["goal_type"] == "combined"
+    assert isinstance(json.loads((finished_run / "args.json").read_text())["bf16"], bool)
+
+    events = EventAccumulator(str(finished_run))
+    events.Reload()
+    scalars = set(events.Tags()["scalars"])
+    tags = ("episodic_return", "episodic_length", "success")
+    for tag in ("learning_rate", "SPS") if trainer == "bc" else tags:
+        assert f"charts/{tag}" in scalars
+    for tag in ("success_rate", "clean_success_rate", "episode_length", "collision_rate"):
+        assert [event.step for event in events.Scalars(f"eval/{tag}")] == [600, 1200]
+    assert "eval/rollout" in events.Tags()["images"]
+    assert "hyperparameters/text_summary" in events.Tags()["tensors"]
+
+
+def test_the_saved_policy_acts_without_the_script(finished_run, trainer):
+    policy = load_network(finished_run / "policy.pt")
+    assert policy.metadata["kind"] == "policy" and policy.metadata["task"] == "no_obstacles"
+    env = envs.make(policy.metadata["task"], **policy.metadata["env"])
+    observation, _ = env.reset(seed=0)
+    action = policy(**stack([observation], "cpu"))[0].numpy()
+    assert action.shape == (7,) and np.abs(action).max() <= 0.06
+    env.step(action)
+
+
+def test_the_running_average_of_the_policy_is_what_is_saved(tmp_path, trainer, short_episodes):
+    module = load(trainer)
+    length = "--total-updates" if trainer == "bc" else "--total-timesteps"
+    flags = [length, "600", "--policy-average", "0.01", "--goal-type", "ee"]
+    run = run_script(trainer, tmp_path, *flags)
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    args = module.Args(hidden_size=16, bf16=False, goal_type="ee")
+    actor, average = (module.Actor(args, 10).eval() for _ in range(2))
+    actor.load_state_dict(state["actor"])
+    average.load_state_dict(state["actor_average"])
+    observation, goal = torch.randn(8, 10), torch.randn(8, 3)
+    saved = load_network(run / "policy.pt")(
+        observation=observation, achieved_goal=goal, desired_goal=goal
+    )
+    torch.testing.assert_close(saved, average(observation, goal, goal))
+    assert (saved - actor(observation, goal, goal)).abs().max() > 1e-4
+
+
+def same(a, b):
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a.keys() - {"seconds"}:
+            same(a[key], b[key])
+    elif isinstance(a, list):
+        for one, other in zip(a, b, strict=True):
+            same(one, other)
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a, b)
+    else:
+        assert a == b
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer, device):
+    whole = run_script(trainer, tmp_path / "whole", "--device", device)
+    process = subprocess.Popen(
+        command(trainer, tmp_path / "killed", "--device", device),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    deadline = time.time() + 120
+    while not list((tmp_path / "killed").glob("*/checkpoint.pt")) and time.time() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    killed = next((tmp_path / "killed").iterdir())
+    assert not (killed / "result.json").exists()
+    left = killed / ".checkpoint.pt.0123abcd.tmp"
+    left.write_bytes(b"half a checkpoint")  # must not be read
+
+    done = subprocess.run(
+        [sys.executable, PATHS[trainer], "--resume", killed], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert not left.exists()
+    same(*(torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed)))
+    results = [json.loads((run / "result.json").read_text()) for run in (whole, killed)]
+    assert results[0]["success_rate"] == results[1]["success_rate"]
+
+
+@pytest.mark.parametrize("stop, steps", [(None, 1200), (1.0, 600)])
+def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps):
+    success = {"success_rate": 1.0, "clean_success_rate": 1.0}
+    monkeypatch.setattr("roboarm_nmp.envs.training.protocol.evaluate", lambda *_: success)
+    flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
+    if stop is not None:
+        flags += ["--stop-at-success", stop]
+    run_here(*flags)
+    (result,) = tmp_path.glob("*/result.json")
+    assert json.loads(result.read_text())["steps"] == steps
+
+
+# --- Bad input
+
+
+@pytest.mark.parametrize(
+    "flags, message",
+    [
+        (["--task", "walls"], "unknown task 'walls': one of no_obstacles, wall"),
+        (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
+        (["--resume", "nowhere"], "nowhere is no run's folder"),
+        (["--goal-type", "pose"], "goal-type"),
+        (["--buffer-size", "49"], "--buffer-size 49: an episode has 50 transitions"),
+        (["--demo-prob", "1.5"], "--demo-prob must be in [0, 1], got 1.5"),
+        (["--demo-prob", "1", "--velocities"], "demonstrations have no velocities"),
+        (["--demo-prob", "1", "--max-step", "0.02"], "steps up to 0.03"),
+        (["--demo-prob", "1", "--demos", "nowhere.h5"], "nowhere.h5: no such file"),
+        (
+            ["--demo-prob", "1", "--demos", str(demo_path("wall"))],
+            "this file is for the task 'wall', not 'no_obstacles'",
+        ),
+        (["--demos", "some.h5"], "--demos goes with --demo-prob"),
+    ],
+)
+def test_bad_flags(tmp_path, flags, message, capsys):  # refused in a shared block
+    assert message in refusal("sac_her_mp", capsys, tmp_path, *flags)
+
+
+@pytest.mark.parametrize(
+    ("name", "flags"),
+    [
+        ("sac_her_mp", ["--policy-lr", "1e30", "--q-lr", "1e30"]),
+        ("td3_her_mp", ["--policy-lr", "1e30", "--q-lr", "1e30"]),
+        ("bc", ["--learning-rate", "1e30"]),
+    ],
+)
+def test_a_diverged_run_ends(name, flags, tmp_path):
+    with pytest.raises(FloatingPointError, match="the policy's actions are no longer finite"):
+        run_here(*command(name, tmp_path, *flags)[1:])
+    assert not list(tmp_path.glob("*/policy.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
+
+
+def test_resuming_refuses_another_configuration_and_a_damaged_checkpoint(
+    finished_run, tmp_path, trainer
+):
+    resume = [sys.executable, PATHS[trainer], "--resume", finished_run]
+    done = subprocess.run([*resume, "--hidden-size", "8"], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "--hidden-size is 8 now, the run had 16" in done.stderr and "task" not in done.stderr
+
+    (tmp_path / "args.json").write_bytes((finished_run / "args.json").read_bytes())
+    checkpoint = (finished_run / "checkpoint.pt").read_bytes()
+    (tmp_path / "checkpoint.pt").write_bytes(checkpoint[: len(checkpoint) // 2])
+    resume[-1] = tmp_path
+    done = subprocess.run(resume, capture_output=True, text=True)
+    assert done.returncode != 0 and "checkpoint.pt is damaged" in done.stderr
+    assert "Traceback" not in done.stderr

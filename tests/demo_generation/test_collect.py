@@ -1,0 +1,688 @@
+"""Collecting and verifying: the same file whatever the workers and however often it is killed."""
+
+import contextlib
+import dataclasses
+import functools
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation import collect
+from roboarm_nmp.demo_generation.following import follow
+from roboarm_nmp.demo_generation.planning import Planner
+from roboarm_nmp.demo_generation.verify import VERDICTS, Verifier, verify
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.datasets.journal import VERSION, line_of
+from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json
+from roboarm_nmp.envs.utils import workers
+
+TASK, NUM = "double_walls", 16
+
+
+def options(**changes):
+    """What a demonstration depends on, as the command's defaults have it."""
+    args = collect.Args(TASK)
+    return {name: getattr(args, name) for name in collect.OPTIONS} | changes
+
+
+def command(output, *flags, num=NUM, task=TASK):
+    arguments = ["--task", task, "--num", num, "--workers", 1, "--output", output, *flags]
+    return [sys.executable, "-m", "roboarm_nmp.demo_generation.collect", *map(str, arguments)]
+
+
+def run(output, *flags, **kwargs):
+    return subprocess.run(
+        command(output, *flags, **kwargs), cwd=ROOT, capture_output=True, text=True, timeout=100
+    )
+
+
+def journal_lines(output):
+    """Whole lines of the journal after the first, which holds the options."""
+    journal = collect.journal_of(output)
+    return max(journal.read_bytes().count(b"\n") - 1, 0) if journal.exists() else 0
+
+
+@contextlib.contextmanager
+def running(output, *flags, demos=2, **kwargs):
+    """A collection in its own process group, once `demos` are in its journal."""
+    process = subprocess.Popen(
+        command(output, *flags, **kwargs),
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        wait_for(lambda: journal_lines(output) >= demos or process.poll() is not None)
+        assert process.poll() is None, process.communicate()
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.005)
+
+
+def worker_processes(process):
+    return [
+        child
+        for child in psutil.Process(process.pid).children(recursive=True)
+        if "spawn_main" in " ".join(child.cmdline())
+    ]
+
+
+def has_ended(process):
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE  # orphans may wait for their init
+    except psutil.NoSuchProcess:
+        return True
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A file collected by one worker without interruption."""
+    path = tmp_path_factory.mktemp("whole") / "demos.h5"
+    result = run(path)
+    assert result.returncode == 0, result.stderr
+    assert f"{NUM} demonstrations from " in result.stdout and "solved" in result.stdout
+    assert list(path.parent.iterdir()) == [path]
+    return path
+
+
+@pytest.fixture
+def output(tmp_path):
+    return tmp_path / "demos.h5"
+
+
+def finish(output, whole, *flags):
+    """Run the command on `output` to its end; how many demonstrations it says it began with."""
+    result = run(output, *flags)
+    assert result.returncode == 0, result.stderr
+    assert output.read_bytes() == whole.read_bytes()
+    assert list(output.parent.iterdir()) == [output]
+    return int(re.search(rf"(\d+)/{NUM} ", result.stderr).group(1))
+
+
+# --- The same file
+
+
+def test_two_workers_collect_the_same_bytes(whole, output):
+    assert finish(output, whole, "--workers", "2") == 0
+
+
+def test_a_demonstration_depends_on_its_number_alone(whole):
+    collector, demos = collect.Collector(options()), load_demos(whole)
+    for index in (11, 3):
+        made = collector(index)
+        assert made["index"] == index and made["digest"] == demos[index].digest
+        assert made["plan_seed"] == demos.plan_seed[index]
+        np.testing.assert_array_equal(collect._decode(made["plan"]), demos[index].plan)
+    assert collect.Collector(options(seed=1))(3)["digest"] != demos[3].digest
+    assert len(set(demos.digest.tolist())) == NUM
+
+
+def test_collected_demonstrations_are_good(whole):
+    demos, env = load_demos(whole), envs.make(TASK)
+    assert demos.task == TASK and demos.seed == 0 and len(demos) == NUM
+    assert not demos.collided.any()
+    verifier = Verifier(whole, mend=False)
+    assert [verifier(index) for index in range(NUM)] == [(i, "good", None) for i in range(NUM)]
+    for demo in demos:
+        execution = follow(env, demo.plan)
+        assert execution.digest == demo.digest == zlib.crc32(execution.states.tobytes())
+        assert execution.reached and not execution.collided
+        assert len(demo.actions) == len(execution.states) - 1 <= env.horizon
+    env.close()
+
+
+def test_the_file_says_how_to_make_it_again(whole):
+    demos = load_demos(whole)
+    assert demos.made_by.startswith("python -m roboarm_nmp.demo_generation.collect ")
+    arguments = demos.made_by.split()[3:]
+    flags = dict(zip(arguments[::2], arguments[1::2], strict=True))
+    assert flags["--task"] == TASK and flags["--num"] == str(NUM) and flags["--seed"] == "0"
+    assert set(flags) <= {f"--{name.replace('_', '-')}" for name in ("num", *collect.OPTIONS)}
+    assert demos.parameters["options"] == options()
+
+
+@pytest.mark.parametrize("task", ["double_walls", "random_boxes_hard"])
+def test_packaged_demonstrations_have_the_queries_of_their_seed(task):
+    """Their plans are of an earlier planner (docs/demonstrations.md), their queries are not."""
+    packaged = load_demos(task)
+    collector = collect.Collector(options(task=task))
+    for index in (0, 1, 4_321):
+        demo = collector(index)
+        assert demo["given_up"] == 0
+        plan = collect._decode(demo["plan"])
+        assert plan[[0, -1]].tobytes() == packaged[index].plan[[0, -1]].tobytes()
+        assert from_array(demo["obstacles"]) == packaged[index].scene.obstacles
+
+
+def test_rejected_attempts_are_counted(output):
+    tight = options(max_checks=300, attempts=1)
+    counts = collect.collect(output, 4, tight, progress=False)
+    stored = load_demos(output).parameters["counts"]
+    assert stored == dict(counts)
+    assert stored["attempts"] == 4 + sum(stored[reason] for reason in collect.REASONS)
+    rejected = [collect.Collector(tight)(index)["rejected"] for index in range(4)]
+    for reason in collect.REASONS:
+        assert stored[reason] == sum(one.get(reason, 0) for one in rejected)
+    assert stored["no_plan"] > 0
+    assert stored["queries_given_up"] == stored["attempts"] - 4  # one attempt on each query
+
+
+def test_limits_too_tight_for_any_query(tmp_path):
+    result = run(tmp_path / "demos.h5", "--max-checks", 1, task="no_obstacles")
+    assert result.returncode == 1
+    assert "error: 100 queries in a row could not be solved ({'no_plan': 300})" in result.stderr
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith("error: ") and "Traceback" not in result.stderr
+
+
+# --- Interrupted, killed, damaged
+
+
+def test_a_killed_worker_is_replaced(whole, output):
+    with running(output, "--workers", "2") as process:
+        victim = worker_processes(process)[0]
+        victim.kill()
+        stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == 0, stderr
+    assert "a worker died" in stdout + stderr and "Traceback" not in stderr
+    assert output.read_bytes() == whole.read_bytes()
+    assert list(output.parent.iterdir()) == [output]
+
+
+def test_a_killed_run_goes_on_and_leaves_no_workers(whole, output):
+    with running(output, "--workers", "2", demos=3) as process:
+        children = worker_processes(process)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        assert len(children) == 2
+        wait_for(lambda: all(has_ended(child) for child in children), 20)
+    collected = journal_lines(output)
+    assert 3 <= collected < NUM and not output.exists()
+    assert finish(output, whole) == collected
+
+
+def test_control_c_and_on_again(whole, output):
+    with running(output, demos=2) as process:
+        os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the workers, too
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stderr.splitlines()[-1] == "interrupted; the same command goes on from here"
+    assert "Traceback" not in stderr
+    collected = journal_lines(output)
+    assert collected >= 2 and not output.exists()
+    assert finish(output, whole) == collected
+
+
+@pytest.fixture(scope="module")
+def journal():
+    """The journal of a collection that was stopped just before it wrote its file."""
+    scene = scene_to_json(envs.TASKS[TASK].scene)
+    collector = collect.Collector(options())
+    made = [collector(index) for index in reversed(range(NUM))]
+    lines = [{"journal": VERSION, **options(), "scene": scene}, *made]
+    return b"".join(map(line_of, lines))
+
+
+def entry_of(line):
+    return json.loads(line[9:])
+
+
+def test_what_is_in_the_journal_is_not_made_again(journal, output):
+    lines = journal.splitlines(keepends=True)
+    marked = entry_of(lines[5]) | {"digest": 123456789}
+    lines[5] = line_of(marked)
+    collect.journal_of(output).write_bytes(b"".join(lines))
+    collect.collect(output, NUM, options(), progress=False)
+    digests = load_demos(output).digest
+    assert digests[marked["index"]] == 123456789
+    assert (digests == 123456789).sum() == 1
+
+
+@pytest.mark.parametrize("cut", [1, 9000], ids=["without its end", "with lines before"])
+def test_a_torn_last_line_is_dropped(whole, journal, output, cut):
+    collect.journal_of(output).write_bytes(journal[:-cut])
+    left = journal[:-cut].count(b"\n") - 1
+    assert 8 < left < NUM
+    assert finish(output, whole) == left
+
+
+def test_a_journal_goes_on_after_a_torn_line(journal, output):
+    path, lines = collect.journal_of(output), journal.splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:4]) + lines[4][:100])
+    for expected in (3, 4, 5):  # torn, whole, whole
+        with contextlib.closing(collect.Journal(path, options())) as opened:
+            assert len(opened.entries) == expected
+            opened.append(entry_of(lines[expected + 1]))
+    assert path.read_bytes() == b"".join(lines[:7])
+
+
+def test_a_flipped_bit_costs_its_entry_and_is_said(whole, journal, output):
+    rng, flipped = np.random.default_rng(0), bytearray(journal)
+    flipped[rng.integers(journal.index(b"\n") + 1, len(journal) - 1)] ^= 1 << rng.integers(8)
+    collect.journal_of(output).write_bytes(flipped)
+    result = run(output)
+    assert result.returncode == 0 and output.read_bytes() == whole.read_bytes()
+    assert f"{collect.journal_of(output)}: damaged, " in result.stderr
+    begun = int(re.search(rf"(\d+)/{NUM} ", result.stderr).group(1))
+    assert NUM - 2 <= begun < NUM  # two of them, if it was the end of a line
+
+
+def test_a_torn_first_line_is_written_again(whole, journal, output):
+    collect.journal_of(output).write_bytes(journal[:30])
+    assert finish(output, whole) == 0
+
+
+def test_a_journal_may_have_any_of_the_demonstrations(whole, journal, output):
+    few = journal.splitlines(keepends=True)[:5]
+    collect.journal_of(output).write_bytes(b"".join(few))  # numbers 12 to 15
+    assert finish(output, whole) == 4
+
+
+def test_fewer_can_be_taken_than_are_in_the_journal(whole, journal, output):
+    collect.journal_of(output).write_bytes(journal)
+    collect.collect(output, 3, options(), progress=False)
+    np.testing.assert_array_equal(load_demos(output).digest, load_demos(whole).digest[:3])
+
+
+def test_a_full_disk(whole, output):
+    def small_files():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))  # bytes
+
+    result = subprocess.run(
+        command(output), cwd=ROOT, capture_output=True, text=True, preexec_fn=small_files
+    )
+    assert result.returncode == 1
+    assert "error: " in result.stderr and "Traceback" not in result.stderr
+    assert result.stderr.strip().splitlines()[-1].startswith("what was collected is safe")
+    contents = collect.journal_of(output).read_bytes()
+    assert contents.endswith(b"\n") and 1000 < len(contents) <= 9000
+    for line in contents.splitlines(keepends=True):
+        assert line == line_of(entry_of(line))
+    assert list(output.parent.iterdir()) == [collect.journal_of(output)]
+    collected = journal_lines(output)
+    assert collected >= 1
+    assert finish(output, whole) == collected
+
+
+def test_a_disk_too_full_for_the_file(whole, journal, output, monkeypatch):
+    collect.journal_of(output).write_bytes(journal)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fsync", full)
+        with pytest.raises(SystemExit) as ended:
+            collect.main(collect.Args(TASK, num=NUM, output=output))
+    assert str(ended.value.code).startswith("error: [Errno 28] No space left on device")
+    assert collect.journal_of(output).read_bytes() == journal and not output.exists()
+    assert finish(output, whole) == NUM
+
+
+def test_two_collections_at_once(whole, output):
+    with running(output, demos=1) as process:
+        process.send_signal(signal.SIGSTOP)  # so that it does not finish in the meantime
+        second = run(output)
+        process.send_signal(signal.SIGCONT)
+        assert second.returncode == 1
+        expected = f"error: {collect.journal_of(output)}: another process is writing to it\n"
+        assert second.stderr.endswith(expected) and "Traceback" not in second.stderr
+        assert process.wait(60) == 0
+    assert output.read_bytes() == whole.read_bytes()
+
+
+# --- Refused
+
+
+def refusal(args):
+    """What the command says when it refuses; it must not have taken long."""
+    begin = time.monotonic()
+    with pytest.raises(SystemExit) as ended:
+        collect.main(args)
+    assert time.monotonic() - begin < 10
+    message = ended.value.code
+    assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ({"task": "double_wals"}, "unknown task 'double_wals': one of no_obstacles, wall"),
+        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': one of"),
+        ({"num": 0}, "--num must be at least 1"),
+        ({"workers": 0}, r"--workers must be in \[1, 256\], got 0"),
+        ({"seed": -1}, r"--seed must be in \[0, 2\^32\)"),
+        ({"attempts": 0}, "--attempts must be at least 1"),
+        ({"max_checks": 0}, "--max-checks must be at least 1"),
+        ({"time_limit": -1.0}, "--time-limit must be above 0"),
+        ({"clearance": -0.1}, "--clearance must be at least 0"),
+        ({"clearance": 0.6}, "clearance must be in"),
+        ({"ray_address": "x"}, "--ray-address must be `auto` or HOST:PORT"),
+        ({"planner_range": -1.0}, "--planner-range must be at least 0"),
+        ({"simplify": -1}, "--simplify must be at least 0"),
+        ({"output": Path("missing/demos.h5")}, "cannot write .*missing/demos.h5: No such file"),
+        ({"output": Path(".")}, "is a directory"),
+    ],
+)
+def test_refused_before_any_work(tmp_path, arguments, complaint):
+    output = tmp_path / arguments.pop("output", "demos.h5")
+    args = collect.Args(**({"task": TASK, "num": 4, "output": output} | arguments))
+    assert re.search(complaint, refusal(args))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("task", [name for name in envs.TASKS if not envs.TASKS[name].trainable])
+def test_a_task_for_testing_only_is_refused(task, output):
+    assert f"{task} is for testing only" in refusal(collect.Args(task, output=output))
+
+
+def test_the_command_says_it_in_one_line(tmp_path):
+    result = run(tmp_path / "missing" / "demos.h5", task="wall")
+    assert result.returncode == 1 and result.stdout.count("\n") <= 1
+    errors = [line for line in result.stderr.splitlines() if "pybullet" not in line]
+    assert len(errors) == 1 and errors[0].startswith("error: cannot write")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_file_is_refused_without_overwrite(whole, output):
+    output.write_bytes(b"precious")
+    args = collect.Args(TASK, num=NUM, output=output)
+    assert refusal(args) == f"error: {output} exists; --overwrite replaces it"
+    assert output.read_bytes() == b"precious" and list(output.parent.iterdir()) == [output]
+    assert finish(output, whole, "--overwrite") == 0
+
+
+def test_the_journal_of_another_collection_is_refused(journal, output):
+    path = collect.journal_of(output)
+    path.write_bytes(journal)
+    message = refusal(collect.Args(TASK, num=NUM, seed=5, planner="RRT", output=output))
+    assert str(path) in message
+    assert "(seed 0, not 5, planner 'RRTConnect', not 'RRT')" in message
+    assert path.read_bytes() == journal and not output.exists()
+
+
+@pytest.mark.parametrize(
+    "contents",
+    [b"dear diary,\ntoday was fine\n", b"PK\x03", b'["a", "list"]\n', b'{"journal": 99}\n'],
+)
+def test_what_is_no_journal_is_left_alone(output, contents):
+    path = collect.journal_of(output)
+    path.write_bytes(contents)
+    assert f"{path}: not a journal" in refusal(collect.Args(TASK, num=1, output=output))
+    assert path.read_bytes() == contents
+
+
+# --- Workers
+
+
+def test_a_job_that_raises_is_heard_of():
+    results = workers.run(functools.partial, (int,), ["7", "eight"], 1)  # a worker that is `int`
+    with pytest.raises(ValueError, match="eight"):
+        assert list(results) == [7, 8]
+
+
+def test_workers_that_always_die_are_given_up():
+    said = []
+    with pytest.raises(RuntimeError, match="workers died 5 times without a result"):
+        list(workers.run(os._exit, (1,), range(3), 1, warn=said.append))
+    assert len(said) == 4 and all("a worker died" in text for text in said)
+
+
+class DiesOnceOnEachJob:
+    """A worker that leaves a file in `folder` and dies; the next one does the job."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __call__(self, job):
+        mark = self.folder / str(job)
+        if not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return 10 * job
+
+
+def test_each_job_is_done_once_whatever_dies(tmp_path):
+    said = []
+    results = list(workers.run(DiesOnceOnEachJob, (tmp_path,), range(7), 1, warn=said.append))
+    assert sorted(results) == [0, 10, 20, 30, 40, 50, 60]
+    assert len(said) == 7 > workers.MAX_DEATHS  # with results between
+
+
+def test_nothing_to_do_starts_nothing():
+    assert list(workers.run(os._exit, (1,), [], 1)) == []
+
+
+# --- Verifying and mending
+
+
+@pytest.fixture(scope="module")
+def exact(whole):
+    """Of each demonstration of `whole`: plan, execution (not rounded, as in the file), seed."""
+    demos = load_demos(whole)
+    with contextlib.closing(envs.make(TASK)) as env:
+        return [
+            [demo.plan, follow(env, demo.plan), int(seed)]
+            for demo, seed in zip(demos, demos.plan_seed, strict=True)
+        ]
+
+
+@pytest.fixture(scope="module")
+def straight(exact):
+    """The same, straight from start to goal, whatever is in the way."""
+    with contextlib.closing(envs.make(TASK)) as env:
+        return [[plan[[0, -1]], follow(env, plan[[0, -1]]), seed] for plan, _, seed in exact]
+
+
+@pytest.fixture(scope="module")
+def touching():
+    """A configuration inside the limits and in collision."""
+    rng = np.random.default_rng(0)
+    with contextlib.closing(envs.make(TASK)) as env:
+        while True:
+            configuration = rng.uniform(0.9 * panda.LOWER, 0.9 * panda.UPPER).astype(np.float32)
+            if env.in_collision(configuration):
+                return configuration
+
+
+def write(path, demos, parameters=None):
+    plans, executions, seeds = zip(*demos, strict=True)
+    write_demos(
+        path,
+        TASK,
+        0,
+        plans,
+        [execution.states for execution in executions],
+        {
+            "plan_seed": seeds,
+            "digest": [execution.digest for execution in executions],
+            "collided": [execution.collided for execution in executions],
+        },
+        "made by a test",
+        {"options": options()} if parameters is None else parameters,
+    )
+    return path
+
+
+def starting_at(configuration, demo):
+    plan = demo[0].copy()
+    plan[0] = configuration
+    return [plan, *demo[1:]]
+
+
+@pytest.fixture
+def damaged(output, exact, straight, touching):
+    """A file with demonstrations that are not good; and their verdict -> number."""
+    collided = next(i for i, (_, e, _) in enumerate(straight) if e.collided and e.reached)
+    missed = next(i for i, (_, e, _) in enumerate(straight) if not e.reached)
+    changed, refused = [i for i in range(NUM) if i not in (collided, missed)][4:6]
+    demos = list(exact)
+    for i in (collided, missed):
+        demos[i] = straight[i]
+    plan, execution, seed = exact[changed]
+    demos[changed] = [plan, dataclasses.replace(execution, digest=execution.digest ^ 1), seed]
+    demos[refused] = starting_at(touching, exact[refused])
+    bad = {"collided": collided, "missed": missed, "changed": changed, "refused": refused}
+    return write(output, demos), bad
+
+
+def verify_command(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "roboarm_nmp.demo_generation.verify", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+
+
+def verdicts(path):
+    verifier = Verifier(path, mend=False)
+    return [verifier(index)[1] for index in range(len(verifier.demos))]
+
+
+def test_verify_finds_what_is_not_good(whole, damaged):
+    path, bad = damaged
+    before = path.read_bytes()
+    expected = ["good"] * NUM
+    for verdict, index in bad.items():
+        expected[index] = verdict
+    assert verdicts(path) == expected
+    result = verify_command(whole, path)
+    assert result.returncode == 1
+    lines = result.stdout.splitlines()
+    none = "0 changed, 0 missed, 0 collided, 0 refused"
+    assert f"{whole}: {NUM} good, {none} of {NUM} demonstrations" in lines
+    one_each = "1 changed, 1 missed, 1 collided, 1 refused"
+    assert f"{path}: {NUM - 4} good, {one_each} of {NUM} demonstrations" in lines
+    assert path.read_bytes() == before
+
+
+def test_mending(damaged):
+    path, bad = damaged
+    old = load_demos(path)
+    result = verify_command(path, "--mend")
+    assert result.returncode == 0, result.stderr
+    assert "; 3 mended, 1 removed" in result.stdout
+    demos = load_demos(path)
+    assert (demos.parameters["mended"], demos.parameters["removed"]) == (3, 1)
+    assert demos.made_by == old.made_by and demos.parameters["options"] == options()
+    assert not demos.collided.any()
+    kept = [i for i in range(NUM) if i != bad["refused"]]
+    for demo, seed, i in zip(demos, demos.plan_seed, kept, strict=True):
+        planned_anew = i in (bad["collided"], bad["missed"])
+        np.testing.assert_array_equal(demo.start, old[i].start)
+        np.testing.assert_array_equal(demo.goal, old[i].goal)
+        assert (demo.plan.tobytes() != old[i].plan.tobytes()) == planned_anew
+        assert (seed != old.plan_seed[i]) == planned_anew
+        assert (demo.digest != old[i].digest) == (planned_anew or i == bad["changed"])
+    none = dict.fromkeys(VERDICTS, 0)
+    expected = none | {"good": NUM - 1, "total": NUM - 1, "removed": 0}
+    assert verify(path, progress=False) == expected
+
+
+def test_mending_a_good_file_changes_nothing(whole, output):
+    output.write_bytes(whole.read_bytes())
+    assert verify(output, mend=True, progress=False)["good"] == NUM
+    assert output.read_bytes() == whole.read_bytes()
+
+
+def test_states_that_are_not_the_execution_are_found(output, exact):
+    demos = list(exact[:3])
+    states = demos[1][1].states.copy()
+    states[5, 3] += 0.002
+    demos[1] = [demos[1][0], dataclasses.replace(demos[1][1], states=states), demos[1][2]]
+    assert verdicts(write(output, demos)) == ["good", "changed", "good"]
+
+
+def test_collisions_are_rejected_unless_allowed(output, straight):
+    allowed, clean = (collect.Collector(options(allow_collisions=yes)) for yes in (True, False))
+    for collector in (allowed, clean):
+        collector.planner = Planner(collector.env, lambda _, *ends: np.stack(ends[:2]))
+        collector.planner.simplify = 0
+    index = next(index for index in range(60) if allowed(index)["collided"])
+    made = clean(index)
+    assert not made["collided"] and made["given_up"] >= 1
+    assert made["rejected"]["collided"] in (3, 6, 9)  # all three attempts on a query are straight
+    # Verified by the same rule as collected.
+    reached = [demo for demo in straight if demo[1].reached]
+    loose = {"options": options(allow_collisions=True)}
+    assert set(verdicts(write(output, reached, loose))) == {"good"}
+    assert load_demos(output).collided.tolist() == [demo[1].collided for demo in reached]
+    assert set(verdicts(write(output, reached))) == {"good", "collided"}
+
+
+def test_a_file_in_which_nothing_can_be_mended(output, exact, touching):
+    before = write(output, [starting_at(touching, exact[0])]).read_bytes()
+    with pytest.raises(DatasetError) as caught:
+        verify(output, num_workers=1, mend=True, progress=False)
+    assert str(output) in str(caught.value)
+    assert output.read_bytes() == before
+
+
+def test_a_file_that_was_not_collected_cannot_be_verified(output, exact):
+    write(output, exact[:2], parameters={})  # it does not say with what options
+    with pytest.raises(DatasetError) as caught:
+        verify(output, num_workers=1, progress=False)
+    assert str(output) in str(caught.value)
+
+
+def test_verify_goes_on_after_a_bad_file(whole, tmp_path):
+    (tmp_path / "bad.h5").write_bytes(whole.read_bytes()[:3000])
+    result = verify_command(tmp_path / "bad.h5", tmp_path / "none.h5", whole)
+    assert result.returncode == 1 and "Traceback" not in result.stderr
+    errors = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 2 and "bad.h5" in errors[0] and "none.h5: no such file" in errors[1]
+    assert f"{whole}: {NUM} good" in result.stdout
+
+
+# --- On a cluster
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_node_collects_the_same_bytes(output, tmp_path, cluster):
+    num = 150
+    local = tmp_path / "local.h5"
+    assert run(local, "--workers", "2", num=num).returncode == 0
+    with running(output, "--ray-address", cluster.address, demos=40, num=num) as process:
+        cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+        assert journal_lines(output) < num - 40
+        _, stderr = process.communicate(timeout=300)
+    assert process.returncode == 0, stderr
+    assert output.read_bytes() == local.read_bytes()
+
+
+@pytest.mark.slow
+def test_no_cluster_to_work_on(output):
+    pytest.importorskip("ray")
+    result = run(output, "--ray-address", "auto")
+    assert result.returncode == 1 and "Traceback" not in result.stderr
+    assert "error: Could not find any running Ray instance" in result.stderr
+    assert not output.exists()

@@ -1,0 +1,508 @@
+"""The planner: exact ends, no collisions, the clearance asked for, and the same seed again."""
+
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import psutil
+import pybullet as p
+import pytest
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.planning import (
+    CAUTIONS,
+    FIRST_TURN,
+    MARGIN,
+    PLANNERS,
+    Planner,
+    PlanningError,
+)
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.scenes.primitives import Scene
+
+# Configurations on `wall`: two that touch nothing, and three that do.
+READY = np.array([1.0, -0.5, 0.0, -1.8, 0.0, 1.5, 0.0], np.float32)
+TURNED = np.array([1.3, -0.2, 0.3, -1.5, 0.3, 1.8, 0.3], np.float32)
+INTO_THE_WALL = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.5, 0.0], np.float32)
+INTO_THE_TABLE = np.array([1.0, 1.2, 0.0, -1.6, 0.0, 2.0, 0.0], np.float32)
+INTO_ITSELF = np.array([1.0, -0.5, 0.0, -1.8, 0.0, -0.08, 0.0], np.float32)
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """Task -> environment."""
+    worlds = {task: envs.make(task) for task in ("no_obstacles", "wall", "double_walls")}
+    yield worlds
+    for env in worlds.values():
+        env.close()
+
+
+def interpolate(path, step):
+    """Configurations (rad) along a path, at most `step` apart in the normalised space."""
+    corners = panda.normalise(path.astype(np.float64))
+    points = [corners[0]]
+    for here, there in zip(corners[:-1], corners[1:], strict=True):
+        pieces = int(np.linalg.norm(there - here) / step) + 1
+        points += [here + (there - here) * i / pieces for i in range(1, pieces + 1)]
+    return panda.denormalise(np.array(points))
+
+
+def length(path):
+    return np.linalg.norm(np.diff(panda.normalise(path), axis=0), axis=1).sum()
+
+
+def is_path_of(path, start, goal):
+    assert path.dtype == np.float32 and path.ndim == 2 and path.shape[1] == 7
+    return path[0].tobytes() == start.tobytes() and path[-1].tobytes() == goal.tobytes()
+
+
+# --- Paths
+
+
+def test_paths_join_the_query_exactly_and_touch_nothing(worlds):
+    env, queries = worlds["double_walls"], load_queries("double_walls")
+    planner = Planner(env)
+    bent = 0
+    for seed, (start, goal, _) in enumerate(queries[:12], 1):
+        path = planner.plan(start, goal, seed=seed)
+        assert is_path_of(path, start, goal)
+        assert ((path >= panda.LOWER) & (path <= panda.UPPER)).all()
+        assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
+        direct = np.stack([start, goal])
+        bent += any(env.in_collision(point) for point in interpolate(direct, 0.01))
+    assert bent >= 5  # many straight lines would touch something
+
+
+def test_a_query_at_the_limits_gets_a_path(worlds):
+    start, goal = READY.copy(), READY.copy()
+    start[[0, 6]] = panda.UPPER[0], panda.LOWER[6]
+    goal[[0, 3, 6]] = panda.LOWER[0], panda.UPPER[3], panda.UPPER[6]
+    assert is_path_of(Planner(worlds["no_obstacles"]).plan(start, goal, seed=1), start, goal)
+
+
+def test_a_query_that_goes_nowhere_gets_a_path(worlds):
+    assert is_path_of(Planner(worlds["no_obstacles"]).plan(READY, READY, seed=1), READY, READY)
+
+
+def test_simplifying_shortens(worlds):
+    start, goal, _ = load_queries("double_walls")[0]
+    simple, raw = (
+        [
+            length(Planner(worlds["double_walls"], simplify=simplify).plan(start, goal, seed=seed))
+            for seed in range(1, 9)
+        ]
+        for simplify in (1, 0)
+    )
+    assert np.mean(simple) < 0.8 * np.mean(raw)
+
+
+def test_a_new_scene_is_planned_in(worlds):
+    env, (start, goal, _) = envs.make("no_obstacles"), load_queries("wall")[4]
+    planner = Planner(env)
+    assert any(worlds["wall"].in_collision(c) for c in interpolate(np.stack([start, goal]), 0.01))
+    planner.plan(start, goal, seed=1)
+    env.set_scene(worlds["wall"].scene)
+    path = planner.plan(start, goal, seed=1)
+    assert not any(worlds["wall"].in_collision(c) for c in interpolate(path, 0.01))
+    env.close()
+
+
+# --- The same seed, the same path
+
+
+def test_same_seed_same_path_whatever_was_planned_before(worlds):
+    planner = Planner(worlds["double_walls"])
+    queries = load_queries("double_walls")
+    first = planner.plan(*queries[0], seed=7)
+    checks = planner.checks
+    others = [planner.plan(*queries[i], seed=7 + i) for i in (3, 1)]
+    again = planner.plan(*queries[0], seed=7)
+    assert again.tobytes() == first.tobytes() and planner.checks == checks
+    fresh = Planner(worlds["double_walls"])
+    assert fresh.plan(*queries[1], seed=8).tobytes() == others[1].tobytes()
+
+
+def test_other_seeds_other_paths(worlds):
+    planner, (start, goal, _) = Planner(worlds["double_walls"]), load_queries("double_walls")[0]
+    assert len({planner.plan(start, goal, seed=seed).tobytes() for seed in range(1, 6)}) == 5
+
+
+SEARCHES = """
+    import sys, zlib
+    import roboarm_nmp
+    from roboarm_nmp.demo_generation.planning import Planner
+    from roboarm_nmp.envs.datasets.queries import load_queries
+
+    env, queries = roboarm_nmp.make("wall"), load_queries("wall")
+    for name in sys.argv[2:]:
+        for seed in range(int(sys.argv[1])):
+            Planner(env, "RRT").plan(*queries[8], seed=50 + seed)
+        planner = Planner(env, name, max_checks=8000, simplify=0)
+        path = planner.plan(*queries[0], seed=5)
+        print("search:", name, planner.checks, zlib.crc32(path.tobytes()))
+"""
+
+
+def test_same_seed_same_search_in_another_process():
+    names = [name for name in PLANNERS if "FMT" not in name]  # those take a second each
+    searches = []
+    for arguments in (["0", *names], ["1", *reversed(names)]):
+        result = subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(SEARCHES), *arguments],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+        )
+        assert result.returncode == 0, result.stderr
+        searches.append(sorted(x for x in result.stdout.splitlines() if x.startswith("search:")))
+    assert searches[0] == searches[1] and len(searches[0]) == len(names)
+
+
+# --- Planners
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_every_planner_solves_an_easy_query(worlds, name):
+    env = worlds["no_obstacles"]
+    start, goal, _ = load_queries("no_obstacles")[0]
+    # FMT and BFMT first connect a thousand samples; the "stars" use all they are given.
+    planner = Planner(env, name, max_checks=100_000 if "FMT" in name else 3000)
+    path = planner.plan(start, goal, seed=1)
+    assert is_path_of(path, start, goal)
+    assert not any(env.in_collision(point) for point in interpolate(path, 0.02))
+    assert length(path) < 1.2 * length(np.stack([start, goal]))  # simplified
+
+
+def test_the_planners_are_ompls():
+    assert {"RRTConnect", "RRT", "RRTstar", "BITstar", "KPIECE1"} <= set(PLANNERS)
+
+
+@pytest.mark.parametrize("simplify", [1, 0])
+def test_a_planner_of_your_own(worlds, simplify):
+    env, asked = worlds["wall"], []
+
+    def over_the_top(is_valid, start, goal, rng):
+        top = panda.normalise([0.0, -0.3, 0.0, -0.2, 0.0, 1.5, 0.0])
+        asked.extend([is_valid(top), is_valid(panda.normalise(INTO_THE_WALL)), rng.integers(2**40)])
+        assert is_valid.checks == 2 and not is_valid.exhausted()
+        return [start, top, goal]
+
+    planner = Planner(env, over_the_top, simplify=simplify)
+    path = planner.plan(READY, TURNED, seed=3)
+    assert is_path_of(path, READY, TURNED)
+    assert asked == [True, False, np.random.default_rng(3).integers(2**40)]
+    if simplify:
+        assert planner.checks > 2
+    else:
+        assert planner.checks == 2
+        np.testing.assert_allclose(path[1], [0.0, -0.3, 0.0, -0.2, 0.0, 1.5, 0.0], atol=1e-6)
+
+
+def test_your_own_planners_limits(worlds):
+    def never(is_valid, start, goal, rng):
+        while not is_valid.exhausted():
+            is_valid(start)
+
+    planner = Planner(worlds["no_obstacles"], never, max_checks=123)
+    with pytest.raises(PlanningError, match="no path in 123 collision checks.*123 checks, 10.0 s"):
+        planner.plan(READY, READY, seed=1)
+    assert planner.checks == 123
+    planner = Planner(worlds["no_obstacles"], never, time_limit=0.05, max_checks=10**9)
+    with pytest.raises(PlanningError, match="0.05 s"):
+        planner.plan(READY, READY, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("answer", "complaint"),
+    [
+        (lambda start, goal: [start[:6], goal[:6]], r"shape \(2, 6\)"),
+        (lambda start, goal: [start], r"shape \(1, 7\)"),
+        (lambda start, goal: start, r"shape \(7,\)"),
+        (lambda start, goal: [goal, start], "does not start at the query's start"),
+        (
+            lambda start, goal: [start, goal + 1e-3],
+            "does not end at the query's end|does not end at the query's goal",
+        ),
+        (lambda start, goal: [start, start * 0 + 1.001, goal], r"leaves \[-1, 1\]\^7"),
+        (lambda start, goal: [start, start * np.nan, goal], r"leaves \[-1, 1\]\^7"),
+    ],
+)
+def test_what_your_own_planner_returns_is_checked(worlds, answer, complaint):
+    start, goal, _ = load_queries("no_obstacles")[0]
+    planner = Planner(worlds["no_obstacles"], lambda is_valid, *query: answer(*query[:2]))
+    with pytest.raises(ValueError, match=complaint):
+        planner.plan(start, goal, seed=1)
+
+
+def test_your_own_planner_may_round(worlds):
+    def rounded(is_valid, start, goal, rng):
+        return np.stack([start, goal]).round(6)
+
+    start, goal, _ = load_queries("no_obstacles")[0]
+    for simplify in (1, 0):
+        path = Planner(worlds["no_obstacles"], rounded, simplify=simplify).plan(start, goal, seed=1)
+        assert is_path_of(path, start, goal)
+
+
+def test_your_own_planner_may_find_nothing(worlds):
+    with pytest.raises(PlanningError, match="no path in 0 collision checks"):
+        Planner(worlds["no_obstacles"], lambda *_: None).plan(READY, READY, seed=1)
+
+
+def test_your_own_planner_asks_about_many_at_once(worlds):
+    asked = []
+
+    def batched(is_valid, start, goal, rng):
+        points = rng.uniform(-1, 1, (50, 7))
+        free = is_valid.free(points)
+        assert is_valid.checks == 50
+        assert free.tolist() == [is_valid(point) for point in points]
+        before, free_points = is_valid.checks, points[free]
+        motions = is_valid.motions_free(start, free_points)
+        assert is_valid.checks >= before + len(free_points)
+        one_by_one = [is_valid.motion_free(tuple(start), tuple(point)) for point in free_points]
+        assert motions.tolist() == one_by_one
+        asked.extend([free.mean(), motions.mean()])
+        return [start, free_points[motions.argmax()], goal]
+
+    Planner(worlds["wall"], batched, simplify=0).plan(READY, TURNED, seed=3)
+    assert 0 < asked[0] < 1 and 0 < asked[1] < 1
+
+
+def test_planning_within_a_time(worlds):
+    queries = load_queries("double_walls")
+    planner = Planner(worlds["double_walls"], time_limit=3.0, max_checks=123)
+    paths = [planner.plan_within(60.0, *queries[0], rng=np.random.default_rng(4)) for _ in "ab"]
+    assert is_path_of(paths[0], queries[0].start, queries[0].goal)
+    assert paths[0].tobytes() == paths[1].tobytes()
+    with pytest.raises(PlanningError, match="no path in 1e-09 s"):
+        planner.plan_within(1e-9, *queries[0], rng=np.random.default_rng(4))
+
+
+def test_another_planner_helps_where_rrt_connect_takes_long():
+    """A problem that takes RRT-Connect alone half a million checks or more: docs/benchmarks.md."""
+    env = envs.make("benchmaker_bookshelf_thin")
+    query, planner = load_queries("benchmaker_bookshelf_thin", "original")[88], Planner(env)
+    paths = [planner.plan_within(60.0, *query, rng=np.random.default_rng(4)) for _ in "ab"]
+    assert FIRST_TURN < planner.checks < 30_000
+    assert is_path_of(paths[0], query.start, query.goal)
+    assert paths[0].tobytes() == paths[1].tobytes()
+    with pytest.raises(PlanningError, match="no path in 1[0-9]{5} collision checks"):
+        Planner(env, max_checks=100_000).plan(*query, seed=4)  # alone
+    env.close()
+
+
+def test_a_path_longer_than_an_episode_is_planned_again(monkeypatch):
+    env = envs.make("double_walls", horizon=200)
+    start, goal, _ = load_queries("double_walls")[0]
+    there = panda.denormalise(np.random.default_rng(0).uniform(-1, 1, (6, 7))).astype(np.float32)
+    detour, longer = np.stack([start, *there, goal]), np.stack([start, *there, start, goal])
+    short = np.stack([start, goal])
+    assert length(longer) > length(detour) > 200 * 0.03 > length(short)
+
+    def searched(*paths):
+        """What comes out of searches that find these paths, and how many it takes."""
+        left = list(paths)
+
+        def search(is_valid, start, goal, rng):
+            return panda.normalise(left.pop(0))
+
+        planner = Planner(env, search, simplify=0)
+        return planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1)), len(left)
+
+    for paths, best, left in (
+        ((detour, short, detour), short, 1),
+        ((longer, detour, longer, short), detour, 1),
+    ):
+        path, unused = searched(*paths)
+        np.testing.assert_allclose(path, best, atol=1e-6)
+        assert unused == left
+    env.close()
+
+
+def test_a_long_search_keeps_less_and_less_distance(worlds):
+    env, (start, goal, _) = worlds["wall"], load_queries("wall")[0]
+    points = np.random.default_rng(0).uniform(-1, 1, (20_000, 7))
+    distances = CollisionChecker(env.scene).nearest(points).distance.min(-1)
+    near = np.abs(distances - 0.003) < 0.006  # of what a margin decides about, all there is
+    kept, asked = [], []
+
+    def search(is_valid, start, goal, rng):
+        for checks, _ in CAUTIONS:
+            while is_valid.checks < checks:
+                is_valid.free(points[:500])
+            kept.append(distances[near][is_valid.free(points[near])].min())
+        asked.append(is_valid)
+        return [start, goal]
+
+    planner = Planner(env, search, clearance=0.0)
+    planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1))
+    # What shortens the path keeps everything.
+    kept.append(distances[near][asked[0].free(points[near])].min())
+    wanted = np.array([caution for _, caution in CAUTIONS] + [1.0]) * MARGIN
+    assert (kept >= wanted).all() and np.abs(kept - wanted).max() < 0.0005
+
+
+# --- Clearance
+
+
+@pytest.fixture(scope="module")
+def box():
+    """An environment with nothing but the box of `wall`."""
+    env = envs.RoboArmEnv(Scene(envs.TASKS["wall"].scene.obstacles, table=None, floor=None))
+    yield env
+    env.close()
+
+
+def distance(env, configuration):
+    """Of the arm from the box, m, by PyBullet's query for closest points; at most 0.2."""
+    panda.set_configuration(env.client, env.robot, configuration)
+    (body,) = {0, 1} - {env.robot}
+    points = p.getClosestPoints(env.robot, body, 0.2, physicsClientId=env.client)
+    return min((point[8] for point in points), default=0.2)
+
+
+def nearest(env, path):
+    return min(distance(env, point) for point in interpolate(path, 0.01))
+
+
+def box_queries(env, number, low, high):
+    """Queries of `wall` whose nearer end is between `low` and `high` m from the box.
+
+    The straight line between them touches it.
+    """
+    chosen = []
+    for start, goal, _ in load_queries("wall")[:400]:
+        ends = min(distance(env, end) for end in (start, goal))
+        if low < ends < high and nearest(env, np.stack([start, goal])) < 0:
+            chosen.append((start, goal))
+            if len(chosen) == number:
+                break
+    assert len(chosen) == number
+    return chosen
+
+
+def test_paths_keep_the_clearance(box):
+    kept, touched = Planner(box, clearance=0.03), Planner(box, clearance=0.0)
+    close = []
+    for seed, (start, goal) in enumerate(box_queries(box, 6, 0.056, 0.21), 1):
+        assert nearest(box, kept.plan(start, goal, seed=seed)) > 0.029
+        close.append(nearest(box, touched.plan(start, goal, seed=seed)))
+    assert np.median(close) < 0.02  # and without, they do not keep it
+
+
+def test_less_caution_less_clearance(box):
+    planner = Planner(box, clearance=0.06)
+    (query,) = box_queries(box, 1, 0.11, 0.21)
+    means = []
+    for caution in (1.0, 0.5, 0.0):
+        kept = [
+            nearest(box, planner.plan(*query, seed=seed, caution=caution)) for seed in range(1, 6)
+        ]
+        assert min(kept) > 0.06 * caution - 0.001
+        means.append(np.mean(kept))
+    assert means[0] > means[1] > means[2]
+
+
+def test_a_query_that_nearly_touches_is_planned(worlds):
+    env, rng = worlds["double_walls"], np.random.default_rng(3)
+    checker = CollisionChecker(env.scene)
+    planned = 0
+    while planned < 3:
+        start = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
+        near = checker.nearest(panda.normalise(start)).distance.min()
+        if not env.in_collision(start) and near < 0.001:
+            goal = env.sample_feasible(rng)
+            path = Planner(env).plan(start, goal, seed=1)
+            assert is_path_of(path, start, goal)
+            assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
+            planned += 1
+
+
+def test_a_query_nearer_than_the_clearance_is_planned_anyway(box):
+    for start, goal in box_queries(box, 2, 0.004, 0.028):
+        path = Planner(box, clearance=0.03).plan(start, goal, seed=1)
+        assert is_path_of(path, start, goal)
+        assert nearest(box, path) > 0
+
+
+# --- Refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': one of .*RRTConnect"),
+        ({"planner": "PRM"}, "unknown planner 'PRM'"),
+        ({"planner": None}, "unknown planner None"),
+        ({"time_limit": 0.0}, "time_limit must be positive, got 0.0"),
+        ({"time_limit": float("nan")}, "time_limit must be positive"),
+        ({"max_checks": 0}, "max_checks must be positive, got 0"),
+        ({"max_checks": -5}, "max_checks must be positive, got -5"),
+        ({"clearance": -0.01}, r"clearance must be in \[0, 0.5\) m, got -0.01"),
+        ({"clearance": 0.5}, r"clearance must be in \[0, 0.5\) m"),
+        ({"clearance": float("nan")}, r"clearance must be in \[0, 0.5\) m"),
+        ({"planner_range": -0.1}, "planner_range must be 0 or positive, got -0.1"),
+        ({"planner_range": float("nan")}, "planner_range must be 0 or positive"),
+        ({"simplify": -1}, "simplify must be a number of rounds, got -1"),
+        ({"simplify": 1.5}, "simplify must be a number of rounds, got 1.5"),
+    ],
+)
+def test_wrong_arguments_are_refused(worlds, arguments, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        Planner(worlds["no_obstacles"], **arguments)
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "complaint"),
+    [
+        (INTO_THE_WALL, READY, "start is in collision: the arm with obstacle 0"),
+        (READY, INTO_THE_WALL, "goal is in collision: the arm with obstacle 0"),
+        (READY, INTO_THE_TABLE, "goal is in collision: the arm with the table"),
+        (INTO_ITSELF, READY, "start is in collision: the arm with itself"),
+        (READY + 9, READY, "start is outside the joint limits: joint 1 is 10.0000 rad"),
+        (READY, READY - 9, "goal is outside the joint limits: joint 1"),
+        (READY * np.nan, READY, "start must be finite"),
+        (READY, READY + np.float32(np.inf), "goal must be finite"),
+        (READY[:6], READY, r"start must have 7 numbers, got shape \(6,\)"),
+        (READY, READY[:3], "goal must have 7 numbers"),
+        (READY, "home", "goal must be numbers"),
+    ],
+)
+def test_bad_queries_are_refused(worlds, start, goal, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        Planner(worlds["wall"]).plan(start, goal, seed=1)
+
+
+@pytest.mark.parametrize("seed", [0, -1])
+def test_seeds_that_ompl_would_ignore_are_refused(worlds, seed):
+    with pytest.raises(ValueError, match="seed"):
+        Planner(worlds["no_obstacles"]).plan(READY, READY, seed=seed)
+
+
+def test_a_search_ends_at_its_limits(worlds):
+    start, goal, _ = load_queries("double_walls")[0]
+    planner = Planner(worlds["double_walls"], max_checks=50, time_limit=9.0)
+    with pytest.raises(PlanningError, match=r"limits: 50 checks, 9.0 s\)"):
+        planner.plan(start, goal, seed=1)
+    assert 50 <= planner.checks < 200
+    planner = Planner(worlds["double_walls"], max_checks=4000, time_limit=1e-6)
+    with pytest.raises(PlanningError, match=r"limits: 4000 checks, 1e-06 s\)"):
+        planner.plan(start, goal, seed=1)
+
+
+# --- Memory
+
+
+def test_planning_does_not_grow(worlds):
+    planner, queries = Planner(worlds["no_obstacles"]), load_queries("no_obstacles")
+    for seed in range(1, 51):
+        planner.plan(*queries[seed], seed=seed)
+    before = psutil.Process().memory_info().rss
+    for seed in range(51, 351):
+        planner.plan(*queries[seed], seed=seed)
+    assert psutil.Process().memory_info().rss - before < 20e6

@@ -1,0 +1,328 @@
+"""Roadmaps: paths that keep their distance, labels from anywhere, and files that repeat exactly."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.roadmaps import Args, Roadmap, collect
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
+from roboarm_nmp.envs.datasets.shards import shard_path
+from roboarm_nmp.envs.scenes.primitives import Scene, to_array
+
+SMALL = {"scenes": 5, "paths_per_scene": 6, "num_nodes": 150, "shard_size": 2, "workers": 1}
+
+
+def hard_scene(number):
+    return envs.get_task("random_boxes_hard").scene.sample(np.random.default_rng(number))
+
+
+def distances(scene, states):
+    return CollisionChecker(scene).nearest(states).distance.min(-1)
+
+
+def along(path, spacing=0.02):
+    """Points on a path."""
+    pieces = [
+        np.linspace(a, b, 1 + int(np.ceil(np.linalg.norm(b - a) / spacing)))
+        for a, b in zip(path[:-1], path[1:], strict=True)
+    ]
+    return np.concatenate(pieces)
+
+
+def length(path):
+    return np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+
+
+@pytest.fixture(scope="module")
+def roadmap():
+    return Roadmap(hard_scene(3), np.random.default_rng(0))
+
+
+def test_paths_keep_their_distance(roadmap):
+    paths = roadmap.random_paths(60, np.random.default_rng(1))
+    assert len(paths) == 60
+    assert all(path.dtype == np.float32 and path.shape == (len(path), 7) for path in paths)
+    near = [distances(roadmap.scene, along(path)) for path in paths]
+    assert min(x.min() for x in near) > -1e-4
+    assert (np.concatenate(near) < roadmap.margin - 0.001).mean() < 0.1
+    # Where both ends and everything on the way have room, all of the margin is kept.
+    roomy = [x for x in near if min(x[0], x[-1]) > 0.016 and x.min() > 0.006]
+    assert len(roomy) > 20
+    assert np.mean([x.min() > roadmap.margin - 0.001 for x in roomy]) > 0.9
+
+
+def test_paths_are_short(roadmap):
+    rng = np.random.default_rng(2)
+    starts, goals = roadmap.sample(30, rng, 0.015), roadmap.sample(30, rng, 0.015)
+    points, room, found = roadmap._search(starts, goals)
+    paths = roadmap.paths(starts, goals, np.random.default_rng(2))
+    assert found.sum() > 20
+    raw = np.array([length(p) for p in points[found]])
+    smooth = np.array([length(path) for path, there in zip(paths, found, strict=True) if there])
+    assert (smooth <= raw + 1e-5).all()
+    assert smooth.mean() < 0.85 * raw.mean()
+    for start, goal, path in zip(starts, goals, paths, strict=True):
+        if path is not None:
+            np.testing.assert_array_equal(path[0], start.astype(np.float32))
+            np.testing.assert_array_equal(path[-1], goal.astype(np.float32))
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+def test_paths_are_those_of_a_roadmap_of_which_all_is_known(narrow):
+    """Where every motion has been looked at before anything is asked."""
+    roadmap, known = (Roadmap(hard_scene(4), np.random.default_rng(0), 300) for _ in range(2))
+    for _ in range(2):  # with the margin, and then with what nodes keep
+        known._look(known._edges.T, narrow=True)
+    usable = known._kept <= 1
+    assert known._is_known[usable].all() and 0.2 < usable.mean() < 0.9
+    ends, room = known.nodes[known._edges], known._room[known._edges]
+    free = known._joined(*ends, *room, roadmap.margin)
+    # The first look is not at the same states of a motion.
+    assert (free == (known._kept == 0)).mean() > 0.99
+    rng = np.random.default_rng(5)
+    starts, goals = roadmap.sample(40, rng), np.repeat(roadmap.sample(8, rng), 5, axis=0)
+    both = [one._search(starts, goals, narrow) for one in (roadmap, known)]
+    assert both[0][2].sum() > 15
+    for ours, theirs in zip(*both, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert roadmap._is_known.sum() < 0.5 * known._is_known.sum()
+
+
+def test_no_paths_are_asked_for(roadmap):
+    assert roadmap.paths(np.empty((0, 7)), np.empty((0, 7)), np.random.default_rng(0)) == []
+
+
+def test_a_free_straight_motion_is_the_path():
+    roadmap = Roadmap(Scene(), np.random.default_rng(0), num_nodes=100)
+    start, goal = np.array([[0.1] * 7, [-0.1] * 7])
+    (path,) = roadmap.paths([start], [goal], np.random.default_rng(0))
+    np.testing.assert_allclose(path, [start, goal], atol=1e-6)
+    directions, lengths = roadmap.labels([start, goal], [goal, goal], np.random.default_rng(0))
+    np.testing.assert_allclose(directions, [[-(7**-0.5)] * 7, [0.0] * 7], atol=1e-6)
+    np.testing.assert_allclose(lengths, [0.2 * 7**0.5, 0.0], atol=1e-6)
+
+
+def test_queries_that_a_planner_solved_are_found():
+    queries = load_queries("random_boxes_hard", "validation")
+    near, found = [], 0
+    for i in range(8):
+        start, goal, scene = queries[i]
+        start, goal = panda.normalise(start), panda.normalise(goal)
+        near.append(distances(scene, np.stack([start, goal])).min())
+        roadmap = Roadmap(scene, np.random.default_rng(i), num_nodes=600)
+        (path,) = roadmap.paths([start], [goal], np.random.default_rng(i))
+        if path is not None:
+            found += 1
+            assert distances(scene, along(path)).min() > -1e-4
+    assert min(near) < 0.003  # some begin or end in a narrow place
+    assert found >= 7
+
+
+def touching(roadmap, depth):
+    """Configurations with something this deep (m) in the arm, found by walking into it."""
+    rng, found = np.random.default_rng(4), []
+    starts = roadmap.sample(30, rng, 0.003)
+    ends = starts + 0.3 * rng.standard_normal(starts.shape)
+    for line in np.linspace(starts, np.clip(ends, -1, 1), 1000, axis=1):
+        near = distances(roadmap.scene, line)
+        inside = np.flatnonzero(near < -depth)
+        if len(inside) and near[inside[0]] > -depth - 0.0005:
+            found.append(line[inside[0]])
+    return np.array(found[:10])
+
+
+@pytest.mark.parametrize("depth", [0.0003, 0.008])
+def test_labels_of_states_in_contact(roadmap, depth):
+    states = touching(roadmap, depth)
+    assert len(states) >= 5
+    goals = np.repeat(roadmap.sample(1, np.random.default_rng(5), 0.015), len(states), axis=0)
+    paths = roadmap.paths(states, goals, np.random.default_rng(6))
+    directions, lengths = roadmap.labels(states, goals, np.random.default_rng(6))
+    there = np.array([path is not None for path in paths])
+    assert there.sum() >= 0.7 * len(states)
+    np.testing.assert_array_equal(np.isfinite(lengths), there)
+    np.testing.assert_array_equal(np.isfinite(directions).all(1), there)
+    np.testing.assert_allclose(np.linalg.norm(directions[there], axis=1), 1.0, atol=1e-5)
+    for state, direction, path, rest in zip(states, directions, paths, lengths, strict=True):
+        if path is None:
+            continue
+        assert rest == pytest.approx(length(path), rel=1e-5)
+        before = distances(roadmap.scene, state)
+        if depth > 0.001:  # first out, by the shortest way: no random direction is much better
+            assert distances(roadmap.scene, path[1:]).min() > -1e-4
+            rng = np.random.default_rng(7)
+            others = rng.standard_normal((50, 7))
+            others /= np.linalg.norm(others, axis=1, keepdims=True)
+            gain = distances(roadmap.scene, np.clip(state + 0.002 * direction, -1, 1)) - before
+            other = distances(roadmap.scene, np.clip(state + 0.002 * others, -1, 1)) - before
+            assert gain > 0
+            assert gain > other.max() - 1e-5
+        else:
+            assert distances(roadmap.scene, along(path)).min() > before - 1e-4
+
+
+def test_no_way_to_a_goal_inside_of_something(roadmap):
+    goal = touching(roadmap, 0.008)[0]
+    start = roadmap.sample(1, np.random.default_rng(0))[0]
+    assert roadmap.paths([start], [goal], np.random.default_rng(0)) == [None]
+    directions, lengths = roadmap.labels([start], [goal], np.random.default_rng(0))
+    assert np.isnan(directions).all() and np.isnan(lengths).all()
+    assert roadmap.paths(np.empty((0, 7)), np.empty((0, 7)), np.random.default_rng(0)) == []
+
+
+def test_the_same_seed_gives_the_same_labels(roadmap):
+    rng = np.random.default_rng(8)
+    states, goals = roadmap.sample(10, rng), np.repeat(roadmap.sample(2, rng), 5, axis=0)
+    again = Roadmap(roadmap.scene, np.random.default_rng(0))
+    for one, other in zip(
+        roadmap.labels(states, goals, np.random.default_rng(9)),
+        again.labels(states, goals, np.random.default_rng(9)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_trainer_that_asks_for_labels_needs_no_ompl():
+    check = "import sys, demo_generation.roadmaps; sys.exit('ompl' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], cwd=ROOT).returncode == 0
+
+
+def test_a_margin_below_that_of_the_nodes_is_refused():
+    with pytest.raises(ValueError, match="margin"):
+        Roadmap(Scene(), np.random.default_rng(0), margin=0.001)
+
+
+# --- Collections
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("roadmaps")
+    collect(Args(folder, **SMALL), progress=False)
+    return folder
+
+
+def test_what_was_collected(collected):
+    paths = load_roadmap_paths(collected)
+    assert len(paths) == 5 and paths.task == "random_boxes_hard" and paths.seed == 0
+    np.testing.assert_array_equal(paths.path_offsets, np.arange(6) * 6)
+    assert len({paths.scenes[i] for i in range(5)}) == 5
+    for i in range(5):
+        for path in paths.of_scene(i):
+            assert distances(paths.scenes[i], along(path)).min() > -1e-4
+    assert sum(len(p) for i in range(5) for p in paths.of_scene(i)) == len(paths.points)
+    assert paths.offsets[-1] == len(paths.points)
+
+
+def test_no_scene_is_one_of_the_queries(collected):
+    paths = load_roadmap_paths(collected)
+    mine = {to_array(paths.scenes[i].obstacles).tobytes() for i in range(len(paths))}
+    for split in ("test", "validation"):
+        scenes = load_queries("random_boxes_hard", split).scenes
+        ends = scenes.offsets
+        rows = {scenes.rows[a:b].tobytes() for a, b in zip(ends[:-1], ends[1:], strict=True)}
+        assert len(rows) > 10 and not mine & rows
+
+
+def test_the_files_do_not_depend_on_the_workers(collected, tmp_path):
+    collect(replace(Args(tmp_path, **SMALL), workers=2), progress=False)
+    assert files(tmp_path) == files(collected)
+
+
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_files(collected, tmp_path, cluster):
+    collect(Args(tmp_path, **SMALL, ray_address=cluster.address), progress=False)
+    assert files(tmp_path) == files(collected)
+
+
+def test_killed_and_resumed_is_the_same(collected, tmp_path):
+    flags = [f"--{k.replace('_', '-')}={v}" for k, v in SMALL.items()]
+    command = [
+        sys.executable,
+        "-m",
+        "roboarm_nmp.demo_generation.roadmaps",
+        "--output",
+        str(tmp_path),
+        *flags,
+    ]
+    process = subprocess.Popen(command, cwd=ROOT, start_new_session=True, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 100
+    while not shard_path(tmp_path, 0).exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    written = shard_path(tmp_path, 0).stat().st_mtime_ns
+    collect(Args(tmp_path, **SMALL), progress=False)
+    assert shard_path(tmp_path, 0).stat().st_mtime_ns == written
+    assert files(tmp_path) == files(collected)
+
+
+def test_more_scenes_go_on_from_what_is_there(collected, tmp_path):
+    collect(Args(tmp_path, **SMALL | {"scenes": 3}), progress=False)
+    collect(Args(tmp_path, **SMALL), progress=False)
+    assert files(tmp_path) == files(collected)
+
+
+def test_a_corrupt_shard_is_named(collected, tmp_path):
+    for name, contents in files(collected).items():
+        (tmp_path / name).write_bytes(contents)
+    (tmp_path / "shard_00000.h5.bak").write_bytes(b"")  # no shard
+    path = shard_path(tmp_path, 1)
+    good = path.read_bytes()
+    points = load_roadmap_paths(tmp_path).of_scene(2)[0]
+    place = good.index(points.tobytes())
+    path.write_bytes(good[: place + 5] + bytes([good[place + 5] ^ 1]) + good[place + 6 :])
+    with pytest.raises(DatasetError, match="shard_00001.h5: points is missing or corrupt"):
+        load_roadmap_paths(tmp_path)
+    path.write_bytes(good[:2000])
+    with pytest.raises(DatasetError, match="shard_00001.h5: truncated or corrupt"):
+        load_roadmap_paths(tmp_path)
+    with pytest.raises(ValueError, match="shard_00001.h5"):
+        collect(Args(tmp_path, **SMALL), progress=False)
+    path.unlink()
+    with pytest.raises(DatasetError, match="shard_00001.h5: no such file, but later ones exist"):
+        load_roadmap_paths(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"seed": 1}, "made by another command"),
+        ({"task": "pole_shelves"}, "for testing only"),
+        ({"output": Path(envs.__file__).parent / "demos" / "new"}, "repository"),
+        ({"scenes": 0}, "--scenes"),
+        ({"num_nodes": 20}, "--num-nodes"),
+        ({"seed": 2**32}, "--seed"),
+        ({"margin": 0.0}, "--margin"),
+    ],
+)
+def test_what_cannot_be_collected_is_refused(collected, changes, message):
+    before = files(collected)
+    with pytest.raises(ValueError, match=message):
+        collect(replace(Args(collected, **SMALL), **changes), progress=False)
+    assert files(collected) == before
+    assert not (Path(envs.__file__).parent / "demos" / "new").exists()
+
+
+def test_a_task_with_one_scene_has_new_paths_each_time(tmp_path):
+    paths = collect(Args(tmp_path, task="wall", **SMALL | {"scenes": 2}), progress=False)
+    assert paths.scenes[0] == paths.scenes[1] == envs.get_task("wall").scene
+    assert not np.array_equal(paths.of_scene(0)[0], paths.of_scene(1)[0])

@@ -1,0 +1,73 @@
+"""docs/your_own_algorithm.md, followed as it says."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from paths import ROOT
+from trainers import PATHS, TINY, load
+
+from roboarm_nmp import envs
+
+PAGE = (ROOT / "docs" / "your_own_algorithm.md").read_text()
+
+
+def test_the_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
+    name, before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:3]
+    source = PATHS["sac_her_mp"].read_text()
+    assert source.count(before) == 1
+    script = tmp_path / "sac_final_mp.py"
+    source = source.replace('    exp_name: str = "sac_her_mp"\n', name).replace(before, after)
+    script.write_text(source)
+
+    command = [sys.executable, str(script), "--runs-dir", str(tmp_path / "runs"), *TINY.split()]
+    subprocess.run([*command, "--task", "wall"], check=True, capture_output=True)
+    (run,) = (tmp_path / "runs").glob("wall__sac_final_mp__1__*")
+    again = [sys.executable, str(script), "--resume", str(run), "--total-timesteps", "1800"]
+    subprocess.run(again, check=True, capture_output=True)
+    assert json.loads((run / "result.json").read_text())["steps"] == 1800
+    evaluate = [sys.executable, str(ROOT / "clean_rl_scripts" / "evaluate.py"), "--task", "wall"]
+    evaluate += [
+        "--policy",
+        str(run),
+        "--num-queries",
+        "3",
+        "--json",
+        str(tmp_path / "result.json"),
+    ]
+    subprocess.run(evaluate, check=True, capture_output=True)
+    assert json.loads((tmp_path / "result.json").read_text())["num_queries"] == 3
+
+
+def test_the_example_relabels_with_the_ends_of_episodes(tmp_path, monkeypatch):
+    _, before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:3]
+    script = tmp_path / "sac_final_mp.py"
+    script.write_text(PATHS["sac_her_mp"].read_text().replace(before, after))
+    monkeypatch.setitem(PATHS, "sac_final_mp", script)
+    module = load("sac_final_mp")
+    env = envs.make("no_obstacles")
+    buffer = module.HerReplayBuffer(env, 100, 1.0, np.random.default_rng(0))
+    for length in (3, 7):
+        buffer.add_episode(
+            [
+                {
+                    "observation": np.zeros(10),
+                    "action": np.zeros(7),
+                    "next_observation": np.zeros(10),
+                    "next_achieved_goal": np.full(3, 100 * length + step),
+                    "desired_goal": np.zeros(3),
+                    "collision": False,
+                }
+                for step in range(length)
+            ]
+        )
+    assert set(np.unique(buffer.sample(200)["desired_goal"])) == {302.0, 706.0}
+    env.close()
+
+
+def test_the_pages_commands_name_what_exists():
+    for path in re.findall(r"(?:clean_rl_scripts|benchmarks|bc_script)/\w+\.\w+", PAGE):
+        assert Path(path).name == "sac_final_mp.py" or (ROOT / path).exists(), path

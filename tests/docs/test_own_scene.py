@@ -1,0 +1,376 @@
+"""docs/your_own_scene.md from top to bottom with tiny numbers, and what it says of errors."""
+
+import contextlib
+import importlib
+import io
+import json
+import math
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import tyro
+from paths import ROOT
+from PIL import Image
+
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation import collect
+from roboarm_nmp.envs import show
+from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
+from roboarm_nmp.envs.scenes.files import load_scene, save_scene
+from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, Box, Cylinder, Scene, Sphere
+
+SCRIPTS = ROOT / "clean_rl_scripts"
+sys.path.append(str(SCRIPTS))
+BLOCKS = re.findall(
+    r"^```(\w*)\n(.*?)^```", (ROOT / "docs/your_own_scene.md").read_text(), re.S | re.M
+)
+COMMANDS = [
+    line.partition("#")[0].strip()
+    for kind, text in BLOCKS
+    for line in text.splitlines()
+    if kind == "" and line.startswith("python ")
+]
+YAML = next(text for kind, text in BLOCKS if kind == "yaml")
+POSTS = [text for kind, text in BLOCKS if kind == "python"][-1]
+
+# Numbers of the page -> of this test, and flags that the page leaves at their defaults.
+FEWER = {"1000": "6"}
+ONE_WORKER = ["--workers", "1"]
+TINY = {
+    "roboarm_nmp.demo_generation.make_queries": ["--num-validation", "4", *ONE_WORKER],
+    "roboarm_nmp.demo_generation.collect": ONE_WORKER,
+    "roboarm_nmp.demo_generation.verify": ONE_WORKER,
+    "roboarm_nmp.envs.show": ["--size", "80", "60"],
+    "sac_her_mp.py": shlex.split(
+        "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 "
+        "--num-envs 2 --horizon 50 --eval-every 400 --eval-queries 2 --test-queries 3 "
+        "--total-timesteps 400"
+    ),
+}
+
+
+@dataclass
+class Result:
+    code: int
+    out: str
+    error: str
+
+
+def run(command):
+    """A command as one would type it in the repository's folder, but in the current one."""
+    if "runs/RUN" in command and Path("runs").exists():
+        command = command.replace("runs/RUN", str(next(Path("runs").iterdir())))
+    words = [FEWER.get(word, word) for word in shlex.split(command)][1:]
+    name = words[1] if words[0] == "-m" else Path(words[0]).name
+    arguments = words[2 if words[0] == "-m" else 1 :] + TINY.get(name, [])
+    if name == "sac_her_mp.py":  # all that it does is in its `if __name__ == "__main__"`
+        script = [sys.executable, str(SCRIPTS / name), *arguments]
+        done = subprocess.run(script, capture_output=True, text=True, timeout=300)
+        return Result(done.returncode, done.stdout, done.stderr)
+    out, error = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
+        try:
+            code = main_of(name)(arguments)
+        except SystemExit as end:
+            code = end.code
+    if isinstance(code, str):  # as the interpreter does
+        error.write(code + "\n")
+        code = 1
+    return Result(code or 0, out.getvalue(), error.getvalue())
+
+
+def main_of(name):
+    module = importlib.import_module(name.removesuffix(".py"))
+    if name == "roboarm_nmp.envs.datasets":
+        return module._main
+    if name in ("roboarm_nmp.envs.show", "evaluate.py"):
+        return module.main
+    return lambda arguments: module.main(tyro.cli(module.Args, args=arguments))
+
+
+def error_of(command):
+    """The one line of a command that must fail."""
+    result = run(command)
+    lines = [line for line in result.error.splitlines() if line and "0%|" not in line]  # its bar
+    lines = [line for line in lines if not line.startswith("pybullet build time")]
+    assert result.code in (1, 2) and len(lines) == 1, result.error
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The folder after the page was followed, and the results of its commands."""
+    folder, results, names = tmp_path_factory.mktemp("page"), {}, {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.delenv("DISPLAY", raising=False)
+        patch.setattr(show, "MAX_FRAMES", 4)
+        for kind, text in BLOCKS:
+            if kind == "yaml":
+                Path("from_python.yaml").write_bytes(Path("my_scene.yaml").read_bytes())
+                Path("my_scene.yaml").write_text(text)
+            elif kind == "python":
+                exec(text, names)
+            for line in text.splitlines():
+                command = line.partition("#")[0].strip()
+                if command in COMMANDS:
+                    results[command] = run(command)
+    return folder, results
+
+
+@pytest.fixture
+def inside(page, tmp_path, monkeypatch):
+    """In a copy of what the page made, without the runs."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    for name in ("my_scene.yaml", "my_scene_queries.h5", "my_scene_demos.h5"):
+        Path(name).write_bytes((page[0] / name).read_bytes())
+    return tmp_path
+
+
+def result_of(page, part):
+    [result] = [result for command, result in page[1].items() if part in command]
+    return result
+
+
+# --- The page
+
+
+def test_the_commands_work(page):
+    assert len(page[1]) == len(COMMANDS) == 14
+    for command, result in page[1].items():
+        window = "show" in command and "--output" not in command
+        assert result.code == (2 if window else 0), (command, result.error)
+        assert "Traceback" not in result.error
+        if window:
+            assert result.error.startswith("error: a window needs a display")
+    assert sorted(path.name for path in page[0].iterdir()) == [
+        "episode.gif",
+        "from_python.yaml",
+        "my_scene.yaml",
+        "my_scene_demos.h5",
+        "my_scene_queries.h5",
+        "runs",
+        "scene.png",
+        "scenes.png",
+    ]
+
+
+def test_the_scene_is_what_the_page_says(page):
+    cylinder = Cylinder((0.4, -0.4, 0.25), 0.05, 0.5)
+    sphere = Sphere((-0.1, 0.55, 0.5), 0.1)
+    box = Box((0.5, 0.3, 0.3), (0.3, 0.04, 0.6))
+    assert load_scene(page[0] / "from_python.yaml") == Scene((box, cylinder, sphere))
+    turned, *others = load_scene(page[0] / "my_scene.yaml").obstacles
+    assert others == [cylinder, sphere]
+    assert (turned.position, turned.size) == (box.position, box.size)
+    assert turned.orientation == pytest.approx(
+        (0, 0, math.sin(math.pi / 12), math.cos(math.pi / 12))
+    )
+
+
+def test_queries_and_demonstrations_are_beside_the_scene(page):
+    task = str(page[0] / "my_scene.yaml")
+    scene = load_scene(task)
+    test, validation = load_queries(task, "test"), load_queries(task, "validation")
+    demos = load_demos(task)
+    assert (len(test), len(validation), len(demos)) == (6, 4, 6)
+    assert test.task == demos.task == "my_scene"
+    assert test[5].scene == demos[5].scene == scene
+    assert "6 test and 4 validation queries for my_scene" in result_of(page, "validate").out
+    assert "(0.000)" in result_of(page, "make_queries").out  # not solved
+    assert "6 good, 0 changed" in result_of(page, "verify").out
+    assert "demonstrations | 6\n" in result_of(page, "describe").out
+    pictures = [np.asarray(Image.open(page[0] / f"{name}.png")) for name in ("scene", "scenes")]
+    assert [picture.shape for picture in pictures] == [(60, 80, 3), (120, 160, 3)]
+
+
+def test_training_and_evaluating(page):
+    [run_folder] = (page[0] / "runs").iterdir()
+    assert run_folder.name.startswith("my_scene__sac_her_mp__1__")
+    result = json.loads((run_folder / "result.json").read_text())
+    assert (result["task"], result["num_queries"], result["steps"]) == ("my_scene.yaml", 3, 400)
+    checkpoint = torch.load(run_folder / "checkpoint.pt", weights_only=True)
+    assert checkpoint["progress"]["demos_injected"] > 0
+    for policy in ("runs/RUN", "go-to-goal", "via-points", "planner"):
+        text = result_of(page, f"evaluate.py --task my_scene.yaml --policy {policy}").out
+        assert "on my_scene.yaml: 6 test queries" in text
+        if policy == "planner":  # the queries are solvable
+            assert re.search(r"success +1\.0000", text)
+    assert f"runs/{run_folder.name}: " in result_of(page, "--policy runs/RUN --output").out
+
+
+# --- What is refused
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_malformed_file_gives_its_line(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my_scene.yaml").write_text(YAML.replace("length:", "height:"))
+    [message] = [text.strip() for kind, text in BLOCKS if kind == "" and "unknown key" in text]
+    assert message in error_of(command)
+    assert [path.name for path in tmp_path.iterdir()] == ["my_scene.yaml"]
+
+
+def test_a_changed_scene_makes_its_files_out_of_date(inside):
+    [message] = [text.strip() for kind, text in BLOCKS if kind == "" and "out of date" in text]
+    Path("my_scene.yaml").write_text(YAML.replace("radius: 0.1}", "radius: 0.11}"))
+    queries = re.escape(message.removesuffix("..."))
+    demos = queries.replace("_queries", "_demos").replace("make_queries", "collect")
+    for load, expected in ((load_queries, queries), (load_demos, demos)):
+        with pytest.raises(DatasetError, match=f"^{expected}python -m roboarm_nmp.demo_generation"):
+            load("my_scene.yaml")
+    for command in COMMANDS:
+        if "make_queries" in command or "show" in command and "--output" not in command:
+            continue
+        if "RUN" in command:
+            continue  # without a run they say that there is none
+        kind = demos if re.search("verify|describe", command) else queries
+        assert re.search(kind, error_of(command)), command
+    assert not Path("runs").exists()
+
+
+def test_training_without_demonstrations_says_so_too(inside):
+    Path("my_scene.yaml").write_text(YAML.replace("radius: 0.1}", "radius: 0.11}"))
+    line = error_of("python clean_rl_scripts/sac_her_mp.py --task my_scene.yaml")
+    assert "out of date" in line
+    assert not Path("runs").exists()
+
+
+@pytest.fixture
+def other(inside):
+    """`other/my_scene.yaml`: another scene under the same name, with files of its own."""
+    queries, demos = (load("my_scene.yaml") for load in (load_queries, load_demos))
+    Path("other").mkdir()
+    task = "other/my_scene.yaml"
+    save_scene(Scene((Sphere((0.0, 0.7, 0.2), 0.05),)), task)
+    columns = {n: getattr(demos, n)[:2] for n in ("plan_seed", "digest", "collided")}
+    plans, states = zip(*((demos[i].plan, demos[i].states) for i in (0, 1)), strict=True)
+    there, back = (queries.start, queries.goal), (queries.goal, queries.start)
+    splits = {"test": back, "validation": there}
+    write_queries(task.replace(".yaml", "_queries.h5"), task, 0, splits, "a test", {})
+    parameters = {"options": collect.Args(task).__dict__ | {"output": None}}
+    write_demos(
+        task.replace(".yaml", "_demos.h5"), task, 0, plans, states, columns, "a test", parameters
+    )
+    return task
+
+
+def test_two_scenes_of_one_name_do_not_mix_up(other):
+    tasks = ("my_scene.yaml", other)
+    here, there = (load_queries(task) for task in tasks)
+    np.testing.assert_array_equal(here.start, there.goal)
+    assert [len(load_demos(task)) for task in tasks] == [6, 2]
+    for task, queries in zip(tasks, (here, there), strict=True):
+        assert queries[0].scene == load_demos(task)[0].scene == load_scene(task)
+        assert envs.make(task).scene == load_scene(task)
+    evaluate = "python clean_rl_scripts/evaluate.py --policy go-to-goal --num-queries 1"
+    assert f"on {other}: 1 test" in run(f"{evaluate} --task {other}").out
+    for task, folder in ((other, "."), ("my_scene.yaml", "other")):
+        line = error_of(f"{evaluate} --task {task} --queries {folder}/my_scene_queries.h5")
+        assert "out of date: made for another version of the scene" in line
+    # Files put beside the other scene.
+    for kind, load in (("queries", load_queries), ("demos", load_demos)):
+        Path(f"my_scene_{kind}.h5").replace(f"other/my_scene_{kind}.h5")
+        with pytest.raises(DatasetError, match="out of date"):
+            load(other)
+
+
+def test_training_refuses_demonstrations_of_another_scene_of_this_name(other):
+    flags = "--demo-prob 1 --demos other/my_scene_demos.h5"
+    line = error_of(f"python clean_rl_scripts/sac_her_mp.py --task my_scene.yaml {flags}")
+    assert "other/my_scene_demos.h5" in line
+    assert not Path("runs").exists()
+
+
+def test_a_collection_does_not_go_on_in_a_changed_scene(inside):
+    options = {name: getattr(collect.Args("my_scene.yaml"), name) for name in collect.OPTIONS}
+    journal = collect.journal_of(Path("new.h5"))
+    with contextlib.closing(collect.Journal(journal, options)) as opened:
+        opened.append({"index": 0})
+    with contextlib.closing(collect.Journal(journal, options)) as opened:
+        assert opened.entries  # the same collection
+    Path("my_scene.yaml").write_text(YAML.replace("radius: 0.1}", "radius: 0.11}"))
+    with pytest.raises(ValueError, match="the journal of something else"):
+        collect.Journal(journal, options)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "make_queries --task my_scene.yaml --num-test 1",
+        "collect --task my_scene.yaml --num 1",
+    ],
+)
+def test_a_scene_without_room_for_the_arm(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_scene(Scene((Sphere((0.0, 0.0, 0.3), 0.3),)), "my_scene.yaml")
+    assert "no feasible configuration" in error_of(
+        f"python -m roboarm_nmp.demo_generation.{command}"
+    )
+
+
+# --- Random scenes
+
+
+@pytest.fixture
+def posts():
+    names = {}
+    exec(POSTS, names)
+    return names
+
+
+def test_the_pages_distribution(posts):
+    env, scenes = posts["env"], [posts["env"].scene]
+    assert env.episodes_per_scene == 3
+    for _ in range(6):
+        env.reset()
+        scenes.append(env.scene)
+        assert not env.in_collision(env.start_configuration)
+    assert [scene == before for before, scene in zip(scenes, scenes[1:], strict=False)] == [
+        True,
+        True,
+        False,
+        True,
+        True,
+        False,
+    ]
+    for scene in scenes:
+        assert (scene.table, scene.floor, len(scene.obstacles)) == (TABLE, FLOOR, 3)
+        for post in scene.obstacles:
+            assert math.hypot(*post.position[:2]) == pytest.approx(0.5)
+            assert (post.position[2], post.radius, post.length) == (0.5, 0.04, 1.0)
+
+
+def test_a_seed_draws_the_same_scene_and_query(posts):
+    def begin(env, seed):
+        observation, _ = env.reset(seed=seed)
+        return env.scene, np.concatenate(list(observation.values())).tolist()
+
+    env, fresh = posts["env"], envs.RoboArmEnv(posts["Posts"](), episodes_per_scene=3)
+    first, other = begin(env, 5), begin(env, 6)
+    assert first[0] != other[0] and first[1] != other[1]
+    env.reset()  # two of the three episodes in this scene
+    assert begin(env, 5) == first == begin(fresh, 5)
+    assert begin(env, 5) == first
+    scene = env.scene
+    drawn = [(env.reset(), env.scene)[1] for _ in range(3)]
+    assert [one == scene for one in drawn] == [True, True, False]
+
+
+def test_each_episode_has_a_scene_of_its_own(posts):
+    env = envs.RoboArmEnv(posts["Posts"]())
+    scenes = set()
+    for i in range(4):
+        env.reset(seed=0 if i == 0 else None)
+        scenes.add(env.scene)
+    assert len(scenes) == 4

@@ -1,0 +1,654 @@
+"""Compiled collision checks: PyBullet's answers, distances by hand, motions, bad input."""
+
+import hashlib
+import math
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+
+import numpy as np
+import pybullet as p
+import pytest
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision import checker as collision
+from roboarm_nmp.envs.collision.checker import (
+    ARM,
+    FLOOR,
+    NOTHING,
+    TABLE,
+    CollisionChecker,
+)
+from roboarm_nmp.envs.collision.kernels import BULLET_MARGIN
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.panda import COLLISION_LINKS
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+
+# Stretched out, upwards and to the front, and far from itself.
+STATE = panda.normalise([0.3, 0.4, 0.2, -0.9, 0.3, 1.2, 0.4])
+EMPTY = Scene(table=None, floor=None)
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = envs.RoboArmEnv(EMPTY)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def hulls(env):
+    """At `STATE`: for each of `COLLISION_LINKS`, its vertices (n, 3) in the base's frame, by PyBullet."""
+    panda.set_configuration(env.client, env.robot, panda.denormalise(STATE))
+    hulls = []
+    for link in COLLISION_LINKS:
+        flags = p.MESH_DATA_SIMULATION_MESH
+        mesh = p.getMeshData(env.robot, link, flags=flags, physicsClientId=env.client)[1]
+        state = p.getLinkState(
+            env.robot, link, computeForwardKinematics=1, physicsClientId=env.client
+        )
+        rotation = np.array(p.getMatrixFromQuaternion(state[1])).reshape(3, 3)
+        hulls.append(np.array(mesh) @ rotation.T + state[0])  # meshes are about the mass centre
+    return hulls
+
+
+def random_scene(rng, table=True):
+    """Boxes, cylinders and spheres of all sizes and poses, where the arm can reach."""
+    while True:
+        obstacles = []
+        for _ in range(2):
+            obstacles.append(Box(place(rng), tuple(rng.uniform(0.02, 0.4, 3)), turn(rng)))
+            length = rng.uniform(0.02, 0.5)
+            obstacles.append(Cylinder(place(rng), rng.uniform(0.01, 0.1), length, turn(rng)))
+            obstacles.append(Sphere(place(rng), rng.uniform(0.01, 0.15)))
+        scene = Scene(tuple(obstacles))
+        if not table:
+            scene = Scene(tuple(obstacles), table=None, floor=None)
+        if CollisionChecker(scene).is_free(rng.uniform(-1, 1, (200, 7))).mean() > 0.15:
+            return scene
+
+
+def place(rng):
+    direction = rng.normal(size=3)
+    direction[2] = abs(direction[2])
+    return tuple(rng.uniform(0.4, 0.9) * direction / np.linalg.norm(direction))
+
+
+def turn(rng):
+    quaternion = rng.normal(size=4)
+    return tuple(quaternion / np.linalg.norm(quaternion))
+
+
+# --- The same answers as PyBullet
+
+
+def near_contact(checker, rng, number):
+    """States at which the nearest thing is within 5 mm, inside or outside: (number, 7)."""
+    found = np.empty((0, 7))
+    while len(found) < number:
+        a, b = rng.uniform(-1, 1, (2, 200, 7))
+        low, high = np.zeros(200), np.ones(200)
+        wanted = rng.uniform(-0.005, 0.005, 200)
+
+        def beyond(share, a=a, b=b, wanted=wanted):
+            return checker.nearest(a + share[:, None] * (b - a)).distance.min(-1) > wanted
+
+        crosses = beyond(low) != beyond(high)
+        below = beyond(low)
+        for _ in range(25):
+            middle = (low + high) / 2
+            same = beyond(middle) == below
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+        found = np.concatenate([found, (a + low[:, None] * (b - a))[crosses]])
+    return found[:number]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_scenes_agree_with_pybullet(env, seed):
+    rng = np.random.default_rng(seed)
+    scene = random_scene(rng)
+    env.set_scene(scene)
+    checker = CollisionChecker(scene)
+    for states in (rng.uniform(-1, 1, (300, 7)), near_contact(checker, rng, 300)):
+        theirs = [not env.in_collision(c) for c in panda.denormalise(states)]
+        np.testing.assert_array_equal(checker.is_free(states), theirs)
+        assert 0.05 < np.mean(theirs) < 0.95
+    # The states near contact do tell a millimetre.
+    assert (checker.is_free(states, margin=0.001) != theirs).mean() > 0.05
+    # A distance is negative in a collision and nowhere else.
+    np.testing.assert_array_equal(checker.nearest(states).distance.min(-1) >= 0, theirs)
+    env.set_scene(EMPTY)
+
+
+@pytest.mark.parametrize(
+    "task", ["narrow_shelves", "benchmaker_bookshelf_thin", "random_boxes_hard"]
+)
+def test_tasks_agree_with_pybullet(task):
+    env, rng = envs.make(task), np.random.default_rng(5)
+    queries = load_queries(task, "validation")
+    for i in (0, 50):
+        scene = queries[i].scene
+        env.set_scene(scene)
+        checker = CollisionChecker(scene)
+        states = np.concatenate([rng.uniform(-1, 1, (150, 7)), near_contact(checker, rng, 150)])
+        theirs = [not env.in_collision(c) for c in panda.denormalise(states)]
+        np.testing.assert_array_equal(checker.is_free(states), theirs)
+    env.close()
+
+
+def test_starts_and_goals_of_queries_are_free():
+    for task in envs.TASKS:
+        queries = load_queries(task, "validation")
+        for i in range(0, 40, 4):
+            checker = CollisionChecker(queries[i].scene)
+            ends = np.clip(panda.normalise([queries[i].start, queries[i].goal]), -1, 1)
+            assert checker.is_free(ends).all(), (task, i)
+
+
+def test_distances_agree_with_pybullet(env):
+    """Each link's distance from each of some obstacles, apart and overlapping, by Bullet's GJK."""
+    rng, further = np.random.default_rng(7), []
+    for obstacle in random_scene(rng, table=False).obstacles:
+        scene = Scene((obstacle,), table=None, floor=None)
+        env.set_scene(scene)
+        (body,) = env.world._bodies
+        states = rng.uniform(-1, 1, (40, 7))
+        near = CollisionChecker(scene).nearest(states, self_collisions=False)
+        assert (near.thing == 0).all()
+        for state, distances in zip(states, near.distance, strict=True):
+            panda.set_configuration(env.client, env.robot, panda.denormalise(state))
+            for link, distance in zip(COLLISION_LINKS, distances, strict=True):
+                points = p.getClosestPoints(
+                    env.robot, body, 2.0, linkIndexA=link, physicsClientId=env.client
+                )
+                if distance > 1e-4:  # where shapes overlap, Bullet's depth is rougher
+                    further.append(points[0][8] - distance)
+                elif distance < -1e-3:
+                    assert points[0][8] < 0
+    # Both are distances of two points, so the smaller one is the better; Bullet stops earlier.
+    assert len(further) > 1000 and min(further) > -1e-7
+    assert np.median(further) < 1e-8 and max(further) < 5e-5
+    env.set_scene(EMPTY)
+
+
+# --- By hand
+
+
+def outermost(hulls):
+    """The link that reaches farthest to the front: its place in `COLLISION_LINKS`, and that vertex."""
+    link = int(np.argmax([hull[:, 0].max() for hull in hulls]))
+    return link, hulls[link][hulls[link][:, 0].argmax()]
+
+
+@pytest.mark.parametrize("gap", [0.001, 0.0001, -0.0005, 0.2])
+def test_a_sphere_in_front(hulls, gap):
+    link, tip = outermost(hulls)
+    radius = 0.05
+    centre = tip + [BULLET_MARGIN + gap + radius, 0, 0]
+    checker = CollisionChecker(Scene((Sphere(tuple(centre), radius),), table=None, floor=None))
+    near = checker.nearest(STATE, self_collisions=False)
+    assert near.thing[link] == 0
+    assert near.distance[link] == pytest.approx(gap, abs=2e-6)
+    np.testing.assert_allclose(near.direction[link], [-1, 0, 0], atol=1e-4)
+    np.testing.assert_allclose(near.point[link], tip, atol=1e-5)
+    assert checker.is_free(STATE) == (gap > 0)
+    assert checker.is_free(STATE, margin=0.0005) == (gap > 0.0005)
+    assert checker.is_free(STATE, clearance=0.0005) == (gap > 0.0005)
+
+
+def test_a_box_edge_on(hulls):
+    """A box turned by 45 degrees, one of its (rounded) edges towards the tip."""
+    link, tip = outermost(hulls)
+    gap, edge = 0.003, 0.2
+    centre = tip + [gap + edge / math.sqrt(2), 0, 0]
+    turn = (0.0, 0.0, math.sin(math.pi / 8), math.cos(math.pi / 8))
+    box = Box(tuple(centre), (edge, edge, edge), turn)
+    near = CollisionChecker(Scene((box,), table=None, floor=None)).nearest(STATE)
+    rounded_off = (math.sqrt(2) - 1) * BULLET_MARGIN
+    assert near.distance[link] == pytest.approx(gap + rounded_off - BULLET_MARGIN, abs=2e-6)
+    np.testing.assert_allclose(near.direction[link], [-1, 0, 0], atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["box", "sphere", "cylinder"])
+def test_the_arm_inside(hulls, kind):
+    """Every link's depth is the way to the nearest face of a large obstacle around the arm."""
+    size = 4.0
+    obstacle = {
+        "box": Box((0.1, 0.0, 0.2), (size, size, size)),
+        "sphere": Sphere((0.0, 0.0, 0.0), 2.0),
+        "cylinder": Cylinder((0.0, 0.0, 0.2), 30.0, size),  # its bases are much nearer
+    }[kind]
+    checker = CollisionChecker(Scene((obstacle,), table=None, floor=None))
+    near = checker.nearest(STATE, self_collisions=False)
+    assert not checker.is_free(STATE)
+    for hull, distance, direction in zip(hulls, near.distance, near.direction, strict=True):
+        if kind == "sphere":  # by all directions of a fine grid around the one that was found
+            ways = direction + np.random.default_rng(0).normal(0, 0.1, (2000, 3))
+            ways = np.concatenate([direction[None], ways])
+            ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+            depths = 2.0 - (hull @ ways.T).min(0)
+            assert depths[0] <= depths.min() + 1e-5
+            assert distance == pytest.approx(-depths[0] - BULLET_MARGIN, abs=1e-4)
+            continue
+        low, high = hull.min(0) - obstacle.position, hull.max(0) - obstacle.position
+        ways = np.concatenate([size / 2 - low, size / 2 + high])  # out by +x +y +z, -x -y -z
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        if kind == "cylinder":
+            ways, axes = ways[[2, 5]], axes[[2, 5]]
+        assert distance == pytest.approx(-ways.min() - BULLET_MARGIN, abs=1e-5)
+        np.testing.assert_allclose(direction, axes[ways.argmin()], atol=1e-3)
+
+
+def test_of_several_things_the_nearest_or_deepest_counts():
+    rng = np.random.default_rng(5)
+    scene = Scene(tuple(o for _ in range(5) for o in random_scene(rng).obstacles), None, None)
+    states = rng.uniform(-1, 1, (1000, 7))
+    together = CollisionChecker(scene).nearest(states, self_collisions=False)
+    alone = np.stack(
+        [
+            CollisionChecker(replace(scene, obstacles=(one,))).nearest(states, False).distance
+            for one in scene.obstacles
+        ]
+    )
+    assert ((alone < -0.02).sum(0) > 1).sum() > 100  # in two of them at once
+    np.testing.assert_allclose(together.distance, alone.min(0), atol=1e-6)
+
+
+def test_a_sphere_at_a_hulls_centre(hulls):
+    """The centres coincide: nothing says which way to begin with."""
+    for link in range(len(COLLISION_LINKS)):
+        centre = (hulls[link].min(0) + hulls[link].max(0)) / 2
+        scene = Scene((Sphere(tuple(centre), 0.001),), table=None, floor=None)
+        near = CollisionChecker(scene).nearest(STATE, self_collisions=False)
+        assert near.distance[link] < -0.005
+
+
+def test_the_way_out(env):
+    """Moving the obstacle against `direction` moves it away by as much."""
+    rng, step = np.random.default_rng(3), 1e-4
+    for _ in range(30):
+        (obstacle, *_) = rng.permutation(np.array(random_scene(rng).obstacles, dtype=object))
+        scene = Scene((obstacle,), table=None, floor=None)
+        state = rng.uniform(-1, 1, 7)
+        near = CollisionChecker(scene).nearest(state, self_collisions=False)
+        for link in (3, 7, 9):
+            moved = tuple(obstacle.position - step * near.direction[link])
+            scene = Scene((type(obstacle)(moved, *list(vars(obstacle).values())[1:]),), None, None)
+            there = CollisionChecker(scene).nearest(state, self_collisions=False)
+            assert there.distance[link] - near.distance[link] == pytest.approx(step, rel=0.02)
+            # The point is on the link, and that far from the obstacle along the way.
+            if isinstance(obstacle, Sphere) and near.distance[link] > 0:
+                away = near.point[link] - obstacle.position
+                expected = np.linalg.norm(away) - obstacle.radius - BULLET_MARGIN
+                assert near.distance[link] == pytest.approx(expected, abs=1e-6)
+
+
+def test_what_the_nearest_thing_is():
+    scene = Scene((Sphere((5.0, 0, 0), 0.1), Sphere((0.9, 0, 0.5), 0.1)))
+    states = np.zeros((3, 7))
+    states[0] = panda.normalise([1.0, 1.1, 0.0, -1.6, 0.0, 2.0, 0.0])  # low over the table
+    states[1] = panda.normalise([0.0, 0.5, 0.0, -1.2, 0.0, 1.5, 0.0])  # to the sphere
+    states[2] = panda.normalise([1.0, -0.5, 0.0, -2.6, 0.0, 0.3, 0.0])  # folded together
+    things = CollisionChecker(scene).nearest(states).thing
+    assert (things[0] == TABLE).any() and (things[1] == 1).any() and (things[2] == ARM).any()
+    assert not (things == 0).any()
+    without = CollisionChecker(scene).nearest(states, self_collisions=False)
+    assert not (without.thing == ARM).any()
+    floor = CollisionChecker(Scene(table=None, floor=0.0)).nearest(states, self_collisions=False)
+    assert (floor.thing == FLOOR).all()
+
+
+def test_links_against_each_other(env):
+    """`ARM`'s distances, both links of a pair, by PyBullet."""
+    rng, seen = np.random.default_rng(11), 0
+    checker = CollisionChecker(EMPTY)
+    for state in rng.uniform(-1, 1, (60, 7)):
+        near = checker.nearest(state)
+        panda.set_configuration(env.client, env.robot, panda.denormalise(state))
+        expected = dict.fromkeys(COLLISION_LINKS, 10.0)
+        for a, b in panda.SELF_COLLISION_PAIRS:
+            points = p.getClosestPoints(env.robot, env.robot, 3.0, a, b, physicsClientId=env.client)
+            for link in (a, b):
+                if link in expected:
+                    expected[link] = min(expected[link], points[0][8])
+        for link, distance in zip(COLLISION_LINKS, near.distance, strict=True):
+            if expected[link] > 1e-4 and expected[link] < 10:
+                assert distance == pytest.approx(expected[link], abs=1e-5)
+                seen += 1
+            elif expected[link] == 10.0:
+                assert distance == math.inf
+    assert seen > 200
+
+
+# --- Margins
+
+
+def test_margins_count_from_the_scene_and_between_links():
+    checker = CollisionChecker(envs.TASKS["wall"].scene)
+    states = np.random.default_rng(0).uniform(-1, 1, (2000, 7))
+    scene = checker.nearest(states, self_collisions=False).distance.min(-1)
+    all_ = checker.nearest(states).distance.min(-1)
+    np.testing.assert_array_equal(checker.is_free(states, margin=0.01), all_ >= 0.01)
+    both = checker.is_free(states, margin=0.01, clearance=0.02)
+    np.testing.assert_array_equal(both, (all_ >= 0.01) & (scene >= 0.03))
+    assert both.sum() < (all_ >= 0.01).sum() < (all_ >= 0).sum()
+
+
+def test_less_is_asked_near_relaxed_states():
+    checker = CollisionChecker(envs.TASKS["wall"].scene)
+    states = np.random.default_rng(1).uniform(-1, 1, (4000, 7))
+    distance = checker.nearest(states).distance.min(-1)
+    near = states[(distance > 0.002) & (distance < 0.01)][:2]
+    distances, growth, margin = checker.nearest(near).distance.min(-1), 0.01, 0.02
+    relaxed = (near, distances - 1e-9, growth)
+    assert checker.is_free(near, margin, relaxed=relaxed).all()
+    assert not checker.is_free(near, margin).any()
+    around = np.clip(near[0] + np.random.default_rng(2).normal(0, 0.03, (3000, 7)), -1, 1)
+    away = np.linalg.norm(around[:, None] - near, axis=-1)
+    asked = np.minimum(margin, (distances - 1e-9 + growth * away).min(-1))
+    got = checker.nearest(around).distance.min(-1)
+    np.testing.assert_array_equal(checker.is_free(around, margin, relaxed=relaxed), got >= asked)
+    assert 0.1 < (got >= asked).mean() < 0.9
+
+
+def test_each_motion_may_have_its_own_relaxed_states():
+    scene = envs.get_task("boxes").scene
+    checker, rng = CollisionChecker(scene), np.random.default_rng(6)
+    states = rng.uniform(-1, 1, (4000, 7))
+    ends = states[checker.is_free(states)][:200].reshape(100, 2, 7)
+    distances = checker.nearest(ends).distance.min(-1) - 1e-6
+    starts, stops = ends[:, 0], ends[:, 0] + 0.05 * (ends[:, 1] - ends[:, 0])
+    free = checker.is_motion_free(starts, stops, 0.015, relaxed=(ends, distances, 0.1))
+    alone = [
+        checker.is_motion_free(starts[i], stops[i], 0.015, relaxed=(ends[i], distances[i], 0.1))
+        for i in range(100)
+    ]
+    np.testing.assert_array_equal(free, alone)
+    assert (free & ~checker.is_motion_free(starts, stops, 0.015)).sum() > 0
+    assert (~free).sum() > 0
+    single = checker.is_free(starts, 0.015, relaxed=(ends, distances, 0.1))
+    assert single.all()
+    with pytest.raises(ValueError, match="relaxed"):
+        checker.is_free(starts, 0.015, relaxed=(ends[:50], distances[:50], 0.1))
+
+
+# --- Motions
+
+# The first joint turns from one side of a thin board, which stands upright, to the other.
+BOARD = Scene((Box((0.6, 0.0, 0.5), (0.4, 0.004, 0.9)),))
+LEFT, RIGHT = (panda.normalise([s * 0.7, 0.4, 0, -1.6, 0, 2.0, 0]) for s in (1, -1))
+
+
+def test_a_thin_board_between_two_free_ends():
+    checker = CollisionChecker(BOARD)
+    assert checker.is_free([LEFT, RIGHT]).all()
+    assert not checker.is_motion_free(LEFT, RIGHT)
+    assert not checker.is_motion_free(RIGHT, LEFT)
+    assert checker.is_motion_free(LEFT, LEFT)
+    assert CollisionChecker(Scene()).is_motion_free(LEFT, RIGHT)
+    # The board is met in the middle, which comes after the start and the end.
+    assert checker.motion_checks(LEFT, RIGHT) == -3
+
+
+def test_how_many_configurations_a_motion_has():
+    checker = CollisionChecker(EMPTY)
+    for length in (0.0, 0.01, 0.0209, 0.0211, 0.1, 0.3, 0.777):
+        end = STATE + np.array([length, 0, 0, 0, 0, 0, 0])
+        pieces = math.ceil(length / collision.RESOLUTION)
+        assert checker.motion_checks(STATE, end) == max(1, pieces) + 1
+        assert checker.motion_checks(STATE, end, resolution=1.0) == 2
+        between = max(0, pieces - 1)
+        assert checker.motion_checks(STATE, end, ends_known=True) == between
+        assert checker.is_motion_free(STATE, end, ends_known=True)
+    one = checker.motion_checker()
+    assert one(tuple(STATE), tuple(STATE)) == 1
+
+
+def test_ends_that_are_known_are_not_looked_at():
+    checker = CollisionChecker(BOARD)
+    assert checker.motion_checks(LEFT, RIGHT, ends_known=True) == -1  # the middle
+    into = (LEFT + RIGHT) / 2
+    pieces = math.ceil(np.linalg.norm(into - LEFT) / collision.RESOLUTION)
+    steps = LEFT + (into - LEFT) * np.arange(pieces + 1)[:, None] / pieces
+    inside = np.flatnonzero(~checker.is_free(steps))
+    before = steps[inside[0] - 1], steps[inside[0]]
+    assert not checker.is_motion_free(*before)
+    assert checker.is_motion_free(*before, ends_known=True)
+
+
+def test_every_point_of_a_motion_is_looked_at():
+    """The answer for a motion is that for all its points."""
+    checker, rng = CollisionChecker(envs.TASKS["boxes"].scene), np.random.default_rng(4)
+    starts = rng.uniform(-1, 1, (300, 7))
+    ends = np.clip(starts + rng.normal(0, 0.15, (300, 7)), -1, 1)
+    expected = []
+    for start, end in zip(starts, ends, strict=True):
+        pieces = math.ceil(np.linalg.norm(end - start) / collision.RESOLUTION)
+        points = start + np.arange(pieces + 1)[:, None] / pieces * (end - start)
+        expected.append(checker.is_free(points).all())
+    np.testing.assert_array_equal(checker.is_motion_free(starts, ends), expected)
+    assert 0.05 < np.mean(expected) < 0.6
+    one = checker.motion_checker()
+    pairs = zip(map(tuple, starts), map(tuple, ends), strict=True)
+    free = [one(*pair) > 0 and checker.is_free(pair[0]) for pair in pairs]
+    np.testing.assert_array_equal(free, expected)
+
+
+def test_one_start_many_ends():
+    checker = CollisionChecker(BOARD)
+    free = checker.is_motion_free(LEFT, np.stack([LEFT, RIGHT, LEFT + 0.01]))
+    assert free.tolist() == [True, False, True]
+
+
+# --- The same answer whatever the batch, the process, the thread
+
+
+def digest(checker, states):
+    near = checker.nearest(states)
+    parts = (near.distance, near.direction, near.point, near.thing, checker.is_free(states))
+    return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
+
+
+def test_batches_of_one_and_of_ten_thousand_agree():
+    checker = CollisionChecker(envs.TASKS["boxes"].scene)
+    states = np.random.default_rng(0).uniform(-1, 1, (10_000, 7))
+    near, free = checker.nearest(states), checker.is_free(states)
+    for i in range(0, 10_000, 97):
+        one = checker.nearest(states[i])
+        for all_, single in zip(near, one, strict=True):
+            assert all_[i].tobytes() == np.asarray(single).tobytes()
+        assert checker.is_free(states[i]) == free[i]
+        assert checker.is_free(states[i : i + 1]).shape == (1,)
+    shaped = checker.nearest(states.reshape(10, 1000, 7))
+    np.testing.assert_array_equal(shaped.distance.reshape(-1, len(COLLISION_LINKS)), near.distance)
+
+
+ELSEWHERE = """
+    import sys
+    sys.path.insert(0, "tests/envs/collision")
+    import numpy as np
+    from roboarm_nmp import envs
+    from roboarm_nmp.envs.collision.checker import CollisionChecker
+    from test_collision import digest
+    checker = CollisionChecker(envs.TASKS["boxes"].scene)
+    print("digest:", digest(checker, np.random.default_rng(0).uniform(-1, 1, (2000, 7))))
+"""
+
+
+def run(code, cwd, **variables):
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        env=os.environ | variables,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_another_process_agrees():
+    checker = CollisionChecker(envs.TASKS["boxes"].scene)
+    states = np.random.default_rng(0).uniform(-1, 1, (2000, 7))
+    assert f"digest: {digest(checker, states)}" in run(ELSEWHERE, ROOT)
+
+
+def test_an_installation_that_cannot_be_written_to(tmp_path):
+    """Where nothing can be cached, the functions are compiled again."""
+    package = tmp_path / "roboarm_nmp"
+    package.mkdir()
+    shutil.copy(ROOT / "__init__.py", package)
+    shutil.copytree(
+        ROOT / "envs", package / "envs", ignore=shutil.ignore_patterns("*.h5", "*.pt", "__py*")
+    )
+    for name in ("roboarm_nmp/envs/collision/__pycache__", "home"):
+        (tmp_path / name).write_text("")  # root may write to any folder, but not to a file
+    code = """
+        import roboarm_nmp.envs.collision.checker as c
+        from roboarm_nmp.envs.scenes.primitives import Scene
+        assert c.__file__.startswith(__import__("os").getcwd()), c.__file__
+        print("free:", c.CollisionChecker(Scene()).is_free([[0.0] * 7]).tolist())
+    """
+    home = str(tmp_path / "home")
+    variables = {"HOME": home, "XDG_CACHE_HOME": home, "PYTHONPATH": str(tmp_path)}
+    assert "free: [True]" in run(code, tmp_path, **variables)
+
+
+def test_importing_envs_imports_no_numba():
+    code = "import roboarm_nmp, sys; roboarm_nmp.make('wall').reset(seed=0); print('numba' in sys.modules)"
+    assert "False" in run(code, ROOT)
+
+
+# --- Bad input
+
+
+@pytest.fixture(scope="module")
+def wall():
+    return CollisionChecker(envs.TASKS["wall"].scene)
+
+
+@pytest.mark.parametrize(
+    ("states", "complaint"),
+    [
+        (np.full((3, 7), np.nan), "finite"),
+        (np.full((3, 7), np.inf), "finite"),
+        (np.full(7, 1.001), r"in \[-1, 1\]"),
+        (np.zeros((3, 6)), r"shape \(..., 7\), got \(3, 6\)"),
+        (0.0, r"shape \(..., 7\), got \(\)"),
+        (np.zeros((7, 3)), "got"),
+        ("free", "must be numbers"),
+        ([[0.0] * 7, [0.0] * 6], "must be numbers"),
+        (np.zeros(7, dtype=complex) + 1j, "must be numbers"),
+    ],
+)
+def test_bad_states_are_refused(wall, states, complaint):
+    calls = [wall.is_free, wall.nearest, lambda s: wall.is_motion_free(s, np.zeros(7))]
+    calls += [lambda s: wall.is_motion_free(np.zeros(7), s)]
+    for call in calls:
+        with pytest.raises(ValueError, match=complaint):
+            call(states)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"margin": -0.001}, "margin must be in"),
+        ({"margin": np.nan}, "margin must be in"),
+        ({"clearance": 0.5}, "clearance must be in"),
+        ({"clearance": np.inf}, "clearance must be in"),
+        ({"relaxed": (np.zeros((2, 7)), np.zeros(3), 0.1)}, "relaxed"),
+        ({"relaxed": (np.zeros((2, 6)), np.zeros(2), 0.1)}, "relaxed states"),
+        ({"relaxed": (np.zeros((2, 7)), [0.0, np.nan], 0.1)}, "relaxed"),
+        ({"relaxed": (np.zeros((2, 7)), np.zeros(2), -1.0)}, "growth"),
+    ],
+)
+def test_bad_margins_are_refused(wall, options, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        wall.is_free(np.zeros(7), **options)
+    with pytest.raises(ValueError, match=complaint):
+        wall.is_motion_free(np.zeros(7), np.zeros(7), **options)
+
+
+@pytest.mark.parametrize("resolution", [0.0, -1.0, np.nan, np.inf])
+def test_bad_resolutions_are_refused(wall, resolution):
+    with pytest.raises(ValueError, match="resolution must be positive"):
+        wall.is_motion_free(np.zeros(7), np.zeros(7), resolution=resolution)
+
+
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        Box((0.5, 0, 0), (0.1, 0.0, 0.1)),
+        Box((0.5, 0, 0), (0.1, -0.1, 0.1)),
+        Box((0.5, 0, 0), (0.1, np.nan, 0.1)),
+        Box((0.5, np.nan, 0), (0.1, 0.1, 0.1)),
+        Box((0.5, 0, np.inf), (0.1, 0.1, 0.1)),
+        Box((0.5, 0, 0), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0, 0.0)),
+        Box((0.5, 0, 0), (0.1, 0.1, np.inf)),
+        Cylinder((0.5, 0, 0), 0.0, 0.1),
+        Cylinder((0.5, 0, 0), 0.1, -0.1),
+        Sphere((0.5, 0, 0), 0.0),
+        Sphere((0.5, 0, 0), -1.0),
+    ],
+)
+def test_degenerate_obstacles_are_refused(obstacle):
+    with pytest.raises(ValueError, match="finite numbers and positive sizes"):
+        CollisionChecker(Scene((Sphere((1, 1, 1), 0.1), obstacle)))
+    with pytest.raises(TypeError, match="a scene must be"):
+        CollisionChecker((obstacle,))
+
+
+def test_nothing_there():
+    checker = CollisionChecker(EMPTY)
+    near = checker.nearest(STATE, self_collisions=False)
+    assert (near.distance == np.inf).all() and (near.thing == NOTHING).all()
+    assert not near.direction.any() and not near.point.any()
+    # Clearance is from obstacles, a margin from the other links, too.
+    assert checker.is_free(STATE, clearance=0.4) and not checker.is_free(STATE, margin=0.4)
+    folded = panda.normalise([1.0, -0.5, 0.0, -1.8, 0.0, -0.08, 0.0])
+    assert checker.is_free([STATE, folded]).tolist() == [True, False]  # the arm is there
+
+
+def test_nothing_asked(wall):
+    assert wall.is_free(np.empty((0, 7))).shape == (0,)
+    assert wall.is_free(np.empty((2, 0, 7))).shape == (2, 0)
+    assert wall.is_motion_free(np.empty((0, 7)), np.empty((0, 7))).shape == (0,)
+    assert wall.nearest(np.empty((0, 7))).direction.shape == (0, len(COLLISION_LINKS), 3)
+    assert wall.proximity(np.empty((2, 0, 7))).shape == (2, 0, len(COLLISION_LINKS), 8)
+
+
+@pytest.mark.parametrize("self_collisions", [False, True])
+def test_proximity_is_nearest_as_observations_have_it(wall, self_collisions):
+    states = np.random.default_rng(3).uniform(-1.1, 1.1, (4, 25, 7)).astype(np.float32)
+    states[0, 0, 0] = np.inf
+    found = wall.proximity(states, self_collisions, within=0.2)
+    near = wall.nearest(np.clip(states, -1.0, 1.0), self_collisions, within=0.2)
+    distances = np.minimum(near.distance, 0.2)[..., None]
+    assert 0.1 < (distances < 0.2).mean() < 0.9
+    wanted = np.concatenate([distances, near.gradient], axis=-1).astype(np.float32)
+    assert found.dtype == np.float32 and (found == wanted).all()
+    assert (wall.proximity(states[1, 2], self_collisions, within=0.2) == found[1, 2]).all()
+    for bad in (np.full(7, np.nan), np.zeros(6), "near"):
+        with pytest.raises(ValueError, match="states must"):
+            wall.proximity(bad)
+
+
+def test_limits_may_be_rounded(wall):
+    states = np.float32(panda.normalise(np.float32([panda.LOWER, panda.UPPER])))
+    assert wall.is_free(states).shape == (2,)
+
+
+def test_a_very_thin_and_a_very_large_box(hulls):
+    """Thinner than the rounding, larger than the floor."""
+    link, tip = outermost(hulls)
+    for size in ((0.0002, 0.3, 0.3), (2.0, 500.0, 500.0)):
+        for gap in (0.004, -0.0005):
+            centre = tip + [gap + BULLET_MARGIN + size[0] / 2, 0, 0]
+            checker = CollisionChecker(Scene((Box(tuple(centre), size),), table=None, floor=None))
+            assert checker.nearest(STATE).distance[link] == pytest.approx(gap, abs=1e-5)
+            assert checker.is_free(STATE) == (gap > 0)

@@ -1,0 +1,590 @@
+"""The query files: exact, reproducible, never half written, and a bad one is refused by name."""
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import h5py
+import numpy as np
+import pybullet as p
+import pybullet_data
+import pytest
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation import make_queries
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets import files as datasets
+from roboarm_nmp.envs.datasets import format as dataset_format
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.datasets.queries import load_queries, query_path, validate, write_queries
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+
+
+def random_splits(seed=0, test=30, validation=10):
+    """Queries inside the joint limits, feasible or not."""
+    rng = np.random.default_rng(seed)
+    return {
+        split: tuple(
+            (panda.LOWER + (panda.UPPER - panda.LOWER) * rng.uniform(0.01, 0.99, (n, 7))).astype(
+                np.float32
+            )
+            for _ in range(2)
+        )
+        for split, n in (("test", test), ("validation", validation))
+    }
+
+
+def write(path, splits=None, task="wall"):
+    write_queries(path, task, 3, splits or random_splits(), "made by a test", {"hold_steps": 24})
+    return path
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write(tmp_path / "queries.h5")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A small file made by the generator in this process."""
+    path = tmp_path_factory.mktemp("made") / "wall.h5"
+    make_queries.make_queries(path, "wall", 0, 30, 10, progress=False)
+    return path
+
+
+# --- Reading and writing
+
+
+def test_round_trip_is_exact(tmp_path):
+    splits = random_splits()
+    path = write(tmp_path / "queries.h5", splits)
+    for split, (start, goal) in splits.items():
+        queries = load_queries(path, split)
+        assert (queries.task, queries.split, queries.seed) == ("wall", split, 3)
+        assert len(queries) == len(start)
+        for array, expected in (
+            (queries.start, start),
+            (queries.goal, goal),
+            (queries.goal_position, panda.forward_kinematics(goal).astype(np.float32)),
+        ):
+            assert array.dtype == np.float32
+            np.testing.assert_array_equal(array, expected)
+    assert set(validate(path, "wall")) == {"test", "validation"}
+
+
+def test_queries_are_indexed_like_a_list(path):
+    queries = load_queries(path)
+    few = queries[5:8]
+    assert isinstance(few, datasets.Queries) and len(few) == 3
+    np.testing.assert_array_equal(few.goal_position, queries.goal_position[5:8])
+    start, goal, scene = queries[6]
+    np.testing.assert_array_equal(start, few.start[1])
+    np.testing.assert_array_equal(goal, few.goal[1])
+    assert scene == few[1].scene == envs.TASKS["wall"].scene
+    assert len(list(queries)) == len(queries)
+    assert len(queries[np.array([1, 4])]) == 2
+
+
+def test_same_contents_same_bytes(tmp_path):
+    first = write(tmp_path / "first.h5").read_bytes()
+    time.sleep(1.1)  # HDF5's time stamps are whole seconds
+    assert write(tmp_path / "second.h5").read_bytes() == first
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_made_again_the_file_has_the_same_bytes(made, tmp_path, workers):
+    again = tmp_path / "again.h5"
+    make_queries.make_queries(again, "wall", 0, 30, 10, num_workers=workers, progress=False)
+    assert again.read_bytes() == made.read_bytes()
+
+
+def test_interrupted_it_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch):
+    again, done = tmp_path / "again.h5", []
+
+    def die(journal, entry):
+        if len(done) == 17:
+            raise OSError("the disk is full")
+        done.append(entry["index"])
+        append(journal, entry)
+
+    append = make_queries.Journal.append
+    monkeypatch.setattr(make_queries.Journal, "append", die)
+    with pytest.raises(OSError, match="disk is full"):
+        make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
+    with pytest.raises(ValueError, match="seed 0, not 1"):
+        make_queries.make_queries(again, "wall", 1, 30, 10, progress=False)
+    monkeypatch.undo()
+    sampled = []
+    monkeypatch.setattr(
+        make_queries.Journal,
+        "append",
+        lambda journal, entry: sampled.append(entry["index"]) or append(journal, entry),
+    )
+    make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
+    assert len(sampled) == 40 - 17 and not set(sampled) & set(done)
+    assert again.read_bytes() == made.read_bytes()
+    assert list(tmp_path.iterdir()) == [again]
+
+
+def test_a_query_does_not_depend_on_the_others(made):
+    queries = load_queries(made)
+    sampler = make_queries.Sampler("wall", solvable=False)
+    for index in (29, 3):
+        query = sampler((0, "test", index))
+        np.testing.assert_array_equal(queries.start[index], query["start"])
+        np.testing.assert_array_equal(queries.goal[index], query["goal"])
+    sampler.env.close()
+
+
+def test_made_queries_are_feasible_and_not_those_of_a_reset(made):
+    everything = validate(made, "wall", simulate=True)
+    env = envs.make("wall")
+    env.reset(seed=0)
+    for queries in everything.values():
+        assert not (queries.start == env.start_configuration).all(axis=1).any()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda start, goal: (start.astype(np.float64), goal), "float32"),
+        (lambda start, goal: (start[:, :6], goal), r"\(n, 7\)"),
+        (lambda start, goal: (start[:-1], goal), "rows"),
+        (lambda start, goal: (start[:0], goal[:0]), "n > 0"),
+        (lambda start, goal: (start * np.float32(np.nan), goal), "not finite"),
+        (lambda start, goal: (start + np.float32(10), goal), "joint limits"),
+    ],
+)
+def test_bad_arrays_are_not_written(path, change, complaint):
+    before = path.read_bytes()
+    splits = random_splits()
+    splits["validation"] = change(*splits["validation"])
+    with pytest.raises(DatasetError, match=complaint):
+        write(path, splits)
+    assert path.read_bytes() == before
+
+
+def test_splits_must_be_disjoint(path):
+    splits = random_splits()
+    splits["validation"] = tuple(array[4:6] for array in splits["test"])
+    with pytest.raises(DatasetError, match="2 queries are in both splits"):
+        write(path, splits)
+
+
+def test_wrong_arguments_are_refused(path):
+    with pytest.raises(ValueError, match="unknown task 'wal'"):
+        write(path, task="wal")
+    with pytest.raises(ValueError, match="unknown task 'wal'"):
+        query_path("wal")
+    with pytest.raises(ValueError, match="split must be one of test, validation"):
+        load_queries(path, "train")
+
+
+# --- Bad files
+
+
+def missing(path):
+    path.unlink()
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def text(path):
+    path.write_text("start,goal\n0,1\n")
+
+
+def foreign(path):
+    with h5py.File(path, "w") as file:
+        file["start"] = np.zeros((3, 7))
+
+
+def flip_stored_bytes(path):
+    with h5py.File(path) as file:
+        chunk = file["test/goal"].id.get_chunk_info(0)
+    contents = bytearray(path.read_bytes())
+    middle = chunk.byte_offset + chunk.size // 2
+    for i in range(middle, middle + 4):
+        contents[i] ^= 0xFF
+    path.write_bytes(contents)
+
+
+def change_one_number(path):
+    with h5py.File(path, "r+") as file:
+        file["validation/start"][2, 3] -= np.float32(1e-6)
+
+
+def change_the_seed(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["seed"] = 4
+
+
+def newer_schema(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = 2
+
+
+def without_an_array(path):
+    with h5py.File(path, "r+") as file:
+        del file["validation/goal"]
+
+
+def without_an_attribute(path):
+    with h5py.File(path, "r+") as file:
+        del file.attrs["scene"]
+
+
+def replace_array(path, array):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        file["test/goal"] = array
+
+
+def wrong_dtype(path):
+    replace_array(path, np.zeros((30, 7)))
+
+
+def wrong_shape(path):
+    replace_array(path, np.zeros((29, 7), np.float32))
+
+
+def soft_link(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        file["test/goal"] = h5py.SoftLink("/test/start")
+
+
+def external_link(path):
+    with h5py.File(path, "r+") as file:
+        del file["test"]
+        file["test"] = h5py.ExternalLink("/etc/passwd", "/test")
+
+
+def elsewhere(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        shape, where = (30, 7), [("/dev/zero", 0, h5py.h5f.UNLIMITED)]
+        file.create_dataset("test/goal", shape, np.float32, external=where)
+
+
+def never_written(path):
+    with h5py.File(path, "r+") as file:
+        for name in ("start", "goal"):
+            del file[f"test/{name}"]
+            file.create_dataset(f"test/{name}", (5 * 10**6, 7), np.float32)
+
+
+def promised(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        file.create_dataset("test/goal", (10**12, 7), np.float32, chunks=(1000, 7))
+
+
+BAD = [
+    (soft_link, "/test/goal is a link, which is never followed"),
+    (external_link, "/test is a link, which is never followed"),
+    (elsewhere, "/test/goal is no array of this file"),
+    (never_written, "was never written"),
+    (promised, "too many"),
+    (missing, "no such file"),
+    (truncate, "truncated"),
+    (empty, "not an HDF5 file"),
+    (text, "not an HDF5 file"),
+    (foreign, "not a query file"),
+    (flip_stored_bytes, "corrupt"),
+    (change_one_number, "checksum"),
+    (change_the_seed, "checksum"),
+    (newer_schema, "schema version 2, this code reads 1"),
+    (without_an_array, "array validation/goal is missing"),
+    (without_an_attribute, "attribute scene"),
+    (wrong_dtype, "test/goal must be float32, is float64"),
+    (wrong_shape, "test/goal has 29 rows"),
+]
+
+
+@pytest.mark.parametrize(("damage", "complaint"), BAD, ids=[damage.__name__ for damage, _ in BAD])
+def test_bad_files_are_refused_by_name(path, damage, complaint):
+    damage(path)
+    for read in (load_queries, validate):
+        with pytest.raises(DatasetError) as caught:
+            read(path)
+        assert str(path) in str(caught.value) and complaint in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_flipped_bytes_anywhere_change_nothing_or_are_refused(path):
+    contents = path.read_bytes()
+    expected = load_queries(path)
+    rng = np.random.default_rng(0)
+    refused = 0
+    for position in rng.integers(len(contents), size=300):
+        damaged = bytearray(contents)
+        damaged[position] ^= int(rng.integers(1, 256))
+        path.write_bytes(damaged)
+        try:
+            queries = load_queries(path)
+        except DatasetError as error:
+            assert str(path) in str(error)
+            refused += 1
+        else:  # a byte that HDF5 does not use
+            np.testing.assert_array_equal(queries.start, expected.start)
+            np.testing.assert_array_equal(queries.goal, expected.goal)
+    assert refused > 0
+
+
+def test_a_file_for_another_task_is_refused(path, monkeypatch):
+    with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'"):
+        validate(path, "no_obstacles")
+    monkeypatch.setattr("roboarm_nmp.envs.datasets.queries.query_path", lambda task: path)
+    assert load_queries("wall").task == "wall"
+    with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'"):
+        load_queries("no_obstacles")
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene((Box((0.5, 0.0, 0.3), (0.5, 0.05, 0.61)),)),
+        Scene(),
+        dataclasses.replace(envs.TASKS["wall"].scene, table=None),
+        dataclasses.replace(envs.TASKS["wall"].scene, floor=-0.61),
+    ],
+)
+def test_a_file_for_an_old_scene_is_refused(path, monkeypatch, scene):
+    task = dataclasses.replace(envs.TASKS["wall"], scene=scene)
+    monkeypatch.setitem(envs.TASKS, "wall", task)
+    with pytest.raises(DatasetError, match="out of date.*made by a test") as caught:
+        load_queries(path)
+    assert str(path) in str(caught.value)
+
+
+def test_simulating_finds_infeasible_queries(made, tmp_path):
+    folded = np.zeros(7, np.float32)  # inside the limits; elbow and wrist straight and folded
+    folded[3], folded[5] = -3.1, 3.8
+    env = envs.make("wall")
+    assert not env.is_feasible(folded)
+    env.close()
+    queries = validate(made)
+    splits = {split: (queries[split].start, queries[split].goal) for split in queries}
+    splits["validation"][1][7] = folded
+    path = write(tmp_path / "infeasible.h5", splits)
+    validate(path)
+    with pytest.raises(DatasetError, match=r"infeasible.h5: validation/goal\[7\] is not feasible"):
+        validate(path, simulate=True)
+
+
+def test_simulating_finds_wrong_positions(path):
+    with h5py.File(path, "r+") as file:
+        file["test/goal_position"][4, 0] += np.float32(0.001)
+        attributes = {name: datasets.attribute(file, name) for name in dataset_format._ATTRIBUTES}
+        names = dataset_format.array_formats(dataset_format.QUERY_SCHEMA, file)
+        arrays = {name: file[name][()] for name in names}
+        file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
+    validate(path)
+    with pytest.raises(DatasetError, match=r"test/goal_position\[4\]"):
+        validate(path, simulate=True)
+
+
+# --- Killed writers
+
+
+KILLED_IN_THE_MIDDLE = """
+    import os, sys, time
+    import numpy as np
+    from envs import datasets
+
+    def wait(descriptor):
+        print("in the middle", flush=True)
+        time.sleep(60)
+
+    os.fsync = wait  # after the bytes, before they are on the disk under the file's name
+    queries = np.full((5, 7), -0.05, np.float32), np.full((5, 7), -0.06, np.float32)
+    splits = {"test": queries, "validation": queries[::-1]}
+    datasets.write_queries(sys.argv[1], "wall", 0, splits, "", {})
+"""
+
+WRITES_AGAIN_AND_AGAIN = """
+    import sys
+    import numpy as np
+    from envs import datasets, panda
+
+    rng = np.random.default_rng(1)
+    test, validation = (
+        [rng.uniform(0.9 * panda.LOWER, 0.9 * panda.UPPER, (n, 7)).astype(np.float32)] * 2
+        for n in (3000, 10)
+    )
+    for seed in range(10, 10_000):
+        splits = {"test": test, "validation": validation}
+        datasets.write_queries(sys.argv[1], "wall", seed, splits, "", {})
+        print("in the middle", flush=True)
+"""
+
+
+def start_writer(script, path):
+    """The process of `script`, once it has printed its first line."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script), path],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert any(line.startswith("in the middle") for line in process.stdout)
+    return process
+
+
+def test_a_writer_killed_in_the_middle_leaves_the_old_file(path):
+    before = path.read_bytes()
+    process = start_writer(KILLED_IN_THE_MIDDLE, path)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    process.stdout.close()
+    assert path.read_bytes() == before
+    write(path)  # and what the killed writer left behind is in nobody's way
+    assert path.read_bytes() == before
+
+
+def test_a_writer_killed_anywhere_leaves_a_whole_file(path):
+    for delay in (0.0, 0.01, 0.023, 0.041):
+        process = start_writer(WRITES_AGAIN_AND_AGAIN, path)
+        time.sleep(delay)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        assert len(load_queries(path)) == 3000
+        process.stdout.close()
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(path, random_splits(1))
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+# --- The commands
+
+
+def command(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True
+    )
+
+
+def test_validate_command(made, path):
+    good = command("roboarm_nmp.envs.datasets", "validate", made, "--task", "wall", "--simulate")
+    assert good.returncode == 0
+    assert "30 test and 10 validation queries for wall, seed 0" in good.stdout
+    truncate(path)
+    bad = command("roboarm_nmp.envs.datasets", "validate", path, made)
+    assert bad.returncode == 1
+    errors = [line for line in bad.stderr.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1 and str(path) in errors[0] and "truncated" in errors[0]
+    assert "Traceback" not in bad.stderr
+    assert str(made) in bad.stdout
+
+
+def test_make_queries_command_repeats_itself(tmp_path):
+    path = tmp_path / "wall.h5"
+    arguments = "--task wall --seed 5 --num-test 12 --num-validation 3"
+    made_by = f"python -m roboarm_nmp.demo_generation.make_queries {arguments}"
+    result = command(
+        "roboarm_nmp.demo_generation.make_queries", *arguments.split(), "--output", path
+    )
+    assert result.returncode == 0, result.stderr
+    with h5py.File(path) as file:
+        assert file.attrs["made_by"].decode() == made_by
+        assert json.loads(file.attrs["parameters"].decode())["hold_steps"] == 24
+    first = path.read_bytes()
+    command(*made_by.split()[2:], "--output", path, "--workers", 1)
+    assert path.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--task", "wall", "wal"], "unknown task 'wal'"),
+        (["--task", "mixed_scenes"], "mixed_scenes are to learn from"),
+        (["--task", "wall", "--output", "no/such/folder/wall.h5"], "cannot write no/such/folder"),
+        (["--task", "wall", "--output", "envs"], "envs is a directory"),
+        (["--task", "all", "--output", "some.h5"], "one task"),
+        (["--task", "wall", "--workers", "0"], "--workers must be in [1, 256]"),
+        (["--task", "wall", "--seed", "-1"], "--seed must be in [0, 2^32)"),
+    ],
+)
+def test_make_queries_refuses_before_it_works(arguments, complaint):
+    result = command("roboarm_nmp.demo_generation.make_queries", *arguments)
+    assert result.returncode == 1
+    assert complaint in result.stderr
+    assert "queries/s" not in result.stderr and "Traceback" not in result.stderr
+
+
+# --- The packaged files
+
+
+@pytest.mark.parametrize("task", envs.TASKS)
+def test_packaged_queries(task):
+    env = envs.make(task)
+    client = p.connect(p.DIRECT)
+    robot = p.loadURDF(
+        pybullet_data.getDataPath() + "/franka_panda/panda.urdf",
+        useFixedBase=True,
+        physicsClientId=client,
+    )
+    for split in datasets.SPLITS:
+        queries = load_queries(task, split)
+        assert len(queries) == {"test": 10_000, "validation": 200}[split]
+        chosen = np.random.default_rng(0).choice(len(queries), 20, replace=False)
+        for start, goal, scene in queries[chosen]:
+            env.set_scene(scene)
+            assert env.is_feasible(start) and env.is_feasible(goal)
+        for goal, position in zip(queries.goal[chosen], queries.goal_position[chosen], strict=True):
+            for joint, angle in enumerate(goal):
+                p.resetJointState(robot, joint, angle, physicsClientId=client)
+            link = p.getLinkState(robot, 11, computeForwardKinematics=1, physicsClientId=client)
+            np.testing.assert_allclose(position, link[4], rtol=0, atol=1e-6)
+    p.disconnect(physicsClientId=client)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "fewest", "most"),
+    [
+        ("random_boxes_easy", 2, 4),
+        ("random_boxes_medium", 3, 6),
+        ("random_boxes_hard", 4, 8),
+    ],
+)
+def test_packaged_random_scenes(task, fewest, most):
+    queries = load_queries(task)
+    with h5py.File(datasets.query_path(task)) as file:
+        parameters = json.loads(file.attrs["parameters"].decode())
+        counts = file["test/obstacle_count"][()]
+        scene = file["test/scene"][()]
+    assert parameters["solve_attempts"] > 0  # a planner solved them all
+    # Five queries in each of 2,000 scenes, all counts equally often.
+    np.testing.assert_array_equal(scene, np.arange(10_000) // 5)
+    assert len({queries[i].scene for i in range(0, 10_000, 5)}) == 2000
+    shares = np.bincount(counts, minlength=9) / 2000
+    expected = np.zeros(9)
+    expected[fewest : most + 1] = 1 / (most + 1 - fewest)
+    np.testing.assert_allclose(shares, expected, atol=0.04)
+    validation = {query.scene for query in load_queries(task, "validation")}
+    assert len(validation) == 40 and not validation & {queries[i].scene for i in range(10_000)}

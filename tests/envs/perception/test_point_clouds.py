@@ -1,0 +1,175 @@
+"""What is seen of obstacles: points, collision checks against them, and encodings."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.collision.checker import POINT, CollisionChecker
+from roboarm_nmp.envs.networks.operations import NetworkError
+from roboarm_nmp.envs.perception import point_clouds as seeing
+from roboarm_nmp.envs.perception.encoders import SceneEncoder
+from roboarm_nmp.envs.perception.point_clouds import (
+    CELL,
+    POINT_RADIUS,
+    farthest_points,
+    seen_checker,
+    seen_points,
+)
+from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
+
+BOX = Box((0.5, 0.0, 0.25), (0.2, 0.3, 0.5))
+EMPTY = Scene(())
+
+
+@pytest.fixture(scope="module")
+def clutter():
+    """Some scenes of `random_boxes_hard`."""
+    env, rng, scenes = envs.make("random_boxes_hard"), np.random.default_rng(3), []
+    for _ in range(4):
+        env.sample_scene(rng)
+        scenes.append(env.scene)
+    env.close()
+    return scenes
+
+
+def test_points_lie_on_what_can_be_seen():
+    points = seen_points(Scene((BOX,)))
+    out = np.abs(points - BOX.position) - np.array(BOX.size) / 2
+    assert len(points) > 300 and points.dtype == np.float32
+    assert np.abs(out.max(1)).max() < 0.005  # m, from its surface: precision of the depths
+    sides = (np.abs(out) < 0.005).sum(0)
+    assert (sides > 30).all()
+    assert (points[:, 2] > 0.49).sum() > 40 and not (points[:, 2] < -0.005).any()
+    # At most one in each cell.
+    cells = np.floor(points / CELL).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(points)
+
+
+def test_a_scene_is_seen_the_same_way_again():
+    scene = Scene((BOX, Sphere((-0.4, 0.4, 0.3), 0.1)))
+    before = seen_points(scene).tobytes()
+    seen_points(Scene((Sphere((0.4, 0.4, 0.4), 0.05),)))
+    seeing._look.cache_clear()
+    assert seen_points(scene).tobytes() == before
+
+
+def test_nothing_to_see():
+    assert seen_points(EMPTY).shape == (0, 3)
+    states = np.random.default_rng(0).uniform(-1, 1, (200, 7))
+    seen, true = seen_checker(EMPTY), CollisionChecker(EMPTY)
+    assert (seen.is_free(states) == true.is_free(states)).all()
+    assert (seen.nearest(states).distance == true.nearest(states).distance).all()
+    assert not farthest_points(seen_points(EMPTY), 5).any()
+    assert not SceneEncoder("points")(EMPTY).any()
+
+
+def test_what_is_there_but_hidden_is_not_known():
+    """A small box inside of the table."""
+    hidden = Scene((Box((0.0, 0.0, -0.2), (0.05, 0.05, 0.05)),))
+    assert seen_points(hidden).shape == (0, 3)
+    env = envs.make("wall", encoder="points:4", proximity="points")
+    other = envs.make("wall", encoder="points:4", proximity="points")
+    query = env.sample_query(np.random.default_rng(0))
+    observed = [
+        one.reset_specific(*query, scene)[0] for one, scene in ((env, hidden), (other, EMPTY))
+    ]
+    for name, value in observed[0].items():
+        np.testing.assert_array_equal(value, observed[1][name])
+    assert not observed[0]["observation"][10:].any()
+    env.close(), other.close()
+
+
+def test_points_are_balls():
+    """Against the same balls as obstacles of a scene."""
+    rng = np.random.default_rng(1)
+    points = np.concatenate(
+        [rng.uniform((-0.6, -0.6, 0.0), (0.6, 0.6, 0.9), (8, 3)), rng.normal(0.45, 0.03, (60, 3))]
+    )
+    balls = Scene(tuple(Sphere(tuple(map(float, point)), 0.02) for point in points))
+    one, other = CollisionChecker(balls), CollisionChecker(EMPTY, points, 0.02)
+    states = rng.uniform(-1, 1, (3000, 7))
+    for options in ({}, {"margin": 0.02, "clearance": 0.01}):
+        free = one.is_free(states, **options)
+        assert 0.1 < free.mean() < 0.9 and (free == other.is_free(states, **options)).all()
+    ends = states[rng.permutation(len(states))]
+    assert (one.is_motion_free(states, ends) == other.is_motion_free(states, ends)).all()
+    a, b = one.nearest(states), other.nearest(states)
+    np.testing.assert_allclose(b.distance, a.distance, atol=2e-6)
+    assert ((a.thing >= 0) == (b.thing == POINT)).all() and (b.thing == POINT).mean() > 0.3
+    away = np.abs(a.distance) > 1e-4  # where they just touch, the direction is a matter of rounding
+    assert np.quantile(np.abs(a.gradient - b.gradient)[away], 0.999) < 1e-4
+
+
+def test_distances_from_points_are_nearly_those_from_what_was_seen(clutter):
+    """Nine of ten are at most 15 mm too long, none is more than 15 mm too short."""
+    errors = []
+    for scene in clutter:
+        states = np.random.default_rng(0).uniform(-1, 1, (3000, 7))
+        true, seen = CollisionChecker(scene), seen_checker(scene)
+        states = states[true.is_free(states)]
+        a, b = (one.nearest(states, self_collisions=False) for one in (true, seen))
+        near = (a.thing >= 0) & (a.distance < 0.1)
+        errors.append((b.distance - a.distance)[near])
+    errors = np.concatenate(errors)
+    # A point's ball reaches beyond the surface that it is on.
+    assert errors.min() > -POINT_RADIUS - 0.005
+    assert np.abs(np.median(errors)) < 0.01 and np.quantile(errors, 0.9) < 0.015
+
+
+@pytest.mark.parametrize(
+    ("points", "radius"),
+    [([[0.0, np.nan, 0.0]], 0.01), ([[0.0, 0.0, 0.0]], -0.01), ([[0.0, 0.0]], 0.01)],
+)
+def test_bad_points_are_refused(points, radius):
+    with pytest.raises(ValueError, match="points"):
+        CollisionChecker(EMPTY, points, radius)
+
+
+def test_farthest_points_against_a_loop():
+    points = np.random.default_rng(2).uniform(-1, 1, (50, 3)).astype(np.float32)
+    chosen = [max(range(50), key=lambda i: np.linalg.norm(points[i]))]
+    while len(chosen) < 8:
+        chosen.append(
+            max(range(50), key=lambda i: min(np.linalg.norm(points[i] - points[j]) for j in chosen))
+        )
+    assert farthest_points(points, 8).tolist() == points[chosen].tolist()
+    padded = farthest_points(points[:3], 5)
+    assert sorted(padded[:3].tolist()) == sorted(points[:3].tolist()) and not padded[3:].any()
+
+
+def test_points_as_an_encoding():
+    env = envs.make("random_boxes_hard", encoder="points")
+    observation, _ = env.reset(seed=1)
+    scene = observation["observation"][10:].reshape(64, 3)
+    expected = farthest_points(seen_points(env.unwrapped.scene), 64)
+    assert scene.tobytes() == expected.tobytes() and scene.any()
+    assert env.observation_space.contains(observation)
+    after, *_ = env.step(np.full(7, 0.01))
+    assert after["observation"][10:].tobytes() == scene.tobytes()
+    env.close()
+    env = envs.make("random_boxes_hard", encoder="points:16")
+    assert env.reset(seed=1)[0]["observation"].shape == (10 + 48,)
+    env.close()
+    for name in ("points:0", "points:x"):
+        with pytest.raises(NetworkError, match=name):
+            SceneEncoder(name)
+
+
+def test_vector_environments_see_as_single_ones_do():
+    def make():
+        sees = {"encoder": "points:8", "proximity": "points"}
+        return envs.make("random_boxes_hard", goal_type="combined", **sees)
+
+    several, one = gym.vector.SyncVectorEnv([make, make]), make()
+    together, _ = several.reset(seed=[4, 5])
+    for row, seed in enumerate((4, 5)):
+        alone, _ = one.reset(seed=seed)
+        for name, value in alone.items():
+            np.testing.assert_array_equal(together[name][row], value)
+    assert together["proximity"].shape == (2, 10, 8) and together["observation"].shape == (2, 34)
+    actions = np.full((2, 7), 0.01, np.float32)
+    stepped, *_ = several.step(actions)
+    after, *_ = one.step(actions[1])
+    np.testing.assert_array_equal(stepped["proximity"][1], after["proximity"])
+    several.close(), one.close()

@@ -1,0 +1,245 @@
+"""Cameras and point clouds: geometry worked out by hand, classes, and nothing else disturbed."""
+
+import math
+import re
+
+import gymnasium as gym
+import numpy as np
+import psutil
+import pytest
+from gymnasium.utils.env_checker import check_env
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.perception.sensors import (
+    NOTHING,
+    OBSTACLE,
+    OUTPUTS,
+    ROBOT,
+    STATIC,
+    Camera,
+    PointCloud,
+    SensorWorld,
+    cardinal,
+)
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.wrappers import SensorWrapper
+from roboarm_nmp.scene_embedding_train import collect
+
+HOME = np.array([0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8])
+BALL = Sphere((0.4, 0.5, 0.9), 0.1)
+
+
+@pytest.fixture(scope="module")
+def world():
+    world = SensorWorld()
+    yield world
+    world.close()
+
+
+@pytest.mark.parametrize(("size", "fov"), [((224, 224), 60.0), ((160, 120), 40.0)])
+def test_a_ball_is_where_a_pinhole_camera_sees_it(world, size, fov):
+    world.show(Scene((BALL,)), HOME)
+    # Looks along -x, so that the picture's right is +y and its upper edge +z.
+    camera = Camera((2.0, 0.2, 0.7), (0.0, 0.2, 0.7), (0, 0, 1), fov, size, outputs=OUTPUTS)
+    seen = camera.observe(world)
+    rows, columns = np.nonzero(seen["segmentation"] == OBSTACLE)
+    focal = size[1] / 2 / math.tan(math.radians(fov) / 2)  # pixels
+    distance = 2.0 - BALL.position[0]
+    # A ball's outline is a little larger than its cross-section through the centre.
+    column = size[0] / 2 + focal * (BALL.position[1] - 0.2) / distance
+    row = size[1] / 2 - focal * (BALL.position[2] - 0.7) / distance
+    radius = focal * BALL.radius / math.sqrt(distance**2 - BALL.radius**2)
+    assert abs(columns.min() + columns.max() - 2 * column) / 2 < 1.5
+    assert abs(rows.min() + rows.max() - 2 * row) / 2 < 1.5
+    assert len(rows) == pytest.approx(math.pi * radius**2, rel=0.08)
+    middle = seen["depth"][round(row), round(column)]
+    assert 0 <= middle - (distance - BALL.radius) < 0.01  # drawn as a polyhedron, inside
+    assert seen["rgb"].shape == (*size[::-1], 3) and seen["rgb"].dtype == np.uint8
+
+
+@pytest.mark.parametrize("name", list(cardinal()))
+def test_points_lie_on_what_they_are_said_to_hit(world, name):
+    pole = Cylinder((0.0, -0.5, 0.4), 0.05, 0.8)
+    world.show(Scene((BALL, pole)), HOME)
+    cloud = cardinal(PointCloud)[name].observe(world)
+    points, labels = cloud["points"].astype(np.float64), cloud["labels"]
+    hits = labels != NOTHING
+    assert 3000 < hits.sum() < 10_000
+    assert hits[: hits.sum()].all() and not points[~hits].any()
+    x, y, z = points[labels == STATIC].T
+    on_floor, on_top = np.abs(z + 0.6) < 1e-4, np.abs(z) < 1e-4
+    at_edge = (np.abs(np.abs(x - 0.2) - 0.5) < 0.002) | (np.abs(np.abs(y) - 0.5) < 0.002)
+    assert (on_floor | on_top | (at_edge & (z > -0.042) & (z < 0.001))).all()
+    assert on_floor.sum() > 1000 and on_top.sum() > 300
+    obstacles = points[labels == OBSTACLE]
+    from_ball = np.linalg.norm(obstacles - BALL.position, axis=1) - BALL.radius
+    from_pole = np.hypot(*(obstacles[:, :2] - pole.position[:2]).T) - pole.radius
+    # PyBullet draws balls and cylinders as polyhedra.
+    on_ball = (from_ball > -0.01) & (from_ball < 0.0005)
+    on_pole = np.abs(from_pole) < 0.004
+    on_top = (np.abs(obstacles[:, 2] - 0.8) < 0.0005) & (from_pole < 0)
+    assert (on_ball | on_pole | on_top).all()
+    assert on_ball.sum() > 20 and on_pole.sum() > 20
+    robot = points[labels == ROBOT]
+    assert len(robot) > 100 and (robot[:, 2] > -0.01).all()
+    assert (np.linalg.norm(robot - [0.1, 0, 0.5], axis=1) < 0.75).all()
+
+
+def test_a_cloud_is_what_a_camera_in_its_place_sees(world):
+    world.show(envs.TASKS["boxes"].scene, HOME)
+    cloud = cardinal(PointCloud, num_samples=2500)["left"].observe(world)
+    image = cardinal(size=(50, 50), outputs=("depth", "segmentation"))["left"].observe(world)
+    seen = image["segmentation"] != NOTHING
+    hits = cloud["labels"] != NOTHING
+    np.testing.assert_array_equal(cloud["labels"][hits], image["segmentation"][seen])
+    ahead = np.array([0.0, -1.6, -0.4]) / math.hypot(1.6, 0.4)  # the viewing direction
+    depth = (cloud["points"][hits] - np.array([0.0, 1.6, 0.8])) @ ahead
+    np.testing.assert_allclose(depth, image["depth"][seen], atol=1e-5)
+    assert (image["depth"][~seen] == 5.0).all()
+
+
+def test_table_and_floor_may_be_missing(world):
+    world.show(Scene((Box((0.5, 0.0, 0.3), (0.1, 0.1, 0.1)),), table=None, floor=None), HOME)
+    labels = cardinal(PointCloud)["front"].observe(world)["labels"]
+    assert set(labels) == {ROBOT, OBSTACLE, NOTHING}
+
+
+def test_what_is_seen_depends_on_scene_and_arm_only(world):
+    sensors = {**cardinal(outputs=OUTPUTS), "cloud": cardinal(PointCloud)["back"]}
+    tasks = [envs.TASKS[name].scene for name in ("boxes", "double_walls", "narrow_shelves")]
+
+    def look(world, scene, configuration):
+        world.show(scene, configuration)
+        return {name: sensor.observe(world) for name, sensor in sensors.items()}
+
+    first = look(world, tasks[0], HOME)
+    other = look(world, tasks[1], HOME)
+    look(world, tasks[2], np.zeros(7))
+    fresh = SensorWorld()
+    for again in (look(world, tasks[0], HOME), look(fresh, tasks[0], HOME)):
+        for name, outputs in first.items():
+            for output, array in outputs.items():
+                np.testing.assert_array_equal(again[name][output], array)
+    fresh.close()
+    assert (first["front"]["rgb"] != other["front"]["rgb"]).any()
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda: Camera((0, 0, 1), (0, 0, 0)), "up direction"),
+        (lambda: Camera((1, 0, 1), (1, 0, 1)), "from its target"),
+        (lambda: Camera((1, 0)), "eye must be three"),
+        (lambda: Camera((1, 0, math.nan)), "eye must be three"),
+        (lambda: Camera((1, 0, 1), outputs=("rgb", "smell")), "outputs"),
+        (lambda: Camera((1, 0, 1), outputs=()), "outputs"),
+        (lambda: Camera((1, 0, 1), size=(0, 10)), "size"),
+        (lambda: Camera((1, 0, 1), field_of_view=180), "field_of_view"),
+        (lambda: PointCloud((1, 0, 1), near=1.0, far=0.5), "near < far"),
+        (lambda: PointCloud((1, 0, 1), num_samples=10), "square"),
+    ],
+)
+def test_a_sensor_that_makes_no_sense_is_refused(make, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        make()
+
+
+# --- The wrapper
+
+MIX = {
+    "above": Camera((0.1, 0.0, 2.5), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), size=(32, 24)),
+    "depth": Camera((1.6, 0.0, 0.8), size=(20, 20), outputs=("depth",)),
+    "cloud": PointCloud((0.0, 1.6, 0.8), num_samples=400),
+}
+
+
+def same(one, other):
+    return all(
+        np.array_equal(one[name][output], other[name][output])
+        for name in one
+        for output in one[name]
+    )
+
+
+def test_the_wrapper_is_a_gymnasium_environment():
+    check_env(SensorWrapper(envs.make("random_boxes_easy", horizon=5), MIX), skip_render_check=True)
+
+
+def test_observed_once_per_episode_or_in_every_step():
+    for every_step in (False, True):
+        env = SensorWrapper(envs.make("random_boxes_hard"), MIX, every_step)
+        first, _ = env.reset(seed=4)
+        assert env.observation_space.contains(first)
+        for _ in range(20):
+            later = env.step(np.full(7, 0.3, np.float32))[0]
+        assert same(first["sensors"], later["sensors"]) == (not every_step)
+        query = (env.unwrapped.start_configuration, env.unwrapped.goal_configuration)
+        scene = env.unwrapped.scene
+        again, _ = env.reset_specific(*query, scene)
+        assert same(first["sensors"], again["sensors"])
+        assert not same(first["sensors"], env.reset()[0]["sensors"])  # another scene
+        env.close()
+
+
+def test_the_code_of_the_docs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    collect.collect(
+        collect.Args(num=80, sensors="images", image_size=16, shard_size=50, workers=1), False
+    )
+    page = (ROOT / "docs" / "sensors.md").read_text()
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)
+    heights = names["env"].reset(seed=0)[0]["sensors"]["heights"]["heights"]
+    assert heights.shape == (20, 20) and 0.25 < heights.max() < 1.6
+    assert names["env"].observation_space["sensors"]["heights"]["heights"].contains(heights)
+    z = names["z"]
+    assert z.shape == (64,) and np.isfinite(z).all() and z.std() > 0
+    principal = names["PrincipalComponents"](names["pictures"])(**names["pictures"])
+    np.testing.assert_allclose(principal.mean(0), 0, atol=1e-3)
+    np.testing.assert_allclose(principal.std(0), 1, atol=0.05)
+
+
+def test_looking_changes_nothing_else():
+    plain = envs.make("random_boxes_hard", render_mode="rgb_array")  # with a goal's marker
+    wrapped = SensorWrapper(
+        envs.make("random_boxes_hard", render_mode="rgb_array"), MIX, every_step=True
+    )
+    marked = wrapped.reset(seed=3)[0]["sensors"]
+    unmarked = SensorWrapper(envs.make("random_boxes_hard"), MIX)
+    assert same(marked, unmarked.reset(seed=3)[0]["sensors"])
+    rng = np.random.default_rng(0)
+    for episode in range(3):
+        expected, seen = plain.reset(seed=episode)[0], wrapped.reset(seed=episode)[0]
+        for _ in range(60):
+            for name, array in expected.items():
+                np.testing.assert_array_equal(seen[name], array)
+            action = rng.uniform(-0.05, 0.05, 7)
+            expected, seen = plain.step(action)[0], wrapped.step(action)[0]
+    for env in (plain, wrapped, unmarked):
+        env.close()
+
+
+def test_in_a_vector_environment():
+    vector = gym.vector.SyncVectorEnv(
+        [lambda: SensorWrapper(envs.make("random_boxes_easy"), MIX) for _ in range(2)]
+    )
+    observation, _ = vector.reset(seed=[1, 2])
+    assert observation["sensors"]["above"]["rgb"].shape == (2, 24, 32, 3)
+    assert observation["sensors"]["cloud"]["points"].shape == (2, 400, 3)
+    vector.close()
+
+
+def test_many_scenes_do_not_grow_the_process():
+    env = SensorWrapper(envs.make("random_boxes_hard"), cardinal(size=(16, 16)))
+    rng, sizes = np.random.default_rng(0), []
+    for number in range(2400):
+        env.unwrapped.sample_scene(rng)
+        env._world.show(env.unwrapped.scene, HOME)
+        for sensor in env.sensors.values():
+            sensor.observe(env._world)
+        if number % 800 == 799:
+            sizes.append(psutil.Process().memory_info().rss)
+    assert sizes[-1] - sizes[0] < 20e6
+    env.close()

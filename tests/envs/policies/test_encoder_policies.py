@@ -1,0 +1,149 @@
+"""Policies that see the scene through an encoder: buffer, demonstrations, training, evaluation."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from paths import ROOT
+from trainers import PATHS, TRAINERS, load, refusal, run_here, run_script
+
+from roboarm_nmp import envs
+from roboarm_nmp.clean_rl_scripts import evaluate
+from roboarm_nmp.envs.datasets.demonstrations import load_demos
+from roboarm_nmp.envs.datasets.episodes import demo_transitions
+from roboarm_nmp.envs.perception.encoders import oracle, scene_encoder
+
+HARD = "random_boxes_hard"
+SIZE = len(oracle(envs.TASKS["wall"].scene))
+
+
+@pytest.fixture
+def env():
+    env = envs.make(HARD, encoder="oracle")
+    yield env
+    env.close()
+
+
+def steps(env, length):
+    """An episode of random steps as transitions."""
+    observation, _ = env.reset()
+    transitions = []
+    for _ in range(length):
+        action = env.action_space.sample()
+        following = env.step(action)[0]
+        transitions.append(
+            {
+                "observation": observation["observation"],
+                "action": action,
+                "next_observation": following["observation"],
+                "next_achieved_goal": following["achieved_goal"],
+                "desired_goal": following["desired_goal"],
+                "collision": False,
+            }
+        )
+        observation = following
+    return transitions
+
+
+def test_the_buffer_gives_each_transition_the_code_of_its_scene(env):
+    sac = load("sac_her_mp")
+    env.reset(seed=0)
+    buffer = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
+    assert buffer.rows.shape[1] < 50  # latents are not in the rows
+    known = {}
+    for _ in range(8):  # the oldest ones are overwritten
+        episode = steps(env, 10)
+        known |= {t["observation"][:10].tobytes(): t for t in episode}
+        buffer.add_episode(episode)
+    copy = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
+    copy.load_state_dict(buffer.state_dict())
+    for one in (buffer, copy):
+        batch = one.sample(200)
+        assert batch["observation"].shape == (200, 10 + SIZE)
+        assert batch["observation"].dtype == np.float32
+        for row, following in zip(batch["observation"], batch["next_observation"], strict=True):
+            transition = known[row[:10].tobytes()]
+            np.testing.assert_array_equal(row, transition["observation"])
+            np.testing.assert_array_equal(following, transition["next_observation"])
+
+
+def test_demonstrations_have_the_code_of_their_scene(env):
+    demos = load_demos(HARD)
+    for i in (0, 7):
+        for transition in demo_transitions(demos[i], env):
+            for name in ("observation", "next_observation"):
+                np.testing.assert_array_equal(transition[name][10:], oracle(demos[i].scene))
+
+
+def test_proximity_in_the_observation_the_buffer_and_demonstrations():
+    knows = {"encoder": "oracle", "proximity": "obstacles", "append_proximity": True}
+    env = envs.make(HARD, **knows)
+    env.reset(seed=0)
+    buffer = load("sac_her_mp").HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
+    episode = steps(env, 10)
+    buffer.add_episode(episode)
+    observations = np.stack([one["observation"] for one in episode])
+    near = env.proximity_at(observations[:, :7])
+    np.testing.assert_array_equal(observations[:, 10:90], near.reshape(10, 80))
+    np.testing.assert_array_equal(observations[0, 90:], oracle(env.unwrapped.scene))
+    known = {row.tobytes() for row in observations}
+    assert {row.tobytes() for row in buffer.sample(100)["observation"]} == known
+    demo = load_demos(HARD)[7]  # in another scene than the environment's
+    transitions = demo_transitions(demo, env)
+    env.reset_specific(demo.start, demo.goal, demo.scene)
+    for i, one in enumerate(transitions):
+        near = env.proximity_at(demo.states[i]).ravel()
+        np.testing.assert_allclose(one["observation"][10:90], near, atol=1e-6)
+        np.testing.assert_array_equal(one["observation"][90:], oracle(demo.scene))
+    env.close()
+    for append in (True, 1.5, "yes"):
+        with pytest.raises(ValueError, match="is a bool and needs proximity"):
+            envs.make(HARD, append_proximity=append)
+
+
+def flags(trainer):
+    more = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
+    return more if trainer == "bc" else [*more, "--demo-prob", "1", "--proximity", "obstacles"]
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
+    run = run_script(trainer, tmp_path / "whole", *flags(trainer), "--goal-type", "combined")
+    network = torch.load(run / "policy.pt", weights_only=True)
+    assert network["metadata"]["env"]["encoder"] == "oracle"
+    arguments = ["--policy", run, "--num-queries", "3", "--task", HARD]
+    arguments += ["--json", tmp_path / "result.json"]
+    assert evaluate.main(list(map(str, arguments))) == 0
+    assert json.loads((tmp_path / "result.json").read_text())["goal_type"] == "combined"
+    assert network["metadata"]["env"].get("append_proximity", False) == (trainer != "bc")
+    if trainer == "bc":
+        show = [sys.executable, "-m", "roboarm_nmp.envs.show", HARD, "--policy", str(run)]
+        show += ["--size", "60", "40", "--output", str(tmp_path / "rollout.gif")]
+        subprocess.run(show, check=True, capture_output=True, cwd=ROOT)
+        assert (tmp_path / "rollout.gif").stat().st_size > 0
+        return
+    part = [*flags(trainer), "--goal-type", "combined", "--total-timesteps", "600"]
+    again = run_script(trainer, tmp_path / "part", *part)
+    run_here(PATHS[trainer], "--resume", again, "--total-timesteps", "1200")
+    one, other = (
+        torch.load(path / "checkpoint.pt", weights_only=True)["actor"] for path in (run, again)
+    )
+    assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_what_is_no_encoder_is_refused(trainer, tmp_path, capsys):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "encoder.pt").write_text("nothing")
+    given = ("--encoder", str(tmp_path / "encoder.pt"))
+    said = refusal(trainer, capsys, tmp_path / "runs", *given)
+    assert "--encoder: " in said and "not a network file" in said
+
+
+def test_one_encoder_serves_all_environments_of_a_process(env):
+    other = envs.make(HARD, encoder="oracle")
+    assert env.encoder is other.encoder is scene_encoder("oracle")
+    other.close()

@@ -1,0 +1,400 @@
+"""Scene files: exact round trips, and every mistake is refused with its line."""
+
+import math
+import os
+import re
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from roboarm_nmp.envs.scenes import files as scene_files
+from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.tasks import TASKS
+
+DOCUMENTED = textwrap.dedent(re.search(r"(    table:.*\n)\nA box", scene_files.__doc__, re.S)[1])
+EXAMPLE = Scene(
+    (
+        Box((0.5, 0.0, 0.3), (0.3, 0.04, 0.6)),
+        Box(
+            (0.5, 0.3, 0.3),
+            (0.3, 0.04, 0.6),
+            (0.0, 0.0, math.sin(math.pi / 8), math.cos(math.pi / 8)),
+        ),
+        Cylinder((0.4, 0.4, 0.25), 0.05, 0.5),
+        Sphere((0.3, -0.4, 0.5), 0.1),
+    )
+)
+
+
+@pytest.fixture
+def load(tmp_path):
+    """load(text or bytes): the scene in a file with these contents."""
+
+    def load(contents):
+        path = tmp_path / "scene.yaml"
+        path.write_bytes(contents if isinstance(contents, bytes) else contents.encode())
+        return load_scene(path)
+
+    return load
+
+
+def random_scene(seed):
+    """A scene with all kinds, turned or not, numbers of many magnitudes, to the last bit."""
+    rng = np.random.default_rng(seed)
+
+    def numbers(count):
+        return tuple((rng.normal(size=count) * 10.0 ** rng.integers(-12, 3)).tolist())
+
+    def sizes(count):
+        return tuple(abs(number) for number in numbers(count))
+
+    def orientation():
+        quaternion = rng.normal(size=4)
+        return tuple((quaternion / np.linalg.norm(quaternion)).tolist())
+
+    def box():
+        return Box(numbers(3), sizes(3), *[orientation()][: rng.integers(2)])
+
+    def cylinder():
+        return Cylinder(numbers(3), *sizes(2), *[orientation()][: rng.integers(2)])
+
+    def sphere():
+        return Sphere(numbers(3), *sizes(1))
+
+    kinds = (box, cylinder, sphere)
+    order = rng.permutation([0, 1, 2, *rng.integers(3, size=9)])
+    obstacles = tuple(kinds[kind]() for kind in order)
+    table = (TABLE, None, box())[seed % 3]
+    return Scene(obstacles, table, (FLOOR, None, *numbers(1))[seed // 3 % 3])
+
+
+# --- What is read
+
+
+def test_the_example_of_the_documentation(load):
+    """And so a scene from a file is the one written in Python."""
+    assert load(DOCUMENTED) == EXAMPLE
+    assert load("table: true\nfloor: -0.6\nobstacles: []\n") == Scene()
+
+
+@pytest.mark.parametrize(
+    ("text", "scene"),
+    [
+        ("{}", Scene()),
+        ("\ufefftable: false", Scene(table=None)),  # byte order mark
+        ("table: false\r\nfloor: false\r\n", Scene(table=None, floor=None)),
+        ("table: true", Scene()),
+        ("floor: 0", Scene(floor=0.0)),
+        (
+            "table: {position: [0, 0, -0.1], size: [1, 1, 0.2], orientation: [0, 0, 1, 0]}",
+            Scene(table=Box((0.0, 0.0, -0.1), (1.0, 1.0, 0.2), (0.0, 0.0, 1.0, 0.0))),
+        ),
+        (
+            "obstacles:\n- sphere:\n    radius: 1e-2\n    position:\n"
+            "    - 1E1\n    - +.5\n    - -3.\n",
+            Scene((Sphere((10.0, 0.5, -3.0), 0.01),)),
+        ),
+        (
+            "obstacles: [{cylinder: {position: [1, 2, 3], radius: 1, length: 2, "
+            "orientation: [0.6, 0, -0.8, 0]}}]",
+            Scene((Cylinder((1.0, 2.0, 3.0), 1.0, 2.0, (0.6, 0.0, -0.8, 0.0)),)),
+        ),
+        (
+            "obstacles:\n"
+            "  - box: {position: &here [1, 2, 3], size: *here}\n"
+            "  - &ball {sphere: {position: *here, radius: 1}}\n"
+            "  - *ball\n",
+            Scene((Box((1, 2, 3), (1, 2, 3)), Sphere((1, 2, 3), 1), Sphere((1, 2, 3), 1))),
+        ),
+    ],
+)
+def test_what_is_read(load, text, scene):
+    assert load(text) == scene
+
+
+def test_numbers_are_floats(load):
+    scene = load("floor: -1\nobstacles: [{sphere: {position: [1, 2, 3], radius: 1}}]")
+    [sphere] = scene.obstacles
+    assert all(type(number) is float for number in (scene.floor, sphere.radius, *sphere.position))
+
+
+def test_the_norm_of_an_orientation_has_a_tolerance(load):
+    text = "table: {position: [0, 0, 0], size: [1, 1, 1], orientation: [0, 0, 0, %r]}"
+    orientation = load(text % 0.9999991).table.orientation
+    assert orientation == (0.0, 0.0, 0.0, 0.9999991)  # as it was written
+    with pytest.raises(SceneFileError, match="its norm is 1.0000011$"):
+        load(text % 1.0000011)
+
+
+# --- Writing
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_round_trip_is_exact(tmp_path, seed):
+    scene = random_scene(seed)
+    save_scene(scene, tmp_path / "scene.yaml")
+    assert load_scene(tmp_path / "scene.yaml") == scene
+
+
+@pytest.mark.parametrize("task", [name for name in TASKS if isinstance(TASKS[name].scene, Scene)])
+def test_scenes_of_the_tasks_make_the_round_trip(tmp_path, task):
+    save_scene(TASKS[task].scene, tmp_path / "scene.yaml")
+    assert load_scene(tmp_path / "scene.yaml") == TASKS[task].scene
+
+
+def test_numbers_of_numpy_are_written(tmp_path):
+    position, radius = np.array([0.1, 0.2, 1e-20], dtype=np.float32), np.float64(1 / 3)
+    save_scene(Scene((Sphere(position, radius),), floor=np.float32(-0.7)), tmp_path / "scene.yaml")
+    expected = Sphere(tuple(float(number) for number in position), float(radius))
+    assert load_scene(tmp_path / "scene.yaml") == Scene((expected,), floor=float(np.float32(-0.7)))
+
+
+def test_files_are_for_people(tmp_path):
+    path = str(tmp_path / "scene.yaml")  # a string does as well
+    save_scene(EXAMPLE, path)
+    lines = Path(path).read_text().splitlines()
+    assert lines[0].startswith("# A scene") and lines[1].startswith("#")
+    assert lines[2:6] == [
+        "table: true",
+        "floor: -0.6",
+        "obstacles:",
+        "  - box: {position: [0.5, 0.0, 0.3], size: [0.3, 0.04, 0.6]}",
+    ]
+    assert lines[7:] == [
+        "  - cylinder: {position: [0.4, 0.4, 0.25], radius: 0.05, length: 0.5}",
+        "  - sphere: {position: [0.3, -0.4, 0.5], radius: 0.1}",
+    ]
+
+
+def test_what_could_not_be_loaded_is_not_written(tmp_path):
+    path = tmp_path / "scene.yaml"
+    save_scene(EXAMPLE, path)
+    before = path.read_bytes()
+    scene = Scene(table=Box((0, 0, 0), (1, 1, 1), (0, 0, 0, 2)))
+    with pytest.raises(SceneFileError, match=f"^{path}: cannot be written, .*norm is 2"):
+        save_scene(scene, path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["scene.yaml"]
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch, step):
+    path = tmp_path / "scene.yaml"
+    save_scene(EXAMPLE, path)
+
+    def full(*_):
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, step, full)
+        with pytest.raises(OSError, match="no space"):
+            save_scene(Scene(), path)
+    assert load_scene(path) == EXAMPLE
+    assert os.listdir(tmp_path) == ["scene.yaml"]
+    save_scene(Scene(), path)
+    assert load_scene(path) == Scene()
+
+
+# --- What is refused
+
+
+def obstacle(text):
+    """A file with a good obstacle in line 2 and this one from line 3 on."""
+    return f"obstacles:\n  - sphere: {{position: [0, 0, 1], radius: 1}}\n  - {text}\n"
+
+
+def box(text):
+    """A good box with more fields in line 5."""
+    return obstacle(f"box:\n      position: [1, 2, 3]\n      {text}\n      size: [1, 1, 1]")
+
+
+def sphere(position="[0, 0, 0]", radius="1"):
+    return obstacle(f"sphere:\n      position: {position}\n      radius: {radius}")
+
+
+@pytest.mark.parametrize(
+    ("contents", "line", "reason"),
+    [
+        # Not YAML
+        ("floor: 0\ntable: a: b", 2, "mapping values are not allowed here"),
+        ("obstacles: [\nfloor: 0", 2, "while parsing a flow sequence from line 1 on, expected ','"),
+        ("floor: 0\n\ttable: true", 2, r"found character '\\t' that cannot start any token"),
+        ("floor: 0\n\n table: true", 3, "mapping values are not allowed here"),
+        ("floor: 0\ntable: 'true\n", 3, "while scanning a quoted scalar from line 2 on, found un"),
+        ("floor: 0\ntable: *none", 2, "found undefined alias 'none'"),
+        ("floor: 0\ntable: tr\x00ue", 2, "character 0x0 is not allowed"),
+        ("floor: 0\n# caf\xe9\n".encode("latin-1"), 2, "byte 0xe9 is not UTF-8 text"),
+        ("floor: 0".encode("utf-16"), 1, "byte 0xff is not UTF-8 text"),
+        ('floor: 0\ntable: "\\UFFFFFFFF"', 2, r"not valid YAML \("),
+        ('floor: 0\ntable: "\\U00110000"', 2, r"not valid YAML \("),
+        ("floor: 0\n---\n%YAML 9\nfloor", 2, "expected a single document"),
+        ("\n%YAML " + "1" * 5000 + ".1\n--- 1", 2, r"not valid YAML \("),
+        # Not one document
+        ("", 1, "the file is empty"),
+        ("# only a comment\n", 1, "the file is empty"),
+        ("---\n", 1, "the file is empty"),
+        (
+            "floor: 0\n---\nfloor: 1",
+            2,
+            "single document in the stream from line 1 on, but found another",
+        ),
+        # Dangerous
+        ("floor: 0\ntable: !!python/object/apply:os.abort []", 2, "tags .* are not allowed"),
+        ("floor: 0\n!!str table: true", 2, "tags .* are not allowed"),
+        ("floor: ! 0", 1, "tags .* are not allowed"),
+        ("floor: 0\nobstacles:\n  " + "- " * 100_000, 3, "nested too deeply"),
+        ("floor: 0\nobstacles: " + "[" * 100_000, 2, "nested too deeply"),
+        ("floor: 0\nobstacles: &all [*all]", 2, "an obstacle must be a mapping .* got a list"),
+        ("floor: 0\nobstacles:\n - &a {box: *a}", 3, "unknown key box in box"),
+        ("&a {table: *a}", 1, "unknown key table in table"),
+        (sphere(position="&p [*p, *p, *p]"), 4, "position of sphere .* number, got a list"),
+        ("&a {*a : 1}", 1, "unknown key a mapping"),
+        # Whole
+        (
+            "\n- floor: 0",
+            2,
+            "a scene must be a mapping .* table, floor, friction, obstacles, got a list",
+        ),
+        ("\nfloor", 2, "a scene must be a mapping .* got floor"),
+        ("\n\nfloor\n\n 0", 3, "a scene must be a mapping .* got floor 0"),
+        ("''", 1, "a scene must be a mapping .* got the text ''"),
+        (
+            "floor: 0\nflor: 0",
+            2,
+            "unknown key flor in a scene: known are table, floor, friction, obstacles",
+        ),
+        ("floor: 0\n<<: {table: true}", 2, "unknown key << in a scene"),
+        ("floor: 0\n? [a]\n: 1", 2, "unknown key a list in a scene"),
+        ("floor: 0\ntable: true\nfloor: 0", 3, "floor is in a scene twice"),
+        ("floor: 0\ntable: true\n'floor': 0", 3, "floor is in a scene twice"),
+        # Floor and table
+        ("\nfloor: true", 2, "floor must be a height in metres or false, got true"),
+        ("\nfloor:", 2, "floor must be a finite number, got nothing"),
+        ("\nfloor: 'false'", 2, "floor must be a finite number, got the text 'false'"),
+        ("\nfloor: [0]", 2, "floor must be a finite number, got a list"),
+        ("\ntable: 0.1", 2, "table must be true, false or .*, got 0.1"),
+        ("\ntable: 'true'", 2, "table must be true, false or .*, got the text 'true'"),
+        ("\ntable: yes", 2, "table must be true, false or .*, got yes"),
+        ("\ntable: []", 2, "table must be true, false or .*, got a list"),
+        ("table:\n  size: [1, 1, 1]", 2, "table lacks position"),
+        ("table:\n  size: [1, 1, 1]\n  box: 1", 3, "unknown key box in table: known are posi"),
+        ("table:\n  size: [1, 1, 0]\n  position: [0, 0, 0]", 2, "size of table must be positive"),
+        # Obstacles
+        ("\nobstacles:\n", 2, r"obstacles must be a list \(\[\] if .*, got nothing"),
+        ("\nobstacles: none\n", 2, "obstacles must be a list .* got none"),
+        ("\nobstacles: {box: 1}\n", 2, "obstacles must be a list .* got a mapping"),
+        (obstacle("box"), 3, r"an obstacle must be a mapping of its kind \(box, cyl.*, got box"),
+        (obstacle(""), 3, "an obstacle must be a mapping of its kind .* got nothing"),
+        (obstacle("{}"), 3, r"exactly one key, its kind \(box, cylinder, sphere\): none"),
+        (obstacle("box: 1\n    sphere: 1"), 3, "exactly one key, its kind .*: box, sphere"),
+        (obstacle("box: 1\n    box: 1"), 3, "exactly one key, its kind .*: box, box"),
+        (obstacle("box:\n    size: 1"), 3, "exactly one key, its kind .*: box, size"),
+        (obstacle("cube: {}"), 3, "unknown kind of obstacle cube: one of box, cylinder, sphere"),
+        (obstacle("[box]: {}"), 3, "unknown kind of obstacle a list"),
+        (obstacle("box:"), 3, "box must be a mapping with keys position, size, .* got nothing"),
+        (obstacle("sphere: [1, 2]"), 3, "sphere must be a mapping with keys .* got a list"),
+        (obstacle("box: {}"), 3, "box lacks position, size"),
+        (obstacle("cylinder: {position: [0, 0, 0], length: 1}"), 3, "cylinder lacks radius"),
+        (obstacle("sphere: {position: [0, 0, 0]}"), 3, "sphere lacks radius"),
+        (box("radius: 1"), 5, "unknown key radius in box: known are position, size, orient.*, yaw"),
+        (box("position: [1, 2, 3]"), 5, "position is in box twice"),
+        (sphere(radius="1\n      yaw: 1"), 6, "unknown key yaw in sphere: known are position, rad"),
+        # Numbers
+        (sphere(radius="-1"), 5, "radius of sphere must be positive, got -1"),
+        (sphere(radius="0.0"), 5, "radius of sphere must be positive, got 0.0"),
+        (sphere(radius="1e-400"), 5, "radius of sphere must be positive, got 1e-400"),
+        (sphere(radius="1e300"), 5, "radius of sphere must be at most 1000, got 1e300"),
+        (sphere("[1, -2e9, 3]"), 4, "position of sphere must be at most 1000, got -2e9"),
+        (
+            "a: &a {sphere: {position: [0, 0, 0], radius: 1}}\nobstacles: []\n",
+            1,
+            "unknown key a in a scene",
+        ),
+        (
+            "obstacles: [&a {sphere: {position: [0, 0, 0], radius: 1}}" + ", *a" * 50_000 + "]",
+            1,
+            "a scene has at most 10,000 obstacles",
+        ),
+        (sphere(radius="nan"), 5, "radius of sphere must be a finite number, got nan"),
+        (sphere(radius=".inf"), 5, "radius of sphere must be a finite number, got .inf"),
+        (sphere(radius="1e400"), 5, "radius of sphere must be a finite number, got 1e400"),
+        (sphere(radius="0x10"), 5, "radius of sphere must be a finite number, got 0x10"),
+        (sphere(radius="true"), 5, "radius of sphere must be a finite number, got true"),
+        (sphere(radius="'1'"), 5, "radius of sphere must be a finite number, got the text '1'"),
+        (sphere(radius="|\n        1"), 5, r"must be a finite number, got the text '1\\n'"),
+        (sphere(radius="9" * 50 + "x"), 5, "must be a finite number, got 9{40}...$"),
+        (sphere(radius="{}"), 5, "radius of sphere must be a finite number, got a mapping"),
+        (sphere("[1, 2]"), 4, "position of sphere must be a list of 3 numbers, got 2"),
+        (sphere("[1, 2, 3, 4]"), 4, "position of sphere must be a list of 3 numbers, got 4"),
+        (sphere("1, 2, 3"), 4, "position of sphere must be a list of 3 numbers, got 1, 2, 3"),
+        (sphere("{x: 1}"), 4, "position of sphere must be a list of 3 numbers, got a mapping"),
+        (sphere("[1,\n 2,\n left]"), 6, "position of sphere must be a finite number, got left"),
+        (sphere("[1,\n false, 2]"), 5, "position of sphere must be a finite number, got false"),
+        (obstacle("box: {position: [0, 0, 0],\n size: [1,\n -1, 1]}"), 5, "size of box must be"),
+        (
+            obstacle("cylinder: {position: [0, 0, 0], radius: 1,\n length: 0}"),
+            4,
+            "length of cylinder must be positive, got 0",
+        ),
+        # Orientation
+        (box("orientation: [0, 0, 1]"), 5, "orientation of box must be a list of 4 numbers, got 3"),
+        (box("orientation: [0, 0, 1, 1]"), 5, "of norm 1, its norm is 1.41421356$"),
+        (box("orientation: [0, 0, 0, 0]"), 5, "of norm 1, its norm is 0$"),
+        (box("orientation: [0, 0, 0, .nan]"), 5, "orientation of box must be a finite number"),
+        (box("yaw: [90]"), 5, "yaw of box must be a finite number, got a list"),
+        (box("yaw: 90 degrees"), 5, "yaw of box must be a finite number, got 90 degrees"),
+        (
+            box("orientation: [0, 0, 0, 1]\n      yaw: 0"),
+            6,
+            "box has both yaw and orientation, only one is allowed",
+        ),
+    ],
+)
+def test_mistakes_are_refused_with_their_line(load, tmp_path, contents, line, reason):
+    with pytest.raises(SceneFileError) as caught:
+        load(contents)
+    message = str(caught.value)
+    start = f"{tmp_path / 'scene.yaml'}:{line}: "
+    assert message.startswith(start)
+    assert re.search(reason, message.removeprefix(start))
+    assert "\n" not in message and len(message.removeprefix(start)) < 200
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    for path, reason in ((tmp_path / "none.yaml", "No such file"), (tmp_path, "Is a directory")):
+        with pytest.raises(SceneFileError, match=f"^{path}: {reason}"):
+            load_scene(path)
+
+
+def test_damaged_files_are_refused_or_read(load):
+    """Whatever bytes a file has, the only error is `SceneFileError`, on one of its lines."""
+    rng = np.random.default_rng(0)
+    good = DOCUMENTED.encode()
+    snippets = [bytes([byte]) for byte in b"\t\n -?:,[]{}#&*!|>'\"%@`0.e\\~<\x00\x85\xff"]
+    snippets += [
+        b"\n---\n",
+        b"\n...\n",
+        b"&a ",
+        b"*a",
+        b"!!",
+        b"<<",
+        b"\n%YAML 1.",
+        b'"\\x',
+        b"\r\n",
+    ]
+    refused = 0
+    for _ in range(400):
+        contents = bytearray(good)
+        for _ in range(rng.integers(1, 4)):
+            start = rng.integers(len(contents) + 1)
+            contents[start : start + rng.integers(3)] = snippets[rng.integers(len(snippets))]
+        try:
+            assert isinstance(load(bytes(contents)), Scene)
+        except SceneFileError as error:
+            line = int(re.search(r"scene\.yaml:(\d+): ", str(error))[1])
+            assert 1 <= line <= len(contents.splitlines()) + 1
+            refused += 1
+    assert 100 < refused < 400

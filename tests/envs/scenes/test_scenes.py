@@ -1,0 +1,458 @@
+"""Scenes that vary: drawn at a reset, stored with queries and demonstrations, put back in place."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pybullet as p
+import pytest
+
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation import collect, make_queries, verify
+from roboarm_nmp.demo_generation.planning import Planner, PlanningError
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.datasets import format as dataset_format
+from roboarm_nmp.envs.datasets.demonstrations import load_demos
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
+from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere, from_array, to_array
+from roboarm_nmp.envs.scenes.random_boxes import GRID, KEEP_CLEAR, SHOULDER
+from roboarm_nmp.envs.tasks import TASKS
+
+HARD = "random_boxes_hard"
+
+
+class Shelves:
+    """Two scenes in turn, whatever the random numbers."""
+
+    base = Scene(table=None)
+    drawn = 0
+
+    def sample(self, rng):
+        self.drawn += 1
+        height = 0.4 + 0.1 * (self.drawn % 2)
+        return replace(self.base, obstacles=(Box((0.6, 0.0, height), (0.3, 0.3, 0.03)),))
+
+
+@pytest.fixture
+def env():
+    env = envs.make(HARD)
+    yield env
+    env.close()
+
+
+def distance_to_robot(box):
+    """m, of points on the robot's axis below its shoulder; by PyBullet, an independent way."""
+    to_box = p.invertTransform(box.position, box.orientation)
+    points = [(0.0, 0.0, height) for height in np.linspace(0.0, SHOULDER, 10)]
+    local = np.array([p.multiplyTransforms(*to_box, x, (0, 0, 0, 1))[0] for x in points])
+    beyond = np.maximum(np.abs(local) - np.array(box.size) / 2, 0.0)
+    return np.linalg.norm(beyond, axis=1).min()
+
+
+# --- What is no scene
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"obstacles": (Sphere((0, 0, 0), 1), Sphere((0, 0, 1), 0))},
+        {"obstacles": (Sphere((0, 0, math.inf), 1),)},
+        {"obstacles": (Box((0, 0, math.nan), (1, 1, 1)),)},
+        {"obstacles": (Box((0, 0, 0), (1, 1)),)},
+        {"obstacles": (Box((0, 0, 0), (1, 1, -1)),)},
+        {"obstacles": (Box((0, 0, 0), (1, 1, 1e300)),)},
+        {"obstacles": (Box((0, 0, 0), (1, 1, 1), (0, 0, 0, 0)),)},
+        {"obstacles": (Cylinder((0, 0, 0), 1, math.nan),)},
+        {"table": Box((0, 0, 0), (1, 1, 0))},
+        {"floor": math.nan},
+        {"floor": -math.inf},
+        {"friction": -1.0},
+        {"friction": math.nan},
+        {"obstacles": (Sphere((0, 0, 0), 1),) * 10_001},
+    ],
+)
+def test_what_is_no_scene_is_refused_with_the_reason(fields):
+    with pytest.raises(ValueError, match=r"obstacle needs finite|at most|floor must|friction must"):
+        Scene(**fields)
+
+
+def test_vectors_may_be_lists_and_arrays():
+    given = Scene([Box([1, 2, 3], np.ones(3)), Cylinder(np.zeros(3), 0.1, 1.0)], table=None)
+    plain = Scene((Box((1, 2, 3), (1, 1, 1)), Cylinder((0, 0, 0), 0.1, 1.0)), table=None)
+    assert given == plain and hash(given) == hash(plain) and len({given, plain}) == 1
+
+
+# --- The distribution
+
+
+@pytest.mark.parametrize("level, fewest, most", [("easy", 2, 4), ("medium", 3, 6), ("hard", 4, 8)])
+def test_every_number_of_obstacles_is_equally_likely(level, fewest, most):
+    rng = np.random.default_rng(0)
+    scenes = TASKS[f"random_boxes_{level}"].scene
+    counts = [len(scenes.sample(rng).obstacles) for _ in range(1500)]
+    values, found = np.unique(counts, return_counts=True)
+    assert values.tolist() == list(range(fewest, most + 1))
+    expected = 1500 / len(values)
+    assert np.abs(found - expected).max() < 4.5 * math.sqrt(expected)
+
+
+def test_obstacles_are_shelves_poles_and_walls_that_leave_the_robot_its_place():
+    rng = np.random.default_rng(1)
+    boxes = [box for _ in range(200) for box in TASKS[HARD].scene.sample(rng).obstacles]
+    sizes = np.array([box.size for box in boxes])
+    boards = (sizes[:, 2] < 0.05).mean()
+    slender = (sizes[:, 2] > 1.0) & (sizes[:, :2].max(axis=1) < 0.09)
+    assert 0.1 < boards < 0.9 and 0.1 < slender.mean() < 0.9
+    for box in boxes:
+        assert np.array_equal(np.divide([*box.position, *box.size], GRID) % 1, np.zeros(6))
+        assert distance_to_robot(box) > KEEP_CLEAR - 0.01
+
+
+def test_scenes_differ_and_a_seed_fixes_them():
+    boxes = TASKS[HARD].scene
+    assert boxes.sample(np.random.default_rng(3)) == boxes.sample(np.random.default_rng(3))
+    rng = np.random.default_rng(3)
+    assert len({boxes.sample(rng) for _ in range(20)}) == 20
+
+
+def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
+    mixed = envs.get_task("mixed_scenes").scene
+    assert mixed.sample(np.random.default_rng(3)) == mixed.sample(np.random.default_rng(3))
+    drawn = [mixed.sample(np.random.default_rng([0, i])) for i in range(300)]
+    assert len(set(drawn)) == 300 and not {task.scene for task in TASKS.values()} & set(drawn)
+    assert max(len(scene.obstacles) for scene in drawn) <= MAX_OBSTACLES
+    walls = racks = things = 0
+    for scene in drawn:
+        assert scene == replace(mixed.base, obstacles=scene.obstacles)
+        boxes = [obstacle for obstacle in scene.obstacles if isinstance(obstacle, Box)]
+        assert min(map(distance_to_robot, boxes)) > KEEP_CLEAR - 0.02
+        sizes = np.array([box.size for box in boxes])
+        places = np.array([box.position for box in boxes])
+        walls += (sizes[:, 0] > 0.39).all() and np.allclose(
+            places[:, 2], sizes[:, 2] / 2, atol=GRID
+        )
+        racks += len(np.unique(places[:, :2], axis=0)) < len(places)  # boards above each other
+        things += len(boxes) < len(scene.obstacles)
+    assert 70 < walls < 130 and 70 < racks < 130 and 40 < things < racks
+
+
+def test_there_are_no_queries_in_mixed_scenes():
+    with pytest.raises(DatasetError, match="mixed_scenes are to learn from: no queries or dem"):
+        load_queries("mixed_scenes")
+    env = envs.make("mixed_scenes")
+    env.reset(seed=0)
+    first = env.world.scene
+    env.reset()
+    assert env.world.scene != first
+    env.close()
+
+
+# --- In the environment
+
+
+def test_every_reset_draws_a_scene_in_which_start_and_goal_are_feasible(env):
+    scenes = set()
+    env.reset(seed=5)
+    for _ in range(5):
+        env.reset()
+        scenes.add(env.scene)
+        start, goal = env.start_configuration, env.goal_configuration
+        assert env.is_feasible(start) and env.is_feasible(goal)
+    assert len(scenes) == 5
+
+
+def test_a_scene_stays_for_as_many_episodes_as_asked():
+    shelves = Shelves()
+    env = RoboArmEnv(shelves, episodes_per_scene=3)
+    heights = []
+    for _ in range(7):
+        env.reset()
+        heights.append(env.scene.obstacles[0].position[2])
+    assert heights == [0.5, 0.5, 0.5, 0.4, 0.4, 0.4, 0.5]
+    drawn = shelves.drawn
+    env.reset(seed=1)  # must not depend on what was before
+    assert shelves.drawn == drawn + 1
+    env.close()
+
+
+def test_a_seed_fixes_scene_and_query(env):
+    first = env.reset(seed=7)[0], env.scene
+    env.reset()
+    again = env.reset(seed=7)[0], env.scene
+    assert first[1] == again[1]
+    for name in first[0]:
+        np.testing.assert_array_equal(first[0][name], again[0][name])
+
+
+def test_replay_is_exact_among_other_scenes(env):
+    """Whatever scenes were there before, in this env or never: the same, bit for bit."""
+
+    def run(env, seed):
+        rng = np.random.default_rng(seed)
+        env.sample_scene(rng)
+        observation, _ = env.reset_specific(*env.sample_query(rng))
+        states = [observation["observation"]]
+        for action in rng.uniform(-1, 1, (6, 7)).repeat(10, axis=0):
+            states.append(env.step(action)[0]["observation"])
+        return np.stack(states)
+
+    first = {seed: run(env, seed) for seed in range(8)}
+    for seed in (5, 0, 7, 2):
+        np.testing.assert_array_equal(run(env, seed), first[seed])
+    fresh = envs.make(HARD)
+    np.testing.assert_array_equal(run(fresh, 3), first[3])
+    fresh.close()
+
+
+def test_the_world_is_made_anew_now_and_then_and_nothing_changes(env, monkeypatch):
+    env.reset(seed=2)
+    before = env.reset(seed=3)[0]
+    monkeypatch.setattr("roboarm_nmp.envs.world.MAX_BODIES_MADE", 10)
+    for seed in range(10):
+        env.reset(seed=seed)
+    after = env.reset(seed=3)[0]
+    # Robot, floor, table, obstacles, and nothing left over.
+    assert p.getNumBodies(physicsClientId=env.client) == 3 + len(env.scene.obstacles)
+    for name in before:
+        np.testing.assert_array_equal(before[name], after[name])
+
+
+def test_what_two_scenes_share_stays_and_the_rest_is_exchanged():
+    one, two = Box((0.5, 0.0, 0.3), (0.1, 0.1, 0.6)), Box((0.0, 0.5, 0.3), (0.1, 0.1, 0.6))
+    env = RoboArmEnv(Scene((one, two)))
+    reaching = np.array([0.0, 0.6, 0.0, -1.6, 0.0, 2.2, 0.7])  # into `one`
+    turned = reaching + np.array([np.pi / 2, 0, 0, 0, 0, 0, 0])  # into `two`
+    for obstacles, hit in [
+        ((one, two), (True, True)),
+        ((one,), (True, False)),
+        ((two,), (False, True)),
+        ((two, one), (True, True)),
+        ((), (False, False)),
+    ]:
+        env.set_scene(Scene(obstacles))
+        assert (env.in_collision(reaching), env.in_collision(turned)) == hit
+    env.close()
+
+
+def test_spheres_collide():
+    # The fingers point down: around their tips, and below them by more than the radius.
+    reaching = np.array([0.0, 0.6, 0.0, -1.6, 0.0, 2.2, 0.785])
+    hand = panda.forward_kinematics(reaching)
+    env = RoboArmEnv()
+    for offset, hit in [((0.0, 0.0, 0.0), True), ((0.0, 0.0, -0.13), False)]:
+        env.set_scene(Scene((Sphere(tuple(hand + offset), 0.1),)))
+        assert env.in_collision(reaching) == hit
+    env.close()
+
+
+def test_friction_is_that_of_the_scene():
+    for friction in (0.5, 1.0, 1.5):
+        env = RoboArmEnv(Scene((Box((0.5, 0.0, 0.3), (0.1, 0.1, 0.6)),), friction=friction))
+        found = p.getDynamicsInfo(env.world._bodies[-1], -1, physicsClientId=env.client)[1]
+        assert found == pytest.approx(friction)
+        env.close()
+
+
+# --- In files
+
+
+def some_queries(n, rng):
+    return tuple(rng.uniform(-0.08, -0.01, (2, n, 7)).astype(np.float32))
+
+
+@pytest.fixture
+def scenes():
+    rng = np.random.default_rng(4)
+    return [TASKS[HARD].scene.sample(rng) for _ in range(3)]
+
+
+def write(path, scenes):
+    rng = np.random.default_rng(6)
+    index = [0, 1, 1, 2, 0, 2, 2]
+    splits = {
+        "test": (*some_queries(7, rng), [scenes[i] for i in index]),
+        "validation": (*some_queries(2, rng), scenes[:2]),
+    }
+    write_queries(path, HARD, 0, splits, "made by a test", {})
+    return index
+
+
+def test_queries_come_back_with_their_scenes(tmp_path, scenes):
+    index = write(tmp_path / "queries.h5", scenes)
+    queries = load_queries(tmp_path / "queries.h5")
+    assert [queries[i].scene for i in range(7)] == [scenes[i] for i in index]
+    assert queries[2:5][1].scene == scenes[index[3]]
+    assert queries[np.array([6, 1])][0].scene == scenes[index[6]]
+    assert len(queries.scenes.offsets) == 4  # each scene is stored once
+    assert load_queries(tmp_path / "queries.h5", "validation")[1].scene == scenes[1]
+
+
+def test_queries_in_scenes_without_obstacles(tmp_path):
+    empty = TASKS[HARD].scene.base
+    write(tmp_path / "queries.h5", [empty] * 3)
+    assert load_queries(tmp_path / "queries.h5")[3].scene == empty
+
+
+def test_a_scene_with_another_table_is_refused(tmp_path, scenes):
+    scenes[1] = replace(scenes[1], table=None)
+    with pytest.raises(DatasetError, match="differs from the task's in more than its obstacles"):
+        write(tmp_path / "queries.h5", scenes)
+    assert not (tmp_path / "queries.h5").exists()
+
+
+def test_a_split_that_is_not_there(tmp_path, scenes):
+    write(tmp_path / "queries.h5", scenes)
+    with pytest.raises(DatasetError, match="queries.h5: has no original queries"):
+        load_queries(tmp_path / "queries.h5", "original")
+
+
+def test_scenes_that_make_no_sense_are_refused(tmp_path, scenes):
+    write(tmp_path / "queries.h5", scenes)
+    path = tmp_path / "queries.h5"
+    attributes, arrays = dataset_format.read_file(path, dataset_format.QUERY_SCHEMA, HARD)
+    for name, change, complaint in [
+        ("test/scene", lambda a: a + 1, "does not fit"),
+        ("test/obstacle_count", lambda a: a + 1, "does not fit"),
+        ("test/obstacles", lambda a: np.where(np.arange(11) == 0, 9.0, a), "unknown kind"),
+        ("test/obstacles", lambda a: np.where(np.arange(11) == 3, np.inf, a), "not finite"),
+    ]:
+        damaged = arrays | {name: change(arrays[name]).astype(arrays[name].dtype)}
+        with pytest.raises(DatasetError, match=complaint):
+            dataset_format.read_scenes(path, attributes, damaged, "test/")
+
+
+def test_obstacle_arrays_round_trip():
+    obstacles = (
+        Box((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), (0.0, 0.0, 0.6, 0.8)),
+        Cylinder((0.1, 0.2, 0.3), 0.05, 0.7, (0.6, 0.0, 0.0, 0.8)),
+        Sphere((0.1, 0.2, 0.3), 0.25),
+    )
+    assert from_array(to_array(obstacles)) == obstacles
+
+
+def test_sampled_queries_are_solved_and_have_scenes_of_their_own():
+    sampler = make_queries.Sampler(HARD, solvable=True)
+    made = [sampler((0, "validation", index)) for index in range(3)]
+    again = sampler((0, "validation", 1))
+    assert again == made[1]
+    scenes = [replace(TASKS[HARD].base_scene, obstacles=from_array(q["obstacles"])) for q in made]
+    assert len(set(scenes)) == 3
+    planner = Planner(RoboArmEnv())
+    for query, scene in zip(made, scenes, strict=True):
+        ends = (np.array(query[end], np.float32) for end in ("start", "goal"))
+        assert len(planner.plan(*ends, scene, seed=1, caution=0.25)) >= 2
+
+
+def test_queries_in_a_row_share_a_scene_if_asked():
+    sampler = make_queries.Sampler(HARD, solvable=False, queries_per_scene=2)
+    made = [sampler((0, split, index)) for split in ("test", "validation") for index in range(4)]
+    scenes = [from_array(query["obstacles"]) for query in made]
+    assert scenes[0::2] == scenes[1::2] and len(set(scenes)) == 4
+    assert len({tuple(query["start"]) for query in made}) == 8
+
+
+def test_an_unsolvable_query_is_rejected_and_counted(monkeypatch):
+    sampler = make_queries.Sampler("no_obstacles", solvable=True)
+    solve, tried = sampler.planner.plan, []
+
+    def fail_on_the_first_two(start, goal, *, seed, caution):
+        if len(tried) < 2 and not any((start == other).all() for other in tried):
+            tried.append(start)
+        if any((start == other).all() for other in tried):
+            raise PlanningError("no path")
+        return solve(start, goal, seed=seed, caution=caution)
+
+    monkeypatch.setattr(sampler.planner, "plan", fail_on_the_first_two)
+    query = sampler((0, "test", 0))
+    assert query["rejected"]["unsolved"] == len(tried) == 2
+    assert not any((query["start"] == other).all() for other in tried)
+
+
+def test_collected_demonstrations_have_their_scenes(tmp_path):
+    options = {name: getattr(collect.Args(HARD), name) for name in collect.OPTIONS}
+    collector = collect.Collector(options)
+    journal = collect.Journal(collect.journal_of(tmp_path / "demos.h5"), options)
+    for index in range(3):
+        journal.append(collector(index))
+    journal.close()
+    collect.collect(tmp_path / "demos.h5", 3, options, progress=False)  # all are there already
+    demos = load_demos(tmp_path / "demos.h5")
+    assert len({demos[i].scene for i in range(3)}) == 3
+    verifier = verify.Verifier(tmp_path / "demos.h5", mend=False)
+    assert [verifier(i)[1] for i in range(3)] == ["good"] * 3
+
+
+# --- The shelves
+
+
+@pytest.mark.parametrize("task, turns", [("pole_shelves", 2), ("narrow_shelves", 4)])
+def test_racks_stand_alike_around_the_arm(task, turns):
+    boxes = TASKS[task].scene.obstacles
+    found = np.array([(*box.position, *box.size) for box in boxes])
+    angle = 2 * math.pi / turns
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    turned = found.copy()
+    turned[:, :2] = found[:, :2] @ rotation.T
+    turned[:, 3:5] = np.abs(found[:, 3:5] @ rotation.T)
+    for row in turned:
+        assert np.abs(found - row).max(axis=1).min() < 1e-9
+
+
+@pytest.mark.parametrize("task", ["three_shelves", "pole_shelves", "narrow_shelves"])
+def test_racks_hold_together(task):
+    """Boards end at the inner faces of closed sides, or at the outer faces of poles."""
+    boxes = [box for box in TASKS[task].scene.obstacles if box.position[0] > 0.3]  # in front
+    boards = [box for box in boxes if box.size[2] < 0.05]
+    uprights = [box for box in boxes if box.size[2] > 0.05]
+    assert len(boards) == {"three": 3, "pole": 3, "narrow": 5}[task.split("_")[0]]
+    (depth, width), top = boards[0].size[:2], max(box.position[2] + 0.015 for box in boards)
+    for upright in uprights:
+        bottom = upright.position[2] - upright.size[2] / 2
+        assert bottom == pytest.approx(0) and upright.size[2] == pytest.approx(top)
+        inner, outer = (abs(upright.position[1]) + s * upright.size[1] / 2 for s in (-1, 1))
+        assert (outer if len(uprights) == 4 else inner) == pytest.approx(width / 2)
+        edge = abs(upright.position[0] - boards[0].position[0]) + upright.size[0] / 2
+        assert edge == pytest.approx(depth / 2)
+
+
+# --- MotionBenchMaker's scenes
+
+
+def test_the_bookshelves_are_as_published():
+    """The numbers of the scenes' description, copied by hand: centres and full edges in m."""
+    tall, thin = (TASKS[f"benchmaker_bookshelf_{name}"].scene for name in ("tall", "thin"))
+    for scene in (tall, thin):
+        assert scene.table is None and scene.floor is None
+    boxes = {o.position: o.size for o in tall.obstacles if isinstance(o, Box)}
+    assert boxes == {
+        **{(1.3, 0.0, z): (1.2, 1.0, 0.04) for z in (0.0, 0.3, 0.6, 0.9)},
+        **{(1.3, y, 0.12): (1.3, 0.04, 1.64) for y in (-0.5, 0.5)},
+    }
+    boxes = {o.position: o.size for o in thin.obstacles if isinstance(o, Box)}
+    assert boxes == {
+        **{(0.9, 0.0, z): (0.62, 1.0, 0.04) for z in (-0.35, -0.1, 0.15, 0.4, 0.65, 0.9)},
+        (0.9, 0.0, 0.2): (0.62, 0.04, 1.4),
+        **{(x, y, 0.12): (0.04, 0.04, 1.64) for x in (0.6, 1.2) for y in (-0.5, 0.5)},
+    }
+    for scene, number in ((tall, 9), (thin, 10)):
+        cans = [o for o in scene.obstacles if isinstance(o, Cylinder)]
+        assert len({can.position for can in cans}) == number
+        assert {(can.radius, can.length) for can in cans} == {(0.03, 0.14)}
+
+
+@pytest.mark.parametrize("name", ["tall", "thin"])
+def test_all_original_starts_and_goals_are_feasible_in_our_world(name):
+    task = f"benchmaker_bookshelf_{name}"
+    queries = load_queries(task, "original")
+    assert len(queries) == 100
+    nominal = {can.radius for can in TASKS[task].scene.obstacles if isinstance(can, Cylinder)}
+    env = envs.make(task)
+    for start, goal, scene in queries:
+        assert len(scene.obstacles) == len(TASKS[task].scene.obstacles)
+        assert {o.radius for o in scene.obstacles if isinstance(o, Cylinder)} == nominal
+        env.set_scene(scene)
+        assert env.is_feasible(start) and env.is_feasible(goal)
+    env.close()

@@ -1,0 +1,472 @@
+"""roboarm_nmp.envs.show: what is in its pictures and animations, who moves the arm, and its errors."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pybullet as p
+import pytest
+import torch
+from paths import ROOT
+from PIL import Image
+from torch import nn
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda, show
+from roboarm_nmp.envs.datasets.demonstrations import load_demos
+from roboarm_nmp.envs.datasets.queries import Query, load_queries, write_queries
+from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.tasks import TASKS, Task
+
+SMALL = (96, 72)
+SIZE = ["--size", "96", "72"]
+BENT = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
+AT_THE_SIDE = np.array([1.5, 0.6, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = envs.make("no_obstacles", render_mode="rgb_array")
+    yield env
+    env.close()
+
+
+def env_of(task):
+    return envs.make(task, render_mode="rgb_array")
+
+
+def green(pixels):
+    """Which pixels are green rather than grey, brown or blue."""
+    pixels = pixels.astype(int)
+    return pixels[..., 1] > 30 + np.maximum(pixels[..., 0], pixels[..., 2])
+
+
+def run(*arguments):
+    return show.main([str(argument) for argument in arguments])
+
+
+def frames_of(path):
+    """The frames (n, h, w, 3) of an animation, and their durations in ms."""
+    frames, durations = [], []
+    with Image.open(path) as image:
+        for number in range(image.n_frames):
+            image.seek(number)
+            frames.append(np.asarray(image.convert("RGB")))
+            durations.append(image.info["duration"])
+    return np.stack(frames), durations
+
+
+# --- Pictures
+
+
+def test_an_environment_that_does_not_render_is_drawn_for_pictures():
+    scene = Scene((Sphere((0.5, 0.3, 0.4), 0.1), Cylinder((0.5, -0.3, 0.3), 0.05, 0.3)))
+    query, task = Query(BENT, BENT + 0.1, scene), "random_boxes_hard"
+    plain, drawn = envs.make(task), env_of(task)
+    expected = show.picture(drawn, query, SMALL)
+    assert not np.array_equal(expected, show.picture(drawn, Query(BENT, BENT, Scene()), SMALL))
+    plain.reset_specific(*query)
+    found = [show.picture(plain, query, SMALL) for _ in range(2)]
+    for one in found:
+        different = (one != expected).any(-1) & ~green(expected)  # which is the goal's ball
+        assert different.sum() < 20
+    plain.close()
+    drawn.close()
+
+
+def test_a_picture_has_the_goal_as_a_ball_and_as_a_ghost(env):
+    ball = panda.forward_kinematics(AT_THE_SIDE).astype(np.float32)
+    with_ghost = show.picture(env, Query(BENT, AT_THE_SIDE, Scene()), (160, 120))
+    ball_only = show.picture(env, Query(BENT, ball, Scene()), (160, 120))
+    assert with_ghost.shape == ball_only.shape == (120, 160, 3)
+    assert with_ghost.dtype == ball_only.dtype == np.uint8
+    assert 5 < green(ball_only).sum() < 60
+    assert green(with_ghost).sum() > 300
+    # The other way round, the ghost is where the arm was.
+    swapped = show.picture(env, Query(AT_THE_SIDE, BENT, Scene()), (160, 120))
+    assert (
+        np.abs(np.argwhere(green(with_ghost)).mean(0) - np.argwhere(green(swapped)).mean(0)).max()
+        > 5
+    )
+
+
+def test_an_obstacle_in_front_hides_the_ghost_unless_seen_from_elsewhere(env, monkeypatch):
+    half = np.deg2rad(-35.0 / 2)  # turned to the first of the camera's places
+    wall = Box((0.8, -0.56, 0.7), (0.02, 2.4, 2.4), (0.0, 0.0, np.sin(half), np.cos(half)))
+    query = Query(BENT, AT_THE_SIDE, Scene((wall,), None, None))
+    assert green(show.picture(env, query, SMALL)).sum() > 20
+    monkeypatch.setattr(show, "YAWS", show.YAWS[:1])
+    assert green(show.picture(env, query, SMALL)).sum() == 0
+
+
+def test_the_camera_sees_everything_and_stands_no_further_than_needed(env):
+    scene = Scene(
+        (Box((1.3, 0.0, 0.1), (1.2, 1.0, 1.6)), Sphere((-0.5, 0.9, 0.3), 0.1)), None, None
+    )
+    # Corners of the box and the sphere's ends, by hand.
+    points = [[x, y, z] for x in (0.7, 1.9) for y in (-0.5, 0.5) for z in (-0.7, 0.9)]
+    points += [[-0.6, 0.9, 0.3], [-0.5, 1.0, 0.3], [-0.5, 0.9, 0.4]]
+    env.set_scene(scene)
+    for slopes in ((0.5, 0.4), (0.2, 0.6)):
+        camera = show._camera(env, show._extent(env, [BENT, AT_THE_SIDE]), slopes)
+        view = p.computeViewMatrixFromYawPitchRoll(
+            camera.target.tolist(), camera.distance, camera.yaw, show.PITCH, 0, 2
+        )
+        for configuration in (BENT, AT_THE_SIDE):
+            points.append(panda.forward_kinematics(configuration))
+        homogeneous = np.column_stack([points, np.ones(len(points))])
+        seen = homogeneous @ np.reshape(view, (4, 4))
+        seen = seen[:, :2] / -seen[:, 2:3] / slopes
+        assert np.abs(seen).max() < 1
+        assert np.abs(seen).max() > 0.8
+    env.set_scene(Scene())
+
+
+def test_the_camera_looks_at_the_arm_from_where_it_is_free(env):
+    views = {}
+    for task in ("boxes", "benchmaker_bookshelf_tall", "benchmaker_bookshelf_thin"):
+        env.set_scene(TASKS[task].scene)
+        views[task] = show._camera(env, np.zeros((1, 3)), (0.5, 0.5)).yaw
+    env.set_scene(TASKS["wall"].scene)
+    yaws = set()
+    for query in load_queries("wall")[:5]:
+        env.reset_specific(*query)
+        yaws.add(show._camera(env, np.zeros((1, 3)), (0.5, 0.5)).yaw)
+    assert len(yaws) == 1
+    env.set_scene(Scene())
+    # From behind the arm: the shelves stand in front of it.
+    assert views == {
+        "boxes": 55.0,
+        "benchmaker_bookshelf_tall": -55.0,
+        "benchmaker_bookshelf_thin": -55.0,
+    }
+
+
+def test_a_grid_of_pictures(tmp_path, capsys):
+    assert run("wall", "--output", tmp_path / "a.png", "--draws", 3, "--query", 5, *SIZE) == 0
+    assert "test query 5 to 7" in capsys.readouterr().out
+    grid = np.asarray(Image.open(tmp_path / "a.png"))
+    assert grid.shape == (2 * 72, 2 * 96, 3)
+    tiles = [grid[y : y + 72, x : x + 96] for y in (0, 72) for x in (0, 96)]
+    env = env_of("wall")
+    queries = load_queries("wall")
+    for tile, number in zip(tiles, (5, 6, 7), strict=False):
+        assert np.array_equal(tile, show.picture(env, queries[number], SMALL))
+        assert green(tile).any()
+    env.close()
+    assert not np.array_equal(tiles[0], tiles[1]) and (tiles[3] == 255).all()
+
+
+# --- Animations, and who moves the arm
+
+
+class Straight(nn.Module):
+    """The go-to-goal policy as a network, for goals that are configurations."""
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        return torch.clamp(desired_goal - observation[:, :7], -1, 1)
+
+
+class NoAction(nn.Module):
+    def forward(self, observation, achieved_goal, desired_goal):
+        return observation + 0 * (achieved_goal + desired_goal).sum(1, keepdim=True)
+
+
+def save(path, module=None, **metadata):
+    sizes = {"observation": 10, "achieved_goal": 7, "desired_goal": 7}
+    inputs = {name: torch.zeros(1, size) for name, size in sizes.items()}
+    metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
+    save_network(path, module or Straight(), inputs, metadata)
+    return path
+
+
+def test_a_rollout_is_an_episode(env):
+    goal = panda.normalise(AT_THE_SIDE)
+    query = Query(BENT, AT_THE_SIDE, Scene())
+    path, info = show.rollout(env, query, lambda observation: goal - observation["observation"][:7])
+    assert info["is_success"] and info["elapsed_steps"] == len(path) - 1 > 10
+    assert np.allclose(path[0], BENT, atol=1e-6)
+    ends = panda.forward_kinematics(path)
+    target = panda.forward_kinematics(AT_THE_SIDE)
+    assert np.linalg.norm(ends[-1] - target) <= 0.021 < np.linalg.norm(ends[-2] - target)
+
+
+def test_an_animation_of_a_network_and_of_the_same_policy(tmp_path, capsys, monkeypatch):
+    save(tmp_path / "policy.pt")
+    arguments = ["--query", 2, *SIZE]
+    assert run("wall", "--output", tmp_path / "a.gif", "--policy", tmp_path, *arguments) == 0
+    text = capsys.readouterr().out
+    assert f"test query 2, {tmp_path}: reached the goal in " in text
+    steps = int(text.split(" steps")[0].split()[-1])
+    stride = -(-steps // show.MAX_FRAMES)
+    frames, durations = frames_of(tmp_path / "a.gif")
+    assert frames.shape == (-(-steps // stride) + 1, 72, 96, 3)
+    assert len(frames) > 10 and durations[0] == pytest.approx(1000 * stride / 30, abs=10)
+    assert durations[-1] == 1000 * show.PAUSE
+    changes = np.abs(np.diff(frames.astype(int), axis=0)).sum((1, 2, 3))
+    assert (changes > 0).mean() > 0.9
+    still = show.picture(env_of("wall"), load_queries("wall")[2], SMALL)
+    assert green(frames[0]).sum() == pytest.approx(green(still).sum(), rel=0.5)
+
+    # Fewer frames of more steps each.
+    monkeypatch.setattr(show, "MAX_FRAMES", 4)
+    assert run("wall", "--output", tmp_path / "b.gif", *arguments) == 0
+    assert "test query 2, go-to-goal: reached the goal in " in capsys.readouterr().out
+    few, _ = frames_of(tmp_path / "b.gif")
+    assert 4 <= len(few) <= 5
+
+
+def test_random_actions_depend_on_the_seed(tmp_path, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 3)
+    files = []
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        files.append(tmp_path / f"{name}.gif")
+        policy = ["--policy", "random", "--seed", seed]
+        assert run("no_obstacles", "--output", files[-1], *policy, *SIZE) == 0
+    first, same, other = (file.read_bytes() for file in files)
+    assert first == same != other
+
+
+@pytest.mark.parametrize(
+    ("policy", "touched"),
+    [
+        ("go-to-goal", "something"),
+        ("via-points", "nothing"),
+        ("planner", "nothing"),
+        ("bc-config-double_walls-s1", "something"),
+    ],
+)
+def test_policies_by_name(policy, touched, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+    # Straight to this goal the arm slides along a wall; there is a way around.
+    arguments = ["--policy", policy, "--query", 11, "--split", "validation", *SIZE]
+    assert run("double_walls", "--output", tmp_path / "a.gif", *arguments) == 0
+    text = capsys.readouterr().out
+    assert f"{policy}: reached the goal in " in text and f"touching {touched}" in text
+
+
+def test_a_policy_with_a_last_layer(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+    policy = "dagger-combined-points-random_boxes_hard-s1"
+    arguments = ["--policy", policy, "--query", 1, "--split", "validation", *SIZE]
+    assert run("random_boxes_hard", "--output", tmp_path / "a.gif", *arguments) == 0
+    text = capsys.readouterr().out
+    assert f"{policy}: reached the goal in " in text and "touching nothing" in text
+
+
+def test_a_demonstration(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 3)
+    demo = load_demos("wall")[7]
+    arguments = ["--policy", "demo", "--query", 7, *SIZE]
+    assert run("wall", "--output", tmp_path / "a.gif", *arguments) == 0
+    assert f"demonstration 7: {len(demo.states) - 1} steps" in capsys.readouterr().out
+    frames, _ = frames_of(tmp_path / "a.gif")
+    assert len(frames) in (4, 5) and green(frames[0]).sum() > 2 * green(frames[-1]).sum()
+    # The still picture is of the demonstration's query.
+    assert run("wall", "--output", tmp_path / "a.png", *arguments) == 0
+    picture = show.picture(env_of("wall"), Query(demo.start, demo.goal, demo.scene), SMALL)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), picture)
+
+
+# --- Where the queries come from
+
+
+def write_two_queries(task):
+    """A query file beside a scene file: from BENT to AT_THE_SIDE, and back."""
+    start, goal = np.stack([BENT, AT_THE_SIDE]), np.stack([AT_THE_SIDE, BENT])
+    splits = {"test": (start, goal), "validation": (start + np.float32(0.1), goal)}
+    write_queries(task.with_name("mine_queries.h5"), str(task), 0, splits, "a test", {})
+
+
+def test_random_queries_where_there_is_no_file(tmp_path, capsys):
+    (tmp_path / "mine.yaml").write_text("obstacles: [sphere: {position: [0, 0.9, 0], radius: 0.1}]")
+    task = tmp_path / "mine.yaml"
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        assert run(task, "--output", tmp_path / f"{name}.png", "--seed", seed, *SIZE) == 0
+        assert f"no query file: random queries of seed {seed}" in capsys.readouterr().out
+    a, b, c = ((tmp_path / f"{name}.png").read_bytes() for name in "abc")
+    assert a == b != c
+    # With a file beside it, those of the file.
+    write_two_queries(task)
+    assert run(task, "--output", tmp_path / "d.png", "--query", 1, *SIZE) == 0
+    assert "test query 1" in capsys.readouterr().out
+    env = env_of(str(task))
+    expected = show.picture(env, Query(AT_THE_SIDE, BENT, env.scene), SMALL)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "d.png")), expected)
+
+
+class OneSphere:
+    """A distribution of scenes."""
+
+    base = Scene()
+
+    def sample(self, rng):
+        return Scene((Sphere((rng.uniform(-1, 1), 0.9, 0.3), 0.1),))
+
+
+def test_scenes_that_vary(tmp_path, monkeypatch):
+    monkeypatch.setitem(TASKS, "one_sphere", Task(OneSphere(), "for a test"))
+    assert run("one_sphere", "--output", tmp_path / "a.png", "--draws", 2, *SIZE) == 0
+    grid = np.asarray(Image.open(tmp_path / "a.png")).astype(int)
+    blue = grid[..., 2] > 30 + grid[..., 0]
+    columns = [np.argwhere(half)[:, 1].mean() for half in (blue[:, :96], blue[:, 96:])]
+    assert abs(columns[0] - columns[1]) > 3
+
+
+# --- The window
+
+
+@pytest.fixture
+def window(monkeypatch):
+    """The window's loop without a window; returns the sleeps that it makes between episodes."""
+    sleeps = []
+    make = show.envs.make
+
+    def without_window(task, render_mode, **arguments):
+        assert render_mode == "human"
+        sleeps.append(make(task, **arguments))
+        return sleeps[0]
+
+    def camera(physicsClientId):
+        return [640, 480, None, np.eye(4).ravel().tolist()]
+
+    monkeypatch.setattr(show, "why_no_window", lambda: None)
+    monkeypatch.setattr(show.envs, "make", without_window)
+    monkeypatch.setattr(show.p, "getDebugVisualizerCamera", camera)
+    return sleeps
+
+
+def test_the_window_goes_on_until_ctrl_c(window, tmp_path, capsys, monkeypatch):
+    def sleep(seconds):
+        window.append(seconds)
+        if len(window) == 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(show.time, "sleep", sleep)
+    (tmp_path / "mine.yaml").write_text("{}")
+    write_two_queries(tmp_path / "mine.yaml")
+    assert run(tmp_path / "mine.yaml", "--query", 1) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("Ctrl-C ends")
+    assert [line.split(",")[0] for line in lines[1:]] == [f"test query {i}" for i in (1, 0, 1)]
+    assert window[1:] == [show.PAUSE] * 3
+
+
+def test_a_display_that_does_not_answer(monkeypatch, capsys):
+    monkeypatch.setattr("roboarm_nmp.envs.world.DISPLAY_SECONDS", 2)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert port > 6000  # a display's number is that of its port, less 6000
+        monkeypatch.setenv("DISPLAY", f"127.0.0.1:{port - 6000}")
+        began = time.monotonic()
+        assert run("wall") == 2
+        assert time.monotonic() - began < 10
+    assert f"DISPLAY is 127.0.0.1:{port - 6000}, which " in capsys.readouterr().err
+    env = envs.make("wall", render_mode="human")  # warns
+    env.reset(seed=0)
+    env.close()
+
+
+def test_the_window_ends_with_escape(window, monkeypatch):
+    monkeypatch.setattr(show.time, "sleep", lambda seconds: p.disconnect(window[0].client))
+    assert run("wall", "--policy", "demo") == 0
+
+
+# --- What goes wrong
+
+
+def test_errors(tmp_path, capsys, monkeypatch):
+    def never(*arguments):
+        raise AssertionError("work was done")
+
+    monkeypatch.setattr(show, "_shoot", never)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    policy = save(tmp_path / "policy.pt")
+    (tmp_path / "broken.pt").write_bytes(policy.read_bytes()[:500])
+    encoder = save(tmp_path / "encoder.pt", kind="encoder")
+    unfit = save(tmp_path / "unfit.pt", env={"goal_type": "ee"})
+    no_action = save(tmp_path / "no_action.pt", NoAction())
+    strange = save(tmp_path / "strange.pt", env={"goal_type": "pose"})
+    (tmp_path / "bad.yaml").write_text("obstacles:\n  - bax: {}\n")
+    (tmp_path / "full.yaml").write_text("obstacles: [sphere: {position: [0, 0, 0.3], radius: 0.3}]")
+    (tmp_path / "empty").mkdir()
+    before = sorted(os.listdir(tmp_path))
+    monkeypatch.setattr("roboarm_nmp.envs.world.MAX_SAMPLING_TRIES", 5)
+    png, gif = ["--output", tmp_path / "out.png"], ["--output", tmp_path / "out.gif"]
+    many = len(load_queries("wall"))
+    cases = [
+        (["moon", *png], "unknown task 'moon': one of no_obstacles"),
+        ([tmp_path / "bad.yaml", *png], "bad.yaml:2: unknown kind of obstacle bax"),
+        ([tmp_path / "none.yaml", *png], "none.yaml: No such file"),
+        ([tmp_path / "full.yaml", *png], "no feasible configuration"),
+        (["wall"], "a window needs a display (DISPLAY is not set); --output FILE.png"),
+        (["wall", "--output", tmp_path / "out.jpg"], "must end in .png or .gif"),
+        (["wall", "--output", tmp_path / "none" / "out.png"], "cannot write"),
+        (["wall", *png, "--query", many], f"no test query {many}: the numbers are 0 to {many - 1}"),
+        (["wall", *png, "--query", many - 1, "--draws", 2], f"no test query {many}"),
+        (["wall", *png, "--query", -1], "--query must be at least 0, got -1"),
+        (["wall", *png, "--draws", 0], "--draws must be at least 1, got 0"),
+        (["wall", *gif, "--draws", 2], "--draws goes with --output FILE.png"),
+        (["wall", *png, "--seed", -1], "--seed must be in [0, 2^32)"),
+        (["wall", *png, "--size", 0, 10], "--size must be in [1, 4096], got 0"),
+        (["wall", *png, "--split", "original"], "has no original queries"),
+        (["wall", *gif, "--policy", "go-to-gaol"], "no such policy: go-to-gaol"),
+        (["wall", *gif, "--policy", tmp_path / "empty"], "no such policy"),
+        (["wall", *gif, "--policy", tmp_path / "broken.pt"], "broken.pt: not a network file"),
+        (["wall", *gif, "--policy", encoder], "encoder.pt: a network, but not a policy"),
+        (["wall", *gif, "--policy", unfit], "unfit.pt: aten.sub.Tensor failed"),
+        (["wall", *gif, "--policy", no_action], "no_action.pt: its output is not float32"),
+        (["wall", *gif, "--policy", strange], "goal_type must be one of"),
+        (["benchmaker_bookshelf_tall", *gif, "--policy", "demo"], "has no demonstrations"),
+    ]
+    for arguments, message in cases:
+        assert run(*arguments) == 2, arguments
+        output = capsys.readouterr().err
+        assert message in output, arguments
+        assert output.startswith("error: ") and output.count("\n") == 1
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+def test_an_old_picture_stays_until_the_new_one_is_whole(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "a.png"
+    path.write_bytes(b"old")
+
+    def full(descriptor):
+        raise OSError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)  # after something was written, somewhere
+        assert run("wall", "--output", path, *SIZE) == 2
+    assert "the disk is full" in capsys.readouterr().err
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]
+    assert run("wall", "--output", path, *SIZE) == 0
+    assert path.read_bytes().startswith(b"\x89PNG") and os.listdir(tmp_path) == ["a.png"]
+
+
+def test_an_interrupt_writes_nothing(tmp_path, capsys, monkeypatch):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(show, "_shoot", interrupt)
+    assert run("wall", "--output", tmp_path / "a.png", *SIZE) == 130
+    assert "nothing was written" in capsys.readouterr().err and os.listdir(tmp_path) == []
+
+
+def test_the_command_without_torch(tmp_path):
+    code = (
+        "import sys; from envs import show; code = show.main(sys.argv[1:]);"
+        "assert 'torch' not in sys.modules; sys.exit(code)"
+    )
+    root = str(ROOT)
+    result = subprocess.run(
+        [sys.executable, "-c", code, "wall", "--output", str(tmp_path / "a.png"), *SIZE],
+        env=os.environ | {"PYTHONPATH": root},
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stderr
+    assert f"{tmp_path / 'a.png'}: written, wall, test query 0" in result.stdout

@@ -1,0 +1,106 @@
+"""envs/training/flags.py: a flag outside of its range ends a trainer before anything is made."""
+
+import json
+import sys
+
+import pytest
+from paths import ROOT
+from trainers import PATHS, load
+
+from roboarm_nmp.envs.training import runs
+
+ENCODERS = ("vae", "vqvae", "pointnet2", "field")
+PATHS |= {name: ROOT / "scene_embedding_train" / f"{name}.py" for name in ENCODERS}
+REINFORCEMENT = ("sac_her_mp", "td3_her_mp")
+POLICIES = (*REINFORCEMENT, "bc", "dagger")
+OF_ALL = (
+    *(("--seed", bad) for bad in ("-1", "4294967296")),
+    *(("--threads", bad) for bad in ("0", "100000")),
+    *(("--device", bad) for bad in ("foo", "cuda:99", "")),
+    *(("--exp-name", bad) for bad in ("../../x", "a/b")),
+    ("--batch-size", "0"),
+    ("--eval-every", "0"),
+    ("--runs-dir", "/dev/null/runs"),
+)
+OF_REINFORCEMENT = (
+    *(("--num-envs", bad) for bad in ("0", "-3")),
+    *(("--updates-per-step", bad) for bad in ("nan", "-1", "inf")),
+    *(("--gamma", bad) for bad in ("nan", "1.1")),
+    ("--total-timesteps", "0"),
+    ("--policy-lr", "-1"),
+    ("--num-hidden-layers", "0"),
+    ("--action-scale", "nan"),
+    ("--policy-frequency", "0"),
+    ("--her-probability", "2"),
+    ("--demo-prob", "-0.1"),
+    ("--horizon", "0"),
+    ("--max-step", "0"),
+    ("--stop-at-success", "90"),
+)
+CASES = [
+    *((script, *case) for script in (*POLICIES, *ENCODERS) for case in OF_ALL),
+    *((script, *case) for script in REINFORCEMENT for case in OF_REINFORCEMENT),
+    *((script, f"--{name}-queries", "0") for script in POLICIES for name in ("eval", "test")),
+    ("sac_her_mp", "--alpha", "0"),
+    ("sac_her_mp", "--tau", "0"),
+    ("sac_her_mp", "--target-entropy", "-inf"),
+    ("td3_her_mp", "--exploration-noise", "-0.1"),
+    ("bc", "--num-demos", "0"),
+    ("bc", "--num-modes", "0"),
+    ("dagger", "--keep-distance", "nan"),
+    ("dagger", "--round-every", "-1"),
+    ("dagger", "--round-queries", "0"),
+    ("dagger", "--policy-average", "0"),
+    ("vae", "--kl-weight", "-1"),
+    ("pointnet2", "--num-centres", "32 0"),
+    ("pointnet2", "--radii", "nan 0.4"),
+    ("field", "--spread", "0"),
+    ("field", "--latent-noise", "-1"),
+]
+
+
+@pytest.fixture(scope="module")
+def args_of():
+    """Name of a trainer -> its `Args`."""
+    return {name: load(name).Args for name in (*POLICIES, *ENCODERS)}
+
+
+@pytest.mark.parametrize(("script", "flag", "value"), CASES)
+def test_a_flag_out_of_range_is_refused_by_name(
+    script, flag, value, args_of, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [script, flag, *(value.split() or [""])])
+    with pytest.raises(SystemExit) as ended:
+        runs.parse_args(args_of[script])
+    assert str(ended.value.code).startswith(f"{flag} ")
+    assert str(ended.value.code).count("\n") == 0
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("script", (*POLICIES, *ENCODERS))
+def test_defaults_are_in_their_ranges_and_help_shows_these(
+    script, args_of, monkeypatch, capsys, tmp_path
+):
+    monkeypatch.setattr(sys, "argv", [script, "--runs-dir", str(tmp_path)])
+    assert runs.parse_args(args_of[script]).seed == 1
+    monkeypatch.setattr(sys, "argv", [script, "--help"])
+    with pytest.raises(SystemExit):
+        runs.parse_args(args_of[script])
+    shown = capsys.readouterr().out
+    assert "--seed INT IN [0, 2^32)" in shown and "--batch-size INT >= 1" in shown
+
+
+def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(
+    args_of, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(sys, "argv", ["bc.py", "--runs-dir", str(tmp_path / "runs")])
+    args = runs.parse_args(args_of["bc"])
+    monkeypatch.setattr("time.time", lambda: 1_795_000_000.0)
+    folders = [runs.run_folder(args, "wall") for _ in range(3)]
+    assert [folder.name.removeprefix("wall__bc__1__1795000000") for folder in folders] == [
+        "",
+        "_2",
+        "_3",
+    ]
+    assert all(json.loads((folder / "args.json").read_text())["seed"] == 1 for folder in folders)

@@ -1,0 +1,237 @@
+"""envs/training/protocol.py: what trainers count, and under which rules. (Whole runs: test_trainers.py.)"""
+
+import json
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from roboarm_nmp import envs
+from roboarm_nmp.clean_rl_scripts.evaluate import evaluate
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
+from roboarm_nmp.envs.policies.registry import PolicyError, make_policy
+from roboarm_nmp.envs.policies.safety_filter import LastLayer
+from roboarm_nmp.envs.training import protocol
+
+
+class Toward(torch.nn.Module):
+    """Straight to the goal configuration, in steps of `size` (L2)."""
+
+    def __init__(self, size):
+        super().__init__()
+        self.size = size
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        apart = desired_goal - observation[:, :7]
+        return self.size * apart / torch.linalg.vector_norm(apart, dim=1, keepdim=True)
+
+
+@pytest.mark.parametrize("number", [1, 3, 8])
+def test_what_is_counted_is_what_happens_query_by_query(number):
+    queries = load_queries("wall", "validation")[:6]
+    policy = Toward(0.03)
+    found = protocol.evaluate(
+        policy, protocol.make_envs("wall", number, goal_type="config"), queries, "cpu"
+    )
+    env, outcomes = envs.make("wall", goal_type="config"), []
+    for query in queries:
+        observation, _ = env.reset_specific(*query)
+        over = False
+        while not over:
+            batch = {name: torch.tensor(value[None]) for name, value in observation.items()}
+            observation, _, terminated, truncated, info = env.step(policy(**batch)[0].numpy())
+            over = terminated or truncated
+        outcomes.append((info["is_success"], info["collision_so_far"], info["elapsed_steps"]))
+    assert len({outcome[:2] for outcome in outcomes}) > 1  # some touch or fail, and some do not
+    assert found == pytest.approx(
+        {
+            "success_rate": np.mean([success for success, _, _ in outcomes]),
+            "clean_success_rate": np.mean([s and not touched for s, touched, _ in outcomes]),
+            "collision_rate": np.mean([touched for _, touched, _ in outcomes]),
+            "episode_length": np.mean([steps for _, _, steps in outcomes]),
+        }
+    )
+
+
+def test_a_last_layer_has_its_own_state_in_every_episode():
+    queries = load_queries("random_boxes_hard", "validation")[:7]
+    straight, layer = Toward(0.03), LastLayer(0.012)
+
+    def policy(observation, achieved_goal, desired_goal, **_):
+        return straight(observation, achieved_goal, desired_goal)
+
+    several, one = (
+        protocol.make_envs("random_boxes_hard", number, goal_type="config", proximity="obstacles")
+        for number in (3, 1)
+    )
+    found, outcomes = protocol.evaluate(policy, several, queries, "cpu", layer), []
+    for i, query in enumerate(queries):
+
+        def act(seen):
+            return policy(**protocol.stack([seen], "cpu"))[0].numpy()
+
+        act = layer.around(act, one[0], np.random.default_rng([0, i]))
+        observation, _ = one[0].reset_specific(*query)
+        over = False
+        while not over:
+            observation, _, terminated, truncated, info = one[0].step(act(observation))
+            over = terminated or truncated
+        outcomes.append((info["is_success"], info["elapsed_steps"]))
+    success, steps = np.mean(outcomes, axis=0)
+    assert found["success_rate"] == success and found["episode_length"] == steps
+    bare = protocol.evaluate(policy, several, queries, "cpu")
+    assert found["collision_rate"] < bare["collision_rate"]
+
+
+class Hesitant(torch.nn.Module):
+    """Toward the goal, in turns fast and slowly: steps and moves are in the memory."""
+
+    memory_size = 8
+
+    def forward(self, observation, achieved_goal, desired_goal, memory):
+        steps, moved = memory[:, :1], memory[:, 1:]
+        speed = 0.03 + 0.02 * torch.sin(steps) - 0.002 * torch.abs(moved)
+        action = speed * torch.tanh(10 * (desired_goal - observation[:, :7]))
+        return action, torch.cat([steps + 1, moved + action], dim=1)
+
+
+def test_a_memory_is_fresh_in_every_episode_and_the_same_by_name(tmp_path):
+    arguments, queries = {"goal_type": "config"}, load_queries("wall", "validation")[:5]
+    several = protocol.make_eval_envs("wall", 3, **arguments)
+    found, policy, outcomes = protocol.evaluate(Hesitant(), several, queries, "cpu"), Hesitant(), []
+    env = envs.make("wall", **arguments)
+    for query in queries:
+        observation, _ = env.reset_specific(*query)
+        over, memory = False, torch.zeros(1, 8)
+        while not over:
+            action, memory = policy(**protocol.stack([observation], "cpu"), memory=memory)
+            observation, _, terminated, truncated, info = env.step(action[0].numpy())
+            over = terminated or truncated
+        assert memory[0, 0] == info["elapsed_steps"]
+        outcomes.append((info["is_success"], info["elapsed_steps"]))
+    assert len({steps for _, steps in outcomes}) == 5
+    success, steps = np.mean(outcomes, axis=0)
+    assert found["success_rate"] == success and found["episode_length"] == steps
+
+    args = SimpleNamespace(task="wall", exp_name="hesitant", seed=1)
+    protocol.save_policy(tmp_path, policy, several, "cpu", args, arguments, 7)
+    saved = load_network(tmp_path / "policy.pt")
+    assert saved.metadata["memory"] == 8 and "memory" in saved.inputs
+    assert protocol.evaluate(saved, several, queries, "cpu") == found
+    picture = protocol.picture_of_rollout(saved, several[0], queries[0], "cpu", frames=3)
+    assert (
+        picture == protocol.picture_of_rollout(policy, several[0], queries[0], "cpu", frames=3)
+    ).all()
+    result = evaluate(tmp_path, "wall", split="validation", num_queries=5)
+    assert result["success_rate"] == success
+    reached = [steps for success, steps in outcomes if success]
+    assert result["mean_steps"] == pytest.approx(np.mean(reached))
+
+
+def test_in_a_detour_of_the_last_layer_nothing_is_remembered():
+    arguments = {"goal_type": "config", "proximity": "obstacles"}
+    queries = load_queries("random_boxes_hard", "validation")[:3]
+    several, asked = protocol.make_eval_envs("random_boxes_hard", 3, **arguments), []
+
+    class Counting(torch.nn.Module):
+        memory_size = 1
+
+        def forward(self, observation, achieved_goal, desired_goal, memory, **_):
+            asked.append(memory[:, 0])
+            return 0.05 * (desired_goal - observation[:, :7]), memory + 1
+
+    layer = LastLayer()
+    for query in queries:
+        asked.clear()
+        result = protocol.evaluate(Counting(), several[:1], [query], "cpu", layer)
+        if result["episode_length"] > asked[-1] + 1:  # there were detours
+            break
+    assert result["episode_length"] == len(asked) > asked[-1] + 1
+
+
+@pytest.mark.parametrize("size", [-1, 2.0, True, 10**9])
+def test_a_memory_that_makes_no_sense_is_refused(size):
+    policy = SimpleNamespace(memory_size=size)
+    with pytest.raises(PolicyError, match="memory has 0 to 65,536 numbers"):
+        protocol.evaluate(policy, [], [], "cpu")
+
+
+def test_a_file_whose_memory_is_not_what_it_returns(tmp_path):
+    env = envs.make("wall", goal_type="config")
+    example = protocol.stack([env.reset(seed=0)[0]] * 2, "cpu")
+    metadata = {"kind": "policy", "env": {"goal_type": "config"}}
+    path = tmp_path / "policy.pt"
+    save_network(path, Toward(0.05), example, metadata | {"memory": 8})
+    with pytest.raises(PolicyError, match="not a sequence of 2"):
+        make_policy(path, env)
+    example["memory"] = torch.zeros(2, 8)
+    for size, message in ((0, "needs memory"), (7, "do not fit|failed"), (9, "do not fit|failed")):
+        save_network(path, Hesitant(), example, metadata | {"memory": size})
+        with pytest.raises(PolicyError, match=message):
+            make_policy(path, env)
+
+
+def test_of_equally_good_policies_the_latest_is_the_best(monkeypatch):
+    rates = iter([0.5, 0.7, 0.6, 0.7, 0.2])
+    monkeypatch.setattr(protocol, "evaluate", lambda *_: {"success_rate": next(rates)})
+    monkeypatch.setattr(protocol, "picture_of_rollout", lambda *_: None)
+    writer = SimpleNamespace(add_scalar=lambda *_: None, add_image=lambda *_, **__: None)
+    progress, best = {"best_success": -1.0, "best_step": 0}, []
+    for step in range(1, 6):
+        protocol.validate(None, [None], [None], "cpu", writer, step, progress)
+        best.append((progress["best_step"], progress["best_success"]))
+    assert best == [(1, 0.5), (2, 0.7), (2, 0.7), (4, 0.7), (4, 0.7)]
+
+
+def result_of(run, capsys, **env_arguments):
+    """`result.json` and the printed lines for a policy that needs more than 50 steps."""
+    args = SimpleNamespace(task="no_obstacles", goal_type="config", exp_name="x", seed=1)
+    env_arguments |= {"goal_type": "config"}
+    made = protocol.make_eval_envs(args.task, 3, **env_arguments)
+    protocol.save_policy(run, Toward(0.01), made, "cpu", args, env_arguments, 7)
+    queries = load_queries("no_obstacles", "test")[:3]
+    progress = {"seconds": 2.0, "best_success": 0.5, "best_step": 7}
+    protocol.final_test(run, args, env_arguments, queries, "cpu", progress, 10)
+    return json.loads((run / "result.json").read_text()), capsys.readouterr().out
+
+
+def test_the_test_is_run_under_the_standard_rules(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(protocol, "asdict", vars)
+    standard, line = result_of(tmp_path, capsys)
+    assert standard["success_rate"] > 0.5 and standard["episode_length"] > 50
+    assert standard["rules"] == standard["rules_in_training"]
+    assert (standard["policy_step"], standard["steps"], standard["seconds"]) == (7, 10, 2)
+    assert standard["validation_success_rate"] == 0.5
+    assert "trained with" not in line and "3 test queries: success" in line
+    assert standard["deviations"] == {} and "not comparable" not in line
+    for other in ({"horizon": 50}, {"stop_on_collision": True}):
+        result, lines = result_of(tmp_path, capsys, **other)
+        assert result["rules"] == {"horizon": 400, "stop_on_collision": False}
+        assert result["rules_in_training"] == result["rules"] | other
+        assert result["success_rate"] == standard["success_rate"]
+        assert result["episode_length"] == standard["episode_length"]
+        assert "tested under the standard rules, 400 steps, contacts allowed:" in lines
+
+
+def test_other_steps_are_not_comparable(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(protocol, "asdict", vars)
+    result, lines = result_of(tmp_path, capsys, max_step=0.02)
+    assert result["deviations"] == {"max_step": 0.02}
+    assert "not comparable: max_step is 0.02, not 0.03" in lines
+    assert result["rules"] == result["rules_in_training"]
+
+
+def test_a_trainer_without_replay_buffer_or_demonstrations():
+    @dataclass
+    class Args(protocol.EnvFlags):
+        task: str = "wall"
+        num_envs: int = 2
+
+    made = protocol.make_training_envs(Args(goal_type="config", velocities=True))
+    assert len(made) == 2
+    for observation in protocol.begin_episodes(made, seed=1, step=0):
+        assert observation["observation"].shape == (17,)
+        assert observation["desired_goal"].shape == (7,)

@@ -1,0 +1,73 @@
+"""Trainers as modules and as commands, for the tests."""
+
+import importlib.util
+import runpy
+import sys
+from unittest.mock import patch
+
+import pytest
+import torch
+from paths import ROOT
+
+PATHS = {
+    "sac_her_mp": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
+    "td3_her_mp": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
+    "bc": ROOT / "bc_script" / "bc.py",
+    "dagger": ROOT / "bc_script" / "dagger.py",
+}
+# Those that need nothing but a task; dagger.py needs roadmap paths.
+TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
+NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
+GPU = pytest.param("cuda", marks=NO_GPU)  # a `--device`
+TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
+TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1200"
+TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --eval-queries 3"
+TINY_BC += " --test-queries 4 --total-updates 1200"
+TINY_DAGGER = "--hidden-size 16 --token-size 16 --num-blocks 1 --batch-size 16 --pool-size 100"
+TINY_DAGGER += " --examples-per-update 10 --total-updates 40 --round-every 15 --round-queries 1"
+TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1"
+
+
+def load(trainer):
+    """A trainer's script as a module."""
+    spec = importlib.util.spec_from_file_location(trainer, PATHS[trainer])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[trainer] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def command(trainer, folder, *flags):
+    """A run of seconds; later flags win."""
+    tiny = {"bc": TINY_BC, "dagger": TINY_DAGGER}.get(trainer, TINY).split()
+    return [sys.executable, str(PATHS[trainer]), "--runs-dir", str(folder), *tiny, *flags]
+
+
+def run_script(trainer, folder, *flags):
+    """The folder of such a run, which is made in this process: without seconds of imports."""
+    run_here(*command(trainer, folder, *flags)[1:])
+    return next(folder.iterdir())
+
+
+def run_here(script, *arguments):
+    """A script in this process, so that what it imports can be changed first.
+
+    It leaves torch's settings as they were.
+    """
+    state, threads = torch.get_rng_state(), torch.get_num_threads()
+    argv = patch.object(sys, "argv", [str(script), *map(str, arguments)])
+    with argv, patch.object(sys, "excepthook", sys.excepthook):
+        try:
+            runpy.run_path(str(script), run_name="__main__")
+        finally:
+            torch.use_deterministic_algorithms(False)
+            torch.set_num_threads(threads)
+            torch.set_rng_state(state)
+
+
+def refusal(trainer, capsys, folder, *flags):
+    """What such a run says of flags with which it ends before it has made anything."""
+    with pytest.raises(SystemExit) as end:
+        run_here(*command(trainer, folder, *flags)[1:])
+    assert end.value.code not in (None, 0) and not list(folder.iterdir())
+    return f"{capsys.readouterr().err}{end.value.code}"

@@ -1,0 +1,215 @@
+"""Senseless arguments of environments, scenes, sensors and policies' layers; senseless actions."""
+
+import dataclasses
+import random
+import warnings
+
+import numpy as np
+import pybullet as p
+import torch
+
+from attacks.children import RAN, REFUSED
+from roboarm_nmp import envs
+from roboarm_nmp.envs import arm_env, panda
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.perception import sensors
+from roboarm_nmp.envs.perception.sensors import SensorWorld
+from roboarm_nmp.envs.policies.safety_filter import LastLayer
+from roboarm_nmp.envs.scenes import primitives as scenes
+from roboarm_nmp.envs.world import World
+
+NUMBERS = (0, 1, -1, 2, 3, 0.5, -0.5, 1e-6, 20, 1e4, 2**31, 2**63, 10**400, 1e300, 1e-320)
+ODD = (
+    *NUMBERS,
+    *(float("nan"), float("inf"), -float("inf"), True, None, "", "ee", "x", b"x", 1j, (), [], {}),
+    *((1, 2), (-1, 5), (70_000, 70_000), (0.5, 0.5), [1, 2, 3], {"a": 1}, object(), range(3)),
+    np.float32(3), np.array(2), np.arange(7), np.zeros((0, 7)), np.datetime64("2026-01-01"),
+    *(torch.tensor(1.0), torch.zeros(7, dtype=torch.bfloat16), np.ma.masked, slice(None)),
+)  # fmt: skip
+ARGUMENTS = (
+    *("episodes_per_scene", "goal_type", "ee_tolerance", "config_tolerance", "action_mode"),
+    *("max_step", "horizon", "stop_on_collision", "reward", "sink_state", "velocities"),
+    *("render_mode", "render_size", "encoder", "proximity", "scene", "no_such_argument"),
+)
+GOOD_VALUES = {
+    "episodes_per_scene": (1, 3),
+    "goal_type": arm_env.GOAL_TYPES,
+    "action_mode": arm_env.ACTION_MODES,
+    "horizon": (1, 50),
+    "velocities": (False, True),
+    "render_mode": (None, "rgb_array"),
+    "encoder": (None, "oracle", "points"),
+    "proximity": (None, "obstacles", "points"),
+}
+OF_SCENES = ("position", "size", "orientation", "radius", "length", "obstacles", "table", "floor")
+
+
+def make_and_step(rng):
+    """An environment with one to three odd arguments."""
+    chosen = rng.sample(ARGUMENTS, rng.randint(1, 3))
+    arguments = {
+        name: rng.choice(GOOD_VALUES.get(name, ODD) if rng.random() < 0.3 else ODD)
+        for name in chosen
+    }
+    task = rng.choice(["wall", "random_boxes_hard"]) if rng.random() < 0.95 else rng.choice(ODD)
+    try:
+        env = envs.make(task, **arguments)
+    except TypeError as error:
+        # A name that does not exist, and what is no text, scene or path, may be told by Python.
+        if {"no_such_argument", "scene"} & set(chosen) or not isinstance(task, str):
+            return REFUSED
+        raise error
+    try:
+        env.reset(seed=rng.randrange(2**32))
+        env.action_space.seed(0)
+        for _ in range(3):
+            observation, reward, *_ = env.step(env.action_space.sample())
+            assert np.isfinite(observation["observation"]).all() and np.isfinite(reward)
+        if arguments.get("render_mode") == "rgb_array":
+            env.render()
+    finally:
+        env.close()
+    return RAN
+
+
+def act_oddly(rng):
+    """An odd action: it is refused and nothing moves, or it is a step like any other."""
+    env = _environment()
+    numbers = [rng.choice(NUMBERS) for _ in range(7)]
+    action = rng.choice(
+        [
+            *(rng.choice(ODD), numbers, np.array(numbers, object), np.zeros(rng.randint(0, 9))),
+            *(np.zeros((1, 7)), np.zeros(7, complex), np.zeros(7, "M8[s]"), np.zeros(7, "S3")),
+            np.ma.masked_array(np.zeros(7), [True] * 7),
+            *(torch.zeros(7), torch.zeros(7, dtype=torch.bfloat16), torch.zeros(7).to_sparse()),
+            *(np.full(7, rng.choice([np.nan, np.inf, 1e38, -1e30])), ["0"] * 7, [None] * 7),
+            [0.0] * 6 + [rng.choice(ODD)],
+        ]
+    )
+    before = _joints(env)
+    try:
+        observation, *_ = env.step(action)
+    except ValueError:
+        assert _joints(env) == before, "it moved"
+        return REFUSED
+    assert np.isfinite(observation["observation"]).all()
+    return RAN
+
+
+def begin_oddly(rng):
+    """Odd starts, goals and scenes."""
+    env = _environment()
+    good = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
+    query = [good, good, rng.choice([None, scenes.Scene()])]
+    for _ in range(rng.randint(1, 2)):
+        place = rng.randrange(3)
+        query[place] = rng.choice(ODD)
+        if place < 2 and rng.random() < 0.5:
+            query[place] = good.astype(object)
+            query[place][rng.randrange(7)] = rng.choice(NUMBERS)
+    try:
+        observation, _ = env.reset_specific(*query)
+    except ValueError:
+        return REFUSED
+    except TypeError:
+        if isinstance(query[2], (scenes.Scene, type(None))):
+            raise
+        return REFUSED
+    assert np.isfinite(observation["observation"]).all()
+    return RAN
+
+
+def build(rng):
+    """A scene of odd obstacles, in the engine and in the compiled checks."""
+    kind = rng.choice([scenes.Box, scenes.Cylinder, scenes.Sphere])
+    good = {"position": (0.5, 0.1, 0.3), "size": (0.1, 0.1, 0.2), "radius": 0.1, "length": 0.2}
+    fields = {f.name: good.get(f.name, scenes.IDENTITY) for f in dataclasses.fields(kind)}
+    arguments = {}
+    if rng.random() < 0.7:
+        name = rng.choice(list(fields))
+        fields[name] = rng.choice(ODD)
+        if isinstance(good.get(name, scenes.IDENTITY), tuple) and rng.random() < 0.7:
+            size = len(good.get(name, scenes.IDENTITY))
+            fields[name] = tuple(rng.choice((*NUMBERS, 0.3)) for _ in range(size))
+    else:
+        arguments[rng.choice(["table", "floor", "friction", "obstacles"])] = rng.choice(ODD)
+    try:
+        scene = scenes.Scene(**{"obstacles": (kind(**fields),)} | arguments)
+    except (TypeError, ValueError):
+        return REFUSED
+    world = World(scene)
+    world.in_collision(panda.denormalise(np.zeros(7)))
+    world.close()
+    checker = CollisionChecker(scene)
+    assert np.isfinite(checker.nearest(np.zeros((1, 7))).distance).all()
+    return RAN
+
+
+def look(rng):
+    """An odd sensor."""
+    kind = rng.choice([sensors.Camera, sensors.PointCloud])
+    fields = {"eye": (1.6, 0.0, 0.8)}
+    fields |= {"size": (8, 8)} if kind is sensors.Camera else {"num_samples": 64}
+    names = [field.name for field in dataclasses.fields(kind)]
+    for name in rng.sample(names, rng.randint(1, 2)):
+        fields[name] = rng.choice(ODD)
+        if name in ("eye", "target", "up") and rng.random() < 0.7:
+            fields[name] = tuple(rng.choice(NUMBERS) for _ in range(3))
+    try:
+        sensor = kind(**fields)
+    except (TypeError, ValueError):
+        return REFUSED
+    pixels = np.prod(getattr(sensor, "size", None) or sensor.num_samples)
+    if pixels > 10**6:  # allowed, and slow
+        return RAN
+    world = SensorWorld()
+    world.show(scenes.Scene(), sensors.POSE)
+    for output, space in sensor.space.spaces.items():
+        assert space.contains(sensor.observe(world)[output]), output
+    world.close()
+    return RAN
+
+
+def add_layer(rng):
+    """An odd last layer."""
+    try:
+        layer = LastLayer(rng.choice(ODD), rng.choice((True, False, *ODD)))
+    except (TypeError, ValueError):
+        return REFUSED
+    move = layer(np.full(7, 0.01), np.zeros((9, 8)), max_step=0.03)
+    assert np.isfinite(move).all()
+    return RAN
+
+
+_kept = {}
+
+
+def _environment():
+    """The same for all attempts of a process."""
+    if not _kept:
+        _kept["env"] = envs.make("wall")
+    _kept["env"].reset(seed=0)
+    return _kept["env"]
+
+
+def _joints(env):
+    return [
+        state[:2] for state in p.getJointStates(env.robot, range(7), physicsClientId=env.client)
+    ]
+
+
+KINDS = (make_and_step, make_and_step, act_oddly, act_oddly, begin_oddly, build, look, add_layer)
+
+
+def attempts(seed, folder):
+    """The attempt: a function from a number to what came of odd arguments."""
+
+    def attempt(number):
+        warnings.simplefilter("ignore")  # NumPy's
+        rng = random.Random(f"{seed} {number}")
+        try:
+            return KINDS[number % len(KINDS)](rng)
+        except ValueError:
+            return REFUSED
+
+    return attempt

@@ -1,0 +1,197 @@
+"""Commands with one to three flags at random values."""
+
+import contextlib
+import dataclasses
+import importlib
+import os
+import random
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+from paths import ROOT
+
+from attacks import children
+from attacks.children import RAN, REFUSED
+
+sys.path.append(str(ROOT))  # where `benchmarks` is
+MEGABYTES = 8000
+SECONDS = 60  # what is not refused is a whole run, and trials of a sweep are processes of their own
+NUMBERS = (0, -1, -5, 1, 2, 3.5, 2**31, 2**63, 2**70, 10**30, 1e-300, 1e-320, 1e300, 0.5)
+WORDS = ("nan", "inf", "-inf", "", " ", "x", "None", "../../x", "/proc", "/dev/null", "/dev/null/x")
+WORDS += ("no/such/folder", "a" * 300, "ü\n", "1,5", "1e3", "0x10", "--", "-", "wall", "empty.h5")
+PLAIN = 20  # the round of attempts in which every command has no odd flags: they do run
+# Where large numbers are only long work.
+LONG = ("total_timesteps", "total_updates", "num", "num_test", "num_validation", "scenes", "trials")
+LONG += ("paths_per_scene", "steps", "horizon", "tries", "num_nodes", "round_queries", "draws")
+LONG += (
+    "num_queries",
+    "round_labels",
+    "attempts",
+    "max_checks",
+    "simplify",
+    "time_limit",
+    "updates_per_step",
+)
+
+RUN = "--eval-queries 1 --test-queries 1 --runs-dir runs"
+RL = f"--task wall --num-envs 1 --hidden-size 8 --batch-size 4 --learning-starts 20 {RUN}"
+RL += " --total-timesteps 60 --eval-every 60 --horizon 20 --buffer-size 100"
+TINY = {
+    "roboarm_nmp.clean_rl_scripts.sac_her_mp": RL,
+    "roboarm_nmp.clean_rl_scripts.td3_her_mp": RL,
+    "roboarm_nmp.bc_script.bc": f"--task wall --hidden-size 8 --batch-size 4 --num-demos 5 {RUN}"
+    " --total-updates 4 --eval-every 4",
+    "roboarm_nmp.bc_script.dagger": f"--paths roadmaps --task wall --hidden-size 8 --token-size 8 {RUN}"
+    " --num-blocks 1 --batch-size 4 --pool-size 20 --examples-per-update 4 --total-updates 4"
+    " --eval-every 4 --round-every 2 --round-queries 1",
+    "roboarm_nmp.scene_embedding_train.vae": "--observations observations --total-updates 2 --eval-every 2"
+    " --batch-size 1 --picture-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
+    "roboarm_nmp.scene_embedding_train.vqvae": "--observations observations --total-updates 2 --eval-every 2"
+    " --batch-size 1 --picture-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
+    "roboarm_nmp.scene_embedding_train.pointnet2": "--observations observations --total-updates 2"
+    " --eval-every 2 --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs"
+    " --num-points 16 --num-centres 8 4 --num-neighbours 4",
+    "roboarm_nmp.scene_embedding_train.field": "--observations observations --total-updates 2 --eval-every 2"
+    " --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs --num-points 16",
+    "roboarm_nmp.clean_rl_scripts.evaluate": "--policy go-to-goal --task wall --num-queries 1 --json a.json",
+    "roboarm_nmp.demo_generation.collect": "--task wall --num 1 --workers 1 --output demos.h5",
+    "roboarm_nmp.demo_generation.make_queries": "--task mine.yaml --num-test 2 --num-validation 1 --workers 1"
+    " --output queries.h5",
+    "roboarm_nmp.demo_generation.roadmaps": "--output paths --task wall --scenes 1 --paths-per-scene 2"
+    " --num-nodes 50 --workers 1",
+    "roboarm_nmp.demo_generation.verify": "demos_of_wall.h5 --workers 1",
+    "demo_generation.export_minari": "--file demos_of_wall.h5 --overwrite",
+    "roboarm_nmp.scene_embedding_train.collect": "--num 1 --image-size 16 --num-samples 100 --workers 1"
+    " --output seen",
+    "roboarm_nmp.envs.show": "wall --output a.png --size 32 32",
+    "roboarm_nmp.clean_rl_scripts.sweep": "trainer.py --search x=1..3 --trials 1 --folder sweep",
+    "benchmarks.paper_tables": "--list --runs-dir runs",
+}
+TRAINER = """
+import json, sys
+from dataclasses import dataclass
+from pathlib import Path
+import tyro
+
+@dataclass
+class Args:
+    x: int = 1
+    runs_dir: Path = Path("runs")
+
+args = tyro.cli(Args)
+run = args.runs_dir / "run"
+run.mkdir(parents=True)
+(run / "result.json").write_text(json.dumps({"validation_success_rate": 1 / args.x}))
+"""
+
+
+def attempts(seed, folder):
+    """The attempt: a function from a number to what came of a command with such flags."""
+    fields = {name: _fields(name) for name in TINY}
+    given = folder / "given"
+    given.mkdir()
+    _make_inputs(given)
+    os.environ["MINARI_DATASETS_PATH"] = "minari"  # of each attempt's folder
+
+    def attempt(number):
+        rng = random.Random(f"{seed} {number}")
+        module = list(TINY)[number % len(TINY)]
+        plain = number // len(TINY) == PLAIN
+        odd = [] if plain else _flags(fields[module], rng)
+        here = folder / str(number)
+        shutil.rmtree(here, ignore_errors=True)
+        shutil.copytree(given, here, symlinks=True)
+        before = _everything(here)
+        try:
+            code, said = _run(module, [*TINY[module].split(), *odd], here)
+            made = _everything(here) - before
+        finally:
+            shutil.rmtree(here)
+        if children.repeating:
+            print(said)
+        if "Traceback" in said:
+            return f"traceback of {module}: {said.strip().splitlines()[-1][:120]}"
+        if any(not path.name.isdigit() for path in folder.iterdir() if path != given):
+            return f"{module} left something elsewhere"
+        if plain and code != 0:
+            return f"{module} does not run"
+        if code == 0 or "training has diverged" in said:
+            return RAN
+        if any(path.name.endswith((".tmp", ".part", ".journal")) for path in made):
+            return f"{module} left {sorted(path.name for path in made)}"
+        return REFUSED if not made else f"{module}: late, after {sorted(p.name for p in made)[:3]}"
+
+    return attempt
+
+
+def _everything(folder):
+    return set(folder.rglob("*"))
+
+
+def _fields(module):
+    args = importlib.import_module(module).Args
+    return {field.name: field for field in dataclasses.fields(args)}
+
+
+def _flags(fields, rng):
+    """One to three flags, as they stand in a command line."""
+    flags = []
+    for name in rng.sample(sorted(fields), min(len(fields), rng.randint(1, 3))):
+        flag = f"--{name.replace('_', '-')}"
+        if str(fields[name].type).startswith(("bool", "<class 'bool'")):
+            flags.append(rng.choice([flag, f"--no-{flag[2:]}"]))
+            continue
+        values = [one for one in NUMBERS if name not in LONG or not 5 < one < 2**62]
+        value = rng.choice(
+            [*values, *(word for word in WORDS if word != "None" or name not in LONG)]
+        )
+        flags += [flag, str(value)] + [str(rng.choice(values))] * (name in ("size", "radii"))
+    return flags
+
+
+def _run(module, arguments, folder):
+    """The exit code and what was said, of a command run in this process, in a folder."""
+    os.chdir(folder)
+    sys.argv = [module, *arguments]
+    said, streams = open("said", "w+"), (os.dup(1), os.dup(2))  # noqa: SIM115 (closed below)
+    with said, contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        os.dup2(said.fileno(), 1)
+        os.dup2(said.fileno(), 2)
+        try:
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+            code = 0
+        except SystemExit as end:
+            code = end.code or 0
+            if isinstance(code, str):
+                print(code, file=said)
+        except BaseException as error:
+            sys.excepthook(type(error), error, error.__traceback__)
+            code = 1
+        said.flush()
+        said.seek(0)
+        text = said.read()
+    for number, stream in enumerate(streams, start=1):
+        os.dup2(stream, number)
+    Path("said").unlink()
+    return code, text
+
+
+def _make_inputs(folder):
+    """What the tiny commands need."""
+    from roboarm_nmp.demo_generation import collect, roadmaps
+    from roboarm_nmp.envs.scenes.files import save_scene
+    from roboarm_nmp.envs.scenes.primitives import Scene
+    from roboarm_nmp.scene_embedding_train import collect as observe
+
+    save_scene(Scene(), folder / "mine.yaml")
+    (folder / "trainer.py").write_text(TRAINER)
+    (folder / "empty.h5").touch()
+    args = collect.Args("wall")
+    options = {name: getattr(args, name) for name in collect.OPTIONS}
+    collect.collect(folder / "demos_of_wall.h5", 1, options, progress=False)
+    small = {"scenes": 2, "paths_per_scene": 4, "num_nodes": 100, "workers": 1}
+    roadmaps.collect(roadmaps.Args(folder / "roadmaps", **small), progress=False)
+    small = {"num": 4, "image_size": 32, "num_samples": 400, "workers": 1}
+    observe.collect(observe.Args(output=folder / "observations", **small), progress=False)
