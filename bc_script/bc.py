@@ -74,10 +74,12 @@ class Args(runs.RunFlags):  # those of the run's folder are in `envs/training/ru
     encoder: str | None = None
     """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
     `vqvae`, `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `points`
-    of what sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default
+    of what sensors see (docs/safety_filter.md), or `oracle`, the obstacles themselves; by default
     nothing"""
+    num_points: flags.PositiveInt = 64
+    """points of the encoder `point_cloud`"""
     velocities: ClassVar[bool] = False  # demonstrations have none
-    proximity: ClassVar[str | None] = None
+    link_distances: ClassVar[str | None] = None
 
     # Evaluation and bookkeeping
     eval_every: flags.PositiveInt = 50_000
@@ -103,7 +105,7 @@ class Features(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
         self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
-        self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.proximity else None
+        self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.link_distances else None
         self.size = observation_size + goal_size + 14 * args.trigonometric + 10 * bool(self.near)
         self.size += 3 * self.relative_goal + 7 * self.relative_configuration
 
@@ -229,7 +231,11 @@ if __name__ == "__main__":
         files = [load_demos(file, args.task) for file in args.demos or (args.task,)]
     except DatasetError as error:
         sys.exit(f"--demos: {error}")
-    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
+    env_arguments = {
+        "goal_type": args.goal_type,
+        "encoder": args.encoder,
+        "num_points": args.num_points,
+    }
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     run = runs.run_folder(args, task_name(args.task))
 
@@ -256,9 +262,9 @@ if __name__ == "__main__":
     parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
     progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
-    saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
-    saved_parts |= {"progress": progress}
-    runs.load_checkpoint(args, saved_parts)
+    checkpoint_state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
+    checkpoint_state |= {"progress": progress}
+    runs.load_checkpoint(args, checkpoint_state)
     writer = runs.summary_writer(run, args, progress["updates"])
     seconds_before = progress["seconds"]
     bar = runs.progress_bar(args.total_updates, progress["updates"], "update")
@@ -294,7 +300,7 @@ if __name__ == "__main__":
                 )
             bar.set_postfix(eval=success, best=progress["best_success"])
             progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, saved_parts, device)
+            runs.save_checkpoint(run, checkpoint_state, device)
     bar.close()
     protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
     writer.close()

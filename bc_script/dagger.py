@@ -6,7 +6,7 @@
 A policy for scenes that it never saw. It learns the direction in which a roadmap's smoothed path
 goes on, from configurations anywhere on such paths, and from those that it came to by itself
 (DAgger: Ross et al., 2011). It is told what is there (`--encoder`), and how far each link is from
-the nearest thing, here and at the goal (`envs.wrappers.ProximityWrapper`). Part of it is a last
+the nearest thing, here and at the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a last
 layer that keeps links away from things (`envs.policies.safety_filter`). To make an algorithm of your own, copy
 this file and change the parts under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are
 those of `bc_script/bc.py`.
@@ -31,9 +31,9 @@ from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.networks.operations import NetworkError
-from roboarm_nmp.envs.perception import point_clouds as seeing
-from roboarm_nmp.envs.perception.encoders import scene_encoder
-from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, LastLayer
+from roboarm_nmp.envs.perception.encoders import make_encoder
+from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, ground_truth_checker
+from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.envs.training import flags, protocol, runs
@@ -75,9 +75,11 @@ class Args(runs.RunFlags):
     length_weight: flags.NonNegativeFloat = 0.1
     """of the second loss, that of the remaining length"""
     encoder: str = "oracle"
-    """what the policy sees of the scene: `oracle`, the obstacles themselves, `points` of them that
-    four sensors see, or an encoder's z_E (a name or path); proximity is that of the same, or of the
-    seen points if z_E cannot tell it"""
+    """the scene as the policy receives it, as tokens: `point_cloud` for observed points, `oracle`
+    for the ground-truth obstacles, or an encoder's latent code, one token (`vae`, `vqvae`,
+    `pointnet2`, `field`, or the path of your own `encoder.pt`)"""
+    num_points: flags.PositiveInt = 64
+    """points of the encoder `point_cloud`"""
     token_size: flags.Width = 128
     """width of the layers that look at one obstacle or point each"""
     hidden_size: flags.Width = 384
@@ -89,9 +91,9 @@ class Args(runs.RunFlags):
     velocities: ClassVar[bool] = False  # paths have none
 
     # The last layer
-    keep_distance: flags.NonNegativeFloat = 0.01
+    safety_margin: flags.NonNegativeFloat = 0.01
     """m, that it keeps"""
-    way_out: bool = True
+    escape: bool = True
     """whether it leaves dead ends"""
 
     # DAgger
@@ -149,14 +151,14 @@ class Actor(nn.Module):
 
     def __init__(self, args):
         super().__init__()
-        self.row_size = scene_encoder(args.encoder).row_size  # numbers of a token
+        self.token_size = make_encoder(args.encoder, args.num_points).token_size
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         size = 10 + {"config": 7, "combined": 10}[args.goal_type] + 28 + 2 * 80
-        self.of_token = nn.Linear(self.row_size, args.token_size)
+        self.token_in = nn.Linear(self.token_size, args.token_size)
         self.of_arm = nn.Linear(size, args.token_size)
-        self.of_both = Hidden(args.token_size, args.token_size, args.bf16)
+        self.fuse = Hidden(args.token_size, args.token_size, args.bf16)
         self.first = nn.Linear(size + args.token_size, args.hidden_size)
         blocks = (Block(args.hidden_size, args.bf16) for _ in range(args.num_blocks))
         self.blocks = nn.Sequential(*blocks)
@@ -164,21 +166,21 @@ class Actor(nn.Module):
         nn.init.zeros_(self.head.weight)  # it begins as go-to-goal
         nn.init.zeros_(self.head.bias)
 
-    def features(self, observation, desired_goal, proximity, goal_proximity):
+    def features(self, observation, desired_goal, link_distances, goal_link_distances):
         """What is known of the arm, and of the goal."""
         states = torch.cat([observation[:, :7], desired_goal[:, :7]], dim=1)
         angles = (states.unflatten(1, (2, 7)) * self.half_range + self.middle).flatten(1)
-        near = torch.stack([proximity, goal_proximity], dim=1)
+        near = torch.stack([link_distances, goal_link_distances], dim=1)
         near = torch.cat([10.0 * near[..., :1], near[..., 1:]], dim=-1)  # distances are small
         inputs = observation[:, :10], desired_goal, torch.sin(angles), torch.cos(angles)
         return torch.cat([*inputs, near.flatten(1)], dim=1)
 
-    def outputs(self, observation, desired_goal, proximity, goal_proximity):
+    def outputs(self, observation, desired_goal, link_distances, goal_link_distances):
         """The direction (N, 7), of any length, and the length of the rest of the way (N,)."""
-        features = self.features(observation, desired_goal, proximity, goal_proximity)
-        tokens = observation[:, 10:].unflatten(1, (-1, self.row_size))
-        seen = F.relu(self.of_token(tokens) + self.of_arm(features).unsqueeze(1))
-        seen = F.relu(self.of_both(seen))
+        features = self.features(observation, desired_goal, link_distances, goal_link_distances)
+        tokens = observation[:, 10:].unflatten(1, (-1, self.token_size))
+        seen = F.relu(self.token_in(tokens) + self.of_arm(features).unsqueeze(1))
+        seen = F.relu(self.fuse(seen))
         there = (tokens != 0.0).any(dim=2, keepdim=True)
         seen = (seen * there).amax(1)  # (nothing is below zero)
         x = self.blocks(F.relu(self.first(torch.cat([features, seen], dim=1))))
@@ -187,16 +189,18 @@ class Actor(nn.Module):
         direction = F.normalize(to_goal, dim=1) + outputs[:, :7]
         return direction, to_goal.norm(dim=1) + F.softplus(outputs[:, 7])
 
-    def forward(self, observation, achieved_goal, desired_goal, proximity, goal_proximity):
+    def forward(
+        self, observation, achieved_goal, desired_goal, link_distances, goal_link_distances
+    ):
         """The action (N, 7); this is what policy.pt contains."""
-        direction, _ = self.outputs(observation, desired_goal, proximity, goal_proximity)
+        direction, _ = self.outputs(observation, desired_goal, link_distances, goal_link_distances)
         to_goal = (desired_goal[:, :7] - observation[:, :7]).norm(dim=1, keepdim=True)
         return F.normalize(direction, dim=1) * to_goal.clamp(max=MAX_STEP)
 
 
 # ALGO LOGIC: examples
 AHEAD = 0.1  # normalised: an example's direction is to where its path is after so much
-PER_PATH = 4  # examples of each path that is chosen: its goal's proximity serves all of them
+PER_PATH = 4  # examples of each path that is chosen: its goal's link_distances serves all of them
 STUCK = 5.0  # states that the policy was stuck in are so much likelier to be labelled
 DRAW, ROUND = 6, 7  # streams of random numbers; those before belong to demo_generation's files
 
@@ -204,7 +208,7 @@ DRAW, ROUND = 6, 7  # streams of random numbers; those before belong to demo_gen
 class Examples:
     """Makes examples, dicts of tensors, a row each:
 
-    `observation` (n, 10), `desired_goal` (n, g), `proximity` and `goal_proximity` (n, 10, 8); the
+    `observation` (n, 10), `desired_goal` (n, g), `link_distances` and `goal_link_distances` (n, 10, 8); the
     unit vector to go on, `direction` (n, 7), and the `length` of the rest of the way (n,); the
     number of the `scene` (n,), int64.
 
@@ -216,7 +220,9 @@ class Examples:
 
     def __init__(self, paths, args, device):
         self.paths, self.args, self.device = paths, args, device
-        self.checker_of = seeing.checker_of(scene_encoder(args.encoder).proximity)
+        self.geometry_source = find_geometry_source(
+            make_encoder(args.encoder, args.num_points).geometry_source
+        )
         self.with_paths = np.flatnonzero(np.diff(paths.path_offsets))  # numbers of scenes
         steps = np.linalg.norm(np.diff(paths.points, axis=0), axis=1)
         steps[paths.offsets[1:-1] - 1] = 1.0  # from the end of a path to the next one: anything
@@ -247,7 +253,7 @@ class Examples:
         goals = self.paths.points[np.where(backwards, first, last)]
         return self._examples(scene, states, goals, moves / lengths[:, None], lengths + rest)
 
-    def visit(self, actor, env, last_layer, step):
+    def visit(self, actor, env, safety_filter, step):
         """Examples of a round of DAgger, and the share of its queries that the policy reached."""
         rng = np.random.default_rng([self.args.seed, ROUND, step])
         parts, reached, visited = [], [], []
@@ -259,12 +265,12 @@ class Examples:
         while len(reached) < self.args.round_queries:
             number, first, last = self._choose(rng, 1)
             scene, ends = self.paths.scenes[number], self.paths.points[np.r_[first, last]]
-            if not seeing.true_checker(scene).is_free(ends, margin=0.001).all():
+            if not ground_truth_checker(scene).is_free(ends, margin=0.001).all():
                 continue  # rounded, the environment might refuse it
             query = Query(*panda.denormalise(ends).astype(np.float32), scene)
             visited.clear()
             seed = int(rng.integers(2**32))  # of the ways out of dead ends
-            result = protocol.evaluate(act, [env], [query], self.device, last_layer, seed)
+            result = protocol.evaluate(act, [env], [query], self.device, safety_filter, seed)
             reached.append(result["success_rate"])
             states = np.array(visited)
             chances = np.ones(len(states))
@@ -277,7 +283,7 @@ class Examples:
             kept = lengths > 0.0  # there is a way, and it is not at the goal
             labelled = (x[kept] for x in (states, goals, directions, lengths))
             parts.append(self._examples(number, *labelled))
-        return joined(parts), np.mean(reached)
+        return concat(parts), np.mean(reached)
 
     def _choose(self, rng, number):
         """A scene, and the first and the last point of some of its paths (number,)."""
@@ -286,14 +292,14 @@ class Examples:
         return scene, self.paths.offsets[path], self.paths.offsets[path + 1] - 1
 
     def _examples(self, scene, states, goals, directions, lengths):
-        checker = self.checker_of(self.paths.scenes[scene])
+        checker = self.geometry_source(self.paths.scenes[scene])
         ends, which = np.unique(goals, axis=0, return_inverse=True)
         observation, _, goal = observed(states, panda.denormalise(goals), self.args.goal_type)
         examples = {
             "observation": observation,
             "desired_goal": goal,
-            "proximity": checker.proximity(states),
-            "goal_proximity": checker.proximity(ends)[which],
+            "link_distances": checker.link_distances(states),
+            "goal_link_distances": checker.link_distances(ends)[which],
             "direction": directions.astype(np.float32),
             "length": lengths.astype(np.float32),
             "scene": np.full(len(states), scene),
@@ -301,20 +307,20 @@ class Examples:
         return {name: torch.as_tensor(x, device=self.device) for name, x in examples.items()}
 
 
-def joined(parts):
+def concat(parts):
     """Examples of several dicts in one."""
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def some(examples, number):
+def sample(examples, number):
     """So many random ones of them."""
     rows = torch.randint(len(examples["scene"]), (number,), device=examples["scene"].device)
     return {name: tensor[rows] for name, tensor in examples.items()}
 
 
-def with_scene(batch, latents, row_size):
+def with_scene(batch, latents, token_size):
     """The batch with encoded scenes (scenes, z) in observations, as far as there are any tokens."""
-    tokens = latents[batch["scene"]].unflatten(1, (-1, row_size))
+    tokens = latents[batch["scene"]].unflatten(1, (-1, token_size))
     tokens = tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)]
     observation = torch.cat([batch["observation"], tokens.flatten(1)], dim=1)
     return batch | {"observation": observation}
@@ -333,7 +339,7 @@ def polyak_update(target_parameters, parameters, tau):
 # ALGO LOGIC: one update
 def update(actor, optimizer, batch, length_weight):
     """One step on a batch of examples; the losses before it, of direction and length."""
-    inputs = ("observation", "desired_goal", "proximity", "goal_proximity")
+    inputs = ("observation", "desired_goal", "link_distances", "goal_link_distances")
     direction, length = actor.outputs(*(batch[name] for name in inputs))
     direction_loss = 1.0 - F.cosine_similarity(direction, batch["direction"]).mean()
     length_loss = F.smooth_l1_loss(length, batch["length"])
@@ -349,7 +355,7 @@ if __name__ == "__main__":
     runs.resolve_bf16(args)
     validation, test = protocol.load_task(args)
     try:
-        proximity = scene_encoder(args.encoder).proximity
+        geometry_source = make_encoder(args.encoder, args.num_points).geometry_source
     except NetworkError as error:
         sys.exit(f"--encoder: {error}")
     num_draws = args.pool_size // args.examples_per_update
@@ -359,9 +365,11 @@ if __name__ == "__main__":
         paths = load_roadmap_paths(args.paths)
     except DatasetError as error:
         sys.exit(f"--paths: {error}")
-    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder, "proximity": proximity}
+    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
+    env_arguments |= {"num_points": args.num_points, "geometry_source": geometry_source}
+    env_arguments |= {"link_distances": True}
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
-    last_layer = LastLayer(args.keep_distance, args.way_out)
+    safety_filter = SafetyFilter(args.safety_margin, args.escape)
     run = runs.run_folder(args, task_name(args.task))
 
     # ALGO LOGIC: network and optimiser
@@ -372,9 +380,9 @@ if __name__ == "__main__":
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
     progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
     visited = {}  # examples of all rounds
-    saved_parts = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
-    saved_parts |= {"progress": progress, "visited": visited}
-    runs.load_checkpoint(args, saved_parts)
+    checkpoint_state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
+    checkpoint_state |= {"progress": progress, "visited": visited}
+    runs.load_checkpoint(args, checkpoint_state)
     visited |= {name: tensor.to(device) for name, tensor in visited.items()}
 
     # ALGO LOGIC: data. The pool is not in checkpoints: what was drawn is drawn again.
@@ -384,7 +392,7 @@ if __name__ == "__main__":
     firsts = range(progress["updates"], progress["updates"] + num_draws)
     for number in tqdm(firsts, desc="drawing examples", mininterval=2.0):
         pool[number % num_draws] = examples.draw(number)
-    pool = joined(pool)
+    pool = concat(pool)
 
     writer = runs.summary_writer(run, args, progress["updates"])
     seconds_before = progress["seconds"]
@@ -397,13 +405,13 @@ if __name__ == "__main__":
         if args.anneal:
             remaining = 1.0 - progress["updates"] / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
-        batch = some(pool, args.batch_size)
+        batch = sample(pool, args.batch_size)
         if visited and len(visited["scene"]):
             weight = args.round_weight * len(visited["scene"])
             count = int(args.batch_size * weight / (weight + len(pool["scene"])))
-            batch = joined([some(visited, count), batch])
+            batch = concat([sample(visited, count), batch])
             batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
-        batch = with_scene(batch, latents, actor.row_size)
+        batch = with_scene(batch, latents, actor.token_size)
         direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
         polyak_update(average_parameters, parameters, args.policy_average)
         oldest = progress["updates"] % num_draws * args.examples_per_update
@@ -422,22 +430,22 @@ if __name__ == "__main__":
         # ALGO LOGIC: a round of DAgger
         if args.round_every and step % args.round_every == 0 and step < args.total_updates:
             # In the last environment: the first one draws, and is slower to change its scene.
-            found, reached = examples.visit(actor_average, eval_envs[-1], last_layer, step)
-            visited |= joined([visited, found]) if visited else found
+            found, reached = examples.visit(actor_average, eval_envs[-1], safety_filter, step)
+            visited |= concat([visited, found]) if visited else found
             writer.add_scalar("charts/round_success", reached, step)
 
         # Evaluate, keep the best policy, checkpoint
         if step % args.eval_every == 0 or step == args.total_updates:
             success = protocol.validate(
-                actor_average, eval_envs, validation, device, writer, step, progress, last_layer
+                actor_average, eval_envs, validation, device, writer, step, progress, safety_filter
             )
             if progress["best_step"] == step:
                 protocol.save_policy(
-                    run, actor_average, eval_envs, device, args, env_arguments, step, last_layer
+                    run, actor_average, eval_envs, device, args, env_arguments, step, safety_filter
                 )
             bar.set_postfix(eval=success, best=progress["best_success"])
             progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, saved_parts, device)
+            runs.save_checkpoint(run, checkpoint_state, device)
     bar.close()
     background.shutdown()
     protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)

@@ -89,7 +89,7 @@ def table(results, unseen):
         "success]. Who plans has LBKPIECE1's help where RRT-Connect takes long",
         "([demonstrations.md](demonstrations.md)). What 0.05 s are enough for depends on the",
         "machine, and here on the day. `reactive, points` is `go-to-goal` with a",
-        "[last layer](last_layer.md) that sees points (goal `combined`; which version of it:",
+        "[last layer](safety_filter.md) that sees points (goal `combined`; which version of it:",
         "[unseen_obstacles.md](unseen_obstacles.md)).",
         "",
         "| task | paper, `go-to-goal` | " + " | ".join(COLUMNS) + " |",
@@ -119,7 +119,7 @@ def _cell(results, task, name):
     if result is None:
         return "not run"
     low, high = result["success_rate_interval"]
-    rates = f"{result['success_rate']:.3f}, {result['clean_success_rate']:.3f}"
+    rates = f"{result['success_rate']:.3f}, {result['collision_free_success_rate']:.3f}"
     return f"{rates} [{low:.3f}, {high:.3f}]"
 
 
@@ -160,7 +160,7 @@ def main():
     args = parser.parse_args()
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     if not args.table:
-        # A task without a packaged query file has no cells.
+        # A task without a pretrained query file has no cells.
         tasks = args.only or [task for task in envs.TASKS if query_path(task).exists()]
         run(results, tasks, args.policies, args.num, args.workers)
     unseen = json.loads(UNSEEN.read_text()) if UNSEEN.exists() else {}

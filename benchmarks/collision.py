@@ -15,7 +15,7 @@ between two of those until something is within 1 cm, inside or outside, uniforml
 - deepest_mm: of these, the largest distance from contact, by whichever of the two says more.
 
 Speed: uniform configurations in 40 scenes of `random_boxes_hard`, processor time of one core, in
-turns, the median of `--rounds`. `proximity` is asked about one configuration at a time, a free one,
+turns, the median of `--rounds`. `link_distances` is asked about one configuration at a time, a free one,
 as at every step of a policy: of the true obstacles, of the points that sensors see, and of those
 that the encoder `field` tells of. PyBullet's check is what
 planners used before: set the joints, detect collisions, read the contacts; `in_collision` also
@@ -41,10 +41,10 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.perception.encoders import told_checker
-from roboarm_nmp.envs.perception.point_clouds import seen_checker
+from roboarm_nmp.envs.perception.encoders import decoded_checker
+from roboarm_nmp.envs.perception.point_clouds import observed_checker
 
-NEAR = 0.01  # m
+ACTIVATION_DISTANCE = 0.01  # m
 SCENES = 40  # of each distribution
 
 
@@ -55,13 +55,13 @@ def scenes_of(task, split):
 
 
 def nudge(checker, states, rng):
-    """Configurations (n, 7) moved to within `NEAR` of contact; fewer, where no line leads there."""
+    """Configurations (n, 7) moved to within `ACTIVATION_DISTANCE` of contact; fewer, where no line leads there."""
     others = rng.uniform(-1.0, 1.0, states.shape)
-    wanted = rng.uniform(-NEAR, NEAR, len(states))
+    wanted = rng.uniform(-ACTIVATION_DISTANCE, ACTIVATION_DISTANCE, len(states))
 
     def beyond(shares):
         there = states + shares[:, None] * (others - states)
-        return checker.nearest(there).distance.min(-1) - wanted
+        return checker.signed_distances(there).distance.min(-1) - wanted
 
     low, high = np.zeros(len(states)), np.ones(len(states))
     below, above = beyond(low), beyond(high)
@@ -95,7 +95,7 @@ def compare(env, scenes, num, rng, progress):
         free = checker.is_free(states)
         for state, is_free in zip(states, free, strict=True):
             if env.in_collision(panda.denormalise(state)) == is_free:
-                ours = abs(checker.nearest(state).distance.min())
+                ours = abs(checker.signed_distances(state).distance.min())
                 depths.append(float(np.nanmax([ours, abs(pybullet_distance(env))])))
         asked += count
         progress.update(count)
@@ -126,12 +126,12 @@ def speed(rounds, rng):
     scenes = scenes_of("random_boxes_hard", "validation")[:SCENES]
     checkers = [CollisionChecker(scene) for scene in scenes]
     checkers[0].is_free(np.zeros(7))  # compiles
-    checkers[0].nearest(np.zeros(7))
-    seeing_checkers = [seen_checker(scene) for scene in scenes]
-    told_checkers = [told_checker(scene, "field") for scene in scenes]
-    seeing_checkers[0].proximity(np.zeros(7))
-    near = {"proximity": checkers, "proximity, points": seeing_checkers}
-    near |= {"proximity, field": told_checkers}
+    checkers[0].signed_distances(np.zeros(7))
+    seeing_checkers = [observed_checker(scene) for scene in scenes]
+    told_checkers = [decoded_checker(scene, "field") for scene in scenes]
+    seeing_checkers[0].link_distances(np.zeros(7))
+    near = {"link_distances": checkers, "link_distances, points": seeing_checkers}
+    near |= {"link_distances, field": told_checkers}
     seconds = {name: [] for name in ("is_free", "nearest", *near, "pybullet", "in_collision")}
     for _ in range(rounds):
         total = dict.fromkeys(seconds, 0.0)
@@ -141,7 +141,7 @@ def speed(rounds, rng):
             total["nearest"] += timed(checker.nearest, states[:500]) / 500
             free = states[:1000][checker.is_free(states[:1000])][:100]
             for name, ones in near.items():
-                total[name] += timed(ask, ones[i].proximity, free) / len(free)
+                total[name] += timed(ask, ones[i].link_distances, free) / len(free)
             env.set_scene(scene)
             configurations = panda.denormalise(states[:100]).tolist()
             total["pybullet"] += timed(ask, partial(pybullet_check, env), configurations) / 100
@@ -190,9 +190,9 @@ def main():
         "ratio_to_pybullet": micros["pybullet"] / micros["is_free"],
         "ratio_to_in_collision": micros["in_collision"] / micros["is_free"],
         "nearest_per_second": 1e6 / micros["nearest"],
-        "proximity_us": micros["proximity"],
-        "proximity_points_us": micros["proximity, points"],
-        "proximity_field_us": micros["proximity, field"],
+        "link_distances_us": micros["link_distances"],
+        "link_distances_points_us": micros["link_distances, points"],
+        "link_distances_field_us": micros["link_distances, field"],
         "python": platform.python_version(),
     }
     print(json.dumps(result))

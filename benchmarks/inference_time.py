@@ -27,8 +27,8 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception import encoders
 from roboarm_nmp.envs.perception import point_clouds as seeing
-from roboarm_nmp.envs.perception.encoders import scene_encoder, with_told
-from roboarm_nmp.envs.perception.point_clouds import checker_of, seen_points
+from roboarm_nmp.envs.perception.encoders import scene_encoder, with_decoded
+from roboarm_nmp.envs.perception.point_clouds import geometry_source, observed_points
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 
 TASK = "random_boxes_hard"
@@ -37,8 +37,8 @@ SHOWN = ("rendering", "encoding", "planning", "action", "total")
 
 def forget(names):
     """Forget all scenes that were seen; `names` of encoders."""
-    checkers = seeing.seen_checker, seeing.true_checker, encoders.told_checker
-    for cached in (seeing._look, encoders.told_points, *checkers):
+    checkers = seeing.observed_checker, seeing.ground_truth_checker, encoders.decoded_checker
+    for cached in (seeing._look, encoders.decoded_points, *checkers):
         cached.cache_clear()
     for name in names:
         scene_encoder(name)._cached.cache_clear()
@@ -49,18 +49,18 @@ def seeing_times(encoder, near, scene):
 
     Args:
         encoder: the policy's `SceneEncoder`, or None.
-        near: what distances are from, as `envs.make(proximity=...)` takes it, or None.
+        near: what distances are from, as `envs.make(link_distances=...)` takes it, or None.
         scene: the `Scene`.
     """
     if encoder is None and near is None:
         return 0.0, 0.0
-    tells = None if encoder is None else encoder.name if encoder.path else encoder.proximity
+    tells = None if encoder is None else encoder.name if encoder.path else encoder.link_distances
     sources = {near, tells} - {None, "obstacles"}
     networks = {name: scene_encoder(name) for name in sources - {"points"}}
     forget(networks)
     began = time.perf_counter()
     if "points" in sources:
-        seen_points(scene)
+        observed_points(scene)
     seen = {name: network.look(scene) for name, network in networks.items()}
     rendering = time.perf_counter() - began if sources else 0.0
     for name, network in networks.items():
@@ -72,7 +72,7 @@ def seeing_times(encoder, near, scene):
     if encoder is not None:
         encoder(scene)
     if near is not None:
-        checker_of(near)(scene)
+        geometry_source(near)(scene)
     return rendering, encoding + time.perf_counter() - began
 
 
@@ -88,10 +88,10 @@ def times(policy, queries, encoder=None, time_limit=5.0):
     found, arguments = find_policy(policy)
     searches, arguments = policy == "planner", arguments or {}
     if encoder is not None and not searches:
-        arguments = with_told(encoder, arguments)
+        arguments = with_decoded(encoder, arguments)
     env = envs.make(TASK, **arguments)
     begin = make_policy(found, env, time_limit=time_limit, encoder=encoder if searches else None)
-    near = encoder or "obstacles" if searches else arguments.get("proximity")
+    near = encoder or "obstacles" if searches else arguments.get("link_distances")
     seen_by = env.encoder if arguments.get("encoder") else None
 
     def episode(number, query):
@@ -104,8 +104,8 @@ def times(policy, queries, encoder=None, time_limit=5.0):
         while not ended:
             began = time.perf_counter()
             action = act(observation)
-            if "proximity" in observation:  # which the environment has computed
-                env.proximity_at(observation["observation"][:7])
+            if "link_distances" in observation:  # which the environment has computed
+                env.link_distances_at(observation["observation"][:7])
             acting += time.perf_counter() - began
             actions += 1
             observation, _, terminated, truncated, info = env.step(action)
@@ -138,7 +138,7 @@ def main():
     queries = [queries[i] for i in range(min(args.num, len(queries)))]
     jobs = {policy: (policy, None) for policy in args.policies}
     for policy in args.policies:
-        if args.encoder is not None and find_policy(policy)[1].get("proximity") == "points":
+        if args.encoder is not None and find_policy(policy)[1].get("link_distances") == "points":
             jobs[f"{policy}, {args.encoder}"] = policy, args.encoder
     for knows in (None, "points", *([args.encoder] if args.encoder else [])):
         jobs["RRT-Connect" if knows is None else f"RRT-Connect, {knows}"] = "planner", knows

@@ -7,7 +7,7 @@ Of each finished run, `encoder.pt` becomes `scene_embedding_train/encoders/<exp_
 what `--encoder <exp_name>` finds, and its decoder, if there is one, `<exp_name>.decoder.pt`; with
 `--halve` in half precision, after which policies that use it have to be evaluated again. The JSON
 beside it has data, updates, figures on validation scenes and flags;
-`docs/pictures/encoder_<exp_name>.png` is TensorBoard's picture of a validation scene at the update
+`docs/figures/encoder_<exp_name>.png` is TensorBoard's picture of a validation scene at the update
 whose encoder was kept.
 """
 
@@ -25,12 +25,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from roboarm_nmp.envs.datasets.format import attribute
 from roboarm_nmp.envs.datasets.observations import open_shard
 from roboarm_nmp.envs.datasets.shards import shard_path
-from roboarm_nmp.envs.networks.exported_networks import halve_network
-from roboarm_nmp.envs.perception.encoders import DECODER, PACKAGED
+from roboarm_nmp.envs.networks.exported_networks import to_float16
+from roboarm_nmp.envs.perception.encoders import DECODER, PRETRAINED
 from roboarm_nmp.envs.utils.files import write_atomically
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from paper_tables import PICTURES, commit
+from paper_tables import FIGURES, commit
 
 ENLARGED = 2  # each pixel of TensorBoard's picture, in width and height
 PATHS = ("runs_dir", "resume", "observations")  # flags that say nothing about the encoder
@@ -57,7 +57,7 @@ def keep(run, encoders, pictures, halve=False):
     encoders.mkdir(parents=True, exist_ok=True)
     for ending in (".pt", DECODER):
         if (run / f"encoder{ending}").exists():
-            copy = halve_network if halve else shutil.copyfile
+            copy = to_float16 if halve else shutil.copyfile
             copy(run / f"encoder{ending}", encoders / f"{name}{ending}")
     write_atomically(encoders / f"{name}.json", (json.dumps(result, indent=1) + "\n").encode())
     picture(run, trained["best_update"]).save(pictures / f"encoder_{name}.png", optimize=True)
@@ -67,8 +67,8 @@ def keep(run, encoders, pictures, halve=False):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a finished run's folder")
-    parser.add_argument("--encoders", type=Path, default=PACKAGED, help="where networks go")
-    parser.add_argument("--pictures", type=Path, default=PICTURES, help="where pictures go")
+    parser.add_argument("--encoders", type=Path, default=PRETRAINED, help="where networks go")
+    parser.add_argument("--pictures", type=Path, default=FIGURES, help="where pictures go")
     parser.add_argument("--halve", action="store_true", help="in half precision")
     args = parser.parse_args()
     for run in args.runs:

@@ -42,7 +42,7 @@ def soak(minutes, steps):
     bar = tqdm(unit="episode")
     for turn in itertools.count():
         for number, task in enumerate(envs.TASKS):
-            env = SensorWrapper(envs.make(task, encoder="points", proximity="points"), sensors)
+            env = SensorWrapper(envs.make(task, encoder="points", link_distances="points"), sensors)
             env.action_space.seed(turn)
             env.reset(seed=turn * len(envs.TASKS) + number)
             for _ in range(EPISODES_PER_TURN):

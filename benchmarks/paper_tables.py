@@ -41,7 +41,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from roboarm_nmp.clean_rl_scripts.evaluate import wilson_interval
 from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.networks.exported_networks import halve_network
+from roboarm_nmp.envs.networks.exported_networks import to_float16
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, check
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
 
@@ -50,7 +50,7 @@ CELLS = Path(__file__).with_name("paper_cells.csv")
 POLICIES = ROOT / "envs" / "policies" / "pretrained"
 BASELINES = ROOT / "docs" / "baselines.json"
 UNSEEN = ROOT / "docs" / "unseen_obstacles.json"
-PAGE, PICTURES = ROOT / "docs" / "results.md", ROOT / "docs" / "pictures"
+PAGE, FIGURES = ROOT / "docs" / "results.md", ROOT / "docs" / "pictures"
 SCRIPTS = {
     "bc": ROOT / "bc_script" / "bc.py",
     "sac": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
@@ -201,7 +201,7 @@ def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
     kept.unlink(missing_ok=True)  # a result is never beside another's policy
     kept.with_suffix(".pt").unlink(missing_ok=True)
     policy = (kept if keep_policies else folder / kept.name).with_suffix(".pt")
-    halve_network(trained / "policy.pt", policy)
+    to_float16(trained / "policy.pt", policy)
     evaluation = evaluate(policy, cell.task, num_queries, folder / "evaluation.json")
     write_result(kept, summary(cell, trained, evaluation))
 
@@ -235,7 +235,7 @@ def evaluate(policy, task, num_queries, path):
     command += ["--task", task, "--num-queries", str(num_queries), "--json", path]
     subprocess.run(command, check=True)
     evaluation = json.loads(path.read_text())
-    names = ("success_rate", "success_rate_interval", "clean_success_rate", "num_queries")
+    names = ("success_rate", "success_rate_interval", "collision_free_success_rate", "num_queries")
     return {name: evaluation[name] for name in names}
 
 
@@ -390,7 +390,7 @@ def runs_table(cells, results):
     for cell in cells:
         for result in results.get(cell.name, []):
             minutes = result["training_seconds"] / 60
-            clean = result["clean_success_rate"]
+            clean = result["collision_free_success_rate"]
             clean = "not known" if clean is None else f"{clean:.3f}"
             name = f"`{cell.name}-s{result['seed']}`" + ("" if result["kept"] else ", not kept")
             if not cell.is_recipe_of(result["args"]):
@@ -417,7 +417,7 @@ def page(cells, results, baselines, unseen):
         "below it the paper's, mean ± standard deviation of four seeds, after 1,000,000 steps",
         f"({LONG_RUN:,} for random boxes). The last rows do not learn, and know a goal",
         "configuration (measured with goal `ee`: [baselines.md](baselines.md)). `reactive, points`",
-        "is `go-to-goal` with a [last layer](last_layer.md) that sees points (goal `combined`, 200",
+        "is `go-to-goal` with a [last layer](safety_filter.md) that sees points (goal `combined`, 200",
         "test queries or more: [unseen_obstacles.md](unseen_obstacles.md)). With p = 0,",
         "queries are those of the demonstrations, which are not shown; the paper samples them.",
         "`python benchmarks/paper_tables.py` runs cells and writes this page;",
@@ -641,9 +641,9 @@ def main():
         if REACTIVE in found:
             baselines.setdefault(task, {})[REACTIVE] = found[REACTIVE]
     if results:
-        draw_story(cells, results, baselines, unseen, PICTURES / "results_story.png")
-        draw_curves(cells, results, PICTURES / "results_curves.png")
-        draw_bars(cells, results, PICTURES / "results_bars.png")
+        draw_story(cells, results, baselines, unseen, FIGURES / "results_story.png")
+        draw_curves(cells, results, FIGURES / "results_curves.png")
+        draw_bars(cells, results, FIGURES / "results_bars.png")
     write_atomically(PAGE, page(cells, results, baselines, unseen).encode())
     print(f"{PAGE} written")
 

@@ -67,7 +67,7 @@ class PyBulletValidity:
     def exhausted(self):
         return self.checks >= self.max_checks or time.monotonic() > self.deadline
 
-    def insist(self):
+    def restore_margins(self):
         """Nothing to do: what it keeps does not change."""
 
 
@@ -80,19 +80,21 @@ class PyBulletPlanner(Planner):
 
     def plan_within(self, seconds, *query, rng):
         deadline = time.monotonic() + seconds
-        for share, caution in ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25)):
+        for share, margin_scale in ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25)):
             self.time_limit = share * (deadline - time.monotonic())
             with contextlib.suppress(PlanningError):
-                return self.plan(*query, seed=int(rng.integers(1, 2**32)), caution=caution)
+                return self.plan(
+                    *query, seed=int(rng.integers(1, 2**32)), margin_scale=margin_scale
+                )
         raise PlanningError(f"no path in {seconds} s")
 
-    def _validity(self, start, goal, cautions, time_limit, max_checks):
-        ((_, caution),) = cautions
+    def _validity(self, start, goal, schedule, time_limit, max_checks):
+        ((_, margin_scale),) = schedule
         world = self.env
-        self.inflated.set_scene(inflate(self.env.scene, caution * self.clearance))
+        self.inflated.set_scene(inflate(self.env.scene, margin_scale * self.clearance))
         if not any(self.inflated.in_collision(end) for end in (start, goal)):
             world = self.inflated
-        return PyBulletValidity(world, caution * MARGIN, (start, goal), time_limit, max_checks)
+        return PyBulletValidity(world, margin_scale * MARGIN, (start, goal), time_limit, max_checks)
 
     def _space(self, is_valid):
         information = ob.SpaceInformation(planning.normalised_space())

@@ -90,7 +90,7 @@ def main():
             if found[i]
         ]
         for i, path in enumerate(chosen):
-            near.append(checker.nearest(along(path)).distance.min(-1))
+            near.append(checker.signed_distances(along(path)).distance.min(-1))
             path = panda.denormalise(path.astype(np.float64)).astype(np.float32)
             path = np.clip(path, panda.LOWER.astype(np.float32), panda.UPPER.astype(np.float32))
             try:

@@ -9,7 +9,7 @@
 
 Each run is a short training with 32 seen points, all alike but for what is varied, evaluated on the
 fresh queries. What is done is skipped. Results go to docs/scaling.json and to
-docs/pictures/unseen_scaling.png.
+docs/figures/unseen_scaling.png.
 """
 
 import argparse
@@ -38,8 +38,13 @@ UPDATES = 4000
 RUNS = ((50, 2000), (200, 2000), (800, 2000), (800, 0), (800, 500))
 SHARD = 50  # scenes of a shard: demo_generation.roadmaps' default
 KEPT = (
-    *("success_rate", "success_rate_interval", "clean_success_rate", "clean_success_rate_interval"),
-    *("num_queries", "last_layer", "seed"),
+    *(
+        "success_rate",
+        "success_rate_interval",
+        "collision_free_success_rate",
+        "collision_free_success_rate_interval",
+    ),
+    *("num_queries", "safety_filter", "seed"),
 )
 
 
@@ -85,7 +90,10 @@ def picture(results):
     )
     for axis, (label, where, same) in zip(axes, panels, strict=True):
         shown = sorted((one for one in results if one[same] == default[same]), key=where)
-        for name, words in (("success_rate", "success"), ("clean_success_rate", "clean success")):
+        for name, words in (
+            ("success_rate", "success"),
+            ("collision_free_success_rate", "clean success"),
+        ):
             values = [one[name] for one in shown]
             ends = [one[f"{name}_interval"] for one in shown]
             errors = [

@@ -1,6 +1,6 @@
 """What z_E knows of a scene: which cells are occupied, and how far links are from obstacles.
 
-    python benchmarks/scene_knowledge.py                       # the packaged encoders, oracle, mean
+    python benchmarks/scene_knowledge.py                       # the pretrained encoders, oracle, mean
     python benchmarks/scene_knowledge.py runs/.../encoder.pt --json knowledge.json
 
 The space around the robot is divided into cells of 0.2 m; one is occupied if an obstacle reaches
@@ -19,7 +19,7 @@ What a policy needs is how far its links are from obstacles (m, clipped to 0.4).
 as large, learns that from z_E and where the links are, at `POSES` random configurations per scene:
 
 - links: mean error in cm for links that are within 10 cm of an obstacle;
-- decoded: the same by the points that a decoder tells of (`envs.perception.encoders.told_checker`).
+- decoded: the same by the points that a decoder tells of (`envs.perception.encoders.decoded_checker`).
 """
 
 import argparse
@@ -38,23 +38,23 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception.encoders import (
+    DECODED_RADIUS,
+    DECODED_REACH,
     MAX_OBSTACLES,
     ORACLE,
-    TOLD_RADIUS,
-    TOLD_REACH,
+    decoded_points,
     oracle,
-    packaged_encoders,
+    pretrained_encoders,
     scene_encoder,
-    told_points,
 )
 from roboarm_nmp.envs.scenes.primitives import ROW, to_array
 
 TASK = "random_boxes_hard"
 CELL = 0.2  # m
 LOW, HIGH = np.array([-0.8, -0.8, 0.0]), np.array([0.8, 0.8, 1.6])
-POSES, NEAR, FAR = 16, 0.1, 0.4
+POSES, ACTIVATION_DISTANCE, FAR = 16, 0.1, 0.4
 # m: from when on what a decoder tells of counts as being in a cell; one of them is chosen.
-REACHES = [-0.005, 0.0, 0.0025, 0.005, 0.0075, 0.01, TOLD_REACH]
+REACHES = [-0.005, 0.0, 0.0025, 0.005, 0.0075, 0.01, DECODED_REACH]
 SHAPE = tuple(np.round((HIGH - LOW) / CELL).astype(int))
 
 
@@ -86,7 +86,7 @@ def link_distances(scenes, seed):
     """
     states = np.random.default_rng(seed).uniform(-1.0, 1.0, (len(scenes), POSES, 7))
     distances = [
-        CollisionChecker(replace(scene, table=None, floor=None)).proximity(some, within=FAR)
+        CollisionChecker(replace(scene, table=None, floor=None)).link_distances(some, within=FAR)
         for scene, some in zip(tqdm(scenes, desc="distances"), states, strict=True)
     ]
     frames = panda.joint_frames(panda.denormalise(states))
@@ -171,7 +171,7 @@ class NearestObstacle(nn.Module):
 
 
 def distance_probe(latents, data, test_latents, test_data, is_set=False, seed=0, epochs=10):
-    """Train the second network; its mean error (m) on the test scenes' links within `NEAR`."""
+    """Train the second network; its mean error (m) on the test scenes' links within `ACTIVATION_DISTANCE`."""
     torch.manual_seed(seed)
     if not is_set:
         mean, std = latents.mean(0), latents.std(0) + 1e-3
@@ -193,7 +193,7 @@ def distance_probe(latents, data, test_latents, test_data, is_set=False, seed=0,
             scene, pose = rows // POSES, rows % POSES
             truth = distances[scene, pose]
             predicted = network(torch.cat([latents[scene], places[scene, pose]], dim=1))
-            weights = 1.0 + 4.0 * (truth < NEAR)
+            weights = 1.0 + 4.0 * (truth < ACTIVATION_DISTANCE)
             loss = (weights * (predicted - truth).abs()).sum() / weights.sum()
             optimizer.param_groups[0]["lr"] = 1e-3 * (1.0 - done / updates)
             optimizer.zero_grad()
@@ -205,7 +205,7 @@ def distance_probe(latents, data, test_latents, test_data, is_set=False, seed=0,
         inputs = torch.cat([spread, test_places], dim=2).flatten(0, 1)
         predicted = torch.cat([network(some) for some in inputs.split(4096)])
     error = (predicted - test_distances.flatten(0, 1)).abs()
-    return error[test_distances.flatten(0, 1) < NEAR].mean().item()
+    return error[test_distances.flatten(0, 1) < ACTIVATION_DISTANCE].mean().item()
 
 
 def told_cells(points):
@@ -235,19 +235,19 @@ def decoded(name, training, cells, testing, test_cells, test_data):
 
     guesses = {reach: [] for reach in REACHES}
     for scene in tqdm(training[:200], desc="decoded, to choose"):
-        points = told_points(scene, name)
+        points = decoded_points(scene, name)
         for reach, found in guesses.items():
             found.append(told_cells(nearer(scene, points, reach)))
     best = max(REACHES, key=lambda reach: iou(np.stack(guesses[reach]), cells[:200]))
     found, errors = [], []
     _, distances, states = test_data
     for scene, truth, some in zip(tqdm(testing, desc="decoded"), distances, states, strict=True):
-        points = told_points(scene, name)
+        points = decoded_points(scene, name)
         found.append(told_cells(nearer(scene, points, best)))
         bare = replace(scene, obstacles=(), table=None, floor=None)
-        checker = CollisionChecker(bare, points, TOLD_RADIUS)
-        error = np.abs(checker.proximity(some, within=FAR)[..., 0] - truth)
-        errors.append(error[truth < NEAR])
+        checker = CollisionChecker(bare, points, DECODED_RADIUS)
+        error = np.abs(checker.link_distances(some, within=FAR)[..., 0] - truth)
+        errors.append(error[truth < ACTIVATION_DISTANCE])
     mean = 100 * float(np.concatenate(errors).mean())
     return {"decoded_iou": iou(np.stack(found), test_cells), "decoded_cm": mean}
 
@@ -288,7 +288,9 @@ def figures(probabilities, means, cells):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("encoders", nargs="*", help="networks (encoder.pt); default: the packaged")
+    parser.add_argument(
+        "encoders", nargs="*", help="networks (encoder.pt); default: the pretrained"
+    )
     parser.add_argument("--num", type=int, default=10_000, help="scenes to learn from (10,000)")
     parser.add_argument("--num-test", type=int, default=2_000, help="scenes to test on (2,000)")
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
@@ -309,7 +311,7 @@ def main():
     nothing = np.zeros((len(training), 1), np.float32), np.zeros((len(testing), 1), np.float32)
     error = distance_probe(nothing[0], data, nothing[1], test_data)
     results["mean"]["links_cm"] = 100 * error
-    names = args.encoders or packaged_encoders()
+    names = args.encoders or pretrained_encoders()
     known, test_known = latents(names, training), latents(names, testing)
     known[ORACLE], test_known[ORACLE] = (
         np.stack([oracle(scene) for scene in scenes]) for scenes in (training, testing)

@@ -27,8 +27,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
-from roboarm_nmp.envs.networks.exported_networks import halve_network
-from roboarm_nmp.envs.perception.encoders import PACKAGED
+from roboarm_nmp.envs.networks.exported_networks import to_float16
+from roboarm_nmp.envs.perception.encoders import PRETRAINED
 from roboarm_nmp.envs.policies.registry import PolicyError, find_policy
 from roboarm_nmp.envs.policies.safety_filter import VERSION
 from roboarm_nmp.envs.utils.files import write_atomically
@@ -40,14 +40,14 @@ PAPER_CELLS = ROOT / "benchmarks" / "paper_cells.csv"
 POLICIES = ROOT / "envs" / "policies" / "pretrained"
 HARD = "random_boxes_hard"
 # What a last layer around any policy keeps: see docs/experiments.md.
-OBSTACLES = ["--keep-distance", "0.01"]
-POINTS = ["--keep-distance", "0.01", "--encoder", "points"]
+OBSTACLES = ["--safety-margin", "0.01"]
+POINTS = ["--safety-margin", "0.01", "--encoder", "points"]
 STRAIGHT = ["--policy", "go-to-goal", "--goal-type", "combined"]
 PLANNER = ["--policy", "planner", "--goal-type", "combined"]
 CELLS = {
-    "reactive, points, no way out": [*STRAIGHT, *POINTS, "--no-way-out"],
+    "reactive, points, no way out": [*STRAIGHT, *POINTS, "--no-escape"],
     "reactive, points": [*STRAIGHT, *POINTS],
-    "reactive, obstacles, no way out": [*STRAIGHT, *OBSTACLES, "--no-way-out"],
+    "reactive, obstacles, no way out": [*STRAIGHT, *OBSTACLES, "--no-escape"],
     "reactive, obstacles": [*STRAIGHT, *OBSTACLES],
     "look, then plan": [*PLANNER, "--encoder", "points"],
     "look, then plan, field": [*PLANNER, "--encoder", "field"],
@@ -59,7 +59,7 @@ for _encoder, _layer in BC_LAYERS.items():
     _flags = ["--policy", f"bc-combined-{_encoder}-{HARD}-s1"]
     CELLS |= {
         f"bc, {_encoder}, alone": _flags,
-        f"bc, {_encoder}, no way out": [*_flags, *_layer, "--no-way-out"],
+        f"bc, {_encoder}, no way out": [*_flags, *_layer, "--no-escape"],
         f"bc, {_encoder}": [*_flags, *_layer],
     }
 TOLD = "dagger, points told by field"  # trained with points that are seen
@@ -79,13 +79,13 @@ for _name, _policy, _layer, _encoder in (
 ):
     _flags = ["--policy", f"dagger-combined-{_policy}-s1", *_encoder]
     CELLS |= {
-        f"{_name}, alone": [*_flags, "--keep-distance", "0"],
-        f"{_name}, no way out": [*_flags, *_layer, "--no-way-out"],
+        f"{_name}, alone": [*_flags, "--safety-margin", "0"],
+        f"{_name}, no way out": [*_flags, *_layer, "--no-escape"],
         _name: _flags,  # its own layer
     }
 LAYERS = ("alone", "with the layer", "and the way out")
 # z_E is less exact than points are.
-CELLS[TOLD] = [*CELLS[TOLD], "--keep-distance", "0.015"]
+CELLS[TOLD] = [*CELLS[TOLD], "--safety-margin", "0.015"]
 # What stands in the first table: policy, what it knows, what its layer knows, and its cells.
 ROWS = (
     ("`go-to-goal`", "nothing", "points", "go-to-goal", "reactive, points"),
@@ -145,9 +145,14 @@ OF_BASELINES = {
     "RRT-Connect": "RRT-Connect, 5 s",
 }
 KEPT = (
-    *("success_rate", "success_rate_interval", "clean_success_rate", "clean_success_rate_interval"),
+    *(
+        "success_rate",
+        "success_rate_interval",
+        "collision_free_success_rate",
+        "collision_free_success_rate_interval",
+    ),
     *("num_queries", "ms_per_action", "planning_seconds", "mean_steps", "path_length"),
-    *("env", "encoder", "last_layer", "seed"),
+    *("env", "encoder", "safety_filter", "seed"),
 )
 LAYER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the last layer that a result had
 ENCODER_MARK = "†"
@@ -166,7 +171,7 @@ def keep(run):
     encoder = args["encoder"].partition(":")[0]
     scenes = load_roadmap_paths(Path(args["paths"])).task  # that it learned from
     name = f"dagger-{args['goal_type']}-{encoder}-{scenes}-s{args['seed']}"
-    halve_network(run / "policy.pt", POLICIES / f"{name}.pt")
+    to_float16(run / "policy.pt", POLICIES / f"{name}.pt")
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
     made |= {key: training[key] for key in ("policy_step", "validation_success_rate")}
     made |= {"training_seconds": training["seconds"], "date": datetime.date.today().isoformat()}
@@ -227,9 +232,9 @@ def is_done(result, name, num):
 
 
 def digests(result):
-    """Of the packaged encoders that a result depends on, by name."""
-    knows = result["encoder"], *(result["env"].get(key) for key in ("encoder", "proximity"))
-    files = {name: PACKAGED / f"{name}.pt" for text in knows if text for name in text.split(":")}
+    """Of the pretrained encoders that a result depends on, by name."""
+    knows = result["encoder"], *(result["env"].get(key) for key in ("encoder", "link_distances"))
+    files = {name: PRETRAINED / f"{name}.pt" for text in knows if text for name in text.split(":")}
     return {
         name: hashlib.sha256(path.read_bytes()).hexdigest()[:12]
         for name, path in files.items()
@@ -244,11 +249,11 @@ def had_other_encoder(result):
 
 def version_of_layer(result):
     """Of the last layer that a result had; today's, if it had none."""
-    layer = result.get("last_layer")
+    layer = result.get("safety_filter")
     if layer is None:
         return VERSION
     # The first two differ in the way out of dead ends only.
-    return max(layer.get("version", 1), 1 if layer["way_out"] else 2)
+    return max(layer.get("version", 1), 1 if layer["escape"] else 2)
 
 
 def is_older(result):
@@ -315,7 +320,7 @@ def tables(results, others):
 def _of_seeds(results):
     """A sentence: what policies with points have that differ in the seed of their training."""
     text = f"`dagger.py` with points, {len(results)} seeds, `{HARD}`:"
-    for words, key in (("success", "success_rate"), ("clean", "clean_success_rate")):
+    for words, key in (("success", "success_rate"), ("clean", "collision_free_success_rate")):
         rates = [result[key] for result in results]
         each = ", ".join(f"{rate:.3f}" for rate in rates)
         text += f" {words} {each}, so {statistics.mean(rates):.3f}"
@@ -333,7 +338,7 @@ def _cell(result):
     if result is None:
         return "not run"
     low, high = result["success_rate_interval"]
-    rates = f"{result['success_rate']:.3f}, {result['clean_success_rate']:.3f}"
+    rates = f"{result['success_rate']:.3f}, {result['collision_free_success_rate']:.3f}"
     mark = LAYER_MARKS.get(version_of_layer(result), "") + ENCODER_MARK * had_other_encoder(result)
     return f"{rates}{mark} [{result['num_queries']:,}: {low:.3f}, {high:.3f}]"
 

@@ -28,7 +28,7 @@ The last two check collisions with the true obstacles (`envs.collision.checker`)
 does not see; with `--encoder points`, with what four point clouds see of them: look, then plan;
 with the name of an encoder that has a decoder (`--encoder field`), with what its 64 numbers tell.
 
-Around any policy, `--keep-distance` puts a last layer (`envs.policies.safety_filter`): links stay that far (m)
+CircularConv any policy, `--safety-margin` puts a last layer (`envs.policies.safety_filter`): links stay that far (m)
 from everything, as far as it can, and the arm leaves dead ends. It knows the true obstacles, too,
 or with `--encoder points` what is seen. A policy that was trained with points and distances from
 them may get those that an encoder tells of: `--encoder field`.
@@ -75,16 +75,15 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.arm_env import STANDARD_RULES, deviations
 from roboarm_nmp.envs.datasets.format import QueryScenes
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, validate
-from roboarm_nmp.envs.perception.encoders import with_told
 from roboarm_nmp.envs.policies.registry import (
     PLANNING,
     TIME_LIMIT,
     TRIES,
     find_policy,
     make_policy,
-    own_layer,
+    own_safety_filter,
 )
-from roboarm_nmp.envs.policies.safety_filter import VERSION, LastLayer
+from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.envs.training import flags
@@ -106,7 +105,7 @@ FRAMES = 8  # of a picture
 class Args:
     policy: str
     """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy network, a run's folder
-    with a `policy.pt` in it, or the name of a shipped one (docs/results.md)"""
+    with a `policy.pt` in it, or the name of a pretrained one (docs/results.md)"""
     task: str
     """the task, one of `envs.TASKS`, or a scene file (.yaml)"""
     goal_type: Literal["ee", "config", "combined"] | None = None
@@ -121,14 +120,14 @@ class Args:
     """processes; each uses one core"""
     stop_on_collision: bool = False
     """end an episode at the first touch"""
-    encoder: str | None = None
-    """what `planner`, `via-points` and the last layer know of the scene: `points` that sensors see,
-    or an encoder with a decoder (a name or path), which then also tells a policy of points what it
-    knows; by default the true obstacles"""
-    keep_distance: NonNegativeFloat | None = None
+    geometry_source: str | None = None
+    """where `planner`, `via-points`, the safety filter and the policy's observations take the
+    obstacles from: `ground_truth`, `point_cloud`, or an encoder with a decoder (a name or path); by
+    default the policy's own, otherwise `ground_truth`"""
+    safety_margin: NonNegativeFloat | None = None
     """put a last layer around the policy that keeps this distance (m), e.g. 0.01; by default the
     one that is part of the policy, if it has one (0: none at all)"""
-    way_out: bool = True
+    escape: bool = True
     """the last layer also leaves dead ends, by a detour into a random direction"""
     seed: Seed = 0
     """of what is random: `random`, `via-points`, `planner`, ways out"""
@@ -200,8 +199,8 @@ class _Job:
     policy: str | Path | Callable
     task: str
     env: dict
-    encoder: str | None
-    last_layer: LastLayer | None
+    geometry_source: str | None
+    safety_filter: SafetyFilter | None
     start: np.ndarray
     goal: np.ndarray
     scenes: Sequence[Scene]
@@ -213,7 +212,7 @@ class _Job:
 
     def make(self, **kwargs):
         env = envs.make(self.task, **self.env, **kwargs)
-        options = self.seed, self.tries, self.time_limit, self.encoder, self.last_layer
+        options = self.seed, self.tries, self.time_limit, self.geometry_source, self.safety_filter
         return env, make_policy(self.policy, env, *options)
 
     def query(self, index):
@@ -319,8 +318,8 @@ def evaluate(
     seed=0,
     tries=TRIES,
     time_limit=TIME_LIMIT,
-    encoder=None,
-    last_layer=None,
+    geometry_source=None,
+    safety_filter=None,
     workers=1,
     env=None,
     progress=False,
@@ -344,10 +343,10 @@ def evaluate(
         seed: of what is random; each query has its own generator.
         tries: random configurations that `via-points` tries per query, >= 1.
         time_limit: seconds that `planner` may search per query, > 0.
-        encoder: what `planner`, `via-points` and the last layer know (`envs.perception.point_clouds.checker_of`):
-            `points`, or an encoder's name, which tells a policy of points what it knows, too; None:
-            the true obstacles.
-        last_layer: an `envs.policies.safety_filter.LastLayer` around the policy; None: the one that is part of
+        geometry_source: where `planner`, `via-points`, the safety filter and the policy's
+            observations take the obstacles from (`envs.perception.geometry_source`); None for the
+            policy's own, otherwise `ground_truth`.
+        safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None: the one that is part of
             it, if it has one; False: none.
         workers: processes. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
@@ -376,8 +375,8 @@ def _prepare(
     split,
     num_queries,
     stop_on_collision,
-    encoder,
-    last_layer,
+    geometry_source,
+    safety_filter,
     env,
     **options,
 ):
@@ -405,19 +404,18 @@ def _prepare(
                         f"cannot be evaluated with {goal_type!r}"
                     )
                 env, goal_type = trained, trained["goal_type"]
-                if encoder not in (None, "points"):
-                    env = with_told(encoder, env)
+                if geometry_source is not None and "geometry_source" in env:
+                    env = env | {"geometry_source": geometry_source}
         env |= {"goal_type": goal_type or "ee", "stop_on_collision": stop_on_collision}
-        if last_layer is None:
-            last_layer = own_layer(policy)
-        if last_layer:
-            own = env.get("proximity") or encoder or "obstacles"
-            if encoder not in (None, own):
-                raise EvaluationError(f"{policy} is told its distances from {own}, not {encoder}")
-            env["proximity"] = own
-        elif encoder not in (None, env.get("proximity")) and policy not in PLANNING:
+        if safety_filter is None:
+            safety_filter = own_safety_filter(policy)
+        if safety_filter:
+            source = env.get("geometry_source") or geometry_source or "ground_truth"
+            env |= {"link_distances": True, "geometry_source": source}
+        elif geometry_source not in (None, env.get("geometry_source")) and policy not in PLANNING:
             raise EvaluationError(
-                "encoder is for via-points, planner and a last layer: a trained policy has its own"
+                "geometry_source is for via-points, planner, a safety filter, and policies that "
+                "observe points or link distances"
             )
         if queries is None:
             queries = load_queries(task, split)
@@ -425,7 +423,9 @@ def _prepare(
             validate(queries, task)  # they are for this task, with the scene it has now
             queries = load_queries(queries, split)
         arm = envs.make(task, **env)
-        make_policy(policy, arm, encoder=encoder, last_layer=last_layer)  # or it raises
+        make_policy(
+            policy, arm, geometry_source=geometry_source, safety_filter=safety_filter
+        )  # or it raises
         arm.close()
     except (TypeError, ValueError) as error:
         raise EvaluationError(str(error)) from error
@@ -445,8 +445,8 @@ def _prepare(
         policy,
         str(task),
         env,
-        encoder,
-        last_layer,
+        geometry_source,
+        safety_filter,
         queries.start[:count],
         queries.goal[:count],
         scenes,
@@ -485,7 +485,7 @@ def _summary(job, outcomes):
         "split": job.split,
         "num_queries": count,
         **share("success_rate", reached),
-        **share("clean_success_rate", clean),
+        **share("collision_free_success_rate", clean),
         **share("collision_rate", columns.collision),
         "mean_steps": mean(columns.steps),
         "path_length": mean(columns.path_length),
@@ -494,9 +494,11 @@ def _summary(job, outcomes):
         **planning,
         "env": job.env,
         "deviations": deviations(job.env),
-        "encoder": job.encoder,
-        "last_layer": asdict(job.last_layer) | {"version": VERSION} if job.last_layer else None,
-        "seed": job.seed if job.policy in ("random", *PLANNING) or job.last_layer else None,
+        "geometry_source": job.geometry_source,
+        "safety_filter": asdict(job.safety_filter) | {"version": VERSION}
+        if job.safety_filter
+        else None,
+        "seed": job.seed if job.policy in ("random", *PLANNING) or job.safety_filter else None,
         "tries": job.tries if job.policy == "via-points" else None,
         "time_limit": job.time_limit if job.policy == "planner" else None,
         "versions": {
@@ -519,7 +521,7 @@ def _table(result):
         row(label, result[name], interval=result[f"{name}_interval"])
         for label, name in (
             ("success", "success_rate"),
-            ("clean success", "clean_success_rate"),
+            ("clean success", "collision_free_success_rate"),
             ("collision", "collision_rate"),
         )
     ]
@@ -568,16 +570,16 @@ def _draw(job):
     return png.getvalue()
 
 
-def _last_layer(args):
+def _safety_filter(args):
     """As `evaluate` takes it. Raises ValueError: there is no way out that could be left out."""
-    if args.keep_distance is not None:
-        return LastLayer(args.keep_distance, args.way_out) if args.keep_distance else False
-    if args.way_out:
+    if args.safety_margin is not None:
+        return SafetyFilter(args.safety_margin, args.escape) if args.safety_margin else False
+    if args.escape:
         return None
-    own = own_layer(find_policy(args.policy)[0])
+    own = own_safety_filter(find_policy(args.policy)[0])
     if own is None:
-        raise ValueError("--no-way-out: the policy has no last layer; --keep-distance puts one")
-    return replace(own, way_out=False)
+        raise ValueError("--no-escape: the policy has no last layer; --safety-margin puts one")
+    return replace(own, escape=False)
 
 
 def main(arguments=None):
@@ -588,9 +590,9 @@ def main(arguments=None):
         for path in (args.json, args.picture):
             if path is not None:
                 check_writable(path)
-        of_the_command = ("keep_distance", "way_out", "json", "picture")
+        of_the_command = ("safety_margin", "escape", "json", "picture")
         given = {name: flag for name, flag in vars(args).items() if name not in of_the_command}
-        job = _prepare(**given, last_layer=_last_layer(args), env=None)
+        job = _prepare(**given, safety_filter=_safety_filter(args), env=None)
         result = _summary(job, _run(job, progress=True))
     except ValueError as error:
         print(f"evaluate.py: {error}", file=sys.stderr)

@@ -22,7 +22,6 @@ import torch.nn.functional as F
 
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
-from roboarm_nmp.envs.perception.encoders import LatentTable
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.envs.training import flags, protocol, runs
 
@@ -123,7 +122,7 @@ class Features(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
         self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
-        self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.proximity else None
+        self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.link_distances else None
         self.size = observation_size + goal_size + 14 * args.trigonometric + 10 * bool(self.near)
         self.size += 3 * self.relative_goal + 7 * self.relative_configuration
 
@@ -216,6 +215,27 @@ class Actor(nn.Module):
 
 # SHARED: replay buffer and demonstrations
 # ALGO LOGIC: replay buffer
+class LatentTable:
+    """Latent codes of scenes, each stored once: `rows` (n, size), in the order they were added."""
+
+    def __init__(self, size):
+        self.size, self._row_of = size, {}  # the latent's bytes -> its row
+        self._latents = np.zeros((1, size), np.float32)
+
+    @property
+    def rows(self):
+        return self._latents[: len(self._row_of)]
+
+    def row_of(self, latent):
+        """The row of a latent (size,), which is added if it is new."""
+        latent = np.float32(latent)
+        row = self._row_of.setdefault(latent.tobytes(), len(self._row_of))
+        if row == len(self._latents):
+            self._latents = np.concatenate([self._latents, np.zeros_like(self._latents)])
+        self._latents[row] = latent
+        return row
+
+
 class HerReplayBuffer:
     """Transitions of finished episodes in a ring; goals are relabelled when they are sampled.
 
@@ -372,7 +392,7 @@ class SAC:
             fused=True,
         )
 
-    def saved_parts(self):
+    def checkpoint_state(self):
         """What a checkpoint has of it."""
         names = "actor actor_average critics critics_target q_optimizer actor_optimizer log_alpha"
         return {name: getattr(self, name) for name in names.split()}
@@ -453,11 +473,15 @@ if __name__ == "__main__":
     agent = SAC(args, eval_envs[0].observation_space["observation"].shape[0], device)
 
     # SHARED: resuming and episodes
-    saved_parts = agent.saved_parts() | {"buffer": buffer, "rng": rng, "progress": progress}
-    runs.load_checkpoint(args, saved_parts)
+    checkpoint_state = agent.checkpoint_state() | {
+        "buffer": buffer,
+        "rng": rng,
+        "progress": progress,
+    }
+    runs.load_checkpoint(args, checkpoint_state)
     writer = runs.summary_writer(run, args, progress["global_step"])
     observations = protocol.begin_episodes(envs, args.seed, progress["global_step"])
-    staged, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
+    episodes, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
     recent_success, losses, stop = [], {}, False
     seconds_before = progress["seconds"]
     bar = runs.progress_bar(args.total_timesteps, progress["global_step"], "step")
@@ -475,10 +499,10 @@ if __name__ == "__main__":
         for i, env in enumerate(envs):
             before = observations[i]
             observations[i], reward, terminated, truncated, info = env.step(actions[i])
-            staged[i].append(transition(before, actions[i], observations[i], info["collision"]))
+            episodes[i].append(transition(before, actions[i], observations[i], info["collision"]))
             returns[i] += reward
             if terminated or truncated:
-                buffer.add_episode(staged[i])
+                buffer.add_episode(episodes[i])
                 step = progress["global_step"] + i + 1
                 protocol.log_episode(writer, step, returns[i], info, recent_success)
                 if args.demo_prob is not None:
@@ -486,7 +510,7 @@ if __name__ == "__main__":
                         buffer.add_episode(demo_transitions(env.demo, env.env))
                         progress["demos_injected"] += 1
                     writer.add_scalar("charts/demos_injected", progress["demos_injected"], step)
-                staged[i], returns[i], observations[i] = [], 0.0, env.reset()[0]
+                episodes[i], returns[i], observations[i] = [], 0.0, env.reset()[0]
         progress["global_step"] += args.num_envs
         bar.update(args.num_envs)
         step = progress["global_step"]
@@ -507,11 +531,11 @@ if __name__ == "__main__":
             if progress["best_step"] == step:
                 protocol.save_policy(run, policy, eval_envs, device, args, env_arguments, step)
             bar.set_postfix(eval=success, best=progress["best_success"])
-            for episode in filter(None, staged):
+            for episode in filter(None, episodes):
                 buffer.add_episode(episode)
-            staged, returns = [[] for _ in envs], [0.0 for _ in envs]
+            episodes, returns = [[] for _ in envs], [0.0 for _ in envs]
             progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, saved_parts, device)
+            runs.save_checkpoint(run, checkpoint_state, device)
             # A resumed run goes on exactly as this one does: with new episodes.
             observations = protocol.begin_episodes(envs, args.seed, step)
             stop = args.stop_at_success is not None and success >= args.stop_at_success

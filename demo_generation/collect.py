@@ -51,7 +51,7 @@ class Args:
     num: PositiveInt = 10_000
     """Number of demonstrations."""
     seed: Seed = 0
-    """Seed of queries and plans. (The packaged files have 0, and plans of an earlier version.)"""
+    """Seed of queries and plans. (The pretrained files have 0, and plans of an earlier version.)"""
     workers: Workers = 2
     """Number of processes. The file does not depend on it."""
     planner: str = "RRTConnect"
@@ -92,7 +92,7 @@ OPTIONS = (
     "allow_collisions",
 )
 PLANNER_OPTIONS = ("planner", "time_limit", "max_checks", "clearance", "planner_range", "simplify")
-# Of files that were made before these were options, such as the packaged ones.
+# Of files that were made before these were options, such as the pretrained ones.
 EARLIER_OPTIONS = {"planner_range": 0.0, "simplify": 3}
 
 
@@ -161,7 +161,7 @@ def demonstrate(planner, start, goal, rng, attempts, allow_collisions=False, rej
         seed = int(rng.integers(1, 2**32))
         try:
             # Each attempt dares to go nearer to obstacles: some queries leave no choice.
-            path = planner.plan(start, goal, seed=seed, caution=0.5**attempt)
+            path = planner.plan(start, goal, seed=seed, margin_scale=0.5**attempt)
         except PlanningError:
             rejected["no_plan"] += 1
             continue

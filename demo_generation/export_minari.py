@@ -43,7 +43,7 @@ PREFIX = ".exporting-"  # of folders that are not whole yet; Minari does not loo
 @dataclass
 class Args:
     task: str | None = None
-    """Name of a task with a fixed scene: export its packaged demonstrations."""
+    """Name of a task with a fixed scene: export its pretrained demonstrations."""
     file: Path | None = None
     """Demonstration file to export instead."""
     goal_type: Literal["ee", "config", "combined"] = "ee"
@@ -65,7 +65,7 @@ def unrounded(demo, env):
     if execution.digest != demo.digest:
         raise ValueError(
             "the demonstrations do not repeat exactly here: `python -m roboarm_nmp.demo_generation.verify "
-            "FILE --mend` first"
+            "FILE --repair` first"
         )
     states, points = execution.states, subgoals(demo.plan)
     actions = points[np.minimum(np.arange(1, len(states)), len(points) - 1)] - states[:-1]

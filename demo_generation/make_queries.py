@@ -57,7 +57,7 @@ class Args:
     queries_per_scene: PositiveInt = 1
     """Queries in each scene, where scenes vary."""
     seed: Seed = 0
-    """Seed of the queries; 0 gives the packaged files."""
+    """Seed of the queries; 0 gives the pretrained files."""
     num_test: PositiveInt = 10_000
     """Number of test queries."""
     num_validation: PositiveInt = 200

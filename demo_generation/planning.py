@@ -43,13 +43,13 @@ PLANNERS = tuple(
 # A configuration this close (m) to a collision counts as one, which absorbs most of the
 # controller's lag: without it, two of three plans on `double_walls` touch something when followed.
 MARGIN = 0.003
-# Around a start or goal that is nearer than that, the margin grows by this much (m) per unit of
+# CircularConv a start or goal that is nearer than that, the margin grows by this much (m) per unit of
 # normalised distance from it: all of it is kept again some three steps away.
 MARGIN_GROWTH = 0.03
 # `Planner.plan_within` gives up these distances bit by bit as a search goes on, because one that
 # takes long is likely to go on for long: after so many configurations it keeps this share of them.
 # (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmarks.md.)
-CAUTIONS = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
+MARGIN_SCHEDULE = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
 # Where RRT-Connect has found nothing after so many configurations, another planner may look at half
 # as many before it goes on, and so in turns, each twice as long as the last one: some ways out of a
 # shelf that RRT-Connect does not find, LBKPIECE1 finds at once.
@@ -78,7 +78,7 @@ class Validity:
     Args:
         checker: a `CollisionChecker`.
         rules: pairs of a number of checks and, to be kept from then on, a dict of `margin`,
-            `clearance` and `relaxed` of the checker's methods; the first from 0 on.
+            `clearance` and `endpoint_margins` of the checker's methods; the first from 0 on.
         time_limit, max_checks: as for `Planner`.
     """
 
@@ -117,7 +117,7 @@ class Validity:
     def exhausted(self):
         return self.checks >= self._max_checks or time.monotonic() > self._deadline
 
-    def insist(self):
+    def restore_margins(self):
         """From now on, the first rule is kept: for what improves a path that is there."""
         self._later = [self._rules[0]]
         self._relax()
@@ -180,8 +180,8 @@ class Planner:
             those that have such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with
             RRTConnect, docs/benchmarks.md.)
         simplify: rounds of removing vertices and cutting corners; 0 for none.
-        checker_of: from a `Scene` to the `CollisionChecker` that is asked, by default that of the
-            true obstacles; `envs.perception.point_clouds.seen_checker` knows only what sensors see.
+        geometry_source: from a `Scene` to the `CollisionChecker` that is asked, by default that of the
+            true obstacles; `envs.perception.point_clouds.observed_checker` knows only what sensors see.
 
     Raises:
         ValueError: unknown planner, a limit that is not positive, or another number out of range.
@@ -196,7 +196,7 @@ class Planner:
         clearance=0.005,
         planner_range=0.4,
         simplify=1,
-        checker_of=CollisionChecker,
+        geometry_source=CollisionChecker,
     ):
         if not callable(planner) and planner not in PLANNERS:
             raise ValueError(f"unknown planner {planner!r}: one of {', '.join(PLANNERS)}")
@@ -213,15 +213,19 @@ class Planner:
         self.time_limit, self.max_checks = time_limit, max_checks
         self.clearance = clearance
         self.planner_range, self.simplify = planner_range, simplify
-        self._checker_of, self._scene, self._checker = checker_of, env.scene, checker_of(env.scene)
+        self._geometry_source, self._scene, self._checker = (
+            geometry_source,
+            env.scene,
+            geometry_source(env.scene),
+        )
         # What is compiled at its first call is compiled now, not in a plan's time.
         state = (0.0,) * panda.NUM_JOINTS
-        self._checker.nearest(state)
+        self._checker.signed_distances(state)
         self._checker.motion_checker()(state, state)
         self.checks = 0
         """Configurations that the last plan has looked at."""
 
-    def plan(self, start, goal, scene=None, *, seed, caution=1.0):
+    def plan(self, start, goal, scene=None, *, seed, margin_scale=1.0):
         """A path from start to goal: float32 (n, 7), rad; its ends are exactly start and goal.
 
         Args:
@@ -229,22 +233,22 @@ class Planner:
             scene: a `Scene` to change the environment to first.
             seed: int > 0. The same seed gives the same path, whatever was planned before (except
                 where `time_limit` is what ends the search).
-            caution: share of `clearance` and `MARGIN` to keep, in [0, 1].
+            margin_scale: share of `clearance` and `MARGIN` to keep, in [0, 1].
 
         Raises:
             ValueError: start or goal is not 7 numbers inside the limits, or is in collision; seed
-                or caution is out of range; or your own planner returned something that is not a
+                or margin_scale is out of range; or your own planner returned something that is not a
                 path from start to goal.
             PlanningError: no path within `time_limit` and `max_checks`.
         """
-        if not 0 <= caution <= 1:
-            raise ValueError(f"caution must be in [0, 1], got {caution!r}")
-        turns, cautions = ((self.planner, math.inf),), ((0, caution),)
+        if not 0 <= margin_scale <= 1:
+            raise ValueError(f"margin_scale must be in [0, 1], got {margin_scale!r}")
+        turns, schedule = ((self.planner, math.inf),), ((0, margin_scale),)
         limits = self.time_limit, self.max_checks
-        return self._plan(start, goal, scene, seed, turns, cautions, *limits)
+        return self._plan(start, goal, scene, seed, turns, schedule, *limits)
 
     def plan_within(self, seconds, start, goal, scene=None, *, rng):
-        """A path found in `seconds`, which are its only limit; it keeps what `CAUTIONS` say.
+        """A path found in `seconds`, which are its only limit; it keeps what `MARGIN_SCHEDULE` say.
 
         RRT-Connect gets help from `OTHER_PLANNER` where it takes long. The same path comes out on
         every machine that has the time. If it takes longer to follow than an episode lasts, there
@@ -258,7 +262,7 @@ class Planner:
         for _ in range(SEARCHES):
             seed, left = int(rng.integers(1, 2**32)), deadline - time.monotonic()
             try:
-                path = self._plan(start, goal, scene, seed, turns, CAUTIONS, left, math.inf)
+                path = self._plan(start, goal, scene, seed, turns, MARGIN_SCHEDULE, left, math.inf)
             except PlanningError:
                 break
             if best is None or len(subgoals(path)) < len(subgoals(best)):
@@ -269,7 +273,7 @@ class Planner:
             raise PlanningError(f"no path in {seconds} s")
         return best
 
-    def _plan(self, start, goal, scene, seed, turns, cautions, time_limit, max_checks):
+    def _plan(self, start, goal, scene, seed, turns, schedule, time_limit, max_checks):
         if not seed > 0:
             raise ValueError(f"seed must be positive, got {seed!r}")  # OMPL ignores others
         if np.shape(goal) == (3,):  # a position, with which an episode may begin
@@ -277,7 +281,7 @@ class Planner:
         # Both are refused here as an episode would refuse them.
         self.env.reset_specific(start, goal, scene)
         start, goal = (np.asarray(end, dtype=np.float32) for end in (start, goal))
-        is_valid = self._validity(start, goal, cautions, time_limit, max_checks)
+        is_valid = self._validity(start, goal, schedule, time_limit, max_checks)
         states = panda.normalise(start), panda.normalise(goal)
         # For the random number generators that OMPL makes from here on. Spaces make some, for the
         # projections of KPIECE1 and its kin; how many must not matter to the planner.
@@ -290,7 +294,7 @@ class Planner:
         else:
             path = _solve(turns, self.planner_range, space, is_valid, *states)
         if path is not None and self.simplify:
-            is_valid.insist()
+            is_valid.restore_margins()
             path = _simplify(space, path, self.simplify)
         self.checks = is_valid.checks
         if path is None:
@@ -302,20 +306,24 @@ class Planner:
         path[0], path[-1] = start, goal
         return path
 
-    def _validity(self, start, goal, cautions, time_limit, max_checks):
+    def _validity(self, start, goal, schedule, time_limit, max_checks):
         if self._scene is not self.env.scene:
-            self._scene, self._checker = self.env.scene, self._checker_of(self.env.scene)
+            self._scene, self._checker = self.env.scene, self._geometry_source(self.env.scene)
         ends = np.clip(np.stack([panda.normalise(start), panda.normalise(goal)]), -1.0, 1.0)
-        near = self._checker.nearest(ends).distance.min(-1)
-        from_scene = self._checker.nearest(ends, self_collisions=False).distance.min(-1)
-        clearance = cautions[0][1] * self.clearance
+        near = self._checker.signed_distances(ends).distance.min(-1)
+        from_scene = self._checker.signed_distances(ends, self_collisions=False).distance.min(-1)
+        clearance = schedule[0][1] * self.clearance
         clearance = self.clearance if from_scene.min() >= clearance else 0.0
         rules = []
-        for checks, caution in cautions:
+        for checks, margin_scale in schedule:
             # Less a hair, because the ends are checked again after normalising, which rounds.
-            distances = np.minimum(near, from_scene - caution * clearance) - 1e-5
-            relaxed = ends, distances, MARGIN_GROWTH
-            rule = dict(margin=caution * MARGIN, clearance=caution * clearance, relaxed=relaxed)
+            distances = np.minimum(near, from_scene - margin_scale * clearance) - 1e-5
+            endpoint_margins = ends, distances, MARGIN_GROWTH
+            rule = dict(
+                margin=margin_scale * MARGIN,
+                clearance=margin_scale * clearance,
+                endpoint_margins=endpoint_margins,
+            )
             rules.append((checks, rule))
         return Validity(self._checker, rules, time_limit, max_checks)
 

@@ -45,7 +45,7 @@ from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Seed, Wo
 
 # L2, normalised, between states of a motion that are looked at before a path wants to take it.
 COARSE = 8 * RESOLUTION
-# Around a configuration that is nearer to something than the margin, the margin grows by this much
+# CircularConv a configuration that is nearer to something than the margin, the margin grows by this much
 # (m) per unit of normalised distance from it.
 MARGIN_GROWTH = 0.05
 # Nodes keep at least this (m), as plans do (`demo_generation.planning.MARGIN`).
@@ -224,7 +224,7 @@ class Roadmap:
 
     def _distances(self, states):
         """m, of the arm from the nearest thing; negative inside of it."""
-        return self._checker.nearest(states).distance.min(-1)
+        return self._checker.signed_distances(states).distance.min(-1)
 
     def _rooms(self, states):
         """The distances, at most the margin."""
@@ -235,8 +235,10 @@ class Roadmap:
 
     def _free(self, starts, ends, states, room, margin, **options):
         """Whether motions (n, 7) are free, each as near as its own states (n, k, 7) allow."""
-        relaxed = (states, room - _HAIR, MARGIN_GROWTH)
-        return self._checker.is_motion_free(starts, ends, margin, relaxed=relaxed, **options)
+        endpoint_margins = (states, room - _HAIR, MARGIN_GROWTH)
+        return self._checker.is_motion_free(
+            starts, ends, margin, endpoint_margins=endpoint_margins, **options
+        )
 
     def _costs(self, starts, ends, start_room, end_room):
         """Of straight motions (..., 7), if they are free."""
@@ -464,7 +466,7 @@ class Args:
     num_nodes: PositiveInt = 1000
     """Nodes of a roadmap."""
     num_neighbours: PositiveInt = 14
-    """Nearest nodes that each is joined to, where the motion is free."""
+    """SignedDistances nodes that each is joined to, where the motion is free."""
     margin: PositiveFloat = 0.015
     """Metres that paths keep from everything, where there is room."""
     shard_size: PositiveInt = 50

@@ -1,6 +1,6 @@
-"""Verify demonstration files: follow every plan again in the simulator; mend what fails.
+"""Verify demonstration files: follow every plan again in the simulator; repair what fails.
 
-    python -m roboarm_nmp.demo_generation.verify envs/demos/double_walls.h5 --mend
+    python -m roboarm_nmp.demo_generation.verify envs/demos/double_walls.h5 --repair
 
 Paper: appendix "Software package description" ("verification, and correction"). A demonstration
 is good if its plan, followed, gives exactly the execution that is stored, reaches its goal, and
@@ -36,25 +36,25 @@ class Args:
     """Demonstration files, or tasks (names or scene files)."""
     workers: Workers = 2
     """Number of processes."""
-    mend: bool = False
+    repair: bool = False
     """Plan anew what does not verify, on the same query, and replace the file."""
 
 
 class Verifier:
-    """Follows the demonstrations of a file; with `mend`, plans anew where that fails."""
+    """Follows the demonstrations of a file; with `repair`, plans anew where that fails."""
 
-    def __init__(self, path, mend):
+    def __init__(self, path, repair):
         self.demos = load_demos(path)
-        self.mend = mend
+        self.repair = repair
         self.env = RoboArmEnv(self.demos.scenes.base)
         options = self.demos.parameters["options"]
         self.allow_collisions = options["allow_collisions"]
         self.planner = make_planner(self.env, options)
 
     def __call__(self, index):
-        """`(index, verdict, demo)`: one of `VERDICTS`, and, with `mend`, what to store.
+        """`(index, verdict, demo)`: one of `VERDICTS`, and, with `repair`, what to store.
 
-        That is a dict with plan, states, plan_seed, digest, collided; or None: not mended.
+        That is a dict with plan, states, plan_seed, digest, collided; or None: not repaired.
         """
         demo, seed = self.demos[index], int(self.demos.plan_seed[index])
         try:
@@ -62,7 +62,7 @@ class Verifier:
         except ValueError:
             return index, "refused", None  # start or goal: no plan can help
         verdict = self._verdict(demo, execution)
-        if not self.mend:
+        if not self.repair:
             return index, verdict, None
         if verdict in ("good", "changed"):
             return index, verdict, _demo(demo.plan, execution, seed)
@@ -95,8 +95,8 @@ def _demo(plan, execution, seed):
     }
 
 
-def verify(task_or_path, num_workers=1, mend=False, progress=True):
-    """Follow every demonstration of a task or file; with `mend`, replace the file by a good one.
+def verify(task_or_path, num_workers=1, repair=False, progress=True):
+    """Follow every demonstration of a task or file; with `repair`, replace the file by a good one.
 
     Mended: an execution that is another one now is stored as it is; what misses or collides is
     planned anew; what cannot be helped is removed.
@@ -112,12 +112,12 @@ def verify(task_or_path, num_workers=1, mend=False, progress=True):
     path, task = Path(task_or_path), demos.task
     if is_task(task_or_path):
         path, task = demo_path(task_or_path), task_or_path
-    if mend and not is_task(task):
-        raise DatasetError(f"{path}: to mend it, name the scene file {task}.yaml instead")
+    if repair and not is_task(task):
+        raise DatasetError(f"{path}: to repair it, name the scene file {task}.yaml instead")
     if "options" not in demos.parameters:
         raise DatasetError(f"{path}: it does not say with what options it was collected")
     counts, kept = Counter(), {}
-    results = workers.run(Verifier, (path, mend), range(len(demos)), num_workers)
+    results = workers.run(Verifier, (path, repair), range(len(demos)), num_workers)
     bar = tqdm(
         results,
         desc=path.name,
@@ -131,12 +131,12 @@ def verify(task_or_path, num_workers=1, mend=False, progress=True):
         kept[index] = demo
     bad = len(demos) - counts["good"]
     removed = 0
-    if mend and bad:
+    if repair and bad:
         kept = {index: kept[index] for index in sorted(kept) if kept[index] is not None}
         good = list(kept.values())
         removed = len(demos) - len(good)
         if not good:
-            raise DatasetError(f"{path}: nothing in it can be mended")
+            raise DatasetError(f"{path}: nothing in it can be repaired")
         write_demos(
             path,
             task,
@@ -147,7 +147,7 @@ def verify(task_or_path, num_workers=1, mend=False, progress=True):
             made_by=demos.made_by,
             parameters={
                 **demos.parameters,
-                "mended": demos.parameters.get("mended", 0) + bad - removed,
+                "repaired": demos.parameters.get("repaired", 0) + bad - removed,
                 "removed": demos.parameters.get("removed", 0) + removed,
             },
             scenes_of=None if demos.scenes.index is None else map(demos.scenes.__getitem__, kept),
@@ -163,7 +163,7 @@ def main(args):
     failed = False
     for name in args.files:
         try:
-            counts = verify(name, args.workers, args.mend)
+            counts = verify(name, args.workers, args.repair)
         except (ValueError, OSError, RuntimeError) as error:
             print(f"error: {error}", file=sys.stderr)
             failed = True
@@ -174,10 +174,10 @@ def main(args):
         bad = counts["total"] - counts["good"]
         text = ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
         text += f" of {counts['total']} demonstrations"
-        if bad and args.mend:
-            text += f"; {bad - counts['removed']} mended, {counts['removed']} removed"
+        if bad and args.repair:
+            text += f"; {bad - counts['removed']} repaired, {counts['removed']} removed"
         print(f"{name}: {text}")
-        failed = failed or (bad > 0 and not args.mend)
+        failed = failed or (bad > 0 and not args.repair)
     sys.exit(int(failed))
 
 

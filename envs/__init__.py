@@ -10,40 +10,66 @@ from roboarm_nmp.envs.tasks import TASKS, get_task
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
 
 
-def make(task, encoder=None, proximity=None, append_proximity=False, **kwargs):
+def make(
+    task,
+    encoder=None,
+    num_points=64,
+    geometry_source=None,
+    link_distances=False,
+    append_link_distances=False,
+    **kwargs,
+):
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
     Args:
         task: name of a task (`TASKS`), or path of a scene file (docs/your_own_scene.md).
-        encoder: what is appended to `observation` about the scene: name or path of an encoder's
-            network, `oracle` or `points` (`envs.perception.encoders`); None for nothing.
-        proximity: add `proximity` to observations, how far each link is from the nearest thing
-            (`envs.wrappers.ProximityWrapper`): of the true `obstacles`, of the `points` that four
-            sensors saw of them, or what z_E of an encoder tells; None for nothing.
-        append_proximity: with `proximity`: append it to `observation`, too, before z_E.
+        encoder: appends the encoded scene to `observation`: `oracle`, `point_cloud`, or the name or
+            path of an encoder's network (`envs.perception.encoders`); None for nothing.
+        num_points: of the encoder `point_cloud`.
+        geometry_source: where link distances take the obstacles from
+            (`envs.perception.geometry_source`): `ground_truth`, `point_cloud`, or the name or path
+            of an encoder with a decoder, from which the encoder `point_cloud` has its points then.
+        link_distances: add `link_distances` to observations, the signed distance of each link from
+            the nearest obstacle and its gradient (`envs.wrappers.LinkDistancesWrapper`). Needs
+            `geometry_source`.
+        append_link_distances: with `link_distances`: append them to `observation`, too, before z_E.
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:
         ValueError: unknown task, malformed scene file, an argument out of its range, or a file
             that is no encoder.
     """
-    for name, value in (("task", task), ("encoder", encoder), ("proximity", proximity)):
+    for name, value in (("task", task), ("encoder", encoder), ("geometry_source", geometry_source)):
         if not isinstance(value, (str, Path)) and (value is not None or name == "task"):
             raise ValueError(f"{name} must be a name or a path, got {value!r}")
-    if not isinstance(append_proximity, bool) or append_proximity and proximity is None:
-        raise ValueError(f"append_proximity, {append_proximity!r}, is a bool and needs proximity")
+    for name, value in (
+        ("link_distances", link_distances),
+        ("append_link_distances", append_link_distances),
+    ):
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} must be a bool, got {value!r}")
+    if append_link_distances and not link_distances:
+        raise ValueError("append_link_distances needs link_distances")
+    if link_distances and geometry_source is None:
+        raise ValueError(
+            "link_distances needs a geometry_source: ground_truth, point_cloud or an encoder"
+        )
+    if geometry_source is not None and not link_distances and encoder != "point_cloud":
+        raise ValueError("geometry_source goes with link_distances, or the encoder point_cloud")
     env = RoboArmEnv(get_task(task).scene, **kwargs)
     # What takes long to import is imported only where it is needed.
     if encoder is not None:
-        from roboarm_nmp.envs.perception.encoders import scene_encoder
+        from roboarm_nmp.envs.perception.encoders import make_encoder
         from roboarm_nmp.envs.wrappers import SceneEncodingWrapper
 
-        env = SceneEncodingWrapper(env, scene_encoder(encoder))
-    if proximity is not None:
-        from roboarm_nmp.envs.perception.point_clouds import checker_of
-        from roboarm_nmp.envs.wrappers import ProximityWrapper
+        decoded_by = None if geometry_source in ("ground_truth", "point_cloud") else geometry_source
+        env = SceneEncodingWrapper(env, make_encoder(encoder, num_points, decoded_by))
+    if link_distances:
+        from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+        from roboarm_nmp.envs.wrappers import LinkDistancesWrapper
 
-        env = ProximityWrapper(env, checker_of(proximity), append_proximity)
+        source = find_geometry_source(geometry_source)
+        env = LinkDistancesWrapper(env, source, append_link_distances)
     return env
 
 

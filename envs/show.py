@@ -65,7 +65,7 @@ class Args:
     policy: str = "go-to-goal"
     """Who moves the arm, in the window and in an animation: `go-to-goal` (straight to the goal
     configuration), `random`, `via-points`, `planner` (as in clean_rl_scripts/evaluate.py), a policy
-    network, a run's folder with a `policy.pt` in it, or a shipped one's name (docs/results.md).
+    network, a run's folder with a `policy.pt` in it, or a pretrained one's name (docs/results.md).
     `demo` replays the task's demonstrations; --query is the number of one of these then."""
     query: NonNegativeInt = 0
     """Number of the (first) query to show, from 0."""

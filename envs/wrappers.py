@@ -115,25 +115,25 @@ class SceneEncodingWrapper(_ObservingWrapper):
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
 
-class ProximityWrapper(_ObservingWrapper):
-    """Adds `proximity` to the observation: how far each link is from the nearest thing.
+class LinkDistancesWrapper(_ObservingWrapper):
+    """Adds `link_distances` to the observation: how far each link is from the nearest thing.
 
     float32 (10, 8), a row per `envs.collision.checker.LINKS`: the distance from obstacles, table and floor
-    in m, clipped to `envs.collision.checker.PROXIMITY_RANGE`, and its gradient, m per unit of normalised
-    configuration (zeros beyond the range). If the goal is a configuration, `goal_proximity` is the
+    in m, clipped to `envs.collision.checker.LINK_DISTANCE_RANGE`, and its gradient, m per unit of normalised
+    configuration (zeros beyond the range). If the goal is a configuration, `goal_link_distances` is the
     same there. Otherwise this is its `RoboArmEnv`, with all of its attributes.
 
     Args:
         env: a `RoboArmEnv`, possibly in a `SceneEncodingWrapper`.
-        checker_of: from a `Scene` to the `CollisionChecker` that tells: `envs.perception.point_clouds.true_checker`
-            or `seen_checker`.
-        append: whether `observation` has `proximity`, too: 80 numbers, before an encoded scene.
+        geometry_source: from a `Scene` to the `CollisionChecker` that tells: `envs.perception.point_clouds.ground_truth_checker`
+            or `observed_checker`.
+        append: whether `observation` has `link_distances`, too: 80 numbers, before an encoded scene.
     """
 
-    def __init__(self, env, checker_of, append=False):
+    def __init__(self, env, geometry_source, append=False):
         super().__init__(env)
-        self._checker_of, self.appends_proximity = checker_of, append
-        names = ["proximity"] + ["goal_proximity"] * (env.goal_type != "ee")
+        self._geometry_source, self.appends_link_distances = geometry_source, append
+        names = ["link_distances"] + ["goal_link_distances"] * (env.goal_type != "ee")
         # (Inside of something, a distance is at least minus the way out.)
         space = gym.spaces.Box(-np.inf, np.inf, (10, 8), np.float32)
         spaces = env.observation_space.spaces | {name: space for name in names}
@@ -143,25 +143,25 @@ class ProximityWrapper(_ObservingWrapper):
         self.observation_space = gym.spaces.Dict(spaces)
         self._goal, self._of_goal = None, None
 
-    def proximity_at(self, states, scene=None):
-        """What `proximity` would be in other configurations: (..., 7) -> float32 (..., 10, 8).
+    def link_distances_at(self, states, scene=None):
+        """What `link_distances` would be in other configurations: (..., 7) -> float32 (..., 10, 8).
 
         `scene`: a `Scene`, by default that of the environment.
         """
-        checker = self._checker_of(self.unwrapped.scene if scene is None else scene)
-        return checker.proximity(states)
+        checker = self._geometry_source(self.unwrapped.scene if scene is None else scene)
+        return checker.link_distances(states)
 
     def _with_more(self, observation):
         seen = observation["observation"]
-        more = {"proximity": self.proximity_at(seen[:7])}
-        if self.appends_proximity:
+        more = {"link_distances": self.link_distances_at(seen[:7])}
+        if self.appends_link_distances:
             size = self.unwrapped.observation_space["observation"].shape[0]
-            parts = seen[:size], more["proximity"].ravel(), seen[size:]
+            parts = seen[:size], more["link_distances"].ravel(), seen[size:]
             more["observation"] = np.concatenate(parts)
         if self.goal_type != "ee":
             goal = observation["desired_goal"][:7]
             key = self.unwrapped.scene, goal.tobytes()
             if self._goal != key:
-                self._goal, self._of_goal = key, self.proximity_at(goal)
-            more["goal_proximity"] = self._of_goal.copy()
+                self._goal, self._of_goal = key, self.link_distances_at(goal)
+            more["goal_link_distances"] = self._of_goal.copy()
         return {**observation, **more}

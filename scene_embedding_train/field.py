@@ -32,8 +32,8 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs.datasets.observations import sensors_to_json
 from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.perception.sensors import sensors_to_json
 from roboarm_nmp.envs.training.flags import (
     NonNegativeFloat,
     PositiveFloat,
@@ -61,14 +61,14 @@ from roboarm_nmp.scene_embedding_train.clouds import (
     on_obstacles,
     whole_clouds,
 )
-from roboarm_nmp.scene_embedding_train.pictures import averaged, load_pictures
+from roboarm_nmp.scene_embedding_train.pictures import averaged, load_images
 from roboarm_nmp.scene_embedding_train.pictures import batch_of as pictures_of
 from roboarm_nmp.scene_embedding_train.training_data import load_obstacles, open_observations, split
 
 # The field: around the robot's axis, m. Distances are clipped at both ends.
 REACH, HEIGHT = 1.0, 1.5
 DEEPEST, FARTHEST = -0.05, 0.4
-NEAR = 0.1  # m: the distances that matter most
+ACTIVATION_DISTANCE = 0.1  # m: the distances that matter most
 # Cells of angle, distance from the axis, and height; sectors, each with as much of z_E.
 ANGLES, RADII, HEIGHTS = 64, 16, 12
 SECTORS = 8
@@ -147,7 +147,7 @@ def convolutions(size, width):
 
 
 # MODEL
-def tents(places, low, high, number):
+def hat_weights(places, low, high, number):
     """How much of each cell's middle is in places (...): (..., number), linear between neighbours.
 
     There are `number` cells from `low` to `high`; what is beyond counts as in the outermost one.
@@ -160,17 +160,17 @@ def tents(places, low, high, number):
 def cylindrical(points):
     """Of points (..., 3), m, how much is in each cell of angle, distance from the axis, and height.
 
-    (..., ANGLES), (..., RADII), (..., HEIGHTS), as `tents` has it; angles go around and around.
+    (..., ANGLES), (..., RADII), (..., HEIGHTS), as `hat_weights` has it; angles go around and around.
     """
     x, y, z = points.unbind(-1)
     middles = torch.arange(ANGLES, device=points.device) + (0.5 - ANGLES / 2)
     apart = (torch.atan2(y, x).unsqueeze(-1) * (ANGLES / (2 * math.pi)) - middles).abs()
     angles = F.relu(1.0 - torch.minimum(apart, ANGLES - apart))
     radius = (x.square() + y.square()).sqrt()
-    return angles, tents(radius, 0.0, REACH, RADII), tents(z, 0.0, HEIGHT, HEIGHTS)
+    return angles, hat_weights(radius, 0.0, REACH, RADII), hat_weights(z, 0.0, HEIGHT, HEIGHTS)
 
 
-class Around(nn.Module):
+class CircularConv(nn.Module):
     """A linear layer and ReLU for each sector and its two neighbours: (n, sectors, features)."""
 
     def __init__(self, inputs, outputs):
@@ -190,9 +190,11 @@ class SeesClouds(nn.Module):
 
     def __init__(self, args):
         super().__init__()
-        self.first = Around(RADII * HEIGHTS, args.width)
+        self.first = CircularConv(RADII * HEIGHTS, args.width)
         halvings = int(math.log2(ANGLES // SECTORS))
-        self.layers = nn.ModuleList(Around(2 * args.width, args.width) for _ in range(halvings))
+        self.layers = nn.ModuleList(
+            CircularConv(2 * args.width, args.width) for _ in range(halvings)
+        )
         self.last = nn.Linear(args.width, args.latent_size // SECTORS)
 
     def forward(self, points, there):
@@ -232,9 +234,11 @@ class Decoder(nn.Module):
 
     def __init__(self, args):
         super().__init__()
-        self.first = Around(args.latent_size // SECTORS, args.width)
+        self.first = CircularConv(args.latent_size // SECTORS, args.width)
         doublings = int(math.log2(ANGLES // SECTORS))
-        self.layers = nn.ModuleList(Around(args.width, 2 * args.width) for _ in range(doublings))
+        self.layers = nn.ModuleList(
+            CircularConv(args.width, 2 * args.width) for _ in range(doublings)
+        )
         self.last = nn.Sequential(
             nn.Linear(args.width + RADII + HEIGHTS, 128), nn.ReLU(),
             nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, 1),
@@ -323,7 +327,7 @@ def queries(obstacles, number, spread):
     return points
 
 
-def turned(*points):
+def augment(*points):
     """Points (n, p, 3) of scenes, each scene turned about the robot's axis and perhaps mirrored."""
     n, device = len(points[0]), points[0].device
     angle = 2 * math.pi * torch.rand(n, 1, device=device)
@@ -359,14 +363,14 @@ def update(model, optimizer, seen, obstacles, args):
     truth = distances(obstacles, asked)
     if args.sees == "clouds":
         points, there = seen
-        points, asked = turned(points, asked)
+        points, asked = augment(points, asked)
         seen = points, there
     device = asked.device.type
     with torch.autocast(device, torch.bfloat16) if args.bf16 else contextlib.nullcontext():
         z = model.encode(*seen)
         predicted = model.decoder(z + args.latent_noise * torch.randn_like(z), asked)
     error = (predicted.float() - truth).abs()
-    near = truth < NEAR
+    near = truth < ACTIVATION_DISTANCE
     weights = 1.0 + args.near_weight * near
     loss = (weights * error).sum() / weights.sum()
     optimizer.zero_grad()
@@ -380,10 +384,10 @@ def evaluate(model, data, asked, rows, args, device):
     """Mean errors (m) of predicted distances in scenes `rows`, of points `asked`, (rows, q, 3).
 
     Returns:
-        A dict: `error_near` of what is within `NEAR` of an obstacle, and `error_5cm`, `error_10cm`,
+        A dict: `error_near` of what is within `ACTIVATION_DISTANCE` of an obstacle, and `error_5cm`, `error_10cm`,
         `error_20cm`, `error_40cm` by distance, up to there (0 where there is none).
     """
-    spans = {"near": (-1.0, NEAR), "5cm": (-1.0, 0.05), "10cm": (0.05, 0.1)}
+    spans = {"near": (-1.0, ACTIVATION_DISTANCE), "5cm": (-1.0, 0.05), "10cm": (0.05, 0.1)}
     spans |= {"20cm": (0.1, 0.2), "40cm": (0.2, 0.4)}
     sums, counts = dict.fromkeys(spans, 0.0), dict.fromkeys(spans, 0)
     for first in range(0, len(rows), args.batch_size):
@@ -444,7 +448,7 @@ if __name__ == "__main__":
     if args.sees == "clouds":
         names, *data = load_obstacle_points(observations, args.num_points)
     else:
-        pictures, names = load_pictures(observations, args.picture_size)
+        pictures, names = load_images(observations, args.picture_size)
         data = [pictures]
     data.append(load_obstacles(observations))
     run, device = run_folder(args, observations.task), seed_torch(args)
@@ -469,8 +473,8 @@ if __name__ == "__main__":
 
     # SHARED: checkpoint and log
     progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
-    saved_parts = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
-    load_checkpoint(args, saved_parts)
+    checkpoint_state = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
+    load_checkpoint(args, checkpoint_state)
     seconds_before = progress["seconds"]
     writer = summary_writer(run, args, progress["updates"])
     bar = progress_bar(args.total_updates, progress["updates"], "update")
@@ -514,7 +518,7 @@ if __name__ == "__main__":
             bar.set_postfix(near=f"{result['error_near']:.4f}")
             # SHARED: checkpoint and result
             progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, saved_parts, device)
+            save_checkpoint(run, checkpoint_state, device)
     bar.close()
 
     result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}

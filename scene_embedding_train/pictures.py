@@ -1,6 +1,6 @@
 """Cameras' pictures, as the trainers of image encoders use them: batches, errors, comparisons.
 
-Pictures are averaged down, to save time. `load_pictures` does it once for what is trained on,
+Pictures are averaged down, to save time. `load_images` does it once for what is trained on,
 `averaged` in the encoder that is saved.
 """
 
@@ -14,7 +14,7 @@ from roboarm_nmp.envs.perception.sensors import Camera
 from roboarm_nmp.scene_embedding_train.training_data import unpacked
 
 
-def load_pictures(observations, size):
+def load_images(observations, size):
     """What the cameras saw, averaged down: uint8 (scenes, cameras, size, size, 3); cameras' names.
 
     Unpacked once into a file beside the shards, which is then mapped into memory.
@@ -37,7 +37,7 @@ def load_pictures(observations, size):
 
 
 def shrunk_pictures(observations, shard, cameras, size):
-    """`load_pictures`'s rows of one shard."""
+    """`load_images`'s rows of one shard."""
     shrunk = []
     for name in cameras:
         pictures = observations.read(shard, f"{name}/rgb")
@@ -48,7 +48,7 @@ def shrunk_pictures(observations, shard, cameras, size):
 
 
 def batch_of(images, rows, device):
-    """Rows of `load_pictures`'s array as float32 (n, cameras, 3, size, size) in [0, 1]."""
+    """Rows of `load_images`'s array as float32 (n, cameras, 3, size, size) in [0, 1]."""
     chosen = torch.from_numpy(images[np.sort(rows)]).to(device)
     return chosen.permute(0, 1, 4, 2, 3).float() / 255.0
 

@@ -26,9 +26,8 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs.datasets.observations import sensors_to_json
 from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE
+from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE, sensors_to_json
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Share, Width
 from roboarm_nmp.envs.training.runs import (
     RunFlags,
@@ -356,8 +355,8 @@ if __name__ == "__main__":
 
     # SHARED: checkpoint and log
     progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
-    saved_parts = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
-    load_checkpoint(args, saved_parts)
+    checkpoint_state = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
+    load_checkpoint(args, checkpoint_state)
     seconds_before = progress["seconds"]
     writer = summary_writer(run, args, progress["updates"])
     bar = progress_bar(args.total_updates, progress["updates"], "update")
@@ -402,7 +401,7 @@ if __name__ == "__main__":
             bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
             # SHARED: checkpoint and result
             progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, saved_parts, device)
+            save_checkpoint(run, checkpoint_state, device)
     bar.close()
 
     result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}

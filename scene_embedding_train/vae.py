@@ -19,8 +19,8 @@ import numpy as np
 import torch
 import torch.nn as nn
 
-from roboarm_nmp.envs.datasets.observations import sensors_to_json
 from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.perception.sensors import sensors_to_json
 from roboarm_nmp.envs.training.flags import (
     NonNegativeFloat,
     PositiveFloat,
@@ -46,7 +46,7 @@ from roboarm_nmp.scene_embedding_train.pictures import (
     batch_of,
     comparison,
     foreground,
-    load_pictures,
+    load_images,
     mean_picture,
     reconstruction_errors,
 )
@@ -215,7 +215,7 @@ if __name__ == "__main__":
     if num_halvings(size) == 0:
         sys.exit(f"--picture-size {size}: 8, 16, 32, 64, 128, ... pixels")
     num_training, validation = split(observations, args)
-    images, cameras = load_pictures(observations, size)
+    images, cameras = load_images(observations, size)
     run, device = run_folder(args, observations.task), seed_torch(args)
     rng = np.random.default_rng(args.seed)
     mean_image = mean_picture(images, num_training, device)
@@ -232,8 +232,8 @@ if __name__ == "__main__":
 
     # SHARED: checkpoint and log
     progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
-    saved_parts = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
-    load_checkpoint(args, saved_parts)
+    checkpoint_state = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
+    load_checkpoint(args, checkpoint_state)
     seconds_before = progress["seconds"]
     writer = summary_writer(run, args, progress["updates"])
     bar = progress_bar(args.total_updates, progress["updates"], "update")
@@ -272,7 +272,7 @@ if __name__ == "__main__":
             # END SHARED
             # SHARED: checkpoint and result
             progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, saved_parts, device)
+            save_checkpoint(run, checkpoint_state, device)
     bar.close()
 
     result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}

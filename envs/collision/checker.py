@@ -5,8 +5,8 @@
     checker = CollisionChecker(scene)
     checker.is_free(states)                  # normalised (n, 7) -> bool (n,)
     checker.is_motion_free(starts, ends)     # straight motions, checked every `RESOLUTION`
-    checker.nearest(states)                  # per link: how far, which way is out, from what
-    checker.proximity(states)                # the same as observations have it, and quicker
+    checker.signed_distances(states)                  # per link: how far, which way is out, from what
+    checker.link_distances(states)                # the same as observations have it, and quicker
 
 The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`, but no PyBullet
 world is moved. They are: the convex hulls of the links' collision meshes, `BULLET_MARGIN` thicker
@@ -35,10 +35,10 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, group_points, shape_rows
 from roboarm_nmp.envs.collision.kernels import (
     free_batch,
+    link_distances_batch,
     motion,
     motion_batch,
-    nearest_batch,
-    proximity_batch,
+    signed_distances_batch,
 )
 from roboarm_nmp.envs.scenes.primitives import Scene, floor_box
 
@@ -46,13 +46,13 @@ NUM_LINKS = len(panda.COLLISION_LINKS)
 RESOLUTION = 0.021
 """Motions are checked at points at most this far apart, L2 in the normalised space: less than one
 step of the arm (0.03)."""
-PROXIMITY_RANGE = 0.3
+LINK_DISTANCE_RANGE = 0.3
 """m. In observations, things farther away than that are as good as none."""
 NOTHING, TABLE, FLOOR, ARM, POINT = -1, -2, -3, -4, -5
-"""What `Nearest.thing` says where it is not the index of an obstacle."""
+"""What `SignedDistances.geometry` says where it is not the index of an obstacle."""
 
 
-class Nearest(NamedTuple):
+class SignedDistances(NamedTuple):
     """How near each of `panda.COLLISION_LINKS` is to something, for a batch of configurations of shape (...).
 
     Attributes:
@@ -110,7 +110,7 @@ class CollisionChecker:
         self._things = np.array([*things, ARM, POINT, NOTHING])
         self._world = shape_rows(shapes), *group_points(points, point_radius)
 
-    def is_free(self, states, margin=0.0, clearance=0.0, relaxed=None):
+    def is_free(self, states, margin=0.0, clearance=0.0, endpoint_margins=None):
         """Whether the arm is at least `margin` away from everything: bool (...).
 
         Without a margin, it is free where `RoboArmEnv.in_collision` says that it does not collide.
@@ -119,14 +119,14 @@ class CollisionChecker:
             states: (..., 7), normalised.
             margin: m, in [0, `MAX_MARGIN`): from the scene, and between the links.
             clearance: m, in [0, `MAX_MARGIN`): from the scene, in addition.
-            relaxed: None, or `(states (k, 7), distances (k,), growth)`. Near these states the
+            endpoint_margins: None, or `(states (k, 7), distances (k,), growth)`. Near these states the
                 margin is smaller: `distance + growth * d` at most, where d is how far away they are
                 (L2, normalised). For queries that begin or end nearer to something than `margin`.
                 Each configuration, or motion, may have its own: (..., k, 7) and (..., k).
         """
         states = _states("states", states)
         free = np.empty(states.shape[:-1], dtype=np.bool_)
-        rule = _rule(margin, clearance, relaxed, batch=states.shape[:-1])
+        rule = _rule(margin, clearance, endpoint_margins, batch=states.shape[:-1])
         free_batch(states.reshape(-1, 7), *rule, arm_hulls(), self._world, free.reshape(-1))
         return free
 
@@ -136,7 +136,7 @@ class CollisionChecker:
         ends,
         margin=0.0,
         clearance=0.0,
-        relaxed=None,
+        endpoint_margins=None,
         resolution=RESOLUTION,
         ends_known=False,
     ):
@@ -147,11 +147,11 @@ class CollisionChecker:
 
         Args:
             starts, ends: (..., 7), normalised; one may be broadcast to the other.
-            margin, clearance, relaxed: as for `is_free`.
+            margin, clearance, endpoint_margins: as for `is_free`.
             resolution: L2, normalised, > 0.
             ends_known: both ends are known to be free, and not looked at.
         """
-        arguments = starts, ends, margin, clearance, relaxed, resolution, ends_known
+        arguments = starts, ends, margin, clearance, endpoint_margins, resolution, ends_known
         return self.motion_checks(*arguments) >= 0
 
     def motion_checks(
@@ -160,29 +160,31 @@ class CollisionChecker:
         ends,
         margin=0.0,
         clearance=0.0,
-        relaxed=None,
+        endpoint_margins=None,
         resolution=RESOLUTION,
         ends_known=False,
     ):
         """How many configurations `is_motion_free` looks at, int64 (...); negative: not free."""
         starts, ends = np.broadcast_arrays(_states("starts", starts), _states("ends", ends))
-        rule = _rule(margin, clearance, relaxed, resolution, batch=starts.shape[:-1])
+        rule = _rule(margin, clearance, endpoint_margins, resolution, batch=starts.shape[:-1])
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
         flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
         motion_batch(*flat, *rule, arm_hulls(), self._world, ends_known, checks.reshape(-1))
         return checks
 
-    def motion_checker(self, margin=0.0, clearance=0.0, relaxed=None, resolution=RESOLUTION):
+    def motion_checker(
+        self, margin=0.0, clearance=0.0, endpoint_margins=None, resolution=RESOLUTION
+    ):
         """For planners, which ask for one motion at a time: a function of two tuples of 7 floats.
 
         It is `motion_checks` for one motion from a start that is known to be free, which is not
         looked at again; and it does not look at its arguments.
         """
-        rule, relaxed = _rule(margin, clearance, relaxed, resolution)
-        return functools.partial(motion, rule, relaxed[0], arm_hulls(), self._world, False)
+        rule, endpoint_margins = _rule(margin, clearance, endpoint_margins, resolution)
+        return functools.partial(motion, rule, endpoint_margins[0], arm_hulls(), self._world, False)
 
-    def nearest(self, states, self_collisions=True, within=math.inf):
-        """How far each of `panda.COLLISION_LINKS` is from the nearest thing, and which way is out: a `Nearest`.
+    def signed_distances(self, states, self_collisions=True, within=math.inf):
+        """How far each of `panda.COLLISION_LINKS` is from the nearest thing, and which way is out: a `SignedDistances`.
 
         Args:
             states: (..., 7), normalised.
@@ -194,7 +196,7 @@ class CollisionChecker:
         distance, which = np.empty(batch), np.empty(batch, dtype=np.int64)
         direction, point = np.empty((*batch, 3)), np.empty((*batch, 3))
         gradient = np.empty((*batch, panda.NUM_JOINTS))
-        nearest_batch(
+        signed_distances_batch(
             states.reshape(-1, 7),
             bool(self_collisions),
             float(within),
@@ -206,13 +208,13 @@ class CollisionChecker:
             gradient.reshape(-1, NUM_LINKS, panda.NUM_JOINTS),
             which.reshape(-1, NUM_LINKS),
         )
-        return Nearest(distance, direction, point, gradient, self._things[which])
+        return SignedDistances(distance, direction, point, gradient, self._things[which])
 
-    def proximity(self, states, self_collisions=False, within=PROXIMITY_RANGE):
-        """`proximity` as `envs.wrappers.ProximityWrapper` has it: float32 (..., 10, 8).
+    def link_distances(self, states, self_collisions=False, within=LINK_DISTANCE_RANGE):
+        """`link_distances` as `envs.wrappers.LinkDistancesWrapper` has it: float32 (..., 10, 8).
 
-        A row per one of `panda.COLLISION_LINKS`: `Nearest.distance` in m, clipped to `within`, and
-        `Nearest.gradient`, in m per unit of normalised configuration.
+        A row per one of `panda.COLLISION_LINKS`: `SignedDistances.distance` in m, clipped to `within`, and
+        `SignedDistances.gradient`, in m per unit of normalised configuration.
 
         Args:
             states: (..., 7), normalised; beyond the limits, which an arm may be a little, it is
@@ -222,7 +224,7 @@ class CollisionChecker:
         states = _numbers("states", states)
         rows = np.empty((*states.shape[:-1], NUM_LINKS, 8), dtype=np.float32)
         flat = states.reshape(-1, 7), rows.reshape(-1, NUM_LINKS, 8)
-        if not proximity_batch(
+        if not link_distances_batch(
             *flat, bool(self_collisions), float(within), arm_hulls(), self._world
         ):
             raise ValueError("states must be normalised configurations, not NaN")
@@ -251,7 +253,7 @@ def _states(name, states):
     return states
 
 
-def _rule(margin, clearance, relaxed, resolution=RESOLUTION, batch=()):
+def _rule(margin, clearance, endpoint_margins, resolution=RESOLUTION, batch=()):
     """What is asked for, as the compiled functions take it. Raises ValueError.
 
     Returns float64 (4,): margin, clearance, growth, resolution; and (n, k, 8): states and distances
@@ -262,16 +264,20 @@ def _rule(margin, clearance, relaxed, resolution=RESOLUTION, batch=()):
             raise ValueError(f"{name} must be in [0, {MAX_MARGIN}) m, got {value!r}")
     if not 0 < resolution < math.inf:
         raise ValueError(f"resolution must be positive, got {resolution!r}")
-    if relaxed is None:
+    if endpoint_margins is None:
         return np.array([margin, clearance, 0.0, resolution]), np.empty((1, 0, 8))
-    states, distances, growth = relaxed
-    states = _states("relaxed states", states)
+    states, distances, growth = endpoint_margins
+    states = _states("endpoint_margins states", states)
     distances = np.asarray(distances, dtype=np.float64)
     fits = states.ndim == 2 or (states.ndim > 2 and states.shape[:-2] == batch)
     if not fits or distances.shape != states.shape[:-1] or np.isnan(distances).any():
-        raise ValueError(f"relaxed: {states.shape} states and {distances.shape} distances")
+        raise ValueError(f"endpoint_margins: {states.shape} states and {distances.shape} distances")
     if not 0 <= growth < math.inf:
-        raise ValueError(f"relaxed: growth must be finite and not negative, got {growth!r}")
-    relaxed = np.concatenate([states, distances[..., None]], axis=-1)
-    relaxed = relaxed.reshape(-1 if states.ndim > 2 else 1, *relaxed.shape[-2:])
-    return np.array([margin, clearance, growth, resolution]), relaxed
+        raise ValueError(
+            f"endpoint_margins: growth must be finite and not negative, got {growth!r}"
+        )
+    endpoint_margins = np.concatenate([states, distances[..., None]], axis=-1)
+    endpoint_margins = endpoint_margins.reshape(
+        -1 if states.ndim > 2 else 1, *endpoint_margins.shape[-2:]
+    )
+    return np.array([margin, clearance, growth, resolution]), endpoint_margins

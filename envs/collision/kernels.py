@@ -386,17 +386,17 @@ def _as_row(bodies, k, frames, centres, row):
 
 
 @compiled
-def _is_free(q, rule, relaxed, arm, world, memory):
+def _is_free(q, rule, endpoint_margins, arm, world, memory):
     """`CollisionChecker.is_free` of one state."""
     bodies, pairs, vertices, cells = arm
     rows, points, groups, ball = world
     frames, centres, pose, s, other = memory
     margin, clearance, growth = rule[0], rule[1], rule[2]
-    for i in range(relaxed.shape[0]):
+    for i in range(endpoint_margins.shape[0]):
         squared = 0.0
         for j in range(7):
-            squared += (q[j] - relaxed[i, j]) ** 2
-        margin = min(margin, relaxed[i, 7] + growth * math.sqrt(squared))
+            squared += (q[j] - endpoint_margins[i, j]) ** 2
+        margin = min(margin, endpoint_margins[i, 7] + growth * math.sqrt(squared))
     _place(q, bodies, frames, centres)
     for k in range(bodies.shape[0] - 1, 0, -1):  # the hand first: it moves most
         for j in range(rows.shape[0]):
@@ -431,15 +431,15 @@ def _is_free(q, rule, relaxed, arm, world, memory):
 
 
 @compiled
-def free_batch(states, rule, relaxed, arm, world, free):
+def free_batch(states, rule, endpoint_margins, arm, world, free):
     memory = _memory()
     for i in range(states.shape[0]):
-        near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        near = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
         free[i] = _is_free(states[i], rule, near, arm, world, memory)
 
 
 @compiled
-def motion(rule, relaxed, arm, world, end_known, start, end):
+def motion(rule, endpoint_margins, arm, world, end_known, start, end):
     """How many states of a motion were looked at, not counting its start; negative: not free."""
     memory, q = _memory(), np.empty(7)
     squared = 0.0
@@ -460,7 +460,7 @@ def motion(rule, relaxed, arm, world, end_known, start, end):
             for j in range(7):
                 q[j] = start[j] + (end[j] - start[j]) * share
             looked_at += 1
-            if not _is_free(q, rule, relaxed, arm, world, memory):
+            if not _is_free(q, rule, endpoint_margins, arm, world, memory):
                 return -looked_at
         part += 2
         if part > parts:
@@ -470,10 +470,10 @@ def motion(rule, relaxed, arm, world, end_known, start, end):
 
 
 @compiled
-def motion_batch(starts, stops, rule, relaxed, arm, world, ends_known, checks):
+def motion_batch(starts, stops, rule, endpoint_margins, arm, world, ends_known, checks):
     memory = _memory()
     for i in range(starts.shape[0]):
-        near = relaxed[i if relaxed.shape[0] > 1 else 0]
+        near = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
         if ends_known:
             checks[i] = motion(rule, near, arm, world, True, starts[i], stops[i])
             continue
@@ -710,7 +710,7 @@ def _cloud_distance(
 
 
 @compiled
-def nearest_batch(
+def signed_distances_batch(
     states,
     self_collisions,
     within,
@@ -788,8 +788,8 @@ def nearest_batch(
 
 
 @compiled
-def proximity_batch(states, rows, self_collisions, within, arm, world):
-    """Write what `CollisionChecker.proximity` returns, unless a state is NaN: whether none is."""
+def link_distances_batch(states, rows, self_collisions, within, arm, world):
+    """Write what `CollisionChecker.link_distances` returns, unless a state is NaN: whether none is."""
     clipped = np.empty(states.shape)
     for i in range(states.shape[0]):
         for j in range(states.shape[1]):
@@ -801,7 +801,7 @@ def proximity_batch(states, rows, self_collisions, within, arm, world):
     direction, point = np.empty((batch[0], batch[1], 3)), np.empty((batch[0], batch[1], 3))
     gradient = np.empty((batch[0], batch[1], 7))
     found = distance, direction, point, gradient, which
-    nearest_batch(clipped, self_collisions, within, arm, world, *found)
+    signed_distances_batch(clipped, self_collisions, within, arm, world, *found)
     for i in range(batch[0]):
         for link in range(batch[1]):
             rows[i, link, 0] = min(distance[i, link], within)
@@ -814,14 +814,14 @@ def proximity_batch(states, rows, self_collisions, within, arm, world):
 
 
 @compiled
-def project(actions, proximity, keep, max_step, brake, near, push, sweeps):
+def project(actions, link_distances, keep, max_step, brake, near, push, sweeps):
     """Change actions (n, 7) in place."""
     for i in range(actions.shape[0]):
         action = actions[i]
         _shorten(action, max_step)
         for _ in range(sweeps):
-            for link in range(proximity.shape[1]):
-                row = proximity[i, link]
+            for link in range(link_distances.shape[1]):
+                row = link_distances[i, link]
                 if row[0] >= near:
                     continue
                 squared = along = 0.0

@@ -131,7 +131,7 @@ def demo_path(task):
 
 
 def load_demos(task_or_path, task=None):
-    """The `Demos` of a task's packaged file, or of any demonstration file.
+    """The `Demos` of a task's pretrained file, or of any demonstration file.
 
     Args:
         task_or_path: name of a task, path of a scene file, or path of a demonstration file.

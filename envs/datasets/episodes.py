@@ -65,14 +65,14 @@ def demo_episode(demo, env):
     Args:
         demo: an `envs.datasets.Demo`.
         env: an environment of `envs.make` without velocities; its goal type, action mode, goal
-            tolerances, encoder and appended proximity are those of the episode.
+            tolerances, encoder and appended link_distances are those of the episode.
     """
     observation, achieved_goal, desired_goal = observed(demo.states, demo.goal, env.goal_type)
     action = demo.actions
     if env.action_mode == "subgoal":
         action = demo.states[:-1] + demo.actions
-    if getattr(env, "appends_proximity", False):
-        near = env.proximity_at(demo.states, demo.scene)
+    if getattr(env, "appends_link_distances", False):
+        near = env.link_distances_at(demo.states, demo.scene)
         observation = np.hstack([observation, near.reshape(len(near), -1)])
     encoder = getattr(env, "encoder", None)
     if encoder is not None:

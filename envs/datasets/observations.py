@@ -15,8 +15,7 @@ compressed one by one, with a checksum each, so that any of them can be read alo
 """
 
 import io
-import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -25,30 +24,15 @@ import numpy as np
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.format import DatasetError, attribute
 from roboarm_nmp.envs.datasets.shards import read_array, shard_path, shard_paths, write_attributes
-from roboarm_nmp.envs.perception.sensors import Camera, PointCloud
+from roboarm_nmp.envs.perception.sensors import (
+    PointCloud,
+    sensors_from_json,
+    sensors_to_json,
+)
 from roboarm_nmp.envs.scenes.primitives import from_array, scene_from_json, scene_to_json, to_array
 from roboarm_nmp.envs.tasks import get_task, task_name
 
 SCHEMA, SCHEMA_VERSION = "roboarm-nmp observations", 1
-_KINDS = {"camera": Camera, "point_cloud": PointCloud}
-
-
-def sensors_to_json(sensors):
-    """A dict of name -> `Camera` or `PointCloud` as text."""
-    kinds = {kind: name for name, kind in _KINDS.items()}
-    return json.dumps(
-        {name: {"kind": kinds[type(sensor)], **asdict(sensor)} for name, sensor in sensors.items()}
-    )
-
-
-def sensors_from_json(text):
-    """The inverse of `sensors_to_json`."""
-    sensors = {}
-    for name, fields in json.loads(text).items():
-        kind = _KINDS[fields.pop("kind")]
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
-        sensors[name] = kind(**values)
-    return sensors
 
 
 def observe(world, sensors):

@@ -92,7 +92,7 @@ def query_path(task):
 
 
 def load_queries(task_or_path, split="test"):
-    """The `Queries` of a task's packaged file, or of any query file.
+    """The `Queries` of a task's pretrained file, or of any query file.
 
     Args:
         task_or_path: name of a task, path of a scene file, or path of a query file.

@@ -8,18 +8,18 @@ promises less: it may unpickle objects, and evaluates strings of the file as Pyt
 
     save_network("encoder.pt", encoder, {"points": points}, {"kind": "encoder"})
     z = load_network("encoder.pt")(points=points)
-    halve_network("encoder.pt", "smaller.pt")
+    to_float16("encoder.pt", "smaller.pt")
 
 A **policy** is a network from `observation` (N, 10 or 17), `achieved_goal` and `desired_goal`
 (N, 3, 7 or 10), float32 as `RoboArmEnv` gives them, to the deterministic action (N, 7), float32 in
 [-1, 1]. Its metadata hold `kind` ("policy"), `task`, and `env`, a dict of the arguments of
 `envs.make` it was trained with (`goal_type`, `action_mode`, `max_step`, `velocities`, `encoder`,
-`proximity`, `append_proximity`). With an encoder, `observation` is longer by z_E, and with appended
-proximity by 80; with proximity, `proximity` and `goal_proximity` (N, 10, 8) may be inputs, too.
-`last_layer`, a dict of `keep` (m) and `way_out`, is there where an `envs.policies.safety_filter.LastLayer` is
+`link_distances`, `append_link_distances`). With an encoder, `observation` is longer by z_E, and with appended
+link_distances by 80; with link_distances, `link_distances` and `goal_link_distances` (N, 10, 8) may be inputs, too.
+`safety_filter`, a dict of `margin` (m) and `escape`, is there where an `envs.policies.safety_filter.SafetyFilter` is
 part of the policy: whoever runs it by name (`envs.policies.registry`) has that around it. A policy with a
-`memory` of so many numbers takes them as an input of that name, (N, memory), zeros at an episode's
-start, and returns what it takes with the next observation beside the action: (action, memory).
+`recurrent_size` takes an input `recurrent_state` (N, recurrent_size), zeros at an episode's start,
+and returns the next one beside the action: (action, recurrent_state).
 """
 
 import copy
@@ -95,7 +95,7 @@ def save_network(path, module, example_inputs, metadata):
     write_atomically(path, buffer.getbuffer())
 
 
-def halve_network(path, output):
+def to_float16(path, output):
     """Write a network again with its float32 tensors rounded to float16: half as large a file.
 
     It computes in float32 as before, from the rounded numbers (11 significant bits), so its results
@@ -221,28 +221,32 @@ class ExportedNetwork:
             raise NetworkError(f"{self._path}: its inputs are tensors")
         shapes = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
         if shapes not in self._fitting:
-            rehearsal = network_operations.Rehearsal()
+            rehearsal = network_operations.ShapeCheck()
             self.to("meta")._run([tensor.to("meta") for tensor in inputs], rehearsal)
             if len(self._fitting) == _MAX_KNOWN:
                 self._fitting.clear()
             self._fitting.add(shapes)
         return self._run(inputs)
 
-    def row(self, inputs, size=None):
-        """What it makes of one row of inputs, a dict: NumPy float32 (size,).
+    def predict_one(self, inputs, size=None):
+        """The output for a batch of one: NumPy float32 (size,).
 
-        Raises NetworkError: that is not what comes out, or not all of it is finite.
+        Args:
+            inputs: dict of tensors (1, ...).
+            size: int or None for any; or a tuple of them for a network that returns several
+                outputs, which come as a list of arrays.
+
+        Raises:
+            NetworkError: the output has another type or size, or is not finite.
         """
-        return self._row(self(**inputs), size)
-
-    def rows(self, inputs, sizes):
-        """As `row`, of a network that returns several: a list of arrays of these sizes."""
         outputs = self(**inputs)
-        if not isinstance(outputs, list) or len(outputs) != len(sizes):
-            raise NetworkError(f"{self._path}: its output is not a sequence of {len(sizes)}")
-        return [self._row(output, size) for output, size in zip(outputs, sizes, strict=True)]
+        if not isinstance(size, tuple):
+            return self._one(outputs, size)
+        if not isinstance(outputs, list) or len(outputs) != len(size):
+            raise NetworkError(f"{self._path}: its output is not a sequence of {len(size)}")
+        return [self._one(output, one) for output, one in zip(outputs, size, strict=True)]
 
-    def _row(self, output, size):
+    def _one(self, output, size):
         if (
             not isinstance(output, torch.Tensor)
             or output.dtype != torch.float32

@@ -140,7 +140,7 @@ def constant(name):
     return _CONSTANTS[name]
 
 
-class Rehearsal:
+class ShapeCheck:
     """Checks what a network does on the meta device, operation by operation."""
 
     def __init__(self):

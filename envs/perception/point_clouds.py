@@ -1,26 +1,27 @@
-"""What four point clouds see of a scene's obstacles, and collision checks against that alone.
+"""The point cloud that four sensors observe of a scene's obstacles.
 
-    points = seen_points(scene)                  # float32 (n, 3), m
-    checker = seen_checker(scene)                # a CollisionChecker that knows nothing else
+    points = observed_points(scene)              # float32 (n, 3), m
     tokens = farthest_points(points, 64)         # for a network
 
-The sensors (paper, section 4) tell the arm, the table and obstacles apart. The arm knows where it
-is itself, and table and floor are where they always are; so only what is left is taken from them.
+The sensors (paper, section 4) label points of the arm, the table and obstacles. The arm's own
+configuration, the table and the floor are known, so only points of obstacles are used.
 """
 
 import functools
-from dataclasses import replace
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, POSE, PointCloud, SensorWorld, cardinal
 
+POINT_CLOUD = "point_cloud"
+"""Its name as an encoder and as a geometry source."""
+NUM_POINTS = 64
+"""Of the encoder `point_cloud`, by default."""
 CELL = 0.025
 """m. Of the points in a cube of this size, one is kept: some 1,500 on `random_boxes_hard`."""
 POINT_RADIUS = 0.01
 """m. A point stands for what is around it: with this radius there is hardly a hole in a surface."""
-_CACHED_SCENES, _CACHED_CHECKERS = 500, 64  # some 20 and 60 kB each
+_CACHED_SCENES = 500  # about 20 kB each
 _kept = {}
 
 
@@ -29,7 +30,7 @@ def _world():
     return SensorWorld()
 
 
-def seen_points(scene):
+def observed_points(scene):
     """Points of a `Scene`'s obstacles: float32 (n, 3), m, in the base's frame; not to be changed.
 
     There are none where no obstacle is seen. The last scenes are remembered.
@@ -38,9 +39,9 @@ def seen_points(scene):
     return _look(scene) if points is None else points
 
 
-def keep_points(scene):
-    """Remember what is seen of a `Scene`, some 20 kB, for good: it is seen again and again."""
-    _kept[scene] = seen_points(scene)
+def remember_points(scene):
+    """Keep the observed points of a `Scene`, about 20 kB, as long as the process lives."""
+    _kept[scene] = observed_points(scene)
 
 
 @functools.lru_cache(_CACHED_SCENES)
@@ -51,18 +52,6 @@ def _look(scene):
     points = np.concatenate([one["points"][one["labels"] == OBSTACLE] for one in seen])
     _, kept = np.unique(np.floor(points / CELL).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(kept)]
-
-
-@functools.lru_cache(_CACHED_CHECKERS)
-def seen_checker(scene):
-    """A `CollisionChecker` of table, floor, and what is seen of a `Scene`'s obstacles."""
-    return CollisionChecker(replace(scene, obstacles=()), seen_points(scene), POINT_RADIUS)
-
-
-@functools.lru_cache(_CACHED_CHECKERS)
-def true_checker(scene):
-    """The `CollisionChecker` of a `Scene`."""
-    return CollisionChecker(scene)
 
 
 def farthest_points(points, number):
@@ -79,29 +68,3 @@ def farthest_points(points, number):
         distance = np.minimum(distance, np.linalg.norm(points - row, axis=1))
         nearest = distance
     return chosen
-
-
-def checker_of(source):
-    """What is known of scenes: a function from a `Scene` to a `CollisionChecker`.
-
-    Args:
-        source: `obstacles`, the true ones; `points`, what four sensors see of them; or the name or
-            path of an encoder with a decoder, which tells of them in z_E (`envs.perception.encoders`).
-
-    Raises:
-        ValueError: it is none of these.
-    """
-    if source == "obstacles":
-        return true_checker
-    if source == "points":
-        return seen_checker
-    from roboarm_nmp.envs.perception import (
-        encoders,  # here, because PyTorch takes a while to import
-    )
-
-    try:
-        encoders.scene_encoder(source).decoder  # noqa: B018 (or it raises)
-    except ValueError as error:
-        message = "what is known must be 'obstacles', 'points' or an encoder with a decoder"
-        raise ValueError(f"{message}: {error}") from error
-    return functools.partial(encoders.told_checker, name=source)

@@ -5,8 +5,9 @@ sensors look: the scene and the arm once more, in a physics engine of its own, s
 touches an episode, and the goal's marker is not seen. `envs.wrappers` puts the two together.
 """
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import gymnasium as gym
 import numpy as np
@@ -262,3 +263,24 @@ class SensorWorld(World):
         segmentation[np.isin(bodies, self._bodies[:num_static])] = STATIC
         segmentation[bodies < 0], depth[bodies < 0] = NOTHING, sensor.far
         return rgb, depth.astype(np.float32), segmentation
+
+
+_KINDS = {"camera": Camera, "point_cloud": PointCloud}
+
+
+def sensors_to_json(sensors):
+    """A dict of name -> `Camera` or `PointCloud` as text."""
+    kinds = {kind: name for name, kind in _KINDS.items()}
+    return json.dumps(
+        {name: {"kind": kinds[type(sensor)], **asdict(sensor)} for name, sensor in sensors.items()}
+    )
+
+
+def sensors_from_json(text):
+    """The inverse of `sensors_to_json`."""
+    sensors = {}
+    for name, fields in json.loads(text).items():
+        kind = _KINDS[fields.pop("kind")]
+        values = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+        sensors[name] = kind(**values)
+    return sensors

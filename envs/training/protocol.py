@@ -20,14 +20,14 @@ from roboarm_nmp.envs.arm_env import HORIZON, STANDARD_RULES, deviations
 from roboarm_nmp.envs.datasets.episodes import DemoQueriesWrapper, load_demos_for
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
-from roboarm_nmp.envs.policies.registry import memory_size
-from roboarm_nmp.envs.policies.safety_filter import layer_of
+from roboarm_nmp.envs.policies.registry import recurrent_size
+from roboarm_nmp.envs.policies.safety_filter import safety_filter_of
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
 from roboarm_nmp.envs.training.runs import check_finite, write_json
 
 NUM_ENVS = 8  # that an evaluation runs together at most; the first of them takes the pictures
-PICTURE_SIZE = (240, 180)
+IMAGE_SIZE = (240, 180)
 # The rules that every test is run under; how long its steps are is a policy's own.
 RULES = [name for name in STANDARD_RULES if name != "max_step"]
 
@@ -49,20 +49,23 @@ class EnvFlags:
     velocities: bool = False
     """joint velocities in the observation"""
     encoder: str | None = None
-    """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
-    `vqvae`, `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `points`
-    of what sensors see (docs/last_layer.md), or `oracle`, the obstacles themselves; by default
-    nothing"""
-    proximity: str | None = None
-    """append to the observation, too, how far each link is from the nearest thing, and in which
-    direction that grows: of the true `obstacles`, of `points` that sensors see, or as z_E of an
-    encoder tells (`field`, or a path); by default nothing"""
+    """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
+    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `point_cloud` for
+    observed points, or `oracle` for the ground-truth obstacles; by default nothing"""
+    num_points: PositiveInt = 64
+    """points of the encoder `point_cloud`"""
+    geometry_source: str | None = None
+    """where link distances take the obstacles from: `ground_truth`, `point_cloud`, or an encoder
+    with a decoder (`field`, or a path), which then also gives the points of `point_cloud`"""
+    link_distances: bool = False
+    """append the signed distance of each link from the nearest obstacle and its gradient to the
+    observation; needs --geometry-source"""
 
 
 def env_arguments_of(args):
     """The `EnvFlags` in a trainer's flags as a dict, for `envs.make`."""
     arguments = {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
-    return arguments | {"append_proximity": args.proximity is not None}
+    return arguments | {"append_link_distances": args.link_distances}
 
 
 def load_task(args):
@@ -100,8 +103,9 @@ def make_envs(task, number, **kwargs):
     try:
         return [envs.make(task, **kwargs) for _ in range(number)]
     except ValueError as error:
-        given = [name for name in ("encoder", "proximity") if kwargs.get(name) is not None]
-        sys.exit(f"--{' or --'.join(given)}: {error}" if given else str(error))
+        given = [name for name in ("encoder", "geometry_source") if kwargs.get(name) is not None]
+        flags = " or ".join(f"--{name.replace('_', '-')}" for name in given)
+        sys.exit(f"{flags}: {error}" if given else str(error))
 
 
 def make_eval_envs(task, num_queries, **kwargs):
@@ -109,7 +113,7 @@ def make_eval_envs(task, num_queries, **kwargs):
 
     At least two, as `save_policy` wants.
     """
-    pictured = make_envs(task, 1, render_mode="rgb_array", render_size=PICTURE_SIZE, **kwargs)
+    pictured = make_envs(task, 1, render_mode="rgb_array", render_size=IMAGE_SIZE, **kwargs)
     return pictured + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
 
 
@@ -173,51 +177,51 @@ def log_episode(writer, step, episode_return, info, recent_success):
 
 
 @torch.no_grad()
-def evaluate(policy, envs, queries, device, last_layer=None, seed=0):
+def evaluate(policy, envs, queries, device, safety_filter=None, seed=0):
     """Run a deterministic policy on every query, each env one at a time; mean results.
 
     Args:
         policy: from `observation`, `achieved_goal`, `desired_goal` and what else is observed,
-            tensors (N, ...), to actions (N, 7); a module or an exported network. One with a memory
-            (`envs.policies.registry.memory_size`) is given that, too, and returns it beside the actions.
+            tensors (N, ...), to actions (N, 7); a module or an exported network. A recurrent one
+            (`envs.policies.registry.recurrent_size`) also receives its state, and returns the next.
         envs: the environments to do it in.
         queries: `envs.datasets.Queries`, or a list of `Query`.
         device: of the policy.
-        last_layer: an `envs.policies.safety_filter.LastLayer` around the policy, or None.
+        safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy, or None.
         seed: of the layer's ways out, >= 0.
 
     Returns:
-        A dict of floats: `success_rate`, `clean_success_rate` (without a touch), `collision_rate`
+        A dict of floats: `success_rate`, `collision_free_success_rate` (without a touch), `collision_rate`
         and `episode_length` in steps.
 
     Raises:
-        FloatingPointError: the policy's actions are not finite, or its memory.
+        FloatingPointError: the policy's actions are not finite, or its recurrent state.
     """
-    waiting, size = iter(range(len(queries))), memory_size(policy)
-    running, memories, proposed = {}, {}, {}  # env -> observation, memory, action and next memory
+    waiting, size = iter(range(len(queries))), recurrent_size(policy)
+    running, states, proposed = {}, {}, {}  # env -> observation, memory, action and next memory
     acts, results = {}, []  # env -> function
 
     def start(env):
         i = next(waiting, None)
         running.pop(env, None)
 
-        def act(observation):  # (In a detour the last layer does not ask: nothing is remembered.)
-            action, memories[env] = proposed[env]
+        def act(observation):  # (In a detour the last layer does not ask: its state stays.)
+            action, states[env] = proposed[env]
             return action
 
         if i is not None:
             running[env] = env.reset_specific(*queries[i])[0]
-            acts[env], memories[env] = act, np.zeros(size, np.float32)
-            if last_layer is not None:
-                acts[env] = last_layer.around(acts[env], env, np.random.default_rng([seed, i]))
+            acts[env], states[env] = act, np.zeros(size, np.float32)
+            if safety_filter is not None:
+                acts[env] = safety_filter.around(acts[env], env, np.random.default_rng([seed, i]))
 
     for env in envs:
         start(env)
     while running:
-        before = [memories[env] for env in running]
+        before = [states[env] for env in running]
         actions, after = _actions(policy, list(running.values()), before, device)
-        for env, action, memory in zip(list(running), actions, after, strict=True):
-            proposed[env] = action, memory
+        for env, action, state in zip(list(running), actions, after, strict=True):
+            proposed[env] = action, state
             action = acts[env](running[env])
             running[env], _, terminated, truncated, info = env.step(action)
             if terminated or truncated:
@@ -228,40 +232,42 @@ def evaluate(policy, envs, queries, device, last_layer=None, seed=0):
     success, touched, steps = np.array(results, dtype=np.float64).T
     return {
         "success_rate": float(success.mean()),
-        "clean_success_rate": float((success * (1 - touched)).mean()),
+        "collision_free_success_rate": float((success * (1 - touched)).mean()),
         "collision_rate": float(touched.mean()),
         "episode_length": float(steps.mean()),
     }
 
 
-def _actions(policy, observations, memories, device):
-    """Actions (n, 7) for n observations, and the policy's memories after them, n arrays."""
-    if not len(memories[0]):
+def _actions(policy, observations, states, device):
+    """Actions (n, 7) for n observations, and the policy's states after them, n arrays."""
+    if not len(states[0]):
         actions = policy(**stack(observations, device)).cpu().numpy()
     else:
-        known = [o | {"memory": memory} for o, memory in zip(observations, memories, strict=True)]
-        actions, memories = (x.cpu().numpy() for x in policy(**stack(known, device)))
-        check_finite("the policy's memory", memories)
+        known = [
+            o | {"recurrent_state": state} for o, state in zip(observations, states, strict=True)
+        ]
+        actions, states = (x.cpu().numpy() for x in policy(**stack(given, device)))
+        check_finite("the policy's recurrent state", states)
     check_finite("the policy's actions", actions)
-    return actions, memories
+    return actions, states
 
 
 @torch.no_grad()
-def picture_of_rollout(policy, env, query, device, last_layer=None, frames=8):
+def rollout_image(policy, env, query, device, safety_filter=None, frames=8):
     """An image strip (height, frames * width, 3), uint8, of the policy on one query.
 
     `env`: one that renders.
     """
 
-    memories = [np.zeros(memory_size(policy), np.float32)]
+    states = [np.zeros(recurrent_size(policy), np.float32)]
 
     def act(observation):
-        nonlocal memories
-        actions, memories = _actions(policy, [observation], memories, device)
+        nonlocal states
+        actions, states = _actions(policy, [observation], states, device)
         return actions[0]
 
-    if last_layer is not None:
-        act = last_layer.around(act, env, np.random.default_rng([0, 0]))
+    if safety_filter is not None:
+        act = safety_filter.around(act, env, np.random.default_rng([0, 0]))
     observation, _ = env.reset_specific(*query)
     pictures, done = [env.render()], False
     while not done:
@@ -274,13 +280,13 @@ def picture_of_rollout(policy, env, query, device, last_layer=None, frames=8):
     return np.concatenate([pictures[i] for i in chosen], axis=1)
 
 
-def validate(policy, envs, queries, device, writer, step, progress, last_layer=None):
+def validate(policy, envs, queries, device, writer, step, progress, safety_filter=None):
     """`evaluate` on validation queries, with results and a picture of the first in TensorBoard.
 
-    A policy with a last layer is evaluated without it, too (`eval/..._without_layer`).
+    A policy with a last layer is evaluated without it, too (`eval/..._without_filter`).
 
     Args:
-        policy, queries, device, last_layer: as for `evaluate`.
+        policy, queries, device, safety_filter: as for `evaluate`.
         envs: of `make_eval_envs`.
         writer: TensorBoard's.
         step: of the training.
@@ -289,13 +295,13 @@ def validate(policy, envs, queries, device, writer, step, progress, last_layer=N
     Returns:
         The success rate.
     """
-    result = evaluate(policy, envs, queries, device, last_layer)
+    result = evaluate(policy, envs, queries, device, safety_filter)
     for name, value in result.items():
         writer.add_scalar(f"eval/{name}", value, step)
-    if last_layer is not None:
+    if safety_filter is not None:
         for name, value in evaluate(policy, envs, queries, device).items():
-            writer.add_scalar(f"eval/{name}_without_layer", value, step)
-    picture = picture_of_rollout(policy, envs[0], queries[0], device, last_layer)
+            writer.add_scalar(f"eval/{name}_without_filter", value, step)
+    picture = rollout_image(policy, envs[0], queries[0], device, safety_filter)
     writer.add_image("eval/rollout", picture, step, dataformats="HWC")
     success = result["success_rate"]
     if success >= progress["best_success"]:
@@ -303,28 +309,28 @@ def validate(policy, envs, queries, device, writer, step, progress, last_layer=N
     return success
 
 
-def save_policy(run, policy, envs, device, args, env_arguments, step, last_layer=None):
+def save_policy(run, policy, envs, device, args, env_arguments, step, safety_filter=None):
     """Write `policy.pt` for `evaluate.py` and others.
 
     Args:
         run: the run's folder.
         policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else is
-            observed; with a `memory_size`, its `memory`, too.
+            observed; with a `recurrent_size`, its `recurrent_state`, too.
         envs: some of its environments, for examples of observations.
         device: of the policy.
         args: the flags; `task`, `exp_name` and `seed` are noted in the file.
         env_arguments: of `envs.make`, noted too: the policy is evaluated with them.
         step: of the training.
-        last_layer: an `envs.policies.safety_filter.LastLayer` that is part of the policy, or None.
+        safety_filter: an `envs.policies.safety_filter.SafetyFilter` that is part of the policy, or None.
     """
     metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
-    if last_layer is not None:
-        metadata["last_layer"] = {"keep": last_layer.keep, "way_out": last_layer.way_out}
+    if safety_filter is not None:
+        metadata["safety_filter"] = {"margin": safety_filter.margin, "escape": safety_filter.escape}
     metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
     example = stack([env.reset(seed=0)[0] for env in envs[:2]], device)
-    if size := memory_size(policy):
-        metadata["memory"] = size
-        example["memory"] = torch.zeros(len(envs[:2]), size, device=device)
+    if size := recurrent_size(policy):
+        metadata["recurrent_size"] = size
+        example["recurrent_state"] = torch.zeros(len(envs[:2]), size, device=device)
     save_network(run / "policy.pt", policy, example, metadata)
 
 
@@ -348,8 +354,8 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
     policy = load_network(run / "policy.pt").to(device)
     own = {name: value for name, value in env_arguments.items() if name not in RULES}
     test_envs = make_eval_envs(args.task, len(queries), **own)
-    last_layer = layer_of(policy.metadata)
-    result = evaluate(policy, test_envs, queries, device, last_layer)
+    safety_filter = safety_filter_of(policy.metadata)
+    result = evaluate(policy, test_envs, queries, device, safety_filter)
     rules = {name: getattr(test_envs[0], name) for name in RULES}
     trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}
     result |= {"rules": rules, "rules_in_training": trained, "deviations": deviations(own)}
@@ -364,7 +370,7 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
         print(f"not comparable: {name} is {value}, not {STANDARD_RULES[name]}")
     print(
         f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
-        f"success {result['success_rate']:.3f}, clean {result['clean_success_rate']:.3f}; "
+        f"success {result['success_rate']:.3f}, clean {result['collision_free_success_rate']:.3f}; "
         f"{steps} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
     )
 

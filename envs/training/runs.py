@@ -3,12 +3,12 @@
     args = parse_args(Args, may_change={"total_updates"})   # with --resume, those of the run
     run, device = run_folder(args, "wall"), seed_torch(args)
     progress = {"updates": 0, "seconds": 0.0}
-    saved_parts = {"model": model, "optimizer": optimizer, "progress": progress}
-    load_checkpoint(args, saved_parts)
+    checkpoint_state = {"model": model, "optimizer": optimizer, "progress": progress}
+    load_checkpoint(args, checkpoint_state)
     writer = summary_writer(run, args, progress["updates"])
     bar = progress_bar(args.total_updates, progress["updates"], "update")
     ...
-    save_checkpoint(run, saved_parts, device)
+    save_checkpoint(run, checkpoint_state, device)
 
 Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `exp_name` at least.
 These functions are for scripts: where the user is wrong, they end the program with a message.

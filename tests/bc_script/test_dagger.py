@@ -24,9 +24,9 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
 from roboarm_nmp.envs.datasets.shards import shard_path
 from roboarm_nmp.envs.networks.exported_networks import load_network
-from roboarm_nmp.envs.perception.encoders import PACKAGED
+from roboarm_nmp.envs.perception.encoders import PRETRAINED
 from roboarm_nmp.envs.policies.registry import PolicyError, find_policy, make_policy
-from roboarm_nmp.envs.policies.safety_filter import VERSION, LastLayer
+from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.envs.training import protocol
 
 sys.path.append(str(ROOT / "clean_rl_scripts"))
@@ -61,12 +61,12 @@ def some(request, folder, tmp_path_factory):
     encoder = request.param
     if encoder == "vqvae":  # a copy: z_E of the scenes is kept beside it
         encoder = str(tmp_path_factory.mktemp("encoder") / "vqvae.pt")
-        Path(encoder).write_bytes((PACKAGED / "vqvae.pt").read_bytes())
-    env = envs.make(HARD, goal_type="combined", encoder=encoder, proximity="obstacles")
+        Path(encoder).write_bytes((PRETRAINED / "vqvae.pt").read_bytes())
+    env = envs.make(HARD, goal_type="combined", encoder=encoder, link_distances="obstacles")
     paths = load_roadmap_paths(folder)
     args = dagger.Args(encoder=encoder, token_size=16, hidden_size=32, bf16=False)
     examples = dagger.Examples(paths, args, "cpu")
-    batch = dagger.joined([examples.draw(number) for number in range(6)])
+    batch = dagger.concat([examples.draw(number) for number in range(6)])
     assert set(batch["scene"].tolist()) == {0, 2}
     torch.manual_seed(1)
     actor = dagger.Actor(args)
@@ -77,7 +77,7 @@ def some(request, folder, tmp_path_factory):
 
 
 def inputs_of(batch):
-    names = ("observation", "desired_goal", "proximity", "goal_proximity")
+    names = ("observation", "desired_goal", "link_distances", "goal_link_distances")
     return {name: batch[name] for name in names}
 
 
@@ -112,8 +112,8 @@ def test_examples_say_how_paths_go_on_to_either_end(tmp_path):
     np.testing.assert_allclose(drawn["length"], lengths + left, atol=1e-5)
 
     checker = CollisionChecker(scene)
-    for name, where in (("proximity", states), ("goal_proximity", goals)):
-        nearest = checker.nearest(where, self_collisions=False)
+    for name, where in (("link_distances", states), ("goal_link_distances", goals)):
+        nearest = checker.signed_distances(where, self_collisions=False)
         near = np.minimum(nearest.distance, 0.3)
         np.testing.assert_allclose(drawn[name][..., 0], near, atol=1e-5)
         gradient = np.where(near[..., None] < 0.3, nearest.gradient, 0.0)
@@ -194,8 +194,12 @@ def test_bfloat16_in_training_only(some):
 
 def test_saved_with_its_layer_it_acts_alone_as_in_a_batch(some, tmp_path):
     actor, env, _ = some
-    layer = LastLayer(0.02, way_out=False)
-    arguments = {"goal_type": "combined", "encoder": env.encoder.name, "proximity": "obstacles"}
+    layer = SafetyFilter(0.02, escape=False)
+    arguments = {
+        "goal_type": "combined",
+        "encoder": env.encoder.name,
+        "link_distances": "obstacles",
+    }
     flags = dagger.Args()
     protocol.save_policy(tmp_path, actor, [env], "cpu", flags, arguments, 7, layer)
     path, found = find_policy(tmp_path)
@@ -205,7 +209,7 @@ def test_saved_with_its_layer_it_acts_alone_as_in_a_batch(some, tmp_path):
     together = network(**protocol.stack(observations, "cpu")).numpy()
     changed = 0
     for row, observation in enumerate(observations):
-        act, _ = make_policy(path, env, last_layer=False)(0, None)
+        act, _ = make_policy(path, env, safety_filter=False)(0, None)
         np.testing.assert_allclose(act(observation), together[row], atol=1e-6)
         env.reset(seed=row)  # the layer looks where the action leads
         safe, _ = make_policy(path, env)(0, None)
@@ -214,7 +218,7 @@ def test_saved_with_its_layer_it_acts_alone_as_in_a_batch(some, tmp_path):
         changed += np.abs(kept - together[row]).max() > 1e-4
     assert changed
     content = torch.load(path, weights_only=True)
-    content["metadata"]["last_layer"] = {"keep": "far"}
+    content["metadata"]["safety_filter"] = {"keep": "far"}
     torch.save(content, tmp_path / "bad.pt")
     with pytest.raises(PolicyError, match="bad.pt: its last layer makes no sense"):
         find_policy(tmp_path / "bad.pt")
@@ -231,11 +235,11 @@ def finish(run):
 
 
 def test_a_run_killed_and_resumed_its_policy_by_name(tmp_path, folder):
-    flags = ["--paths", str(folder), "--encoder", "points:8", "--keep-distance", "0.012"]
+    flags = ["--paths", str(folder), "--encoder", "points:8", "--safety-margin", "0.012"]
     whole = run_script("dagger", tmp_path / "whole", *flags)
     events = EventAccumulator(str(whole))
     events.Reload()
-    for tag in ("success_rate", "clean_success_rate", "success_rate_without_layer"):
+    for tag in ("success_rate", "collision_free_success_rate", "success_rate_without_filter"):
         assert [event.step for event in events.Scalars(f"eval/{tag}")] == [20, 40]
     assert [event.step for event in events.Scalars("charts/round_success")] == [15, 30]
 
@@ -261,10 +265,10 @@ def test_a_run_killed_and_resumed_its_policy_by_name(tmp_path, folder):
     best = one["progress"]
     result = evaluate(whole, HARD, split="validation", num_queries=2)
     assert result["success_rate"] == best["best_success"]
-    assert result["last_layer"] == {"keep": 0.012, "way_out": True, "version": VERSION}
-    assert result["env"]["proximity"] == "points" and result["env"]["encoder"] == "points:8"
-    bare = evaluate(whole, HARD, split="validation", num_queries=2, last_layer=False)
-    assert bare["last_layer"] is None and bare["mean_steps"] != result["mean_steps"]
+    assert result["safety_filter"] == {"keep": 0.012, "escape": True, "version": VERSION}
+    assert result["env"]["link_distances"] == "points" and result["env"]["encoder"] == "points:8"
+    bare = evaluate(whole, HARD, split="validation", num_queries=2, safety_filter=False)
+    assert bare["safety_filter"] is None and bare["mean_steps"] != result["mean_steps"]
     assert bare["collision_rate"] >= result["collision_rate"]
 
 

@@ -33,7 +33,7 @@ def result(name, seed, success, **more):
         "seed": seed,
         "success_rate": success,
         "success_rate_interval": [success - 0.01, success + 0.01],
-        "clean_success_rate": success / 2,
+        "collision_free_success_rate": success / 2,
         "num_queries": 10_000,
         "steps": 300_000,
         "policy_step": 275_000,
@@ -225,7 +225,12 @@ def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
     paper_tables.run(cell, 5, 60, 6, tmp_path / "not_there")
     assert "--total-updates" not in capfd.readouterr().out
     more = json.loads((tmp_path / "policies" / "bc-config-wall-s5.json").read_text())
-    evaluated = ("success_rate", "success_rate_interval", "clean_success_rate", "num_queries")
+    evaluated = (
+        "success_rate",
+        "success_rate_interval",
+        "collision_free_success_rate",
+        "num_queries",
+    )
     assert more["num_queries"] == 6
     assert all(more[name] == kept[name] for name in kept if name not in evaluated)
     elsewhere = replace(cell, task="double_walls")  # another task, the same policy

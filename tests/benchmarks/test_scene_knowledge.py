@@ -106,7 +106,7 @@ def test_where_links_are_and_how_far_from_obstacles():
     np.testing.assert_allclose(tips, panda.forward_kinematics(panda.denormalise(states)), atol=1e-5)
     assert (distances[1] == np.float32(knowledge.FAR)).all()  # no table, no floor
     bare = Scene(scenes[0].obstacles, table=None, floor=None)
-    expected = CollisionChecker(bare).nearest(states[0], self_collisions=False).distance
+    expected = CollisionChecker(bare).signed_distances(states[0], self_collisions=False).distance
     np.testing.assert_allclose(distances[0], np.minimum(expected, knowledge.FAR), atol=1e-6)
 
 

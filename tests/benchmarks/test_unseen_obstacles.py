@@ -25,7 +25,7 @@ def result(success, clean, number=200):
     return {
         "success_rate": success,
         "success_rate_interval": [success - 0.03, success + 0.03],
-        "clean_success_rate": clean,
+        "collision_free_success_rate": clean,
         "num_queries": number,
         "ms_per_action": 1.25,
         "planning_seconds": 0.5,
@@ -38,8 +38,8 @@ def test_the_tables_between_the_marks_are_of_the_results(tmp_path, monkeypatch):
     page.write_text(f"# Before\n\n{unseen.BEGIN}outdated\n{unseen.END}\nAfter\n")
     hard = {"dagger, points": result(0.93, 0.91, 3000), "dagger, points, alone": result(0.7, 0.4)}
     found = {unseen.HARD: hard, "wall": {"dagger, points": result(0.8, 0.75)}}
-    found["wall"]["dagger, oracle"] = result(0.7, 0.6) | {"last_layer": {"way_out": True}}
-    found["boxes"] = {"dagger, oracle": result(0.7, 0.6) | {"last_layer": {"way_out": False}}}
+    found["wall"]["dagger, oracle"] = result(0.7, 0.6) | {"safety_filter": {"escape": True}}
+    found["boxes"] = {"dagger, oracle": result(0.7, 0.6) | {"safety_filter": {"escape": False}}}
     results.write_text(json.dumps(found))
     monkeypatch.setattr(unseen, "PAGE", page)
     monkeypatch.setattr(unseen, "RESULTS", results)
@@ -70,28 +70,31 @@ def test_the_tables_between_the_marks_are_of_the_results(tmp_path, monkeypatch):
 
 def test_what_is_run_again():
     name = "dagger, points"
-    layer = {"keep": 0.01, "way_out": True, "version": VERSION}
-    done = result(0.9, 0.8) | {"flags": unseen.CELLS[name], "last_layer": layer}
+    layer = {"keep": 0.01, "escape": True, "version": VERSION}
+    done = result(0.9, 0.8) | {"flags": unseen.CELLS[name], "safety_filter": layer}
     assert unseen.is_done(done, name, 200)
     for change in (
         {"num_queries": 100},
         {"flags": [*unseen.CELLS[name], "--seed", "1"]},
-        {"last_layer": layer | {"version": VERSION - 1}},
-        {"last_layer": {"keep": 0.01, "way_out": True}},
+        {"safety_filter": layer | {"version": VERSION - 1}},
+        {"safety_filter": {"keep": 0.01, "escape": True}},
     ):
         assert not unseen.is_done(done | change, name, 200)
     assert not unseen.is_done(None, name, 200)
-    seen_by = done | {"encoder": None, "env": {"encoder": "points:32:field", "proximity": "points"}}
+    seen_by = done | {
+        "encoder": None,
+        "env": {"encoder": "points:32:field", "link_distances": "points"},
+    }
     assert unseen.digests(seen_by).keys() == {"field"}
     assert unseen.is_done(seen_by | {"encoders": unseen.digests(seen_by)}, name, 200)
     replaced = seen_by | {"encoders": {"field": "0123456789ab"}}
     assert not unseen.is_done(replaced, name, 200) and "0.800† [" in unseen._cell(replaced)
     # The first version and the second differ in the way out only.
-    first, second = ({"keep": 0.01, "way_out": False, "version": version} for version in (1, 2))
-    marked = [unseen._cell(done | {"last_layer": layer}) for layer in (first, second)]
+    first, second = ({"keep": 0.01, "escape": False, "version": version} for version in (1, 2))
+    marked = [unseen._cell(done | {"safety_filter": layer}) for layer in (first, second)]
     assert marked[0] == marked[1] and "0.800‡ [" in marked[0]
-    assert "0.800\\* [" in unseen._cell(done | {"last_layer": first | {"way_out": True}})
-    assert not unseen.is_done(done | {"last_layer": second}, name, 200)
+    assert "0.800\\* [" in unseen._cell(done | {"safety_filter": first | {"escape": True}})
+    assert not unseen.is_done(done | {"safety_filter": second}, name, 200)
 
 
 def test_a_runs_policy_is_kept_by_name_and_says_how_it_was_made(tmp_path, monkeypatch):

@@ -82,16 +82,16 @@ def test_network_inputs(goal_type):
 
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
 @pytest.mark.parametrize("velocities", [False, True])
-@pytest.mark.parametrize("proximity", [None, "obstacles"])
-def test_networks_fit_every_observation(goal_type, velocities, proximity):
-    knows = {"goal_type": goal_type, "velocities": velocities, "proximity": proximity}
+@pytest.mark.parametrize("link_distances", [None, "obstacles"])
+def test_networks_fit_every_observation(goal_type, velocities, link_distances):
+    knows = {"goal_type": goal_type, "velocities": velocities, "link_distances": link_distances}
     args = sac.Args(**knows, num_hidden_layers=4)
-    env = envs.make("wall", **knows, append_proximity=proximity is not None)
+    env = envs.make("wall", **knows, append_link_distances=link_distances is not None)
     batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
     actor = sac.Actor(args, env.observation_space["observation"].shape[0])
-    if proximity is not None:  # distances, ten times as large, are the last inputs
+    if link_distances is not None:  # distances, ten times as large, are the last inputs
         features = actor.features(batch["observation"], batch["desired_goal"])
-        torch.testing.assert_close(features[:, -10:], 10.0 * batch["proximity"][..., 0])
+        torch.testing.assert_close(features[:, -10:], 10.0 * batch["link_distances"][..., 0])
     action = actor(**batch)
     assert action.shape == (2, 7)
     features = actor.features(batch["observation"], batch["desired_goal"])

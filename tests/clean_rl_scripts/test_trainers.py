@@ -77,7 +77,7 @@ def test_shared_blocks_have_not_drifted_apart():
 def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run, trainer):
     result = json.loads((finished_run / "result.json").read_text())
     assert result["steps"] == 1200 and result["num_queries"] == 4
-    assert 0 <= result["clean_success_rate"] <= result["success_rate"] <= 1
+    assert 0 <= result["collision_free_success_rate"] <= result["success_rate"] <= 1
     assert result["args"]["goal_type"] == "combined"
     assert isinstance(json.loads((finished_run / "args.json").read_text())["bf16"], bool)
 
@@ -87,7 +87,7 @@ def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run, traine
     tags = ("episodic_return", "episodic_length", "success")
     for tag in ("learning_rate", "SPS") if trainer == "bc" else tags:
         assert f"charts/{tag}" in scalars
-    for tag in ("success_rate", "clean_success_rate", "episode_length", "collision_rate"):
+    for tag in ("success_rate", "collision_free_success_rate", "episode_length", "collision_rate"):
         assert [event.step for event in events.Scalars(f"eval/{tag}")] == [600, 1200]
     assert "eval/rollout" in events.Tags()["images"]
     assert "hyperparameters/text_summary" in events.Tags()["tensors"]
@@ -165,7 +165,7 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer,
 
 @pytest.mark.parametrize("stop, steps", [(None, 1200), (1.0, 600)])
 def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps):
-    success = {"success_rate": 1.0, "clean_success_rate": 1.0}
+    success = {"success_rate": 1.0, "collision_free_success_rate": 1.0}
     monkeypatch.setattr("roboarm_nmp.envs.training.protocol.evaluate", lambda *_: success)
     flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
     if stop is not None:

@@ -46,7 +46,9 @@ def take_apart(agent, *names):
 
 def state(agent):
     """All that an update may change, copied."""
-    return copy.deepcopy({k: v for k, v in agent.saved_parts().items() if "optimizer" not in k})
+    return copy.deepcopy(
+        {k: v for k, v in agent.checkpoint_state().items() if "optimizer" not in k}
+    )
 
 
 def inputs_of(actor, data):

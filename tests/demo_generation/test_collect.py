@@ -147,7 +147,7 @@ def test_collected_demonstrations_are_good(whole):
     demos, env = load_demos(whole), envs.make(TASK)
     assert demos.task == TASK and demos.seed == 0 and len(demos) == NUM
     assert not demos.collided.any()
-    verifier = Verifier(whole, mend=False)
+    verifier = Verifier(whole, repair=False)
     assert [verifier(index) for index in range(NUM)] == [(i, "good", None) for i in range(NUM)]
     for demo in demos:
         execution = follow(env, demo.plan)
@@ -168,16 +168,16 @@ def test_the_file_says_how_to_make_it_again(whole):
 
 
 @pytest.mark.parametrize("task", ["double_walls", "random_boxes_hard"])
-def test_packaged_demonstrations_have_the_queries_of_their_seed(task):
+def test_pretrained_demonstrations_have_the_queries_of_their_seed(task):
     """Their plans are of an earlier planner (docs/demonstrations.md), their queries are not."""
-    packaged = load_demos(task)
+    pretrained = load_demos(task)
     collector = collect.Collector(options(task=task))
     for index in (0, 1, 4_321):
         demo = collector(index)
         assert demo["given_up"] == 0
         plan = collect._decode(demo["plan"])
-        assert plan[[0, -1]].tobytes() == packaged[index].plan[[0, -1]].tobytes()
-        assert from_array(demo["obstacles"]) == packaged[index].scene.obstacles
+        assert plan[[0, -1]].tobytes() == pretrained[index].plan[[0, -1]].tobytes()
+        assert from_array(demo["obstacles"]) == pretrained[index].scene.obstacles
 
 
 def test_rejected_attempts_are_counted(output):
@@ -564,7 +564,7 @@ def verify_command(*arguments):
 
 
 def verdicts(path):
-    verifier = Verifier(path, mend=False)
+    verifier = Verifier(path, repair=False)
     return [verifier(index)[1] for index in range(len(verifier.demos))]
 
 
@@ -588,11 +588,11 @@ def test_verify_finds_what_is_not_good(whole, damaged):
 def test_mending(damaged):
     path, bad = damaged
     old = load_demos(path)
-    result = verify_command(path, "--mend")
+    result = verify_command(path, "--repair")
     assert result.returncode == 0, result.stderr
-    assert "; 3 mended, 1 removed" in result.stdout
+    assert "; 3 repaired, 1 removed" in result.stdout
     demos = load_demos(path)
-    assert (demos.parameters["mended"], demos.parameters["removed"]) == (3, 1)
+    assert (demos.parameters["repaired"], demos.parameters["removed"]) == (3, 1)
     assert demos.made_by == old.made_by and demos.parameters["options"] == options()
     assert not demos.collided.any()
     kept = [i for i in range(NUM) if i != bad["refused"]]
@@ -610,7 +610,7 @@ def test_mending(damaged):
 
 def test_mending_a_good_file_changes_nothing(whole, output):
     output.write_bytes(whole.read_bytes())
-    assert verify(output, mend=True, progress=False)["good"] == NUM
+    assert verify(output, repair=True, progress=False)["good"] == NUM
     assert output.read_bytes() == whole.read_bytes()
 
 
@@ -642,7 +642,7 @@ def test_collisions_are_rejected_unless_allowed(output, straight):
 def test_a_file_in_which_nothing_can_be_mended(output, exact, touching):
     before = write(output, [starting_at(touching, exact[0])]).read_bytes()
     with pytest.raises(DatasetError) as caught:
-        verify(output, num_workers=1, mend=True, progress=False)
+        verify(output, num_workers=1, repair=True, progress=False)
     assert str(output) in str(caught.value)
     assert output.read_bytes() == before
 

@@ -164,7 +164,7 @@ def test_without_reaching_the_goal_an_episode_is_truncated(demos):
 
 def test_exact_export_refuses_other_executions(demos, storage):
     demos.digest[2] += 1
-    with pytest.raises(ValueError, match="verify FILE --mend"):
+    with pytest.raises(ValueError, match="verify FILE --repair"):
         export_minari.export(demos, exact=True, progress=False)
     assert list(storage.iterdir()) == []
 

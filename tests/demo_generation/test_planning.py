@@ -12,9 +12,9 @@ from paths import ROOT
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.planning import (
-    CAUTIONS,
     FIRST_TURN,
     MARGIN,
+    MARGIN_SCHEDULE,
     PLANNERS,
     Planner,
     PlanningError,
@@ -327,12 +327,12 @@ def test_a_path_longer_than_an_episode_is_planned_again(monkeypatch):
 def test_a_long_search_keeps_less_and_less_distance(worlds):
     env, (start, goal, _) = worlds["wall"], load_queries("wall")[0]
     points = np.random.default_rng(0).uniform(-1, 1, (20_000, 7))
-    distances = CollisionChecker(env.scene).nearest(points).distance.min(-1)
+    distances = CollisionChecker(env.scene).signed_distances(points).distance.min(-1)
     near = np.abs(distances - 0.003) < 0.006  # of what a margin decides about, all there is
     kept, asked = [], []
 
     def search(is_valid, start, goal, rng):
-        for checks, _ in CAUTIONS:
+        for checks, _ in MARGIN_SCHEDULE:
             while is_valid.checks < checks:
                 is_valid.free(points[:500])
             kept.append(distances[near][is_valid.free(points[near])].min())
@@ -343,7 +343,7 @@ def test_a_long_search_keeps_less_and_less_distance(worlds):
     planner.plan_within(60.0, start, goal, rng=np.random.default_rng(1))
     # What shortens the path keeps everything.
     kept.append(distances[near][asked[0].free(points[near])].min())
-    wanted = np.array([caution for _, caution in CAUTIONS] + [1.0]) * MARGIN
+    wanted = np.array([margin_scale for _, margin_scale in MARGIN_SCHEDULE] + [1.0]) * MARGIN
     assert (kept >= wanted).all() and np.abs(kept - wanted).max() < 0.0005
 
 
@@ -395,15 +395,16 @@ def test_paths_keep_the_clearance(box):
     assert np.median(close) < 0.02  # and without, they do not keep it
 
 
-def test_less_caution_less_clearance(box):
+def test_less_margin_scale_less_clearance(box):
     planner = Planner(box, clearance=0.06)
     (query,) = box_queries(box, 1, 0.11, 0.21)
     means = []
-    for caution in (1.0, 0.5, 0.0):
+    for margin_scale in (1.0, 0.5, 0.0):
         kept = [
-            nearest(box, planner.plan(*query, seed=seed, caution=caution)) for seed in range(1, 6)
+            nearest(box, planner.plan(*query, seed=seed, margin_scale=margin_scale))
+            for seed in range(1, 6)
         ]
-        assert min(kept) > 0.06 * caution - 0.001
+        assert min(kept) > 0.06 * margin_scale - 0.001
         means.append(np.mean(kept))
     assert means[0] > means[1] > means[2]
 
@@ -414,7 +415,7 @@ def test_a_query_that_nearly_touches_is_planned(worlds):
     planned = 0
     while planned < 3:
         start = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
-        near = checker.nearest(panda.normalise(start)).distance.min()
+        near = checker.signed_distances(panda.normalise(start)).distance.min()
         if not env.in_collision(start) and near < 0.001:
             goal = env.sample_feasible(rng)
             path = Planner(env).plan(start, goal, seed=1)

@@ -30,7 +30,7 @@ def hard_scene(number):
 
 
 def distances(scene, states):
-    return CollisionChecker(scene).nearest(states).distance.min(-1)
+    return CollisionChecker(scene).signed_distances(states).distance.min(-1)
 
 
 def along(path, spacing=0.02):

@@ -20,7 +20,7 @@ from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, from_array, to_array
 
 HOME = np.array([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], dtype=np.float32)
-NEAR_HOME = HOME + np.float32(0.1)
+ACTIVATION_DISTANCE_HOME = HOME + np.float32(0.1)
 # Elbow fully bent: the hand is inside the arm.
 FOLDED = np.array([0.0, 0.0, 0.0, -3.1, 0.0, 0.0, 0.0], dtype=np.float32)
 
@@ -67,7 +67,7 @@ def test_forward_kinematics_equals_pybullets(env):
 @pytest.mark.parametrize("mode", ["relative", "subgoal"])
 def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
     env = envs.make("no_obstacles", action_mode=mode)
-    env.reset_specific(HOME, NEAR_HOME)
+    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
     s = 2 * (HOME.astype(float) - panda.LOWER) / (panda.UPPER - panda.LOWER) - 1
     commanded = []
     command = panda.command
@@ -78,7 +78,7 @@ def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
     direction = rng.normal(size=7)
     direction /= np.linalg.norm(direction)
     for length, expected in [(0.5, 0.03), (0.031, 0.03), (0.01, 0.01)]:
-        env.reset_specific(HOME, NEAR_HOME)
+        env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
         displacement = direction * length
         env.step((displacement if mode == "relative" else s + displacement).astype(np.float32))
         target = 2 * (np.array(commanded[-1]) - panda.LOWER) / (panda.UPPER - panda.LOWER) - 1
@@ -86,7 +86,7 @@ def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
 
 
 def test_the_arm_follows_commands_and_holds_still(env):
-    env.reset_specific(HOME, NEAR_HOME)
+    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
     before = panda.normalise(HOME)
     action = np.zeros(7, np.float32)
     action[0] = 1.0
@@ -94,7 +94,7 @@ def test_the_arm_follows_commands_and_holds_still(env):
     moved = observation["observation"][:7] - before
     assert 0.025 < moved[0] < 0.035
     assert np.abs(moved[1:]).max() < 0.006
-    env.reset_specific(HOME, NEAR_HOME)
+    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
     for _ in range(200):
         observation, *_ = env.step(np.zeros(7, np.float32))
     np.testing.assert_allclose(observation["observation"][:7], before, atol=2e-3)
@@ -124,17 +124,22 @@ def test_contacts_do_not_depend_on_where_the_arm_was_before():
 @pytest.mark.parametrize("goal_type, size", [("ee", 3), ("config", 7), ("combined", 10)])
 def test_goal_types_rewards_and_termination_on_batches(goal_type, size):
     env = envs.make("no_obstacles", goal_type=goal_type)
-    observation, info = env.reset_specific(HOME, NEAR_HOME)
+    observation, info = env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
     expected = {
-        "ee": panda.forward_kinematics(NEAR_HOME),
-        "config": panda.normalise(NEAR_HOME),
-        "combined": np.r_[panda.normalise(NEAR_HOME), panda.forward_kinematics(NEAR_HOME)],
+        "ee": panda.forward_kinematics(ACTIVATION_DISTANCE_HOME),
+        "config": panda.normalise(ACTIVATION_DISTANCE_HOME),
+        "combined": np.r_[
+            panda.normalise(ACTIVATION_DISTANCE_HOME),
+            panda.forward_kinematics(ACTIVATION_DISTANCE_HOME),
+        ],
     }[goal_type]
     np.testing.assert_allclose(observation["desired_goal"], expected, atol=1e-6)
     assert observation["achieved_goal"].shape == (size,)
     np.testing.assert_allclose(
         info["ee_distance"],
-        np.linalg.norm(panda.forward_kinematics(HOME) - panda.forward_kinematics(NEAR_HOME)),
+        np.linalg.norm(
+            panda.forward_kinematics(HOME) - panda.forward_kinematics(ACTIVATION_DISTANCE_HOME)
+        ),
         atol=1e-6,
     )
 
@@ -154,8 +159,8 @@ def test_goal_types_rewards_and_termination_on_batches(goal_type, size):
 
 
 def test_step_agrees_with_the_batch_functions_and_stops_at_the_goal(env):
-    observation, _ = env.reset_specific(HOME, NEAR_HOME)
-    goal = panda.normalise(NEAR_HOME)
+    observation, _ = env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+    goal = panda.normalise(ACTIVATION_DISTANCE_HOME)
     steps, terminated = 0, False
     while not terminated:
         action = (goal - observation["observation"][:7]).astype(np.float32)
@@ -171,7 +176,7 @@ def test_step_agrees_with_the_batch_functions_and_stops_at_the_goal(env):
 
 def test_dense_reward_is_minus_the_distance():
     env = envs.make("no_obstacles", reward="dense")
-    env.reset_specific(HOME, NEAR_HOME)
+    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
     observation, reward, *_ = env.step(np.zeros(7, np.float32))
     distance = np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"])
     assert reward == pytest.approx(-distance)
@@ -186,7 +191,7 @@ def test_horizon_truncates():
 
 def test_velocities_in_the_observation():
     env = envs.make("no_obstacles", velocities=True)
-    env.reset_specific(HOME, NEAR_HOME)
+    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
     action = np.zeros(7, np.float32)
     action[2] = 1.0
     observation, *_ = env.step(action)
@@ -214,7 +219,7 @@ def test_collision_is_reported_while_it_lasts_and_so_far():
     for _ in range(5):
         info = env.step(-TURN_LEFT)[4]
     assert not info["collision"] and info["collision_so_far"]
-    assert not env.reset_specific(HOME, NEAR_HOME)[1]["collision_so_far"]
+    assert not env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)[1]["collision_so_far"]
 
 
 def test_stop_on_collision_terminates_and_relabels():
@@ -284,10 +289,10 @@ def test_scene_arrays_round_trip_and_scenes_change():
         from_array(np.full((1, 11), 7.0))
     env = envs.make("no_obstacles")
     shelf = Scene((Box((0.0, 0, 0.9), (1, 1, 0.1)),))
-    env.reset_specific(HOME * 0.5, NEAR_HOME, scene=env.scene)
+    env.reset_specific(HOME * 0.5, ACTIVATION_DISTANCE_HOME, scene=env.scene)
     with pytest.raises(ValueError, match="obstacle 0"):
-        env.reset_specific(HOME * 0, NEAR_HOME, scene=shelf)
-    env.reset_specific(HOME * 0.5, NEAR_HOME, scene=Scene())
+        env.reset_specific(HOME * 0, ACTIVATION_DISTANCE_HOME, scene=shelf)
+    env.reset_specific(HOME * 0.5, ACTIVATION_DISTANCE_HOME, scene=Scene())
 
 
 # --- Exact replay
@@ -454,7 +459,7 @@ def test_closing_frees_the_connection():
     ],
 )
 def test_bad_actions(env, action):
-    observation, _ = env.reset_specific(HOME, NEAR_HOME)
+    observation, _ = env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
     with pytest.raises(ValueError, match="7 finite numbers"):
         env.step(action)
     after, *_, info = env.step(np.zeros(7, np.float32))
@@ -476,7 +481,7 @@ def test_bad_actions(env, action):
     ],
 )
 def test_bad_queries_leave_the_running_episode_alone(env, start, goal, message):
-    env.reset_specific(HOME, NEAR_HOME)
+    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
     with pytest.raises(ValueError, match=message):
         env.reset_specific(start, goal)
     observation, *_, info = env.step(np.zeros(7, np.float32))

@@ -249,7 +249,7 @@ def test_policies_by_name(policy, touched, tmp_path, capsys, monkeypatch):
     assert f"{policy}: reached the goal in " in text and f"touching {touched}" in text
 
 
-def test_a_policy_with_a_last_layer(tmp_path, capsys, monkeypatch):
+def test_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 1)
     policy = "dagger-combined-points-random_boxes_hard-s1"
     arguments = ["--policy", policy, "--query", 1, "--split", "validation", *SIZE]

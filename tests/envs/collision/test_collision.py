@@ -96,7 +96,7 @@ def near_contact(checker, rng, number):
         wanted = rng.uniform(-0.005, 0.005, 200)
 
         def beyond(share, a=a, b=b, wanted=wanted):
-            return checker.nearest(a + share[:, None] * (b - a)).distance.min(-1) > wanted
+            return checker.signed_distances(a + share[:, None] * (b - a)).distance.min(-1) > wanted
 
         crosses = beyond(low) != beyond(high)
         below = beyond(low)
@@ -121,7 +121,7 @@ def test_random_scenes_agree_with_pybullet(env, seed):
     # The states near contact do tell a millimetre.
     assert (checker.is_free(states, margin=0.001) != theirs).mean() > 0.05
     # A distance is negative in a collision and nowhere else.
-    np.testing.assert_array_equal(checker.nearest(states).distance.min(-1) >= 0, theirs)
+    np.testing.assert_array_equal(checker.signed_distances(states).distance.min(-1) >= 0, theirs)
     env.set_scene(EMPTY)
 
 
@@ -158,8 +158,8 @@ def test_distances_agree_with_pybullet(env):
         env.set_scene(scene)
         (body,) = env.world._bodies
         states = rng.uniform(-1, 1, (40, 7))
-        near = CollisionChecker(scene).nearest(states, self_collisions=False)
-        assert (near.thing == 0).all()
+        near = CollisionChecker(scene).signed_distances(states, self_collisions=False)
+        assert (near.geometry == 0).all()
         for state, distances in zip(states, near.distance, strict=True):
             panda.set_configuration(env.client, env.robot, panda.denormalise(state))
             for link, distance in zip(COLLISION_LINKS, distances, strict=True):
@@ -191,8 +191,8 @@ def test_a_sphere_in_front(hulls, gap):
     radius = 0.05
     centre = tip + [BULLET_MARGIN + gap + radius, 0, 0]
     checker = CollisionChecker(Scene((Sphere(tuple(centre), radius),), table=None, floor=None))
-    near = checker.nearest(STATE, self_collisions=False)
-    assert near.thing[link] == 0
+    near = checker.signed_distances(STATE, self_collisions=False)
+    assert near.geometry[link] == 0
     assert near.distance[link] == pytest.approx(gap, abs=2e-6)
     np.testing.assert_allclose(near.direction[link], [-1, 0, 0], atol=1e-4)
     np.testing.assert_allclose(near.point[link], tip, atol=1e-5)
@@ -208,7 +208,7 @@ def test_a_box_edge_on(hulls):
     centre = tip + [gap + edge / math.sqrt(2), 0, 0]
     turn = (0.0, 0.0, math.sin(math.pi / 8), math.cos(math.pi / 8))
     box = Box(tuple(centre), (edge, edge, edge), turn)
-    near = CollisionChecker(Scene((box,), table=None, floor=None)).nearest(STATE)
+    near = CollisionChecker(Scene((box,), table=None, floor=None)).signed_distances(STATE)
     rounded_off = (math.sqrt(2) - 1) * BULLET_MARGIN
     assert near.distance[link] == pytest.approx(gap + rounded_off - BULLET_MARGIN, abs=2e-6)
     np.testing.assert_allclose(near.direction[link], [-1, 0, 0], atol=1e-4)
@@ -224,7 +224,7 @@ def test_the_arm_inside(hulls, kind):
         "cylinder": Cylinder((0.0, 0.0, 0.2), 30.0, size),  # its bases are much nearer
     }[kind]
     checker = CollisionChecker(Scene((obstacle,), table=None, floor=None))
-    near = checker.nearest(STATE, self_collisions=False)
+    near = checker.signed_distances(STATE, self_collisions=False)
     assert not checker.is_free(STATE)
     for hull, distance, direction in zip(hulls, near.distance, near.direction, strict=True):
         if kind == "sphere":  # by all directions of a fine grid around the one that was found
@@ -248,10 +248,12 @@ def test_of_several_things_the_nearest_or_deepest_counts():
     rng = np.random.default_rng(5)
     scene = Scene(tuple(o for _ in range(5) for o in random_scene(rng).obstacles), None, None)
     states = rng.uniform(-1, 1, (1000, 7))
-    together = CollisionChecker(scene).nearest(states, self_collisions=False)
+    together = CollisionChecker(scene).signed_distances(states, self_collisions=False)
     alone = np.stack(
         [
-            CollisionChecker(replace(scene, obstacles=(one,))).nearest(states, False).distance
+            CollisionChecker(replace(scene, obstacles=(one,)))
+            .signed_distances(states, False)
+            .distance
             for one in scene.obstacles
         ]
     )
@@ -264,22 +266,22 @@ def test_a_sphere_at_a_hulls_centre(hulls):
     for link in range(len(COLLISION_LINKS)):
         centre = (hulls[link].min(0) + hulls[link].max(0)) / 2
         scene = Scene((Sphere(tuple(centre), 0.001),), table=None, floor=None)
-        near = CollisionChecker(scene).nearest(STATE, self_collisions=False)
+        near = CollisionChecker(scene).signed_distances(STATE, self_collisions=False)
         assert near.distance[link] < -0.005
 
 
-def test_the_way_out(env):
+def test_the_escape(env):
     """Moving the obstacle against `direction` moves it away by as much."""
     rng, step = np.random.default_rng(3), 1e-4
     for _ in range(30):
         (obstacle, *_) = rng.permutation(np.array(random_scene(rng).obstacles, dtype=object))
         scene = Scene((obstacle,), table=None, floor=None)
         state = rng.uniform(-1, 1, 7)
-        near = CollisionChecker(scene).nearest(state, self_collisions=False)
+        near = CollisionChecker(scene).signed_distances(state, self_collisions=False)
         for link in (3, 7, 9):
             moved = tuple(obstacle.position - step * near.direction[link])
             scene = Scene((type(obstacle)(moved, *list(vars(obstacle).values())[1:]),), None, None)
-            there = CollisionChecker(scene).nearest(state, self_collisions=False)
+            there = CollisionChecker(scene).signed_distances(state, self_collisions=False)
             assert there.distance[link] - near.distance[link] == pytest.approx(step, rel=0.02)
             # The point is on the link, and that far from the obstacle along the way.
             if isinstance(obstacle, Sphere) and near.distance[link] > 0:
@@ -294,13 +296,15 @@ def test_what_the_nearest_thing_is():
     states[0] = panda.normalise([1.0, 1.1, 0.0, -1.6, 0.0, 2.0, 0.0])  # low over the table
     states[1] = panda.normalise([0.0, 0.5, 0.0, -1.2, 0.0, 1.5, 0.0])  # to the sphere
     states[2] = panda.normalise([1.0, -0.5, 0.0, -2.6, 0.0, 0.3, 0.0])  # folded together
-    things = CollisionChecker(scene).nearest(states).thing
+    things = CollisionChecker(scene).signed_distances(states).geometry
     assert (things[0] == TABLE).any() and (things[1] == 1).any() and (things[2] == ARM).any()
     assert not (things == 0).any()
-    without = CollisionChecker(scene).nearest(states, self_collisions=False)
-    assert not (without.thing == ARM).any()
-    floor = CollisionChecker(Scene(table=None, floor=0.0)).nearest(states, self_collisions=False)
-    assert (floor.thing == FLOOR).all()
+    without = CollisionChecker(scene).signed_distances(states, self_collisions=False)
+    assert not (without.geometry == ARM).any()
+    floor = CollisionChecker(Scene(table=None, floor=0.0)).signed_distances(
+        states, self_collisions=False
+    )
+    assert (floor.geometry == FLOOR).all()
 
 
 def test_links_against_each_other(env):
@@ -308,7 +312,7 @@ def test_links_against_each_other(env):
     rng, seen = np.random.default_rng(11), 0
     checker = CollisionChecker(EMPTY)
     for state in rng.uniform(-1, 1, (60, 7)):
-        near = checker.nearest(state)
+        near = checker.signed_distances(state)
         panda.set_configuration(env.client, env.robot, panda.denormalise(state))
         expected = dict.fromkeys(COLLISION_LINKS, 10.0)
         for a, b in panda.SELF_COLLISION_PAIRS:
@@ -331,50 +335,54 @@ def test_links_against_each_other(env):
 def test_margins_count_from_the_scene_and_between_links():
     checker = CollisionChecker(envs.TASKS["wall"].scene)
     states = np.random.default_rng(0).uniform(-1, 1, (2000, 7))
-    scene = checker.nearest(states, self_collisions=False).distance.min(-1)
-    all_ = checker.nearest(states).distance.min(-1)
+    scene = checker.signed_distances(states, self_collisions=False).distance.min(-1)
+    all_ = checker.signed_distances(states).distance.min(-1)
     np.testing.assert_array_equal(checker.is_free(states, margin=0.01), all_ >= 0.01)
     both = checker.is_free(states, margin=0.01, clearance=0.02)
     np.testing.assert_array_equal(both, (all_ >= 0.01) & (scene >= 0.03))
     assert both.sum() < (all_ >= 0.01).sum() < (all_ >= 0).sum()
 
 
-def test_less_is_asked_near_relaxed_states():
+def test_less_is_asked_near_endpoint_margins_states():
     checker = CollisionChecker(envs.TASKS["wall"].scene)
     states = np.random.default_rng(1).uniform(-1, 1, (4000, 7))
-    distance = checker.nearest(states).distance.min(-1)
+    distance = checker.signed_distances(states).distance.min(-1)
     near = states[(distance > 0.002) & (distance < 0.01)][:2]
-    distances, growth, margin = checker.nearest(near).distance.min(-1), 0.01, 0.02
-    relaxed = (near, distances - 1e-9, growth)
-    assert checker.is_free(near, margin, relaxed=relaxed).all()
+    distances, growth, margin = checker.signed_distances(near).distance.min(-1), 0.01, 0.02
+    endpoint_margins = (near, distances - 1e-9, growth)
+    assert checker.is_free(near, margin, endpoint_margins=endpoint_margins).all()
     assert not checker.is_free(near, margin).any()
     around = np.clip(near[0] + np.random.default_rng(2).normal(0, 0.03, (3000, 7)), -1, 1)
     away = np.linalg.norm(around[:, None] - near, axis=-1)
     asked = np.minimum(margin, (distances - 1e-9 + growth * away).min(-1))
-    got = checker.nearest(around).distance.min(-1)
-    np.testing.assert_array_equal(checker.is_free(around, margin, relaxed=relaxed), got >= asked)
+    got = checker.signed_distances(around).distance.min(-1)
+    np.testing.assert_array_equal(
+        checker.is_free(around, margin, endpoint_margins=endpoint_margins), got >= asked
+    )
     assert 0.1 < (got >= asked).mean() < 0.9
 
 
-def test_each_motion_may_have_its_own_relaxed_states():
+def test_each_motion_may_have_its_own_endpoint_margins_states():
     scene = envs.get_task("boxes").scene
     checker, rng = CollisionChecker(scene), np.random.default_rng(6)
     states = rng.uniform(-1, 1, (4000, 7))
     ends = states[checker.is_free(states)][:200].reshape(100, 2, 7)
-    distances = checker.nearest(ends).distance.min(-1) - 1e-6
+    distances = checker.signed_distances(ends).distance.min(-1) - 1e-6
     starts, stops = ends[:, 0], ends[:, 0] + 0.05 * (ends[:, 1] - ends[:, 0])
-    free = checker.is_motion_free(starts, stops, 0.015, relaxed=(ends, distances, 0.1))
+    free = checker.is_motion_free(starts, stops, 0.015, endpoint_margins=(ends, distances, 0.1))
     alone = [
-        checker.is_motion_free(starts[i], stops[i], 0.015, relaxed=(ends[i], distances[i], 0.1))
+        checker.is_motion_free(
+            starts[i], stops[i], 0.015, endpoint_margins=(ends[i], distances[i], 0.1)
+        )
         for i in range(100)
     ]
     np.testing.assert_array_equal(free, alone)
     assert (free & ~checker.is_motion_free(starts, stops, 0.015)).sum() > 0
     assert (~free).sum() > 0
-    single = checker.is_free(starts, 0.015, relaxed=(ends, distances, 0.1))
+    single = checker.is_free(starts, 0.015, endpoint_margins=(ends, distances, 0.1))
     assert single.all()
-    with pytest.raises(ValueError, match="relaxed"):
-        checker.is_free(starts, 0.015, relaxed=(ends[:50], distances[:50], 0.1))
+    with pytest.raises(ValueError, match="endpoint_margins"):
+        checker.is_free(starts, 0.015, endpoint_margins=(ends[:50], distances[:50], 0.1))
 
 
 # --- Motions
@@ -449,22 +457,22 @@ def test_one_start_many_ends():
 
 
 def digest(checker, states):
-    near = checker.nearest(states)
-    parts = (near.distance, near.direction, near.point, near.thing, checker.is_free(states))
+    near = checker.signed_distances(states)
+    parts = (near.distance, near.direction, near.point, near.geometry, checker.is_free(states))
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
 
 def test_batches_of_one_and_of_ten_thousand_agree():
     checker = CollisionChecker(envs.TASKS["boxes"].scene)
     states = np.random.default_rng(0).uniform(-1, 1, (10_000, 7))
-    near, free = checker.nearest(states), checker.is_free(states)
+    near, free = checker.signed_distances(states), checker.is_free(states)
     for i in range(0, 10_000, 97):
-        one = checker.nearest(states[i])
+        one = checker.signed_distances(states[i])
         for all_, single in zip(near, one, strict=True):
             assert all_[i].tobytes() == np.asarray(single).tobytes()
         assert checker.is_free(states[i]) == free[i]
         assert checker.is_free(states[i : i + 1]).shape == (1,)
-    shaped = checker.nearest(states.reshape(10, 1000, 7))
+    shaped = checker.signed_distances(states.reshape(10, 1000, 7))
     np.testing.assert_array_equal(shaped.distance.reshape(-1, len(COLLISION_LINKS)), near.distance)
 
 
@@ -561,10 +569,10 @@ def test_bad_states_are_refused(wall, states, complaint):
         ({"margin": np.nan}, "margin must be in"),
         ({"clearance": 0.5}, "clearance must be in"),
         ({"clearance": np.inf}, "clearance must be in"),
-        ({"relaxed": (np.zeros((2, 7)), np.zeros(3), 0.1)}, "relaxed"),
-        ({"relaxed": (np.zeros((2, 6)), np.zeros(2), 0.1)}, "relaxed states"),
-        ({"relaxed": (np.zeros((2, 7)), [0.0, np.nan], 0.1)}, "relaxed"),
-        ({"relaxed": (np.zeros((2, 7)), np.zeros(2), -1.0)}, "growth"),
+        ({"endpoint_margins": (np.zeros((2, 7)), np.zeros(3), 0.1)}, "endpoint_margins"),
+        ({"endpoint_margins": (np.zeros((2, 6)), np.zeros(2), 0.1)}, "endpoint_margins states"),
+        ({"endpoint_margins": (np.zeros((2, 7)), [0.0, np.nan], 0.1)}, "endpoint_margins"),
+        ({"endpoint_margins": (np.zeros((2, 7)), np.zeros(2), -1.0)}, "growth"),
     ],
 )
 def test_bad_margins_are_refused(wall, options, complaint):
@@ -605,8 +613,8 @@ def test_degenerate_obstacles_are_refused(obstacle):
 
 def test_nothing_there():
     checker = CollisionChecker(EMPTY)
-    near = checker.nearest(STATE, self_collisions=False)
-    assert (near.distance == np.inf).all() and (near.thing == NOTHING).all()
+    near = checker.signed_distances(STATE, self_collisions=False)
+    assert (near.distance == np.inf).all() and (near.geometry == NOTHING).all()
     assert not near.direction.any() and not near.point.any()
     # Clearance is from obstacles, a margin from the other links, too.
     assert checker.is_free(STATE, clearance=0.4) and not checker.is_free(STATE, margin=0.4)
@@ -618,24 +626,24 @@ def test_nothing_asked(wall):
     assert wall.is_free(np.empty((0, 7))).shape == (0,)
     assert wall.is_free(np.empty((2, 0, 7))).shape == (2, 0)
     assert wall.is_motion_free(np.empty((0, 7)), np.empty((0, 7))).shape == (0,)
-    assert wall.nearest(np.empty((0, 7))).direction.shape == (0, len(COLLISION_LINKS), 3)
-    assert wall.proximity(np.empty((2, 0, 7))).shape == (2, 0, len(COLLISION_LINKS), 8)
+    assert wall.signed_distances(np.empty((0, 7))).direction.shape == (0, len(COLLISION_LINKS), 3)
+    assert wall.link_distances(np.empty((2, 0, 7))).shape == (2, 0, len(COLLISION_LINKS), 8)
 
 
 @pytest.mark.parametrize("self_collisions", [False, True])
-def test_proximity_is_nearest_as_observations_have_it(wall, self_collisions):
+def test_link_distances_is_nearest_as_observations_have_it(wall, self_collisions):
     states = np.random.default_rng(3).uniform(-1.1, 1.1, (4, 25, 7)).astype(np.float32)
     states[0, 0, 0] = np.inf
-    found = wall.proximity(states, self_collisions, within=0.2)
-    near = wall.nearest(np.clip(states, -1.0, 1.0), self_collisions, within=0.2)
+    found = wall.link_distances(states, self_collisions, within=0.2)
+    near = wall.signed_distances(np.clip(states, -1.0, 1.0), self_collisions, within=0.2)
     distances = np.minimum(near.distance, 0.2)[..., None]
     assert 0.1 < (distances < 0.2).mean() < 0.9
     wanted = np.concatenate([distances, near.gradient], axis=-1).astype(np.float32)
     assert found.dtype == np.float32 and (found == wanted).all()
-    assert (wall.proximity(states[1, 2], self_collisions, within=0.2) == found[1, 2]).all()
+    assert (wall.link_distances(states[1, 2], self_collisions, within=0.2) == found[1, 2]).all()
     for bad in (np.full(7, np.nan), np.zeros(6), "near"):
         with pytest.raises(ValueError, match="states must"):
-            wall.proximity(bad)
+            wall.link_distances(bad)
 
 
 def test_limits_may_be_rounded(wall):
@@ -650,5 +658,5 @@ def test_a_very_thin_and_a_very_large_box(hulls):
         for gap in (0.004, -0.0005):
             centre = tip + [gap + BULLET_MARGIN + size[0] / 2, 0, 0]
             checker = CollisionChecker(Scene((Box(tuple(centre), size),), table=None, floor=None))
-            assert checker.nearest(STATE).distance[link] == pytest.approx(gap, abs=1e-5)
+            assert checker.signed_distances(STATE).distance[link] == pytest.approx(gap, abs=1e-5)
             assert checker.is_free(STATE) == (gap > 0)

@@ -536,11 +536,11 @@ def test_make_queries_refuses_before_it_works(arguments, complaint):
     assert "queries/s" not in result.stderr and "Traceback" not in result.stderr
 
 
-# --- The packaged files
+# --- The pretrained files
 
 
 @pytest.mark.parametrize("task", envs.TASKS)
-def test_packaged_queries(task):
+def test_pretrained_queries(task):
     env = envs.make(task)
     client = p.connect(p.DIRECT)
     robot = p.loadURDF(
@@ -572,7 +572,7 @@ def test_packaged_queries(task):
         ("random_boxes_hard", 4, 8),
     ],
 )
-def test_packaged_random_scenes(task, fewest, most):
+def test_pretrained_random_scenes(task, fewest, most):
     queries = load_queries(task)
     with h5py.File(datasets.query_path(task)) as file:
         parameters = json.loads(file.attrs["parameters"].decode())

@@ -545,14 +545,14 @@ def test_a_file_for_an_old_scene_is_refused(path, monkeypatch, scene):
     assert str(path) in str(caught.value)
 
 
-# --- The packaged files
+# --- The pretrained files
 
 
 FILES = sorted((Path(envs.__file__).parent / "demos").glob("*.h5"))
 
 
 @pytest.mark.parametrize("file", FILES, ids=[file.stem for file in FILES])
-def test_packaged_demonstrations(file):
+def test_pretrained_demonstrations(file):
     demos = load_demos(file.stem)
     assert len(demos) == 10_000 and not demos.collided.any()
     env = envs.make(file.stem)

@@ -11,9 +11,16 @@ import pytest
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.observations import Observations, sensors_from_json, sensors_to_json
+from roboarm_nmp.envs.datasets.observations import Observations
 from roboarm_nmp.envs.datasets.shards import shard_path
-from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
+from roboarm_nmp.envs.perception.sensors import (
+    Camera,
+    PointCloud,
+    SensorWorld,
+    cardinal,
+    sensors_from_json,
+    sensors_to_json,
+)
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.scene_embedding_train import collect
 

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from roboarm_nmp.envs.networks import operations as network_operations
-from roboarm_nmp.envs.networks.exported_networks import halve_network, load_network, save_network
+from roboarm_nmp.envs.networks.exported_networks import load_network, save_network, to_float16
 from roboarm_nmp.envs.networks.operations import NetworkError
 
 
@@ -180,7 +180,7 @@ def test_a_halved_network_computes_in_float32_from_rounded_numbers(tmp_path):
     module, batch = Actor().eval(), _inputs(5)
     save_network(tmp_path / "net.pt", module, batch, {"kind": "policy"})
     for _ in range(2):  # the second time there is nothing left to do
-        halve_network(tmp_path / "net.pt", tmp_path / "half.pt")
+        to_float16(tmp_path / "net.pt", tmp_path / "half.pt")
         (tmp_path / "half.pt").rename(tmp_path / "net.pt")
     for name, tensor in module.state_dict().items():
         module.state_dict()[name].copy_(tensor.half().float())
@@ -193,13 +193,13 @@ def test_a_halved_network_computes_in_float32_from_rounded_numbers(tmp_path):
 def test_a_halved_network_has_half_the_size_or_is_an_error(tmp_path):
     module, batch = nn.Linear(100, 1000), {"input": torch.zeros(1, 100)}
     save_network(tmp_path / "net.pt", module, batch, {})
-    halve_network(tmp_path / "net.pt", tmp_path / "half.pt")
+    to_float16(tmp_path / "net.pt", tmp_path / "half.pt")
     sizes = [(tmp_path / name).stat().st_size for name in ("half.pt", "net.pt")]
     assert sizes[0] < 0.51 * sizes[1]
     nn.init.constant_(module.bias, 1e5)
     save_network(tmp_path / "large.pt", module, batch, {})
     with pytest.raises(NetworkError, match=r"large.pt: cannot be halved"):
-        halve_network(tmp_path / "large.pt", tmp_path / "half2.pt")
+        to_float16(tmp_path / "large.pt", tmp_path / "half2.pt")
     assert not (tmp_path / "half2.pt").exists()
 
 
@@ -539,4 +539,4 @@ def test_the_earlier_names_still_work():
     from roboarm_nmp.envs import programs
 
     assert programs.save_program is save_network and programs.load_program is load_network
-    assert programs.halve_program is halve_network and programs.ProgramError is NetworkError
+    assert programs.halve_program is to_float16 and programs.ProgramError is NetworkError

@@ -12,22 +12,25 @@ from paths import ROOT
 from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts.evaluate import EvaluationError, evaluate
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.observations import sensors_to_json
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.networks.operations import NetworkError
 from roboarm_nmp.envs.perception.encoders import (
-    TOLD_CELL,
-    TOLD_HIGH,
-    TOLD_LOW,
-    TOLD_RADIUS,
-    TOLD_REACH,
+    DECODED_CELL,
+    DECODED_HIGH,
+    DECODED_LOW,
+    DECODED_RADIUS,
+    DECODED_REACH,
     SceneEncoder,
-    told_checker,
-    told_points,
-    with_told,
+    decoded_checker,
+    decoded_points,
+    with_decoded,
 )
-from roboarm_nmp.envs.perception.point_clouds import checker_of, seen_checker, true_checker
-from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal
+from roboarm_nmp.envs.perception.point_clouds import (
+    geometry_source,
+    ground_truth_checker,
+    observed_checker,
+)
+from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal, sensors_to_json
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
 
 BALL = (0.45, 0.1, 0.6, 0.15)  # what the encoder tells of, whatever the scene: place and radius, m
@@ -58,13 +61,13 @@ def encoder(tmp_path_factory):
 
 
 def test_points_are_those_of_the_grid_where_something_is_said_to_be(encoder):
-    points = told_points(Scene(), encoder)
+    points = decoded_points(Scene(), encoder)
     axes = [
-        np.arange(low + TOLD_CELL / 2, high, TOLD_CELL)
-        for low, high in zip(TOLD_LOW, TOLD_HIGH, strict=True)
+        np.arange(low + DECODED_CELL / 2, high, DECODED_CELL)
+        for low, high in zip(DECODED_LOW, DECODED_HIGH, strict=True)
     ]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    there = np.linalg.norm(grid - BALL[:3], axis=1) - BALL[3] < TOLD_REACH
+    there = np.linalg.norm(grid - BALL[:3], axis=1) - BALL[3] < DECODED_REACH
     assert points.dtype == np.float32 and there.sum() > 500
     expected = {tuple(row) for row in np.round(grid[there], 4).tolist()}
     assert {tuple(row) for row in np.round(points.astype(float), 4).tolist()} == expected
@@ -72,16 +75,21 @@ def test_points_are_those_of_the_grid_where_something_is_said_to_be(encoder):
 
 
 def test_distances_are_those_of_what_is_told(encoder):
-    told = checker_of(encoder)(Scene())
+    told = geometry_source(encoder)(Scene())
     states = np.random.default_rng(0).uniform(-1, 1, (200, 7))
-    points = told_points(Scene(), encoder)
-    expected = CollisionChecker(Scene(), points, TOLD_RADIUS).nearest(states).distance
-    np.testing.assert_array_equal(told.nearest(states).distance, expected)
-    assert checker_of(encoder)(Scene()) is told  # made once
-    assert checker_of("obstacles") is true_checker and checker_of("points") is seen_checker
+    points = decoded_points(Scene(), encoder)
+    expected = CollisionChecker(Scene(), points, DECODED_RADIUS).signed_distances(states).distance
+    np.testing.assert_array_equal(told.signed_distances(states).distance, expected)
+    assert geometry_source(encoder)(Scene()) is told  # made once
+    assert (
+        geometry_source("obstacles") is ground_truth_checker
+        and geometry_source("points") is observed_checker
+    )
     # The true obstacles count for nothing.
     boxed = Scene((Box((0.0, 0.5, 0.4), (0.3, 0.3, 0.3)),))
-    np.testing.assert_array_equal(told_checker(boxed, encoder).nearest(states).distance, expected)
+    np.testing.assert_array_equal(
+        decoded_checker(boxed, encoder).signed_distances(states).distance, expected
+    )
 
 
 class NotANumber(DistanceFromTheBall):
@@ -102,7 +110,7 @@ def test_what_tells_nothing_is_refused(decoder, encoder, tmp_path):
     inputs = {"latent": torch.rand(2, 4), "points": torch.rand(2, 5, 3)}
     save_network(path.with_suffix(".decoder.pt"), decoder(), inputs, {"kind": "field"})
     with pytest.raises(NetworkError, match=r"encoder.decoder.pt: its output is not"):
-        told_points(Scene(), str(path))
+        decoded_points(Scene(), str(path))
 
 
 def test_nothing_may_be_there(tmp_path, encoder):
@@ -110,9 +118,9 @@ def test_nothing_may_be_there(tmp_path, encoder):
     path.write_bytes(Path(encoder).read_bytes())
     inputs = {"latent": torch.rand(2, 4), "points": torch.rand(2, 5, 3)}
     save_network(path.with_suffix(".decoder.pt"), FarAway(), inputs, {"kind": "field"})
-    assert told_points(Scene(), str(path)).shape == (0, 3)
+    assert decoded_points(Scene(), str(path)).shape == (0, 3)
     states = np.random.default_rng(0).uniform(-1, 1, (50, 7))
-    one, other = (check(Scene(())) for check in (checker_of(str(path)), true_checker))
+    one, other = (check(Scene(())) for check in (geometry_source(str(path)), ground_truth_checker))
     np.testing.assert_array_equal(one.is_free(states), other.is_free(states))
 
 
@@ -125,7 +133,7 @@ def test_cells_that_are_told(encoder):
     """Those of `benchmarks/scene_knowledge.py`: how many are right, and links' distances."""
     sys.path.append(str(ROOT / "benchmarks"))
     knowledge = importlib.import_module("scene_knowledge")
-    points = told_points(Scene(), encoder)
+    points = decoded_points(Scene(), encoder)
     inside = points[np.linalg.norm(points - BALL[:3], axis=1) < BALL[3]]
     cells = knowledge.told_cells(inside)
     at = np.unique(np.floor((inside - knowledge.LOW) / knowledge.CELL).astype(int), axis=0)
@@ -140,56 +148,62 @@ def test_cells_that_are_told(encoder):
 
 def test_in_an_environment(encoder):
     env = envs.make(
-        "random_boxes_hard", goal_type="combined", encoder=f"points:8:{encoder}", proximity=encoder
+        "random_boxes_hard",
+        goal_type="combined",
+        encoder=f"points:8:{encoder}",
+        link_distances=encoder,
     )
     observation, _ = env.reset(seed=1)
     assert env.encoder.size == 24 and env.encoder.row_size == 3
-    assert env.encoder.proximity == encoder
+    assert env.encoder.link_distances == encoder
     told = observation["observation"][10:].reshape(8, 3)
     away = np.linalg.norm(told - BALL[:3], axis=1)
-    assert (away < BALL[3] + TOLD_REACH + 1e-4).all() and away.max() > BALL[3] - TOLD_CELL
-    distances = told_checker(env.scene, encoder).nearest(
+    assert (away < BALL[3] + DECODED_REACH + 1e-4).all() and away.max() > BALL[3] - DECODED_CELL
+    distances = decoded_checker(env.scene, encoder).signed_distances(
         observation["observation"][:7], self_collisions=False
     )
     np.testing.assert_allclose(
-        observation["proximity"][:, 0], distances.distance.clip(max=0.3), atol=1e-5
+        observation["link_distances"][:, 0], distances.distance.clip(max=0.3), atol=1e-5
     )
     env.close()
 
 
 def test_what_encoders_can_tell():
-    assert SceneEncoder("oracle").proximity == "obstacles"
-    assert SceneEncoder("points:5").proximity == SceneEncoder("vae").proximity == "points"
+    assert SceneEncoder("oracle").link_distances == "obstacles"
+    assert SceneEncoder("points:5").link_distances == SceneEncoder("vae").link_distances == "points"
     for name in ("points:8:vae", "points:8:oracle"):
         with pytest.raises(NetworkError, match="has no decoder: it cannot tell how far"):
             SceneEncoder(name)
     with pytest.raises(ValueError, match="vae has no decoder"):
-        envs.make("wall", proximity="vae")
+        envs.make("wall", link_distances="vae")
     with pytest.raises(ValueError, match="nowhere: cannot be read"):
-        checker_of("nowhere")
+        geometry_source("nowhere")
 
 
 def test_only_what_was_seen_is_told():
-    seen = {"goal_type": "config", "encoder": "points:32", "proximity": "points"}
-    told = {"goal_type": "config", "encoder": "points:32:field", "proximity": "field"}
-    assert with_told("field", seen) == told and seen["encoder"] == "points:32"
-    assert with_told("field", {"encoder": "points"}) == {"encoder": "points:64:field"}
-    assert with_told("field", {"proximity": "points"}) == {"proximity": "field"}
-    of_both = {"encoder": "vae", "proximity": "points"}
-    assert with_told("field", of_both) == {"encoder": "vae", "proximity": "field"}
-    true = {"encoder": "oracle", "proximity": "obstacles"}
-    assert with_told("field", true) == true and with_told("field", {}) == {}
+    seen = {"goal_type": "config", "encoder": "points:32", "link_distances": "points"}
+    told = {"goal_type": "config", "encoder": "points:32:field", "link_distances": "field"}
+    assert with_decoded("field", seen) == told and seen["encoder"] == "points:32"
+    assert with_decoded("field", {"encoder": "points"}) == {"encoder": "points:64:field"}
+    assert with_decoded("field", {"link_distances": "points"}) == {"link_distances": "field"}
+    fuse = {"encoder": "vae", "link_distances": "points"}
+    assert with_decoded("field", fuse) == {"encoder": "vae", "link_distances": "field"}
+    true = {"encoder": "oracle", "link_distances": "obstacles"}
+    assert with_decoded("field", true) == true and with_decoded("field", {}) == {}
 
 
 def test_a_policy_of_points_knows_only_what_is_told(encoder):
     options = dict(split="validation", num_queries=2)
     seen = evaluate(POLICY, "random_boxes_hard", **options)
     told = evaluate(POLICY, "random_boxes_hard", encoder=encoder, **options)
-    assert told["env"]["encoder"] == f"points:32:{encoder}" and told["env"]["proximity"] == encoder
-    assert told["last_layer"] == seen["last_layer"] and told["encoder"] == encoder
+    assert (
+        told["env"]["encoder"] == f"points:32:{encoder}"
+        and told["env"]["link_distances"] == encoder
+    )
+    assert told["safety_filter"] == seen["safety_filter"] and told["encoder"] == encoder
     assert told["mean_steps"] != seen["mean_steps"]
-    alone = evaluate(POLICY, "wall", encoder=encoder, last_layer=False, **options)
-    assert alone["env"]["proximity"] == encoder and alone["last_layer"] is None
+    alone = evaluate(POLICY, "wall", encoder=encoder, safety_filter=False, **options)
+    assert alone["env"]["link_distances"] == encoder and alone["safety_filter"] is None
     planned = evaluate("planner", "random_boxes_hard", encoder=encoder, **options)
     assert planned["encoder"] == encoder
     for policy in ("bc-ee-double_walls-s1", "go-to-goal"):

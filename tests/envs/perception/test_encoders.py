@@ -30,10 +30,10 @@ from roboarm_nmp.envs.networks.exported_networks import load_network, save_netwo
 from roboarm_nmp.envs.networks.operations import NetworkError
 from roboarm_nmp.envs.perception.encoders import (
     MAX_OBSTACLES,
-    PACKAGED,
+    PRETRAINED,
     SceneEncoder,
     oracle,
-    packaged_encoders,
+    pretrained_encoders,
 )
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere, from_array
@@ -286,7 +286,7 @@ def test_points_are_asked_about_around_all_obstacles_alike():
 def test_turned_scenes_keep_their_distances_from_points():
     torch.manual_seed(0)
     places, others = torch.randn(5, 7, 3), torch.randn(5, 9, 3)
-    turned, turned_others = field.turned(places, others)
+    turned, turned_others = field.augment(places, others)
     torch.testing.assert_close(torch.cdist(turned, turned_others), torch.cdist(places, others))
     torch.testing.assert_close(turned[..., 2], places[..., 2])
     assert (turned - places).abs().amax((1, 2)).min() > 0.01
@@ -339,7 +339,7 @@ def test_one_update_of_the_field():
     torch.manual_seed(1)
     asked = field.queries(obstacles, 30, args.spread)
     truth = field.distances(obstacles, asked)
-    turned, turned_asked = field.turned(points, asked)
+    turned, turned_asked = field.augment(points, asked)
     z = before.encode(turned, there)
     errors = (before.decoder(z + 0.1 * torch.randn_like(z), turned_asked) - truth).abs()
     total = weight = near = count = 0.0
@@ -383,7 +383,7 @@ def test_an_encoder_learns_something_tiny(name, observations):
     else:
         module, kind = (vae, vae.VAE) if name == "vae" else (vqvae, vqvae.VQVAE)
         args = module.Args(width=8)
-        model, (data, _) = kind(4, 16, args), pictures.load_pictures(read, 16)
+        model, (data, _) = kind(4, 16, args), pictures.load_images(read, 16)
         batch = pictures.batch_of(data, rows, "cpu")
         inputs = (pictures.mean_picture(data, 20, "cpu"),)
 
@@ -421,7 +421,7 @@ def test_each_decoder_of_the_vae_sees_all_cameras_and_of_the_vqvae_its_own():
 
 
 def test_errors_of_the_evaluation(observations):
-    images, cameras = pictures.load_pictures(Observations(observations), 16)
+    images, cameras = pictures.load_images(Observations(observations), 16)
     assert images.shape == (20, 4, 16, 16, 3) and cameras == ["front", "left", "back", "right"]
     rows = np.arange(3, 10)
     truth = torch.from_numpy(images[rows]).permute(0, 1, 4, 2, 3) / 255.0
@@ -438,8 +438,8 @@ def test_errors_of_the_evaluation(observations):
 
 def test_images_are_those_of_the_shards(observations):
     read = Observations(observations)
-    whole, cameras = pictures.load_pictures(read, 32)
-    averaged, _ = pictures.load_pictures(read, 16)
+    whole, cameras = pictures.load_images(read, 32)
+    averaged, _ = pictures.load_images(read, 16)
     for shard in range(3):
         rows = slice(*read.offsets[shard : shard + 2])
         for i, name in enumerate(cameras):
@@ -458,12 +458,12 @@ def test_images_are_those_of_the_shards(observations):
 def test_other_observations_in_the_same_folder_are_unpacked_anew(observations, tmp_path):
     for path in observations.glob("shard_*.h5"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    before, _ = pictures.load_pictures(Observations(tmp_path), 16)
+    before, _ = pictures.load_images(Observations(tmp_path), 16)
     thinned = clouds.load_clouds(Observations(tmp_path), 64)
     with h5py.File(tmp_path / "shard_00001.h5", "r+") as file:
         file["left/rgb"][2] = 255 - file["left/rgb"][2]
         file["left_cloud/segmentation"][2] = OBSTACLE
-    after, _ = pictures.load_pictures(Observations(tmp_path), 16)
+    after, _ = pictures.load_images(Observations(tmp_path), 16)
     changed = np.argwhere((before != after).any((2, 3, 4)))
     np.testing.assert_array_equal(changed, [[10, 1]])
     other = clouds.load_clouds(Observations(tmp_path), 64)
@@ -479,12 +479,12 @@ def test_two_trainers_may_unpack_at_once(observations, tmp_path):
 
     def read(number, name):
         if number == 1 and not made:  # one has begun, and the other does it all meanwhile
-            made.append(pictures.load_pictures(other, 16)[0])
+            made.append(pictures.load_images(other, 16)[0])
         return Observations.read(one, number, name)
 
     one.read = read
-    expected, _ = pictures.load_pictures(Observations(observations), 16)
-    np.testing.assert_array_equal(pictures.load_pictures(one, 16)[0], expected)
+    expected, _ = pictures.load_images(Observations(observations), 16)
+    np.testing.assert_array_equal(pictures.load_images(one, 16)[0], expected)
     np.testing.assert_array_equal(made[0], expected)
     assert len([path for path in tmp_path.iterdir() if path.suffix != ".h5"]) == 1
 
@@ -731,7 +731,7 @@ def test_the_saved_encoder_needs_no_script(run, observations):
                 points, labels = (torch.cat(one) for one in zip(*shards, strict=True))
                 inputs |= {f"{sensor}_points": points, f"{sensor}_labels": labels}
     else:
-        images, cameras = pictures.load_pictures(read, 32)
+        images, cameras = pictures.load_images(read, 32)
         inputs = {one: torch.from_numpy(images[:, i].copy()) for i, one in enumerate(cameras)}
     together = encoder(**inputs)
     assert together.shape == (20, 64) and together.dtype == torch.float32
@@ -896,12 +896,12 @@ def test_a_trained_encoder_in_an_environment(run, observations):
     fresh.close()
 
 
-def test_packaged_encoders_are_found_by_name():
-    assert packaged_encoders() == sorted(SCRIPTS)
-    assert sum(path.stat().st_size for path in PACKAGED.glob("*.[pj]*")) < 7e6
+def test_pretrained_encoders_are_found_by_name():
+    assert pretrained_encoders() == sorted(SCRIPTS)
+    assert sum(path.stat().st_size for path in PRETRAINED.glob("*.[pj]*")) < 7e6
     queries = load_queries("random_boxes_hard")
     for name in SCRIPTS:
-        encoder, path = SceneEncoder(name), PACKAGED / f"{name}.pt"
+        encoder, path = SceneEncoder(name), PRETRAINED / f"{name}.pt"
         latents = np.stack([encoder(queries.scenes[i]) for i in (0, 9_999)])
         assert latents.shape == (2, 64) and np.isfinite(latents).all()
         assert np.abs(latents[0] - latents[1]).max() > 0.1  # it sees the difference

@@ -13,8 +13,8 @@ from roboarm_nmp.envs.perception.point_clouds import (
     CELL,
     POINT_RADIUS,
     farthest_points,
-    seen_checker,
-    seen_points,
+    observed_checker,
+    observed_points,
 )
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
 
@@ -34,7 +34,7 @@ def clutter():
 
 
 def test_points_lie_on_what_can_be_seen():
-    points = seen_points(Scene((BOX,)))
+    points = observed_points(Scene((BOX,)))
     out = np.abs(points - BOX.position) - np.array(BOX.size) / 2
     assert len(points) > 300 and points.dtype == np.float32
     assert np.abs(out.max(1)).max() < 0.005  # m, from its surface: precision of the depths
@@ -48,28 +48,28 @@ def test_points_lie_on_what_can_be_seen():
 
 def test_a_scene_is_seen_the_same_way_again():
     scene = Scene((BOX, Sphere((-0.4, 0.4, 0.3), 0.1)))
-    before = seen_points(scene).tobytes()
-    seen_points(Scene((Sphere((0.4, 0.4, 0.4), 0.05),)))
+    before = observed_points(scene).tobytes()
+    observed_points(Scene((Sphere((0.4, 0.4, 0.4), 0.05),)))
     seeing._look.cache_clear()
-    assert seen_points(scene).tobytes() == before
+    assert observed_points(scene).tobytes() == before
 
 
 def test_nothing_to_see():
-    assert seen_points(EMPTY).shape == (0, 3)
+    assert observed_points(EMPTY).shape == (0, 3)
     states = np.random.default_rng(0).uniform(-1, 1, (200, 7))
-    seen, true = seen_checker(EMPTY), CollisionChecker(EMPTY)
+    seen, true = observed_checker(EMPTY), CollisionChecker(EMPTY)
     assert (seen.is_free(states) == true.is_free(states)).all()
-    assert (seen.nearest(states).distance == true.nearest(states).distance).all()
-    assert not farthest_points(seen_points(EMPTY), 5).any()
+    assert (seen.signed_distances(states).distance == true.signed_distances(states).distance).all()
+    assert not farthest_points(observed_points(EMPTY), 5).any()
     assert not SceneEncoder("points")(EMPTY).any()
 
 
 def test_what_is_there_but_hidden_is_not_known():
     """A small box inside of the table."""
     hidden = Scene((Box((0.0, 0.0, -0.2), (0.05, 0.05, 0.05)),))
-    assert seen_points(hidden).shape == (0, 3)
-    env = envs.make("wall", encoder="points:4", proximity="points")
-    other = envs.make("wall", encoder="points:4", proximity="points")
+    assert observed_points(hidden).shape == (0, 3)
+    env = envs.make("wall", encoder="points:4", link_distances="points")
+    other = envs.make("wall", encoder="points:4", link_distances="points")
     query = env.sample_query(np.random.default_rng(0))
     observed = [
         one.reset_specific(*query, scene)[0] for one, scene in ((env, hidden), (other, EMPTY))
@@ -94,9 +94,9 @@ def test_points_are_balls():
         assert 0.1 < free.mean() < 0.9 and (free == other.is_free(states, **options)).all()
     ends = states[rng.permutation(len(states))]
     assert (one.is_motion_free(states, ends) == other.is_motion_free(states, ends)).all()
-    a, b = one.nearest(states), other.nearest(states)
+    a, b = one.signed_distances(states), other.signed_distances(states)
     np.testing.assert_allclose(b.distance, a.distance, atol=2e-6)
-    assert ((a.thing >= 0) == (b.thing == POINT)).all() and (b.thing == POINT).mean() > 0.3
+    assert ((a.geometry >= 0) == (b.geometry == POINT)).all() and (b.geometry == POINT).mean() > 0.3
     away = np.abs(a.distance) > 1e-4  # where they just touch, the direction is a matter of rounding
     assert np.quantile(np.abs(a.gradient - b.gradient)[away], 0.999) < 1e-4
 
@@ -106,10 +106,10 @@ def test_distances_from_points_are_nearly_those_from_what_was_seen(clutter):
     errors = []
     for scene in clutter:
         states = np.random.default_rng(0).uniform(-1, 1, (3000, 7))
-        true, seen = CollisionChecker(scene), seen_checker(scene)
+        true, seen = CollisionChecker(scene), observed_checker(scene)
         states = states[true.is_free(states)]
-        a, b = (one.nearest(states, self_collisions=False) for one in (true, seen))
-        near = (a.thing >= 0) & (a.distance < 0.1)
+        a, b = (one.signed_distances(states, self_collisions=False) for one in (true, seen))
+        near = (a.geometry >= 0) & (a.distance < 0.1)
         errors.append((b.distance - a.distance)[near])
     errors = np.concatenate(errors)
     # A point's ball reaches beyond the surface that it is on.
@@ -142,7 +142,7 @@ def test_points_as_an_encoding():
     env = envs.make("random_boxes_hard", encoder="points")
     observation, _ = env.reset(seed=1)
     scene = observation["observation"][10:].reshape(64, 3)
-    expected = farthest_points(seen_points(env.unwrapped.scene), 64)
+    expected = farthest_points(observed_points(env.unwrapped.scene), 64)
     assert scene.tobytes() == expected.tobytes() and scene.any()
     assert env.observation_space.contains(observation)
     after, *_ = env.step(np.full(7, 0.01))
@@ -158,7 +158,7 @@ def test_points_as_an_encoding():
 
 def test_vector_environments_see_as_single_ones_do():
     def make():
-        sees = {"encoder": "points:8", "proximity": "points"}
+        sees = {"encoder": "points:8", "link_distances": "points"}
         return envs.make("random_boxes_hard", goal_type="combined", **sees)
 
     several, one = gym.vector.SyncVectorEnv([make, make]), make()
@@ -167,9 +167,12 @@ def test_vector_environments_see_as_single_ones_do():
         alone, _ = one.reset(seed=seed)
         for name, value in alone.items():
             np.testing.assert_array_equal(together[name][row], value)
-    assert together["proximity"].shape == (2, 10, 8) and together["observation"].shape == (2, 34)
+    assert together["link_distances"].shape == (2, 10, 8) and together["observation"].shape == (
+        2,
+        34,
+    )
     actions = np.full((2, 7), 0.01, np.float32)
     stepped, *_ = several.step(actions)
     after, *_ = one.step(actions[1])
-    np.testing.assert_array_equal(stepped["proximity"][1], after["proximity"])
+    np.testing.assert_array_equal(stepped["link_distances"][1], after["link_distances"])
     several.close(), one.close()

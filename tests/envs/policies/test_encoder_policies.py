@@ -78,15 +78,15 @@ def test_demonstrations_have_the_code_of_their_scene(env):
                 np.testing.assert_array_equal(transition[name][10:], oracle(demos[i].scene))
 
 
-def test_proximity_in_the_observation_the_buffer_and_demonstrations():
-    knows = {"encoder": "oracle", "proximity": "obstacles", "append_proximity": True}
+def test_link_distances_in_the_observation_the_buffer_and_demonstrations():
+    knows = {"encoder": "oracle", "link_distances": "obstacles", "append_link_distances": True}
     env = envs.make(HARD, **knows)
     env.reset(seed=0)
     buffer = load("sac_her_mp").HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
     episode = steps(env, 10)
     buffer.add_episode(episode)
     observations = np.stack([one["observation"] for one in episode])
-    near = env.proximity_at(observations[:, :7])
+    near = env.link_distances_at(observations[:, :7])
     np.testing.assert_array_equal(observations[:, 10:90], near.reshape(10, 80))
     np.testing.assert_array_equal(observations[0, 90:], oracle(env.unwrapped.scene))
     known = {row.tobytes() for row in observations}
@@ -95,18 +95,18 @@ def test_proximity_in_the_observation_the_buffer_and_demonstrations():
     transitions = demo_transitions(demo, env)
     env.reset_specific(demo.start, demo.goal, demo.scene)
     for i, one in enumerate(transitions):
-        near = env.proximity_at(demo.states[i]).ravel()
+        near = env.link_distances_at(demo.states[i]).ravel()
         np.testing.assert_allclose(one["observation"][10:90], near, atol=1e-6)
         np.testing.assert_array_equal(one["observation"][90:], oracle(demo.scene))
     env.close()
     for append in (True, 1.5, "yes"):
-        with pytest.raises(ValueError, match="is a bool and needs proximity"):
-            envs.make(HARD, append_proximity=append)
+        with pytest.raises(ValueError, match="is a bool and needs link_distances"):
+            envs.make(HARD, append_link_distances=append)
 
 
 def flags(trainer):
     more = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
-    return more if trainer == "bc" else [*more, "--demo-prob", "1", "--proximity", "obstacles"]
+    return more if trainer == "bc" else [*more, "--demo-prob", "1", "--link_distances", "obstacles"]
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
@@ -118,7 +118,7 @@ def test_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
     arguments += ["--json", tmp_path / "result.json"]
     assert evaluate.main(list(map(str, arguments))) == 0
     assert json.loads((tmp_path / "result.json").read_text())["goal_type"] == "combined"
-    assert network["metadata"]["env"].get("append_proximity", False) == (trainer != "bc")
+    assert network["metadata"]["env"].get("append_link_distances", False) == (trainer != "bc")
     if trainer == "bc":
         show = [sys.executable, "-m", "roboarm_nmp.envs.show", HARD, "--policy", str(run)]
         show += ["--size", "60", "40", "--output", str(tmp_path / "rollout.gif")]

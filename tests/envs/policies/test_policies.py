@@ -8,22 +8,22 @@ import pytest
 from paths import ROOT
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.networks.exported_networks import halve_network
+from roboarm_nmp.envs.networks.exported_networks import to_float16
 from roboarm_nmp.envs.policies.registry import (
     PolicyError,
     find_policy,
     make_policy,
-    own_layer,
+    own_safety_filter,
     policy_file,
-    shipped_policies,
+    pretrained_policies,
 )
-from roboarm_nmp.envs.policies.safety_filter import LastLayer
+from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 
 
-def test_shipped_policies_are_found_from_anywhere(tmp_path, monkeypatch):
+def test_pretrained_policies_are_found_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     kept = {path.stem: path for path in (ROOT / "envs/policies/pretrained").glob("*.pt")}
-    assert len(kept) > 10 and shipped_policies() == kept
+    assert len(kept) > 10 and pretrained_policies() == kept
     assert policy_file("bc-config-double_walls-s1").samefile(
         ROOT / "envs/policies/pretrained/bc-config-double_walls-s1.pt"
     )
@@ -38,10 +38,10 @@ def test_shipped_policies_are_found_from_anywhere(tmp_path, monkeypatch):
     assert policy_file("sac-ee-wall-p1-s1") == Path("sac-ee-wall-p1-s1/policy.pt")
 
 
-@pytest.mark.parametrize("name", shipped_policies())
-def test_shipped_policies_are_in_half_precision(name, tmp_path):
-    path = shipped_policies()[name]
-    halve_network(path, tmp_path / "policy.pt")
+@pytest.mark.parametrize("name", pretrained_policies())
+def test_pretrained_policies_are_in_half_precision(name, tmp_path):
+    path = pretrained_policies()[name]
+    to_float16(path, tmp_path / "policy.pt")
     assert (tmp_path / "policy.pt").read_bytes() == path.read_bytes()
 
 
@@ -65,11 +65,15 @@ def test_a_policy_whose_actions_mean_something_else():
     env.close()
 
 
-def test_a_shipped_policy_brings_what_it_sees_and_its_last_layer():
+def test_a_pretrained_policy_brings_what_it_sees_and_its_safety_filter():
     path, arguments = find_policy("dagger-combined-points-random_boxes_hard-s1")
-    assert arguments == {"goal_type": "combined", "encoder": "points:32", "proximity": "points"}
-    assert own_layer(path) == LastLayer(keep=0.01, way_out=True)
-    assert own_layer(policy_file("bc-config-double_walls-s1")) is None
+    assert arguments == {
+        "goal_type": "combined",
+        "encoder": "points:32",
+        "link_distances": "points",
+    }
+    assert own_safety_filter(path) == SafetyFilter(keep=0.01, escape=True)
+    assert own_safety_filter(policy_file("bc-config-double_walls-s1")) is None
 
 
 def test_envs_needs_neither_the_planner_nor_the_trainers():

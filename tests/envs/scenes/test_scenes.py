@@ -343,7 +343,7 @@ def test_sampled_queries_are_solved_and_have_scenes_of_their_own():
     planner = Planner(RoboArmEnv())
     for query, scene in zip(made, scenes, strict=True):
         ends = (np.array(query[end], np.float32) for end in ("start", "goal"))
-        assert len(planner.plan(*ends, scene, seed=1, caution=0.25)) >= 2
+        assert len(planner.plan(*ends, scene, seed=1, margin_scale=0.25)) >= 2
 
 
 def test_queries_in_a_row_share_a_scene_if_asked():
@@ -358,12 +358,12 @@ def test_an_unsolvable_query_is_rejected_and_counted(monkeypatch):
     sampler = make_queries.Sampler("no_obstacles", solvable=True)
     solve, tried = sampler.planner.plan, []
 
-    def fail_on_the_first_two(start, goal, *, seed, caution):
+    def fail_on_the_first_two(start, goal, *, seed, margin_scale):
         if len(tried) < 2 and not any((start == other).all() for other in tried):
             tried.append(start)
         if any((start == other).all() for other in tried):
             raise PlanningError("no path")
-        return solve(start, goal, seed=seed, caution=caution)
+        return solve(start, goal, seed=seed, margin_scale=margin_scale)
 
     monkeypatch.setattr(sampler.planner, "plan", fail_on_the_first_two)
     query = sampler((0, "test", 0))
@@ -381,7 +381,7 @@ def test_collected_demonstrations_have_their_scenes(tmp_path):
     collect.collect(tmp_path / "demos.h5", 3, options, progress=False)  # all are there already
     demos = load_demos(tmp_path / "demos.h5")
     assert len({demos[i].scene for i in range(3)}) == 3
-    verifier = verify.Verifier(tmp_path / "demos.h5", mend=False)
+    verifier = verify.Verifier(tmp_path / "demos.h5", repair=False)
     assert [verifier(i)[1] for i in range(3)] == ["good"] * 3
 
 

@@ -21,7 +21,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.policies.registry import make_policy
-from roboarm_nmp.envs.policies.safety_filter import VERSION, LastLayer
+from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.tasks import Task
@@ -120,14 +120,14 @@ def test_metrics_of_an_evaluation_are_those_of_its_episodes(queries):
     success, touched, steps, lengths = (np.array(column) for column in zip(*rows, strict=True))
     assert result["num_queries"] == 40
     assert result["success_rate"] == success.mean() > 0.9
-    assert result["clean_success_rate"] == (success & ~touched).mean()
+    assert result["collision_free_success_rate"] == (success & ~touched).mean()
     assert result["collision_rate"] == touched.mean()
-    assert 0 < result["clean_success_rate"] < result["success_rate"]
+    assert 0 < result["collision_free_success_rate"] < result["success_rate"]
     assert result["mean_steps"] == pytest.approx(steps[success].mean())
     assert result["path_length"] == pytest.approx(lengths[success].mean(), abs=1e-5)
     assert 0 < result["smoothness"] < 0.1 and result["ms_per_action"] > 0
-    low, high = result["clean_success_rate_interval"]
-    assert low < result["clean_success_rate"] < high
+    low, high = result["collision_free_success_rate_interval"]
+    assert low < result["collision_free_success_rate"] < high
     assert json.loads(json.dumps(result)) == result
 
 
@@ -144,7 +144,11 @@ def test_a_start_at_the_goal_is_a_success_of_no_steps():
 def test_stopping_on_collision_leaves_clean_successes_only(queries):
     free = evaluate("go-to-goal", "no_obstacles", queries=queries)
     stopped = evaluate("go-to-goal", "no_obstacles", queries=queries, stop_on_collision=True)
-    assert stopped["success_rate"] == stopped["clean_success_rate"] == free["clean_success_rate"]
+    assert (
+        stopped["success_rate"]
+        == stopped["collision_free_success_rate"]
+        == free["collision_free_success_rate"]
+    )
     assert stopped["collision_rate"] == free["collision_rate"]
 
 
@@ -222,10 +226,10 @@ def test_via_points_go_round_the_wall():
     assert 0.25 < x < 0.95 and abs(y) < 0.02 and 0 < z < 0.775
     behind = _queries((LEFT, RIGHT))
     straight = evaluate("go-to-goal", "wall", queries=behind)
-    assert straight["clean_success_rate"] == 0 and straight["collision_rate"] == 1
+    assert straight["collision_free_success_rate"] == 0 and straight["collision_rate"] == 1
     assert straight["free_motion_rate"] is None and straight["planning_seconds"] is None
     result = evaluate("via-points", "wall", queries=behind, tries=200)
-    assert result["clean_success_rate"] == 1 and result["free_motion_rate"] == 1
+    assert result["collision_free_success_rate"] == 1 and result["free_motion_rate"] == 1
     assert result["planning_seconds"] == result["planning_seconds_solved"] > 0
     assert (result["tries"], result["time_limit"]) == (200, None)
 
@@ -235,7 +239,7 @@ def test_via_points_go_straight_where_that_is_free_or_nothing_is_found():
     straight = evaluate("go-to-goal", "wall", queries=both)
     # The one random configuration of this seed is no way to the second goal.
     result = evaluate("via-points", "wall", queries=both, tries=1)
-    assert result["free_motion_rate"] == 0.5 and result["clean_success_rate"] == 0.5
+    assert result["free_motion_rate"] == 0.5 and result["collision_free_success_rate"] == 0.5
     for name in ("success_rate", "collision_rate", "mean_steps", "path_length"):
         assert result[name] == straight[name]
     assert 0 < result["planning_seconds_solved"] != result["planning_seconds"]
@@ -244,10 +248,10 @@ def test_via_points_go_straight_where_that_is_free_or_nothing_is_found():
 def test_the_planner_solves_double_walls_and_follows_its_plan():
     queries = load_queries("double_walls", "validation")[:4]
     straight = evaluate("go-to-goal", "double_walls", queries=queries)
-    assert straight["clean_success_rate"] < 0.6
+    assert straight["collision_free_success_rate"] < 0.6
     options = {"seed": 2, "time_limit": 60.0}  # so long that it does not matter
     result = evaluate("planner", "double_walls", queries=queries, **options)
-    assert result["clean_success_rate"] == 1
+    assert result["collision_free_success_rate"] == 1
     assert 0 < result["planning_seconds"] == result["planning_seconds_solved"] < 60
     assert result["free_motion_rate"] is None and result["time_limit"] == 60.0
     assert "ompl" in result["versions"] and "ompl" not in straight["versions"]
@@ -266,27 +270,27 @@ def test_the_planner_solves_double_walls_and_follows_its_plan():
     assert result["path_length"] == pytest.approx(lengths)
 
 
-def test_a_last_layer_around_a_policy(tmp_path):
-    """`--keep-distance`: fewer touches, and with the way out of dead ends more is reached."""
+def test_a_safety_filter_around_a_policy(tmp_path):
+    """`--safety-margin`: fewer touches, and with the way out of dead ends more is reached."""
     found = {}
     for name, flags in {
         "bare": [],
-        "none": ["--keep-distance", "0"],
-        "layer": ["--keep-distance", "0.01", "--no-way-out"],
-        "way out": ["--keep-distance", "0.01"],
-        "points": ["--keep-distance", "0.015", "--encoder", "points"],
+        "none": ["--safety-margin", "0"],
+        "layer": ["--safety-margin", "0.01", "--no-escape"],
+        "way out": ["--safety-margin", "0.01"],
+        "points": ["--safety-margin", "0.015", "--encoder", "points"],
     }.items():
         command = ["--policy", "go-to-goal", "--task", "random_boxes_hard", "--num-queries", "25"]
         command += ["--split", "validation", "--goal-type", "combined"]
         assert evaluation.main([*command, *flags, "--json", str(tmp_path / "result.json")]) == 0
         found[name] = json.loads((tmp_path / "result.json").read_text())
     assert _numbers(found["none"]) == _numbers(found["bare"])
-    layers = {name: result["last_layer"] for name, result in found.items()}
+    layers = {name: result["safety_filter"] for name, result in found.items()}
     assert layers["bare"] is layers["none"] is None
-    assert layers["layer"] == {"keep": 0.01, "way_out": False, "version": VERSION}
-    assert layers["way out"] == {"keep": 0.01, "way_out": True, "version": VERSION}
-    assert layers["points"] == {"keep": 0.015, "way_out": True, "version": VERSION}
-    knows = {name: result["env"].get("proximity") for name, result in found.items()}
+    assert layers["layer"] == {"keep": 0.01, "escape": False, "version": VERSION}
+    assert layers["way out"] == {"keep": 0.01, "escape": True, "version": VERSION}
+    assert layers["points"] == {"keep": 0.015, "escape": True, "version": VERSION}
+    knows = {name: result["env"].get("link_distances") for name, result in found.items()}
     assert knows == {name: "obstacles" for name in knows} | {
         "bare": None,
         "none": None,
@@ -298,24 +302,26 @@ def test_a_last_layer_around_a_policy(tmp_path):
     rates = {name: result["success_rate"] for name, result in found.items()}
     assert rates["bare"] < rates["layer"] < rates["way out"]
     own = ["--policy", "dagger-combined-points-random_boxes_hard-s1", "--task", "wall"]
-    own += ["--num-queries", "1", "--no-way-out", "--json", str(tmp_path / "result.json")]
+    own += ["--num-queries", "1", "--no-escape", "--json", str(tmp_path / "result.json")]
     assert evaluation.main(own) == 0
-    layer = json.loads((tmp_path / "result.json").read_text())["last_layer"]
-    assert not layer["way_out"] and layer["keep"] > 0
+    layer = json.loads((tmp_path / "result.json").read_text())["safety_filter"]
+    assert not layer["escape"] and layer["keep"] > 0
     assert found["points"]["seed"] == 0 and found["bare"]["seed"] is None
 
 
-@pytest.mark.parametrize("noted", [{}, {"proximity": None}])  # before and since SAC and TD3 had it
-def test_a_last_layer_around_a_network_that_has_no_distances(tmp_path, noted):
+@pytest.mark.parametrize(
+    "noted", [{}, {"link_distances": None}]
+)  # before and since SAC and TD3 had it
+def test_a_safety_filter_around_a_network_that_has_no_distances(tmp_path, noted):
     path = _save(tmp_path / "policy.pt", env={"goal_type": "config"} | noted)
     bare = evaluate(path, "boxes", split="validation", num_queries=5)
-    assert bare["env"].get("proximity") is None and bare["collision_rate"] > 0
+    assert bare["env"].get("link_distances") is None and bare["collision_rate"] > 0
     for encoder, knows in ((None, "obstacles"), ("points", "points")):
-        layer = LastLayer(keep=0.01)
+        layer = SafetyFilter(keep=0.01)
         result = evaluate(
-            path, "boxes", split="validation", num_queries=5, last_layer=layer, encoder=encoder
+            path, "boxes", split="validation", num_queries=5, safety_filter=layer, encoder=encoder
         )
-        assert result["env"]["proximity"] == knows
+        assert result["env"]["link_distances"] == knows
         assert result["collision_rate"] < bare["collision_rate"]
 
 
@@ -392,13 +398,13 @@ def _write_scenes(folder, base, scenes):
 def test_each_query_is_in_its_own_scene(policy, tmp_path):
     task, path = _write_scenes(tmp_path, Scene(), [Scene(), BLOCKED, Scene(), BLOCKED])
     result = evaluate(policy, task, tries=1, time_limit=60.0)
-    assert result["clean_success_rate"] == (1.0 if policy == "planner" else 0.5)
+    assert result["collision_free_success_rate"] == (1.0 if policy == "planner" else 0.5)
     assert result["collision_rate"] == (0.0 if policy == "planner" else 0.5)
     assert result["free_motion_rate"] == (0.5 if policy == "via-points" else None)
     assert (result["task"], result["num_queries"]) == (task, 4)
     queries = load_queries(path)
     alone = SimpleNamespace(start=queries.start, goal=queries.goal)
-    assert evaluate(policy, task, queries=alone, tries=1)["clean_success_rate"] == 1.0
+    assert evaluate(policy, task, queries=alone, tries=1)["collision_free_success_rate"] == 1.0
 
 
 def test_queries_of_a_scene_file(tmp_path):
@@ -427,7 +433,7 @@ def test_random_scenes_are_part_of_a_query(monkeypatch):
     with pytest.raises(evaluation.EvaluationError, match="varied has random scenes: these queries"):
         evaluate("go-to-goal", "varied", queries=_queries(*pairs))
     queries = _queries(*pairs, scenes=[BLOCKED, Scene()])
-    assert evaluate("go-to-goal", "varied", queries=queries)["clean_success_rate"] == 0.5
+    assert evaluate("go-to-goal", "varied", queries=queries)["collision_free_success_rate"] == 0.5
 
 
 # --- The command
@@ -463,7 +469,7 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
     policy = str(_save(tmp_path / "policy.pt"))
     (tmp_path / "broken.pt").write_bytes(Path(policy).read_bytes()[:500])
     encoder = str(_save(tmp_path / "encoder.pt", kind="encoder"))
-    arguments = {"goal_type": "config", "proximity": "obstacles"}
+    arguments = {"goal_type": "config", "link_distances": "obstacles"}
     near = str(_save(tmp_path / "near.pt", env=arguments))
     arguments = {"goal_type": "config", "action_mode": "subgoal"}
     subgoal = str(_save(tmp_path / "subgoal.pt", env=arguments))
@@ -476,9 +482,9 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
         ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
         ({"encoder": "points"}, "encoder is for via-points, planner and a last layer"),
-        ({"policy": near, "keep-distance": "0.1", "encoder": "points"}, "from obstacles, not"),
-        ({"policy": subgoal, "keep-distance": "0.01"}, "a last layer changes displacements"),
-        ({"policy": "go-to-goal", "keep-distance": "0.15"}, "keep must be a distance below 0.15"),
+        ({"policy": near, "safety-margin": "0.1", "encoder": "points"}, "from obstacles, not"),
+        ({"policy": subgoal, "safety-margin": "0.01"}, "a last layer changes displacements"),
+        ({"policy": "go-to-goal", "safety-margin": "0.15"}, "keep must be a distance below 0.15"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),

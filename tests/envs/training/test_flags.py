@@ -47,7 +47,7 @@ CASES = [
     ("td3_her_mp", "--exploration-noise", "-0.1"),
     ("bc", "--num-demos", "0"),
     ("bc", "--num-modes", "0"),
-    ("dagger", "--keep-distance", "nan"),
+    ("dagger", "--safety-margin", "nan"),
     ("dagger", "--round-every", "-1"),
     ("dagger", "--round-queries", "0"),
     ("dagger", "--policy-average", "0"),

@@ -13,7 +13,7 @@ from roboarm_nmp.clean_rl_scripts.evaluate import evaluate
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
 from roboarm_nmp.envs.policies.registry import PolicyError, make_policy
-from roboarm_nmp.envs.policies.safety_filter import LastLayer
+from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.training import protocol
 
 
@@ -49,22 +49,26 @@ def test_what_is_counted_is_what_happens_query_by_query(number):
     assert found == pytest.approx(
         {
             "success_rate": np.mean([success for success, _, _ in outcomes]),
-            "clean_success_rate": np.mean([s and not touched for s, touched, _ in outcomes]),
+            "collision_free_success_rate": np.mean(
+                [s and not touched for s, touched, _ in outcomes]
+            ),
             "collision_rate": np.mean([touched for _, touched, _ in outcomes]),
             "episode_length": np.mean([steps for _, _, steps in outcomes]),
         }
     )
 
 
-def test_a_last_layer_has_its_own_state_in_every_episode():
+def test_a_safety_filter_has_its_own_state_in_every_episode():
     queries = load_queries("random_boxes_hard", "validation")[:7]
-    straight, layer = Toward(0.03), LastLayer(0.012)
+    straight, layer = Toward(0.03), SafetyFilter(0.012)
 
     def policy(observation, achieved_goal, desired_goal, **_):
         return straight(observation, achieved_goal, desired_goal)
 
     several, one = (
-        protocol.make_envs("random_boxes_hard", number, goal_type="config", proximity="obstacles")
+        protocol.make_envs(
+            "random_boxes_hard", number, goal_type="config", link_distances="obstacles"
+        )
         for number in (3, 1)
     )
     found, outcomes = protocol.evaluate(policy, several, queries, "cpu", layer), []
@@ -89,7 +93,7 @@ def test_a_last_layer_has_its_own_state_in_every_episode():
 class Hesitant(torch.nn.Module):
     """Toward the goal, in turns fast and slowly: steps and moves are in the memory."""
 
-    memory_size = 8
+    recurrent_size = 8
 
     def forward(self, observation, achieved_goal, desired_goal, memory):
         steps, moved = memory[:, :1], memory[:, 1:]
@@ -121,9 +125,9 @@ def test_a_memory_is_fresh_in_every_episode_and_the_same_by_name(tmp_path):
     saved = load_network(tmp_path / "policy.pt")
     assert saved.metadata["memory"] == 8 and "memory" in saved.inputs
     assert protocol.evaluate(saved, several, queries, "cpu") == found
-    picture = protocol.picture_of_rollout(saved, several[0], queries[0], "cpu", frames=3)
+    picture = protocol.rollout_image(saved, several[0], queries[0], "cpu", frames=3)
     assert (
-        picture == protocol.picture_of_rollout(policy, several[0], queries[0], "cpu", frames=3)
+        picture == protocol.rollout_image(policy, several[0], queries[0], "cpu", frames=3)
     ).all()
     result = evaluate(tmp_path, "wall", split="validation", num_queries=5)
     assert result["success_rate"] == success
@@ -131,19 +135,19 @@ def test_a_memory_is_fresh_in_every_episode_and_the_same_by_name(tmp_path):
     assert result["mean_steps"] == pytest.approx(np.mean(reached))
 
 
-def test_in_a_detour_of_the_last_layer_nothing_is_remembered():
-    arguments = {"goal_type": "config", "proximity": "obstacles"}
+def test_in_a_detour_of_the_safety_filter_nothing_is_remembered():
+    arguments = {"goal_type": "config", "link_distances": "obstacles"}
     queries = load_queries("random_boxes_hard", "validation")[:3]
     several, asked = protocol.make_eval_envs("random_boxes_hard", 3, **arguments), []
 
     class Counting(torch.nn.Module):
-        memory_size = 1
+        recurrent_size = 1
 
         def forward(self, observation, achieved_goal, desired_goal, memory, **_):
             asked.append(memory[:, 0])
             return 0.05 * (desired_goal - observation[:, :7]), memory + 1
 
-    layer = LastLayer()
+    layer = SafetyFilter()
     for query in queries:
         asked.clear()
         result = protocol.evaluate(Counting(), several[:1], [query], "cpu", layer)
@@ -154,7 +158,7 @@ def test_in_a_detour_of_the_last_layer_nothing_is_remembered():
 
 @pytest.mark.parametrize("size", [-1, 2.0, True, 10**9])
 def test_a_memory_that_makes_no_sense_is_refused(size):
-    policy = SimpleNamespace(memory_size=size)
+    policy = SimpleNamespace(recurrent_size=size)
     with pytest.raises(PolicyError, match="memory has 0 to 65,536 numbers"):
         protocol.evaluate(policy, [], [], "cpu")
 
@@ -177,7 +181,7 @@ def test_a_file_whose_memory_is_not_what_it_returns(tmp_path):
 def test_of_equally_good_policies_the_latest_is_the_best(monkeypatch):
     rates = iter([0.5, 0.7, 0.6, 0.7, 0.2])
     monkeypatch.setattr(protocol, "evaluate", lambda *_: {"success_rate": next(rates)})
-    monkeypatch.setattr(protocol, "picture_of_rollout", lambda *_: None)
+    monkeypatch.setattr(protocol, "rollout_image", lambda *_: None)
     writer = SimpleNamespace(add_scalar=lambda *_: None, add_image=lambda *_, **__: None)
     progress, best = {"best_success": -1.0, "best_step": 0}, []
     for step in range(1, 6):

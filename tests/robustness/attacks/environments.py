@@ -14,7 +14,7 @@ from roboarm_nmp.envs import arm_env, panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception import sensors
 from roboarm_nmp.envs.perception.sensors import SensorWorld
-from roboarm_nmp.envs.policies.safety_filter import LastLayer
+from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.scenes import primitives as scenes
 from roboarm_nmp.envs.world import World
 
@@ -29,7 +29,7 @@ ODD = (
 ARGUMENTS = (
     *("episodes_per_scene", "goal_type", "ee_tolerance", "config_tolerance", "action_mode"),
     *("max_step", "horizon", "stop_on_collision", "reward", "sink_state", "velocities"),
-    *("render_mode", "render_size", "encoder", "proximity", "scene", "no_such_argument"),
+    *("render_mode", "render_size", "encoder", "link_distances", "scene", "no_such_argument"),
 )
 GOOD_VALUES = {
     "episodes_per_scene": (1, 3),
@@ -39,7 +39,7 @@ GOOD_VALUES = {
     "velocities": (False, True),
     "render_mode": (None, "rgb_array"),
     "encoder": (None, "oracle", "points"),
-    "proximity": (None, "obstacles", "points"),
+    "link_distances": (None, "obstacles", "points"),
 }
 OF_SCENES = ("position", "size", "orientation", "radius", "length", "obstacles", "table", "floor")
 
@@ -141,7 +141,7 @@ def build(rng):
     world.in_collision(panda.denormalise(np.zeros(7)))
     world.close()
     checker = CollisionChecker(scene)
-    assert np.isfinite(checker.nearest(np.zeros((1, 7))).distance).all()
+    assert np.isfinite(checker.signed_distances(np.zeros((1, 7))).distance).all()
     return RAN
 
 
@@ -173,7 +173,7 @@ def look(rng):
 def add_layer(rng):
     """An odd last layer."""
     try:
-        layer = LastLayer(rng.choice(ODD), rng.choice((True, False, *ODD)))
+        layer = SafetyFilter(rng.choice(ODD), rng.choice((True, False, *ODD)))
     except (TypeError, ValueError):
         return REFUSED
     move = layer(np.full(7, 0.01), np.zeros((9, 8)), max_step=0.03)

@@ -1,6 +1,6 @@
 """The pictures of docs/unseen_obstacles.md: an animation of a policy, and bars of its numbers.
 
-    python benchmarks/unseen_pictures.py
+    python benchmarks/unseen_figures.py
 
 The animation is of validation queries: above `go-to-goal`, below the policy, in the same scenes.
 The bars are of docs/unseen_obstacles.json (benchmarks/unseen_obstacles.py).
@@ -25,7 +25,7 @@ from roboarm_nmp.envs.utils.files import write_atomically
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
+FIGURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 FRAMES, SECONDS_PER_FRAME, LAST_SECONDS, COLOURS = 36, 0.12, 1.5, 48
 # Of the bars: cell of the results, and its name.
 ALONE = (
@@ -80,7 +80,7 @@ def bars(results):
     )
     for label, shift, column, colour in styles:
         for clean in (False, True):
-            name = "clean_success_rate" if clean else "success_rate"
+            name = "collision_free_success_rate" if clean else "success_rate"
             heights = [
                 results[row[column]][name] if row[column] in results else np.nan for row in rows
             ]
@@ -113,9 +113,9 @@ def main():
     args = parser.parse_args()
     others = others_results(json.loads(BASELINES.read_text()))
     results = others[HARD] | load_results()[HARD]
-    write_atomically(PICTURES / "unseen_bars.png", bars(results))
+    write_atomically(FIGURES / "unseen_bars.png", bars(results))
     contents = animation(args.policy, args.queries, tuple(args.size))
-    write_atomically(PICTURES / "unseen_episodes.gif", contents)
+    write_atomically(FIGURES / "unseen_episodes.gif", contents)
     print(f"{len(contents) / 1e6:.2f} MB")
 
 

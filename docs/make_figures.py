@@ -1,6 +1,6 @@
-"""Render the pictures of the tasks in docs/pictures.
+"""Render the pictures of the tasks in docs/figures.
 
-    python docs/make_pictures.py
+    python docs/make_figures.py
 
 For each task, and `mixed_scenes`: one test query (where scenes vary, six draws), the arm at its
 start and as a ghost at the goal; and where the scene is fixed, the end-effector paths of the first

@@ -1,6 +1,6 @@
-"""Render the pictures of the sensors in docs/pictures.
+"""Render the pictures of the sensors in docs/figures.
 
-    python docs/make_sensor_pictures.py
+    python docs/make_sensor_figures.py
 
 Where the four default sensors are (purple balls), and what each kind puts out for the same scene:
 one column per place; from above: RGB, depth (near is bright), segmentation, point cloud. Classes:

@@ -1,0 +1,66 @@
+"""Geometry sources: where collision checks and link distances take a scene's obstacles from.
+
+    source = find_geometry_source("point_cloud")
+    checker = source(scene)                      # a CollisionChecker of the observed points alone
+
+- `ground_truth`: the obstacles themselves; what uses them is privileged;
+- `point_cloud`: the points that four sensors observe of them;
+- the name or path of an encoder with a decoder: points decoded from its latent code.
+
+Table and floor are known in all cases.
+"""
+
+import functools
+from dataclasses import replace
+
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, POINT_RADIUS, observed_points
+
+GROUND_TRUTH = "ground_truth"
+CACHED_CHECKERS = 64  # about 60 kB each
+DECODED_RADIUS = 0.0  # m, of decoded points
+
+
+def find_geometry_source(name):
+    """A function from a `Scene` to the `CollisionChecker` of what this source has of it.
+
+    Args:
+        name: `ground_truth`, `point_cloud`, or the name or path of an encoder with a decoder.
+
+    Raises:
+        ValueError: it is none of these.
+    """
+    if name == GROUND_TRUTH:
+        return ground_truth_checker
+    if name == POINT_CLOUD:
+        return observed_checker
+    from roboarm_nmp.envs.perception import encoders  # here: PyTorch takes seconds to import
+
+    try:
+        encoder = encoders.make_encoder(name)
+        encoder.decoder  # noqa: B018 (or it raises)
+    except ValueError as error:
+        raise ValueError(
+            f"a geometry source is {GROUND_TRUTH!r}, {POINT_CLOUD!r} or an encoder with a decoder: "
+            f"{error}"
+        ) from error
+    return functools.partial(decoded_checker, encoder=encoder)
+
+
+@functools.lru_cache(CACHED_CHECKERS)
+def ground_truth_checker(scene):
+    """The `CollisionChecker` of a `Scene`."""
+    return CollisionChecker(scene)
+
+
+@functools.lru_cache(CACHED_CHECKERS)
+def observed_checker(scene):
+    """A `CollisionChecker` of table, floor, and the observed points of a `Scene`'s obstacles."""
+    return CollisionChecker(replace(scene, obstacles=()), observed_points(scene), POINT_RADIUS)
+
+
+@functools.lru_cache(CACHED_CHECKERS)
+def decoded_checker(scene, encoder):
+    """A `CollisionChecker` of table, floor, and points that an encoder's decoder gives."""
+    points = encoder.decoded_points(scene)
+    return CollisionChecker(replace(scene, obstacles=()), points, DECODED_RADIUS)
