@@ -243,7 +243,7 @@ def _actions(policy, observations, states, device):
     if not len(states[0]):
         actions = policy(**stack(observations, device)).cpu().numpy()
     else:
-        known = [
+        given = [
             o | {"recurrent_state": state} for o, state in zip(observations, states, strict=True)
         ]
         actions, states = (x.cpu().numpy() for x in policy(**stack(given, device)))
