@@ -16,7 +16,7 @@ between two of those until something is within 1 cm, inside or outside, uniforml
 
 Speed: uniform configurations in 40 scenes of `random_boxes_hard`, processor time of one core, in
 turns, the median of `--rounds`. `link_distances` is asked about one configuration at a time, a free one,
-as at every step of a policy: of the true obstacles, of the points that sensors see, and of those
+as at every step of a policy: of the ground-truth obstacles, of the observed points, and of those
 that the encoder `field` tells of. PyBullet's check is what
 planners used before: set the joints, detect collisions, read the contacts; `in_collision` also
 clears old contacts first.

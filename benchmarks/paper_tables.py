@@ -7,11 +7,11 @@
 
 A cell is a run: algorithm, goal type, task, p of the demo injection. It is trained with its script
 (flags that differ from the defaults: `RECIPES`) in `--runs-dir`, where one that was stopped goes
-on. Its best policy by validation goes to `policies/` beside the script, in half precision, is
+on. Its best policy by validation goes to envs/policies/pretrained, in half precision, is
 evaluated on test queries as it is there, and gets its result beside it, in JSON: what has one is
 done, with the same flags and as many steps or more; on more queries than before the same policy is
 only evaluated again. (With `--no-keep-policies` the result stays alone.) The page, docs/results.md,
-and its pictures are made of those results, of the planners' and of `go-to-goal`'s
+and its figures are made of those results, of the planners' and of `go-to-goal`'s
 (docs/baselines.json), and of the paper's numbers (`paper_cells.csv`: sections 5.2 and 5.3 and the
 tables of the appendix; means and standard deviations of four seeds).
 """
@@ -50,7 +50,7 @@ CELLS = Path(__file__).with_name("paper_cells.csv")
 POLICIES = ROOT / "envs" / "policies" / "pretrained"
 BASELINES = ROOT / "docs" / "baselines.json"
 UNSEEN = ROOT / "docs" / "unseen_obstacles.json"
-PAGE, FIGURES = ROOT / "docs" / "results.md", ROOT / "docs" / "pictures"
+PAGE, FIGURES = ROOT / "docs" / "results.md", ROOT / "docs" / "figures"
 SCRIPTS = {
     "bc": ROOT / "bc_script" / "bc.py",
     "sac": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
@@ -68,22 +68,23 @@ ENCODERS = {
     "vae": "VAE",
     "vqvae": "VQ-VAE",
     "pointnet2": "PointNet++",
-    "oracle": "the obstacles themselves",
+    "oracle": "the ground-truth obstacles",
 }
 LINES = {"bc": ":", "sac": "-", "td3": "--"}  # of the curves
 FAR_BELOW = 0.05  # of the paper's mean: worth an explanation
-# In docs/baselines.json; the second, which sees points and has learned nothing, in `UNSEEN`.
-FLOOR, REACTIVE, CEILING = "go-to-goal", "reactive, points", "RRT-Connect, 5 s"
-LOOKS = "look, then plan, 5 s"
-# Policies in `UNSEEN` that are shown beside the paper's encoders. All have a last layer.
+# In docs/baselines.json; the second in `UNSEEN`.
+GO_TO_GOAL, REACTIVE = "go-to-goal", "go-to-goal, filter, point_cloud"
+RRT_CONNECT = "RRT-Connect, 5 s"
+PLAN_FROM_POINTS = "plan from the point cloud, 5 s"
+# Policies in `UNSEEN` beside the paper's encoders. All have a safety filter.
 IMITATED = {
-    "dagger, vae": "64 numbers (VAE) and distances from seen points",
-    "dagger, vqvae": "64 numbers (VQ-VAE) and distances from seen points",
-    "dagger, pointnet2": "64 numbers (PointNet++) and distances from seen points",
-    "dagger, field": "64 numbers (field) and nothing else",
-    "dagger, points told by field": "64 numbers (field) and nothing else, trained with points",
-    "dagger, points": "seen points",
-    "dagger, oracle": "the obstacles themselves",
+    "dagger, vae": "latent code (VAE), link distances from observed points",
+    "dagger, vqvae": "latent code (VQ-VAE), link distances from observed points",
+    "dagger, pointnet2": "latent code (PointNet++), link distances from observed points",
+    "dagger, field": "latent code (field) alone",
+    "dagger, decoded by field": "points decoded from the latent code (field)",
+    "dagger, point_cloud": "observed points",
+    "dagger, oracle": "the ground-truth obstacles",
 }
 LONG_RUN = 7_000_000  # steps of the paper's runs with encoders (section 5.3)
 
@@ -230,7 +231,7 @@ def write_result(path, result):
 
 
 def evaluate(policy, task, num_queries, path):
-    """Of `evaluate.py`: success, its interval, clean success, number of test queries; a dict."""
+    """Of `evaluate.py`: success, its interval, collision-free success, number of test queries; a dict."""
     command = [sys.executable, ROOT / "clean_rl_scripts" / "evaluate.py", "--policy", policy]
     command += ["--task", task, "--num-queries", str(num_queries), "--json", path]
     subprocess.run(command, check=True)
@@ -261,7 +262,7 @@ def commit():
     """The commit that is checked out, with a `+` if code was changed since."""
     git = ["git", "-C", ROOT]
     head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
-    code = ("*.py", "constraints.txt")  # not the page and its pictures, which the last cell wrote
+    code = ("*.py", "constraints.txt")  # not the page and its figures, which the last cell wrote
     changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", *code]).returncode
     return head.stdout.strip() + "+" * (changed != 0)
 
@@ -326,8 +327,8 @@ def imitated_rows(unseen, tasks):
     Other seeds of a policy are cells named like its own, with `, seed 2` and so on.
     """
     rows = {}
-    for name, knows in IMITATED.items():
-        texts = rows[f"DAgger with a last layer: {knows}"] = {}
+    for name, source in IMITATED.items():
+        texts = rows[f"DAgger with a safety filter: {source}"] = {}
         for task in tasks:
             cells = unseen.get(task, {})
             found = [cells[key] for key in cells if key == name or key.startswith(f"{name}, seed ")]
@@ -342,7 +343,7 @@ def table(cells, results, column, baselines, more=()):
     """Markdown: a row per algorithm, a column per `column(cell)`; ours, and the paper's below.
 
     `more`: further rows, dict of name -> dict of column -> text.
-    Where the columns are tasks, `baselines` gives the last rows: of each task, of `FLOOR` and so
+    Where the columns are tasks, `baselines` gives the last rows: of each task, of `GO_TO_GOAL` and so
     on, the result.
     """
     rows, columns = {}, {}
@@ -355,8 +356,8 @@ def table(cells, results, column, baselines, more=()):
     rows |= dict(more)
     lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for name, word in (
-        *((FLOOR, "floor"), (REACTIVE, "to beat")),
-        *((LOOKS, "searches in what is seen"), (CEILING, "ceiling")),
+        *((GO_TO_GOAL, "no learning"), (REACTIVE, "no learning")),
+        *((PLAN_FROM_POINTS, "search"), (RRT_CONNECT, "search, ground truth")),
     ):
         known = {text: baselines.get(task, {}).get(name) for text, task in columns.items()}
         if len(set(columns.values())) == len(columns) and any(known.values()):
@@ -384,19 +385,19 @@ def long_runs(cells, results):
 def runs_table(cells, results):
     """Markdown: what was run, a row per policy."""
     lines = [
-        "| policy | success [95 %] | clean | steps (best at) | test queries | training | made |",
+        "| policy | success [95 %] | collision-free | steps (best at) | test queries | training | made |",
         "|---|---|---|---|---|---|---|",
     ]
     for cell in cells:
         for result in results.get(cell.name, []):
             minutes = result["training_seconds"] / 60
-            clean = result["collision_free_success_rate"]
-            clean = "not known" if clean is None else f"{clean:.3f}"
+            free = result["collision_free_success_rate"]
+            free = "not known" if free is None else f"{free:.3f}"
             name = f"`{cell.name}-s{result['seed']}`" + ("" if result["kept"] else ", not kept")
             if not cell.is_recipe_of(result["args"]):
                 name += ", other flags"
             lines.append(
-                f"| {name} | {ours([result])} | {clean} "
+                f"| {name} | {ours([result])} | {free} "
                 f"| {result['steps']:,} ({result['policy_step']:,}) | {result['num_queries']:,} "
                 f"| {minutes:.0f} min | {result['date']}, {result['commit']} |"
             )
@@ -409,16 +410,16 @@ def page(cells, results, baselines, unseen):
     lines = [
         "# Results",
         "",
-        "![floor, paper, ours, ceiling](pictures/results_story.png)",
+        "![go-to-goal, paper, ours, RRT-Connect](figures/results_story.png)",
         "",
         "Success on test queries: in bold ours with its 95 % interval (of several seeds: over",
         "all their queries, and the seeds' deviation), in small the steps (BC: batches) and seeds",
         "([other flags](#the-runs): only where there is no run with today's);",
         "below it the paper's, mean ± standard deviation of four seeds, after 1,000,000 steps",
-        f"({LONG_RUN:,} for random boxes). The last rows do not learn, and know a goal",
-        "configuration (measured with goal `ee`: [baselines.md](baselines.md)). `reactive, points`",
-        "is `go-to-goal` with a [last layer](safety_filter.md) that sees points (goal `combined`, 200",
-        "test queries or more: [unseen_obstacles.md](unseen_obstacles.md)). With p = 0,",
+        f"({LONG_RUN:,} for random boxes). The last rows are non-learning baselines, which receive",
+        "a goal configuration (goal `ee`: [baselines.md](baselines.md)). `" + REACTIVE + "` is",
+        "`go-to-goal` with a [safety filter](safety_filter.md) on observed points (goal `combined`,",
+        "200 test queries or more: [unseen_obstacles.md](unseen_obstacles.md)). With p = 0,",
         "queries are those of the demonstrations, which are not shown; the paper samples them.",
         "`python benchmarks/paper_tables.py` runs cells and writes this page;",
         "`clean_rl_scripts/evaluate.py --policy NAME` runs any policy below that was kept.",
@@ -447,13 +448,12 @@ def page(cells, results, baselines, unseen):
     if imitated:
         lines += [
             "",
-            "DAgger imitates a roadmap planner in other scenes of `random_boxes_hard`, and has",
-            "what the paper's policies have not, a last layer that keeps links away from things.",
-            "Which version of it, clean success, and without it:",
-            "[unseen_obstacles.md](unseen_obstacles.md).",
+            "DAgger imitates a roadmap planner in other scenes of `random_boxes_hard`. Unlike the",
+            "paper's policies it has a safety filter, which enforces a minimum clearance. Collision-free",
+            "success, success without filter, versions: [unseen_obstacles.md](unseen_obstacles.md).",
         ]
     lines += long_runs(cells, results)
-    lines += ["", "Why policies that know z_E get lost in scenes of other kinds:"]
+    lines += ["", "Why policies with a latent code fail to generalise to scenes of other kinds:"]
     lines += ["[experiments.md](experiments.md#behavioural-cloning-in-scenes-of-other-kinds)."]
     lines += ["", "## The runs", ""]
     done = [cell for cell in cells if cell.name in results]
@@ -478,34 +478,34 @@ def page(cells, results, baselines, unseen):
     if below:
         lines[-1] += " What was found: [experiments.md](experiments.md#demonstrations);"
         lines[-1] += " with encoders, see below their table."
-    lines += ["", "![success over steps](pictures/results_curves.png)"]
-    lines += ["", "![success per task](pictures/results_bars.png)", ""]
+    lines += ["", "![success over steps](figures/results_curves.png)"]
+    lines += ["", "![success per task](figures/results_bars.png)", ""]
     return "\n".join(lines)
 
 
 def draw_story(cells, results, baselines, unseen, path):
-    """Per task: from floor to ceiling, the best of the paper's cells, and the best of ours.
+    """Per task: from go-to-goal to RRT-Connect, the best of the paper's cells, and the best of ours.
 
-    `unseen` (docs/unseen_obstacles.json) has policies that see points and have a last layer.
+    `unseen` (docs/unseen_obstacles.json) has policies with point clouds and a safety filter.
     """
     tasks = list(dict.fromkeys(cell.task for cell in cells))
     figure, axes = plt.subplots(figsize=(10, 4.5), layout="constrained")
     marks = {
         "paper, the best of its policies": ("D", "tab:gray"),
         "ours, the best of the same cells": ("o", "tab:blue"),
-        "ours, sees points, with a last layer; trained on random boxes": ("s", "tab:orange"),
+        "ours, point cloud and safety filter; trained on random boxes": ("s", "tab:orange"),
     }
     points = {name: [] for name in marks}
     for x, task in enumerate(tasks):
-        known = [baselines.get(task, {}).get(name) for name in (FLOOR, CEILING)]
+        known = [baselines.get(task, {}).get(name) for name in (GO_TO_GOAL, RRT_CONNECT)]
         if all(known):
             low, high = (one["success_rate"] for one in known)
-            axes.bar(x, high - low, 0.7, low, color="0.9", label="floor to ceiling")
+            axes.bar(x, high - low, 0.7, low, color="0.9", label="go-to-goal to RRT-Connect")
         of_task = [cell for cell in cells if cell.task == task]
         papers = [cell.mean for cell in of_task if cell.mean is not None]
         rates = (papers, [mean_success(c, results) for c in of_task if c.name in results])
-        sees = unseen.get(task, {}).get("dagger, points")
-        rates += ([sees["success_rate"]] if sees else [],)
+        observed = unseen.get(task, {}).get("dagger, point_cloud")
+        rates += ([observed["success_rate"]] if observed else [],)
         for name, found in zip(marks, rates, strict=True):
             if found:
                 points[name].append((x, max(found)))
@@ -565,9 +565,9 @@ def _save(figure, path):
     """A quarter as large as it would be with all colours."""
     figure.savefig(path, dpi=100)
     plt.close(figure)
-    with Image.open(path) as picture:
-        picture = picture.convert("RGB").quantize(128)
-    picture.save(path, optimize=True)
+    with Image.open(path) as image:
+        image = image.convert("RGB").quantize(128)
+    image.save(path, optimize=True)
 
 
 def _label(cell):
@@ -588,7 +588,8 @@ class Args:
     runs_dir: Path = Path("runs/paper_tables")
     """where runs are made, and go on"""
     keep_policies: bool = True
-    """keep policies beside their scripts, not the results alone: these stay in `--runs-dir`"""
+    """keep policies among the pretrained ones; otherwise only the results, and policies stay in
+    `--runs-dir`"""
     list: bool = False
     """list cells and what is done; run none"""
 

@@ -5,9 +5,9 @@
     python -m roboarm_nmp.demo_generation.make_queries --task random_boxes_hard --solvable \\
         --queries-per-scene 5 --seed 78 --num-test 1 --num-validation 1000 --output fresh.h5
     python benchmarks/scaling.py --paths roadmaps --queries fresh.h5 --runs-dir runs/scaling
-    python benchmarks/scaling.py --picture      # only draws what docs/scaling.json has
+    python benchmarks/scaling.py --figure      # only draws what docs/scaling.json has
 
-Each run is a short training with 32 seen points, all alike but for what is varied, evaluated on the
+Each run is a short training with 32 observed points, all alike but for what is varied, evaluated on the
 fresh queries. What is done is skipped. Results go to docs/scaling.json and to
 docs/figures/unseen_scaling.png.
 """
@@ -32,7 +32,7 @@ import matplotlib.pyplot as plt
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "scaling.json"
-PICTURE = ROOT / "docs" / "pictures" / "unseen_scaling.png"
+FIGURE = ROOT / "docs" / "figures" / "unseen_scaling.png"
 UPDATES = 4000
 # Scenes, of 300 paths each; updates between rounds of DAgger, of 40 queries each (0: none).
 RUNS = ((50, 2000), (200, 2000), (800, 2000), (800, 0), (800, 500))
@@ -60,7 +60,8 @@ def run(scenes, round_every, args):
                 (paths / shard.name).symlink_to(shard.resolve())
         if not list(folder.glob("*/result.json")):
             command = [sys.executable, ROOT / "bc_script" / "dagger.py", "--paths", paths]
-            command += ["--encoder", "points:32", "--round-every", str(round_every)]
+            command += ["--encoder", "point_cloud", "--num-points", "32"]
+            command += ["--round-every", str(round_every)]
             command += ["--total-updates", str(args.updates), "--eval-every", str(args.updates)]
             command += ["--eval-queries", "100", "--test-queries", "1", "--runs-dir", folder]
             subprocess.run(command, check=True)
@@ -80,8 +81,8 @@ def rounds_of(result):
     return (result["updates"] - 1) // every if every else 0
 
 
-def picture(results):
-    """A PNG file's bytes: success and clean success over scenes, and over rounds."""
+def figure_of(results):
+    """A PNG file's bytes: success and collision-free success over scenes, and over rounds."""
     default = next(one for one in results if (one["scenes"], one["round_every"]) == RUNS[2])
     figure, axes = plt.subplots(1, 2, figsize=(8, 3), sharey=True, layout="constrained")
     panels = (
@@ -92,7 +93,7 @@ def picture(results):
         shown = sorted((one for one in results if one[same] == default[same]), key=where)
         for name, words in (
             ("success_rate", "success"),
-            ("collision_free_success_rate", "clean success"),
+            ("collision_free_success_rate", "collision-free success"),
         ):
             values = [one[name] for one in shown]
             ends = [one[f"{name}_interval"] for one in shown]
@@ -121,21 +122,21 @@ def main():
     parser.add_argument("--queries", type=Path, help="query file, validation split")
     parser.add_argument("--runs-dir", type=Path, default=Path("runs/scaling"))
     parser.add_argument("--updates", type=int, default=UPDATES, help=f"of each run ({UPDATES:,})")
-    parser.add_argument("--picture", action="store_true", help="run nothing")
+    parser.add_argument("--figure", action="store_true", help="run nothing")
     args = parser.parse_args()
-    if args.picture:
+    if args.figure:
         results = json.loads(RESULTS.read_text())
     else:
         if args.paths is None or args.queries is None:
-            parser.error("--paths and --queries are needed, or --picture")
+            parser.error("--paths and --queries are needed, or --figure")
         if len(shard_paths(args.paths, "roadmap paths")) < max(RUNS)[0] // SHARD:
             parser.error(f"--paths: there are fewer than {max(RUNS)[0]} scenes")
         results = []
         for one in RUNS:
             results.append(run(*one, args))
             write_atomically(RESULTS, (json.dumps(results, indent=1) + "\n").encode())
-    write_atomically(PICTURE, picture(results))
-    print(f"{PICTURE} written")
+    write_atomically(FIGURE, figure_of(results))
+    print(f"{FIGURE} written")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The pictures of docs/unseen_obstacles.md: an animation of a policy, and bars of its numbers.
+"""The figures of docs/unseen_obstacles.md: an animation of a policy, and bars of its results.
 
     python benchmarks/unseen_figures.py
 
@@ -25,16 +25,16 @@ from roboarm_nmp.envs.utils.files import write_atomically
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-FIGURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
+FIGURES = Path(__file__).resolve().parent.parent / "docs" / "figures"
 FRAMES, SECONDS_PER_FRAME, LAST_SECONDS, COLOURS = 36, 0.12, 1.5, 48
 # Of the bars: cell of the results, and its name.
 ALONE = (
-    ("go-to-goal", "go-to-goal", "reactive, points"),
-    ("bc.py, VAE", "bc, vae, alone", "bc, vae"),
-    ("bc.py,\nobstacles", "bc, oracle, alone", "bc, oracle"),
-    ("dagger.py,\npoints", "dagger, points, alone", "dagger, points"),
-    ("dagger.py,\nobstacles", "dagger, oracle, alone", "dagger, oracle"),
-    ("look, then\nplan", "look, then plan", None),
+    ("go-to-goal", "go-to-goal", "go-to-goal, filter, point_cloud"),
+    ("bc.py, VAE", "bc, vae, no filter", "bc, vae"),
+    ("bc.py,\noracle", "bc, oracle, no filter", "bc, oracle"),
+    ("dagger.py,\npoint cloud", "dagger, point_cloud, no filter", "dagger, point_cloud"),
+    ("dagger.py,\noracle", "dagger, oracle, no filter", "dagger, oracle"),
+    ("plan from the\npoint cloud", "plan from the point cloud", None),
 )
 
 
@@ -75,8 +75,8 @@ def bars(results):
     rows = [row for row in ALONE if row[1] in results or row[2] in results]
     figure, axes = plt.subplots(figsize=(8, 3.2), layout="constrained")
     styles = (
-        ("alone", -0.2, 1, "#b8c4d6"),
-        ("with the last layer", 0.2, 2, "#3f6fb5"),
+        ("no filter", -0.2, 1, "#b8c4d6"),
+        ("with the safety filter", 0.2, 2, "#3f6fb5"),
     )
     for label, shift, column, colour in styles:
         for clean in (False, True):
@@ -107,7 +107,7 @@ def bars(results):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--policy", default=f"dagger-combined-points-{HARD}-s1")
+    parser.add_argument("--policy", default=f"dagger-combined-point_cloud-{HARD}-s1")
     parser.add_argument("--queries", type=int, nargs="+", default=[1, 4, 8])
     parser.add_argument("--size", type=int, nargs=2, default=(224, 168))
     args = parser.parse_args()

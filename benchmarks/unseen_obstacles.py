@@ -1,4 +1,4 @@
-"""Policies in scenes that they never saw, without and with a last layer: docs/unseen_obstacles.md.
+"""Policies in unseen scenes, without and with a safety filter: docs/unseen_obstacles.md.
 
     python benchmarks/unseen_obstacles.py --keep runs/RUN         # a run of dagger.py: its policy
     python benchmarks/unseen_obstacles.py --workers 2             # hours; what is done is skipped
@@ -7,8 +7,8 @@
 
 Each cell is a call of `clean_rl_scripts/evaluate.py` on the first `--num` test queries, goal
 `combined`. Results go to docs/unseen_obstacles.json at once; the tables in
-docs/unseen_obstacles.md, between its marks, are of what is there. Nothing may be chosen by them:
-for that there is `evaluate.py --split validation`.
+docs/unseen_obstacles.md, between its marks, show these results. Nothing may be chosen by them: use
+`evaluate.py --split validation` for that.
 """
 
 import argparse
@@ -39,109 +39,99 @@ BASELINES = ROOT / "docs" / "baselines.json"
 PAPER_CELLS = ROOT / "benchmarks" / "paper_cells.csv"
 POLICIES = ROOT / "envs" / "policies" / "pretrained"
 HARD = "random_boxes_hard"
-# What a last layer around any policy keeps: see docs/experiments.md.
-OBSTACLES = ["--safety-margin", "0.01"]
-POINTS = ["--safety-margin", "0.01", "--encoder", "points"]
+# The margin of the safety filter: see docs/experiments.md.
+GROUND_TRUTH = ["--safety-margin", "0.01"]
+POINT_CLOUD = ["--safety-margin", "0.01", "--geometry-source", "point_cloud"]
 STRAIGHT = ["--policy", "go-to-goal", "--goal-type", "combined"]
 PLANNER = ["--policy", "planner", "--goal-type", "combined"]
 CELLS = {
-    "reactive, points, no way out": [*STRAIGHT, *POINTS, "--no-escape"],
-    "reactive, points": [*STRAIGHT, *POINTS],
-    "reactive, obstacles, no way out": [*STRAIGHT, *OBSTACLES, "--no-escape"],
-    "reactive, obstacles": [*STRAIGHT, *OBSTACLES],
-    "look, then plan": [*PLANNER, "--encoder", "points"],
-    "look, then plan, field": [*PLANNER, "--encoder", "field"],
+    "go-to-goal, filter, point_cloud, no escape": [*STRAIGHT, *POINT_CLOUD, "--no-escape"],
+    "go-to-goal, filter, point_cloud": [*STRAIGHT, *POINT_CLOUD],
+    "go-to-goal, filter, ground_truth, no escape": [*STRAIGHT, *GROUND_TRUTH, "--no-escape"],
+    "go-to-goal, filter, ground_truth": [*STRAIGHT, *GROUND_TRUTH],
+    "plan from the point cloud": [*PLANNER, "--geometry-source", "point_cloud"],
+    "plan from the decoded cloud, field": [*PLANNER, "--geometry-source", "field"],
     "RRT-Connect": PLANNER,
 }
-# What the layer around a policy of bc.py with an encoder knows.
-BC_LAYERS = {"vae": POINTS, "vqvae": POINTS, "pointnet2": POINTS, "oracle": OBSTACLES}
-for _encoder, _layer in BC_LAYERS.items():
+# The filter around policies of bc.py, by encoder.
+BC_FILTERS = dict.fromkeys(("vae", "vqvae", "pointnet2"), POINT_CLOUD) | {"oracle": GROUND_TRUTH}
+for _encoder, _filter in BC_FILTERS.items():
     _flags = ["--policy", f"bc-combined-{_encoder}-{HARD}-s1"]
     CELLS |= {
-        f"bc, {_encoder}, alone": _flags,
-        f"bc, {_encoder}, no way out": [*_flags, *_layer, "--no-escape"],
-        f"bc, {_encoder}": [*_flags, *_layer],
+        f"bc, {_encoder}, no filter": _flags,
+        f"bc, {_encoder}, no escape": [*_flags, *_filter, "--no-escape"],
+        f"bc, {_encoder}": [*_flags, *_filter],
     }
-TOLD = "dagger, points told by field"  # trained with points that are seen
-SEES = "dagger, points"
+DECODED = "dagger, decoded by field"  # trained with observed points
+OBSERVED = "dagger, point_cloud"
 # The same training with other seeds (the first learned from older roadmaps): in `HARD` only.
-SEEDS = {f"{SEES}, seed {_seed}": f"dagger-combined-points-{HARD}-s{_seed}" for _seed in (2, 3)}
+SEEDS = {
+    f"{OBSERVED}, seed {_seed}": f"dagger-combined-point_cloud-{HARD}-s{_seed}" for _seed in (2, 3)
+}
 CELLS |= {_name: ["--policy", _policy] for _name, _policy in SEEDS.items()}
-for _name, _policy, _layer, _encoder in (
-    ("dagger, vae", f"vae-{HARD}", POINTS[:2], []),
-    ("dagger, vqvae", f"vqvae-{HARD}", POINTS[:2], []),
-    ("dagger, pointnet2", f"pointnet2-{HARD}", POINTS[:2], []),
-    ("dagger, field", f"field-{HARD}", POINTS[:2], []),
-    (TOLD, f"points-{HARD}", POINTS[:2], ["--encoder", "field"]),
-    (SEES, f"points-{HARD}", POINTS[:2], []),
-    ("dagger, points, mixed scenes", "points-mixed_scenes", POINTS[:2], []),
-    ("dagger, oracle", f"oracle-{HARD}", OBSTACLES, []),
+for _name, _policy, _filter, _source in (
+    ("dagger, vae", f"vae-{HARD}", POINT_CLOUD[:2], []),
+    ("dagger, vqvae", f"vqvae-{HARD}", POINT_CLOUD[:2], []),
+    ("dagger, pointnet2", f"pointnet2-{HARD}", POINT_CLOUD[:2], []),
+    ("dagger, field", f"field-{HARD}", POINT_CLOUD[:2], []),
+    (DECODED, f"point_cloud-{HARD}", POINT_CLOUD[:2], ["--geometry-source", "field"]),
+    (OBSERVED, f"point_cloud-{HARD}", POINT_CLOUD[:2], []),
+    (f"{OBSERVED}, mixed scenes", "point_cloud-mixed_scenes", POINT_CLOUD[:2], []),
+    ("dagger, oracle", f"oracle-{HARD}", GROUND_TRUTH, []),
 ):
-    _flags = ["--policy", f"dagger-combined-{_policy}-s1", *_encoder]
+    _flags = ["--policy", f"dagger-combined-{_policy}-s1", *_source]
     CELLS |= {
-        f"{_name}, alone": [*_flags, "--safety-margin", "0"],
-        f"{_name}, no way out": [*_flags, *_layer, "--no-escape"],
-        _name: _flags,  # its own layer
+        f"{_name}, no filter": [*_flags, "--safety-margin", "0"],
+        f"{_name}, no escape": [*_flags, *_filter, "--no-escape"],
+        _name: _flags,  # its own filter
     }
-LAYERS = ("alone", "with the layer", "and the way out")
-# z_E is less exact than points are.
-CELLS[TOLD] = [*CELLS[TOLD], "--safety-margin", "0.015"]
-# What stands in the first table: policy, what it knows, what its layer knows, and its cells.
+VARIANTS = ("no filter", "with the filter", "filter and escape")
+# Decoded points are less exact than observed ones.
+CELLS[DECODED] = [*CELLS[DECODED], "--safety-margin", "0.015"]
+# Rows of the first table: policy, what it receives of the scene, its filter's source, its cell.
 ROWS = (
-    ("`go-to-goal`", "nothing", "points", "go-to-goal", "reactive, points"),
-    ("`go-to-goal`", "nothing", "the obstacles", "go-to-goal", "reactive, obstacles"),
-    ("`bc.py`", "64 numbers (VAE)", "points", "bc, vae, alone", "bc, vae"),
-    ("`bc.py`", "64 numbers (VQ-VAE)", "points", "bc, vqvae, alone", "bc, vqvae"),
-    ("`bc.py`", "64 numbers (PointNet++)", "points", "bc, pointnet2, alone", "bc, pointnet2"),
-    ("`bc.py`", "the obstacles", "the obstacles", "bc, oracle, alone", "bc, oracle"),
+    ("`go-to-goal`", "nothing", "point cloud", "go-to-goal, filter, point_cloud"),
+    ("`go-to-goal`", "nothing", "ground truth", "go-to-goal, filter, ground_truth"),
+    ("`bc.py`", "latent code (VAE)", "point cloud", "bc, vae"),
+    ("`bc.py`", "latent code (VQ-VAE)", "point cloud", "bc, vqvae"),
+    ("`bc.py`", "latent code (PointNet++)", "point cloud", "bc, pointnet2"),
+    ("`bc.py`", "ground truth", "ground truth", "bc, oracle"),
+    ("`dagger.py`", "latent code (VAE), link distances", "point cloud", "dagger, vae"),
+    ("`dagger.py`", "latent code (VQ-VAE), link distances", "point cloud", "dagger, vqvae"),
     (
-        *("`dagger.py`", "64 numbers (VAE); points, how near", "points"),
-        *("dagger, vae, alone", "dagger, vae"),
+        *("`dagger.py`", "latent code (PointNet++), link distances", "point cloud"),
+        "dagger, pointnet2",
     ),
     (
-        *("`dagger.py`", "64 numbers (VQ-VAE); points, how near", "points"),
-        *("dagger, vqvae, alone", "dagger, vqvae"),
+        *("`dagger.py`", "latent code (field), link distances", "decoded from it"),
+        "dagger, field",
     ),
     (
-        *("`dagger.py`", "64 numbers (PointNet++); points, how near", "points"),
-        *("dagger, pointnet2, alone", "dagger, pointnet2"),
+        *("`dagger.py`, with points", "points decoded from the latent code (field)"),
+        *("decoded from it", DECODED),
     ),
-    (
-        *("`dagger.py`", "64 numbers (field)", "64 numbers (field)"),
-        *("dagger, field, alone", "dagger, field"),
-    ),
-    (
-        *("`dagger.py`, with points", "64 numbers (field): points", "64 numbers (field)"),
-        *(f"{TOLD}, alone", TOLD),
-    ),
-    ("`dagger.py`", "points", "points", "dagger, points, alone", "dagger, points"),
-    (
-        *("`dagger.py`, mixed scenes", "points", "points"),
-        *("dagger, points, mixed scenes, alone", "dagger, points, mixed scenes"),
-    ),
-    ("`dagger.py`", "the obstacles", "the obstacles", "dagger, oracle, alone", "dagger, oracle"),
+    ("`dagger.py`", "point cloud", "point cloud", OBSERVED),
+    ("`dagger.py`, mixed scenes", "point cloud", "point cloud", f"{OBSERVED}, mixed scenes"),
+    ("`dagger.py`", "ground truth", "ground truth", "dagger, oracle"),
 )
-# And in the second one, for every task.
+# Columns of the second table, for every task.
 EVERYWHERE = (
-    "reactive, points",
-    "dagger, points",
-    "dagger, points, mixed scenes",
-    "dagger, oracle",
-    "look, then plan",
+    *("go-to-goal, filter, point_cloud", OBSERVED, f"{OBSERVED}, mixed scenes", "dagger, oracle"),
+    "plan from the point cloud",
 )
-# In the third one, for tasks with scenes of other kinds, and the random boxes.
+# Columns of the third table, for tasks with scenes of other kinds, and the random boxes.
 WITH_ENCODERS = (
     *("dagger, vae", "dagger, vqvae", "dagger, pointnet2", "dagger, field"),
-    *(TOLD, "dagger, points", "dagger, oracle"),
+    *(DECODED, OBSERVED, "dagger, oracle"),
 )
 UNSEEN = [
     name for name, task in envs.TASKS.items() if name.startswith("random") or not task.trainable
 ]
-# What docs/baselines.json has, too: whatever the goal is said to be, these do the same, and
-# `combined` is reached like `ee`.
+# Results of docs/baselines.json, which do not depend on the goal type: `combined` is reached like
+# `ee`.
 OF_BASELINES = {
     "go-to-goal": "go-to-goal",
-    "look, then plan": "look, then plan, 5 s",
+    "plan from the point cloud": "plan from the point cloud, 5 s",
     "RRT-Connect": "RRT-Connect, 5 s",
 }
 KEPT = (
@@ -152,13 +142,13 @@ KEPT = (
         "collision_free_success_rate_interval",
     ),
     *("num_queries", "ms_per_action", "planning_seconds", "mean_steps", "path_length"),
-    *("env", "encoder", "safety_filter", "seed"),
+    *("env", "geometry_source", "safety_filter", "seed"),
 )
-LAYER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the last layer that a result had
+FILTER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the safety filter that a result had
 ENCODER_MARK = "†"
 MARKS = {
-    LAYER_MARKS[1]: "with the way out of dead ends as it was before 2026-11-24, without a memory",
-    LAYER_MARKS[2]: "with the last layer as it was when it took slow arrivals for dead ends",
+    FILTER_MARKS[1]: "with the escape as it was before 2026-11-24, without virtual obstacles",
+    FILTER_MARKS[2]: "with a safety filter that took slow arrivals for local minima",
     ENCODER_MARK: "with an encoder that has been replaced since",
 }
 BEGIN, END = "<!-- written by benchmarks/unseen_obstacles.py -->\n", "<!-- until here -->\n"
@@ -168,9 +158,8 @@ def keep(run):
     """Put a run's policy where it is found by name, in half precision, with how it was made."""
     training = json.loads((run / "result.json").read_text())
     args = training["args"]
-    encoder = args["encoder"].partition(":")[0]
     scenes = load_roadmap_paths(Path(args["paths"])).task  # that it learned from
-    name = f"dagger-{args['goal_type']}-{encoder}-{scenes}-s{args['seed']}"
+    name = f"dagger-{args['goal_type']}-{args['encoder']}-{scenes}-s{args['seed']}"
     to_float16(run / "policy.pt", POLICIES / f"{name}.pt")
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
     made |= {key: training[key] for key in ("policy_step", "validation_success_rate")}
@@ -196,10 +185,9 @@ def write_results(results):
 
 
 def run(tasks, names, num, workers):
-    """Fill in the cells that are missing, or had fewer queries, other flags, an older last layer or
-    encoder.
+    """Fill in cells that are missing, or had fewer queries, other flags, or older files.
 
-    Those of a policy that is not there are left out.
+    Cells of a policy that is not there are left out.
     """
     for task in tasks:
         for name in names:
@@ -233,8 +221,9 @@ def is_done(result, name, num):
 
 def digests(result):
     """Of the pretrained encoders that a result depends on, by name."""
-    knows = result["encoder"], *(result["env"].get(key) for key in ("encoder", "link_distances"))
-    files = {name: PRETRAINED / f"{name}.pt" for text in knows if text for name in text.split(":")}
+    names = result["geometry_source"], result["env"].get("encoder")
+    names = {*names, result["env"].get("geometry_source")} - {None}
+    files = {name: PRETRAINED / f"{name}.pt" for name in sorted(names)}
     return {
         name: hashlib.sha256(path.read_bytes()).hexdigest()[:12]
         for name, path in files.items()
@@ -247,24 +236,24 @@ def had_other_encoder(result):
     return "encoders" in result and result["encoders"] != digests(result)
 
 
-def version_of_layer(result):
-    """Of the last layer that a result had; today's, if it had none."""
-    layer = result.get("safety_filter")
-    if layer is None:
+def version_of_filter(result):
+    """Of the safety filter that a result had; today's, if it had none."""
+    made_with = result.get("safety_filter")
+    if made_with is None:
         return VERSION
-    # The first two differ in the way out of dead ends only.
-    return max(layer.get("version", 1), 1 if layer["escape"] else 2)
+    # The first two differ in the escape from local minima only.
+    return max(made_with.get("version", 1), 1 if made_with["escape"] else 2)
 
 
 def is_older(result):
-    """Whether the last layer did otherwise than it does now."""
-    return version_of_layer(result) < VERSION
+    """Whether the safety filter has changed since."""
+    return version_of_filter(result) < VERSION
 
 
 def papers_best():
     """Dict of task -> success of the paper's best policy, sections 5.1 to 5.4.
 
-    On `random_boxes_*` and shelves it knew 64 numbers of the scene; the others it was trained in.
+    On `random_boxes_*` and shelves it received a latent code; it was trained in the other scenes.
     """
     best = {}
     with open(PAPER_CELLS, newline="") as file:
@@ -280,9 +269,9 @@ def others_results(baselines):
         task: {ours: of[theirs] for ours, theirs in OF_BASELINES.items() if theirs in of}
         for task, of in baselines.items()
     }
-    for encoder in BC_LAYERS:
+    for encoder in BC_FILTERS:
         path = POLICIES / f"bc-combined-{encoder}-{HARD}-s1.json"
-        found[HARD][f"bc, {encoder}, alone"] = json.loads(path.read_text())
+        found[HARD][f"bc, {encoder}, no filter"] = json.loads(path.read_text())
     return found
 
 
@@ -290,26 +279,32 @@ def tables(results, others):
     """In Markdown. `others` are the results of `others_results`."""
     results = {task: others.get(task, {}) | results.get(task, {}) for task in envs.TASKS}
     hard, best = results[HARD], papers_best()
-    lines = _row("policy", "knows", "its layer", *LAYERS, "ms per action", is_head=True)
-    for policy, knows, layer_knows, alone, layered in ROWS:
-        cells = [_cell(hard.get(name)) for name in (alone, f"{layered}, no way out", layered)]
-        taken = hard.get(layered, {}).get("ms_per_action")
-        shown = "not measured" if taken is None else f"{taken:.1f}"
-        lines += _row(policy, knows, layer_knows, *cells, shown)
-    for policy, knows, name in (
-        ("look, then plan", "64 numbers (field)", "look, then plan, field"),
-        ("look, then plan", "points", "look, then plan"),
-        ("RRT-Connect", "the obstacles", "RRT-Connect"),
+    head = "policy", "receives", "source of its filter", *VARIANTS, "ms per action"
+    lines = _row(*head, is_head=True)
+    for policy, receives, source, name in ROWS:
+        unfiltered = "go-to-goal" if name.startswith("go-to-goal") else f"{name}, no filter"
+        cells = [_cell(hard.get(cell)) for cell in (unfiltered, f"{name}, no escape", name)]
+        milliseconds = hard.get(name, {}).get("ms_per_action")
+        shown = "not measured" if milliseconds is None else f"{milliseconds:.1f}"
+        lines += _row(policy, receives, source, *cells, shown)
+    for policy, receives, name in (
+        (
+            "plan from the decoded cloud",
+            "latent code (field)",
+            "plan from the decoded cloud, field",
+        ),
+        ("plan from the point cloud", "point cloud", "plan from the point cloud"),
+        ("RRT-Connect", "ground truth", "RRT-Connect"),
     ):
         seconds = f"searches {hard[name]['planning_seconds']:.3f} s" if name in hard else "not run"
-        lines += _row(policy, knows, "none", _cell(hard.get(name)), "", "", seconds)
+        lines += _row(policy, receives, "no filter", _cell(hard.get(name)), "", "", seconds)
     for names, tasks in (("go-to-goal", *EVERYWHERE), envs.TASKS), (WITH_ENCODERS, UNSEEN):
         lines += ["", *_row("task", "paper's best policy", *names, is_head=True)]
         for task in tasks:
             paper = f"{best[task]:.3f}" if task in best else "none given"
             lines += _row(f"`{task}`", paper, *(_cell(results[task].get(name)) for name in names))
     if any(name in hard for name in SEEDS):
-        lines += ["", _of_seeds([hard[name] for name in (SEES, *SEEDS) if name in hard])]
+        lines += ["", _of_seeds([hard[name] for name in (OBSERVED, *SEEDS) if name in hard])]
     dates = sorted({result["date"] for cells in results.values() for result in cells.values()})
     lines += ["", f"In brackets, test queries and the 95 % interval of success. To {dates[-1]}."]
     shown = "".join(lines)
@@ -318,9 +313,12 @@ def tables(results, others):
 
 
 def _of_seeds(results):
-    """A sentence: what policies with points have that differ in the seed of their training."""
-    text = f"`dagger.py` with points, {len(results)} seeds, `{HARD}`:"
-    for words, key in (("success", "success_rate"), ("clean", "collision_free_success_rate")):
+    """A sentence: success of policies with point clouds over seeds of the training."""
+    text = f"`dagger.py` with point clouds, {len(results)} seeds, `{HARD}`:"
+    for words, key in (
+        ("success", "success_rate"),
+        ("collision-free", "collision_free_success_rate"),
+    ):
         rates = [result[key] for result in results]
         each = ", ".join(f"{rate:.3f}" for rate in rates)
         text += f" {words} {each}, so {statistics.mean(rates):.3f}"
@@ -339,7 +337,9 @@ def _cell(result):
         return "not run"
     low, high = result["success_rate_interval"]
     rates = f"{result['success_rate']:.3f}, {result['collision_free_success_rate']:.3f}"
-    mark = LAYER_MARKS.get(version_of_layer(result), "") + ENCODER_MARK * had_other_encoder(result)
+    mark = FILTER_MARKS.get(version_of_filter(result), "") + ENCODER_MARK * had_other_encoder(
+        result
+    )
     return f"{rates}{mark} [{result['num_queries']:,}: {low:.3f}, {high:.3f}]"
 
 

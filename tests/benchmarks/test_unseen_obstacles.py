@@ -112,7 +112,7 @@ def test_a_runs_policy_is_kept_by_name_and_says_how_it_was_made(tmp_path, monkey
     (tmp_path / "result.json").write_text(json.dumps(made | {"args": args | folders}))
     monkeypatch.setattr(sys, "argv", ["unseen_obstacles.py", "--keep", str(tmp_path)])
     unseen.main()
-    path = tmp_path / "policies" / "dagger-combined-points-mixed_scenes-s4.pt"
+    path = tmp_path / "policies" / "dagger-combined-point_cloud-mixed_scenes-s4.pt"
     kept = load_network(path)(torch.ones(1, 3))
     assert torch.allclose(kept, network(torch.ones(1, 3)), atol=1e-2)
     text = path.with_suffix(".json").read_text()

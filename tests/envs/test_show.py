@@ -251,7 +251,7 @@ def test_policies_by_name(policy, touched, tmp_path, capsys, monkeypatch):
 
 def test_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 1)
-    policy = "dagger-combined-points-random_boxes_hard-s1"
+    policy = "dagger-combined-point_cloud-random_boxes_hard-s1"
     arguments = ["--policy", policy, "--query", 1, "--split", "validation", *SIZE]
     assert run("random_boxes_hard", "--output", tmp_path / "a.gif", *arguments) == 0
     text = capsys.readouterr().out

@@ -34,7 +34,7 @@ from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal, sensors_to
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
 
 BALL = (0.45, 0.1, 0.6, 0.15)  # what the encoder tells of, whatever the scene: place and radius, m
-POLICY = "dagger-combined-points-random_boxes_hard-s1"
+POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
 
 
 class AlwaysTheSame(torch.nn.Module):

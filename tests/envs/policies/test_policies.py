@@ -66,7 +66,7 @@ def test_a_policy_whose_actions_mean_something_else():
 
 
 def test_a_pretrained_policy_brings_what_it_sees_and_its_safety_filter():
-    path, arguments = find_policy("dagger-combined-points-random_boxes_hard-s1")
+    path, arguments = find_policy("dagger-combined-point_cloud-random_boxes_hard-s1")
     assert arguments == {
         "goal_type": "combined",
         "encoder": "points:32",

@@ -301,7 +301,7 @@ def test_a_safety_filter_around_a_policy(tmp_path):
         assert found[name]["collision_rate"] < 0.6 * found["bare"]["collision_rate"]
     rates = {name: result["success_rate"] for name, result in found.items()}
     assert rates["bare"] < rates["layer"] < rates["way out"]
-    own = ["--policy", "dagger-combined-points-random_boxes_hard-s1", "--task", "wall"]
+    own = ["--policy", "dagger-combined-point_cloud-random_boxes_hard-s1", "--task", "wall"]
     own += ["--num-queries", "1", "--no-escape", "--json", str(tmp_path / "result.json")]
     assert evaluation.main(own) == 0
     layer = json.loads((tmp_path / "result.json").read_text())["safety_filter"]
