@@ -3,13 +3,14 @@
     python benchmarks/inference_time.py POLICY ...       # runs' folders, or names (docs/results.md)
     python benchmarks/inference_time.py --num 200 bc-combined-vae-random_boxes_hard-s1
 
-Seconds on one core, means over the first test queries of `random_boxes_hard`: rendering the sensors'
-images, and encoding them, once per episode; finding a path, within 5 s, for planners; one action;
-all of an episode but rendering (the paper's total). Queries share scenes, but nothing observed for
+Seconds on one core, means over the first test queries of `random_boxes_hard`: rendering the
+sensors' images, and encoding them, once per episode; finding a path, within 5 s, for planners; one
+action; all of an episode but rendering (the paper's total). Queries share scenes, but nothing observed for
 one query serves another. With `--geometry-source`, policies with point clouds are timed with points
 decoded from that encoder's latent code, too. Encoding includes thinning points, decoding, and what
 distances need; an action includes link distances, and a safety filter. RRT-Connect uses ground
-truth, observed points, and decoded points. Nothing else should run beside it. The last line is JSON.
+truth, observed points, and decoded points. Nothing else should run beside it. The last line is
+JSON.
 """
 
 import argparse
@@ -36,7 +37,7 @@ SHOWN = ("rendering", "encoding", "planning", "action", "total")
 def forget(networks):
     """Empty all caches of scenes, those of these encoders, too."""
     for cached in (
-        point_clouds._observe,
+        point_clouds._look,
         geometry_source.observed_checker,
         geometry_source.ground_truth_checker,
         geometry_source.decoded_checker,

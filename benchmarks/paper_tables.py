@@ -231,7 +231,7 @@ def write_result(path, result):
 
 
 def evaluate(policy, task, num_queries, path):
-    """Of `evaluate.py`: success, its interval, collision-free success, number of test queries; a dict."""
+    """A dict of `evaluate.py`: success rates, interval of the first, number of test queries."""
     command = [sys.executable, ROOT / "clean_rl_scripts" / "evaluate.py", "--policy", policy]
     command += ["--task", task, "--num-queries", str(num_queries), "--json", path]
     subprocess.run(command, check=True)
@@ -343,8 +343,7 @@ def table(cells, results, column, baselines, more=()):
     """Markdown: a row per algorithm, a column per `column(cell)`; ours, and the paper's below.
 
     `more`: further rows, dict of name -> dict of column -> text.
-    Where the columns are tasks, `baselines` gives the last rows: of each task, of `GO_TO_GOAL` and so
-    on, the result.
+    Where the columns are tasks, `baselines` gives the last rows: each task's results of baselines.
     """
     rows, columns = {}, {}
     for cell in cells:
@@ -385,7 +384,8 @@ def long_runs(cells, results):
 def runs_table(cells, results):
     """Markdown: what was run, a row per policy."""
     lines = [
-        "| policy | success [95 %] | collision-free | steps (best at) | test queries | training | made |",
+        "| policy | success [95 %] | collision-free | steps (best at) | test queries | training "
+        "| made |",
         "|---|---|---|---|---|---|---|",
     ]
     for cell in cells:
@@ -418,8 +418,9 @@ def page(cells, results, baselines, unseen):
         "below it the paper's, mean ± standard deviation of four seeds, after 1,000,000 steps",
         f"({LONG_RUN:,} for random boxes). The last rows are non-learning baselines, which receive",
         "a goal configuration (goal `ee`: [baselines.md](baselines.md)). `" + REACTIVE + "` is",
-        "`go-to-goal` with a [safety filter](safety_filter.md) on observed points (goal `combined`,",
-        "200 test queries or more: [unseen_obstacles.md](unseen_obstacles.md)). With p = 0,",
+        "`go-to-goal` with a [safety filter](safety_filter.md) on observed points (goal",
+        "`combined`, 200 test queries or more: [unseen_obstacles.md](unseen_obstacles.md)). With",
+        "p = 0,",
         "queries are those of the demonstrations, which are not shown; the paper samples them.",
         "`python benchmarks/paper_tables.py` runs cells and writes this page;",
         "`clean_rl_scripts/evaluate.py --policy NAME` runs any policy below that was kept.",
@@ -449,8 +450,9 @@ def page(cells, results, baselines, unseen):
         lines += [
             "",
             "DAgger imitates a roadmap planner in other scenes of `random_boxes_hard`. Unlike the",
-            "paper's policies it has a safety filter, which enforces a minimum clearance. Collision-free",
-            "success, success without filter, versions: [unseen_obstacles.md](unseen_obstacles.md).",
+            "paper's policies it has a safety filter, which enforces a minimum clearance.",
+            "Collision-free success, success without filter, versions of the filter:",
+            "[unseen_obstacles.md](unseen_obstacles.md).",
         ]
     lines += long_runs(cells, results)
     lines += ["", "Why policies with a latent code fail to generalise to scenes of other kinds:"]
@@ -484,7 +486,7 @@ def page(cells, results, baselines, unseen):
 
 
 def draw_story(cells, results, baselines, unseen, path):
-    """Per task: from go-to-goal to RRT-Connect, the best of the paper's cells, and the best of ours.
+    """Per task: from go-to-goal to RRT-Connect, the paper's best cell, and our best.
 
     `unseen` (docs/unseen_obstacles.json) has policies with point clouds and a safety filter.
     """

@@ -1,14 +1,13 @@
 """How the success of `dagger.py` grows with the number of scenes, and with rounds of DAgger.
 
-    python -m roboarm_nmp.demo_generation.roadmaps --task random_boxes_hard --scenes 800 --seed 1 \\
-        --output roadmaps
-    python -m roboarm_nmp.demo_generation.make_queries --task random_boxes_hard --solvable \\
-        --queries-per-scene 5 --seed 78 --num-test 1 --num-validation 1000 --output fresh.h5
+    roboarm roadmaps --task random_boxes_hard --scenes 800 --seed 1 --output roadmaps
+    roboarm queries --task random_boxes_hard --solvable --queries-per-scene 5 --seed 78 \\
+        --num-test 1 --num-validation 1000 --output fresh.h5
     python benchmarks/scaling.py --paths roadmaps --queries fresh.h5 --runs-dir runs/scaling
     python benchmarks/scaling.py --figure      # only draws what docs/scaling.json has
 
-Each run is a short training with 32 observed points, all alike but for what is varied, evaluated on the
-fresh queries. What is done is skipped. Results go to docs/scaling.json and to
+Each run is a short training with 32 observed points, in which one setting is varied, evaluated on
+the fresh queries. What is done is skipped. Results go to docs/scaling.json and to
 docs/figures/unseen_scaling.png.
 """
 

@@ -79,8 +79,8 @@ def bars(results):
         ("with the safety filter", 0.2, 2, "#3f6fb5"),
     )
     for label, shift, column, colour in styles:
-        for clean in (False, True):
-            name = "collision_free_success_rate" if clean else "success_rate"
+        for collision_free in (False, True):
+            name = "collision_free_success_rate" if collision_free else "success_rate"
             heights = [
                 results[row[column]][name] if row[column] in results else np.nan for row in rows
             ]
@@ -89,10 +89,10 @@ def bars(results):
                 heights,
                 0.36,
                 color=colour,
-                edgecolor="black" if clean else colour,
+                edgecolor="black" if collision_free else colour,
                 linewidth=0.8,
-                alpha=1.0 if clean else 0.55,
-                label=f"{label}, {'clean' if clean else 'success'}",
+                alpha=1.0 if collision_free else 0.55,
+                label=f"{label}, {'collision-free' if collision_free else 'success'}",
             )
     axes.axhline(0.304, color="#b5533f", linestyle="--", linewidth=1, label="paper's best policy")
     axes.set_xticks(np.arange(len(rows)), [row[0] for row in rows])

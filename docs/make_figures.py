@@ -1,4 +1,4 @@
-"""Render the pictures of the tasks in docs/figures.
+"""Render the figures of the tasks in docs/figures.
 
     python docs/make_figures.py
 
@@ -26,7 +26,7 @@ QUERY = 2  # its start and goal lie on two sides of the walls
 ROWS, COLUMNS = 2, 3  # of scenes that vary
 NUM_DEMOS = 24
 COLOURS = ((0.85, 0.30, 0.25), (0.20, 0.45, 0.80), (0.95, 0.65, 0.15), (0.25, 0.60, 0.35))
-FOLDER = Path(__file__).parent / "pictures"
+FOLDER = Path(__file__).parent / "figures"
 
 
 def save(pixels, name):

@@ -119,8 +119,8 @@ def test_the_page_shows_what_was_run_and_what_was_not(results):
     assert page.count("<br>") - page.count("<sub>") == len(CELLS) + 4
     assert page.count("not run<br>") == len(CELLS) + 4 - page.count("<sub>")
     assert page.count("<sub>") == 4
-    assert page.count("| *floor: go-to-goal* |  | 0.700 |") == 3
-    assert page.count("| *ceiling: RRT-Connect, 5 s* |  | 1.000 |") == 3
+    assert page.count("| *no learning: go-to-goal* |  | 0.700 |") == 3
+    assert page.count("| *search, ground truth: RRT-Connect, 5 s* |  | 1.000 |") == 3
     below = "`sac-ee-double_walls-p1` (0.830, paper 0.916) of these runs. What was found: "
     assert f"Below the paper by more than 0.05: {below}" in page
     assert (
@@ -157,12 +157,12 @@ def test_an_algorithm_of_ones_own(results, tmp_path):
 def test_imitation_stands_beside_the_papers_encoders(results):
     found = {"success_rate": 0.9, "num_queries": 1000}
     more = {"success_rate": 0.8, "num_queries": 1000}
-    seeds = {"dagger, points": found, "dagger, points, seed 2": more, "dagger, points, alone": more}
-    unseen = {"narrow_shelves": {"dagger, points": found}, "wall": {"dagger, oracle": found}}
+    seeds = {"dagger, point_cloud": found, "dagger, point_cloud, seed 2": more, "dagger, point_cloud, no filter": more}
+    unseen = {"narrow_shelves": {"dagger, point_cloud": found}, "wall": {"dagger, oracle": found}}
     unseen["pole_shelves"] = seeds
     page = paper_tables.page(list(CELLS.values()), results, BASELINES, unseen)
     (row,) = (line for line in page.splitlines() if line.startswith("| DAgger"))
-    assert row.startswith("| DAgger with a last layer: seen points |  |  |")
+    assert row.startswith("| DAgger with a safety filter: observed points |  |  |")
     assert row.endswith("| **0.900 [0.880, 0.917]**<br><sub>1,000 queries, 1 seed</sub> |")
     assert "| **0.850 ± 0.071 [0.834, 0.865]**<br><sub>2,000 queries, 2 seeds</sub> |" in row
     for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
@@ -175,7 +175,7 @@ def test_the_page_without_any_result():
 
 
 def test_the_pictures(results, tmp_path):
-    unseen = {"wall": {"dagger, points": {"success_rate": 0.99}}}
+    unseen = {"wall": {"dagger, point_cloud": {"success_rate": 0.99}}}
     story = functools.partial(paper_tables.draw_story, baselines=BASELINES, unseen=unseen)
     for draw in (paper_tables.draw_curves, paper_tables.draw_bars, story):
         draw(list(CELLS.values()), results, path=tmp_path / "picture.png")

@@ -19,7 +19,7 @@ import tyro
 from paths import ROOT
 from PIL import Image
 
-from roboarm_nmp import envs
+from roboarm_nmp import __main__, envs
 from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.envs import show
 from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
@@ -37,7 +37,7 @@ COMMANDS = [
     line.partition("#")[0].strip()
     for kind, text in BLOCKS
     for line in text.splitlines()
-    if kind == "" and line.startswith("python ")
+    if kind == "" and line.startswith(("python ", "roboarm "))
 ]
 YAML = next(text for kind, text in BLOCKS if kind == "yaml")
 POSTS = [text for kind, text in BLOCKS if kind == "python"][-1]
@@ -46,10 +46,10 @@ POSTS = [text for kind, text in BLOCKS if kind == "python"][-1]
 FEWER = {"1000": "6"}
 ONE_WORKER = ["--workers", "1"]
 TINY = {
-    "roboarm_nmp.demo_generation.make_queries": ["--num-validation", "4", *ONE_WORKER],
-    "roboarm_nmp.demo_generation.collect": ONE_WORKER,
-    "roboarm_nmp.demo_generation.verify": ONE_WORKER,
-    "roboarm_nmp.envs.show": ["--size", "80", "60"],
+    "queries": ["--num-validation", "4", *ONE_WORKER],
+    "collect": ONE_WORKER,
+    "verify": ONE_WORKER,
+    "show": ["--size", "80", "60"],
     "sac_her_mp.py": shlex.split(
         "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 "
         "--num-envs 2 --horizon 50 --eval-every 400 --eval-queries 2 --test-queries 3 "
@@ -70,8 +70,8 @@ def run(command):
     if "runs/RUN" in command and Path("runs").exists():
         command = command.replace("runs/RUN", str(next(Path("runs").iterdir())))
     words = [FEWER.get(word, word) for word in shlex.split(command)][1:]
-    name = words[1] if words[0] == "-m" else Path(words[0]).name
-    arguments = words[2 if words[0] == "-m" else 1 :] + TINY.get(name, [])
+    name = Path(words[0]).name
+    arguments = words[1:] + TINY.get(name, [])
     if name == "sac_her_mp.py":  # all that it does is in its `if __name__ == "__main__"`
         script = [sys.executable, str(SCRIPTS / name), *arguments]
         done = subprocess.run(script, capture_output=True, text=True, timeout=300)
@@ -89,10 +89,10 @@ def run(command):
 
 
 def main_of(name):
-    module = importlib.import_module(name.removesuffix(".py"))
-    if name == "roboarm_nmp.envs.datasets":
-        return module._main
-    if name in ("roboarm_nmp.envs.show", "evaluate.py"):
+    """The function of a subcommand of `roboarm`, which takes its arguments."""
+    path = __main__.COMMANDS[name][0]
+    module = importlib.import_module(f"roboarm_nmp.{path}" + ".__main__" * (name == "data"))
+    if name in ("data", "show", "evaluate"):
         return module.main
     return lambda arguments: module.main(tyro.cli(module.Args, args=arguments))
 
@@ -187,11 +187,11 @@ def test_queries_and_demonstrations_are_beside_the_scene(page):
     assert test.task == demos.task == "my_scene"
     assert test[5].scene == demos[5].scene == scene
     assert "6 test and 4 validation queries for my_scene" in result_of(page, "validate").out
-    assert "(0.000)" in result_of(page, "make_queries").out  # not solved
+    assert "(0.000)" in result_of(page, "roboarm queries").out  # not solved
     assert "6 good, 0 changed" in result_of(page, "verify").out
     assert "demonstrations | 6\n" in result_of(page, "describe").out
-    pictures = [np.asarray(Image.open(page[0] / f"{name}.png")) for name in ("scene", "scenes")]
-    assert [picture.shape for picture in pictures] == [(60, 80, 3), (120, 160, 3)]
+    images = [np.asarray(Image.open(page[0] / f"{name}.png")) for name in ("scene", "scenes")]
+    assert [image.shape for image in images] == [(60, 80, 3), (120, 160, 3)]
 
 
 def test_training_and_evaluating(page):
@@ -202,7 +202,7 @@ def test_training_and_evaluating(page):
     checkpoint = torch.load(run_folder / "checkpoint.pt", weights_only=True)
     assert checkpoint["progress"]["demos_injected"] > 0
     for policy in ("runs/RUN", "go-to-goal", "via-points", "planner"):
-        text = result_of(page, f"evaluate.py --task my_scene.yaml --policy {policy}").out
+        text = result_of(page, f"roboarm evaluate --task my_scene.yaml --policy {policy}").out
         assert "on my_scene.yaml: 6 test queries" in text
         if policy == "planner":  # the queries are solvable
             assert re.search(r"success +1\.0000", text)
@@ -213,7 +213,7 @@ def test_training_and_evaluating(page):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_malformed_file_gives_its_line(command, tmp_path, monkeypatch):
+def test_malformed_scene_file_is_rejected_with_its_line(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my_scene.yaml").write_text(YAML.replace("length:", "height:"))
     [message] = [text.strip() for kind, text in BLOCKS if kind == "" and "unknown key" in text]
@@ -221,16 +221,16 @@ def test_a_malformed_file_gives_its_line(command, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["my_scene.yaml"]
 
 
-def test_a_changed_scene_makes_its_files_out_of_date(inside):
+def test_files_of_a_changed_scene_are_out_of_date(inside):
     [message] = [text.strip() for kind, text in BLOCKS if kind == "" and "out of date" in text]
     Path("my_scene.yaml").write_text(YAML.replace("radius: 0.1}", "radius: 0.11}"))
     queries = re.escape(message.removesuffix("..."))
-    demos = queries.replace("_queries", "_demos").replace("make_queries", "collect")
+    demos = queries.replace("_queries", "_demos").replace("roboarm queries", "roboarm collect")
     for load, expected in ((load_queries, queries), (load_demos, demos)):
-        with pytest.raises(DatasetError, match=f"^{expected}python -m roboarm_nmp.demo_generation"):
+        with pytest.raises(DatasetError, match=f"^{expected}roboarm (queries|collect)"):
             load("my_scene.yaml")
     for command in COMMANDS:
-        if "make_queries" in command or "show" in command and "--output" not in command:
+        if "roboarm queries" in command or "show" in command and "--output" not in command:
             continue
         if "RUN" in command:
             continue  # without a run they say that there is none
@@ -273,7 +273,7 @@ def test_two_scenes_of_one_name_do_not_mix_up(other):
     for task, queries in zip(tasks, (here, there), strict=True):
         assert queries[0].scene == load_demos(task)[0].scene == load_scene(task)
         assert envs.make(task).scene == load_scene(task)
-    evaluate = "python clean_rl_scripts/evaluate.py --policy go-to-goal --num-queries 1"
+    evaluate = "roboarm evaluate --policy go-to-goal --num-queries 1"
     assert f"on {other}: 1 test" in run(f"{evaluate} --task {other}").out
     for task, folder in ((other, "."), ("my_scene.yaml", "other")):
         line = error_of(f"{evaluate} --task {task} --queries {folder}/my_scene_queries.h5")
@@ -307,16 +307,14 @@ def test_a_collection_does_not_go_on_in_a_changed_scene(inside):
 @pytest.mark.parametrize(
     "command",
     [
-        "make_queries --task my_scene.yaml --num-test 1",
-        "collect --task my_scene.yaml --num 1",
+        "roboarm queries --task my_scene.yaml --num-test 1",
+        "roboarm collect --task my_scene.yaml --num 1",
     ],
 )
 def test_a_scene_without_room_for_the_arm(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_scene(Scene((Sphere((0.0, 0.0, 0.3), 0.3),)), "my_scene.yaml")
-    assert "no feasible configuration" in error_of(
-        f"python -m roboarm_nmp.demo_generation.{command}"
-    )
+    assert "no feasible configuration" in error_of(command)
 
 
 # --- Random scenes
