@@ -220,7 +220,7 @@ def test_saved_with_its_layer_it_acts_alone_as_in_a_batch(some, tmp_path):
     content = torch.load(path, weights_only=True)
     content["metadata"]["safety_filter"] = {"keep": "far"}
     torch.save(content, tmp_path / "bad.pt")
-    with pytest.raises(PolicyError, match="bad.pt: its last layer makes no sense"):
+    with pytest.raises(PolicyError, match="bad.pt: invalid safety_filter"):
         find_policy(tmp_path / "bad.pt")
 
 
