@@ -12,8 +12,11 @@ the filter enforces a discrete-time control barrier function (Agrawal and Sreena
     d(q + a) - d_min >= (1 - gamma) (d(q) - d_min),
 
 linearised by the gradient of d: one half-space of actions per link. d_min is the margin, and gamma
-`CBF_GAIN`. A link nearer than the margin has to move away, by at most `MAX_RECOVERY` per step. The
-action is projected onto the half-spaces in turn (cyclic projection).
+`CBF_GAIN`. A link nearer than the margin has to move away, by at most `MAX_RECOVERY` per step.
+
+Cyclic projection onto the half-spaces finds an action that satisfies them, where there is one. The
+change is close to the smallest one (L2), and exact for a single half-space; for two, it is at most
+15 % longer (docs/experiments.md, "Projection").
 
 The nearest point of a link may change during the step. So the distances at q + a are computed, too,
 and add a second half-space per link. Distances come from the observation's geometry source, table
@@ -101,7 +104,10 @@ class SafetyFilter:
             raise ValueError(f"invalid safety_filter in its metadata: {options!r}") from error
 
     def __call__(self, actions, link_distances, margins=None, max_step=MAX_STEP, cbf_gain=CBF_GAIN):
-        """Actions that satisfy the constraints of all rows, close to the given ones: float32.
+        """Actions (..., 7), float32, that satisfy the constraints of all rows, to first order.
+
+        They are close to the given actions, but not always the closest. Where the constraints
+        conflict, or the sweeps do not suffice, some are violated.
 
         Args:
             actions: (..., 7), displacements of the normalised configuration.

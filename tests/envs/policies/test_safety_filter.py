@@ -179,6 +179,33 @@ def test_change_for_a_single_half_space_is_the_smallest_one():
     assert done == pytest.approx(wanted + gradient * by / (gradient @ gradient), abs=1e-7)
 
 
+def smallest_change(wanted, normals, bounds):
+    """The nearest of all actions with normals @ action >= bounds, for two half-spaces."""
+    candidates = [wanted]
+    for active in ([0], [1], [0, 1]):
+        n, short = normals[active], bounds[active] - normals[active] @ wanted
+        candidates.append(wanted + n.T @ np.linalg.solve(n @ n.T, short))
+    feasible = [x for x in candidates if (normals @ x >= bounds - 1e-9).all()]
+    return min(feasible, key=lambda x: np.linalg.norm(x - wanted))
+
+
+def test_change_for_two_half_spaces_is_at_most_a_sixth_longer_than_the_smallest():
+    rng, ratios = np.random.default_rng(0), []
+    for _ in range(1000):
+        distances, normals = rng.uniform(-0.005, 0.03, 2), rng.normal(0, 0.3, (2, 7))
+        wanted = rng.normal(0, 0.01, 7)
+        rows = np.concatenate([distances[:, None], normals], axis=1)
+        done = SafetyFilter(margin=0.01)(wanted, rows, max_step=1.0)
+        bounds = np.minimum(CBF_GAIN * (0.01 - distances), MAX_RECOVERY)
+        exact = smallest_change(wanted, normals, bounds)
+        assert (normals @ done > bounds - 1e-3).all()  # after a limited number of sweeps
+        if (normals @ wanted < bounds - 1e-4).any():
+            ratios.append(np.linalg.norm(done - wanted) / np.linalg.norm(exact - wanted))
+    # Cyclic projection is exact for one half-space, and 2 / sqrt(3) too long at worst for two.
+    assert len(ratios) > 500 and np.median(ratios) == pytest.approx(1.0, abs=1e-3)
+    assert max(ratios) < 2 / np.sqrt(3) + 0.01
+
+
 def test_two_opposing_planes_constrain_only_motion_towards_them():
     both = link_distances((0.02, 0.5, 0.0), (0.02, -0.5, 0.0))
     for towards in (-0.02, 0.02):
