@@ -1,25 +1,23 @@
-"""Compiled collision checks against PyBullet's: do they agree, and how fast are they?
-
-Ours are those of `envs.collision.checker`.
+"""Compiled collision checks against PyBullet's: agreement and speed.
 
     pip install -c constraints.txt -e .
     python benchmarks/collision.py                # 2 minutes
     python benchmarks/collision.py --num 15000    # fewer configurations
 
-Agreement with `RoboArmEnv.in_collision`: `--num` configurations, as many for each of the thirteen
-tasks' scenes (random boxes: 40 scenes each, of the validation queries) and for the 100 original
-problems of each MotionBenchMaker shelf. Two thirds are uniform; the others were moved along a line
-between two of those until something is within 1 cm, inside or outside, uniformly.
+Agreement of `envs.collision.checker` with `RoboArmEnv.in_collision`: `--num` configurations, as
+many for each of the thirteen tasks' scenes (random boxes: 40 scenes each, of the validation
+queries) and for the 100 original problems of each MotionBenchMaker shelf. Two thirds are uniform.
+The others were moved along a line between two of those to a distance from contact that is uniform
+from -1 cm to 1 cm.
 
 - disagreement: share of configurations with different answers;
-- deepest_mm: of these, the largest distance from contact, by whichever of the two says more.
+- deepest_mm: of these, the largest distance from contact, by whichever of the two has the larger.
 
 Speed: uniform configurations in 40 scenes of `random_boxes_hard`, processor time of one core, in
-turns, the median of `--rounds`. `link_distances` is asked about one configuration at a time, a free one,
-as at every step of a policy: of the ground-truth obstacles, of the observed points, and of those
-that the encoder `field` tells of. PyBullet's check is what
-planners used before: set the joints, detect collisions, read the contacts; `in_collision` also
-clears old contacts first.
+turns, the median of `--rounds`. `link_distances` takes one free configuration at a time, as at
+every step of a policy, with three geometry sources: the ground truth, the observed point cloud, and
+points decoded by the encoder `field`. `pybullet` sets the joints, detects collisions and reads the
+contacts; `in_collision` also clears old contacts first.
 
 The last line is JSON.
 """
@@ -41,10 +39,9 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.perception.encoders import decoded_checker
-from roboarm_nmp.envs.perception.point_clouds import observed_checker
+from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 
-ACTIVATION_DISTANCE = 0.01  # m
+CONTACT_RANGE = 0.01  # m
 SCENES = 40  # of each distribution
 
 
@@ -55,9 +52,9 @@ def scenes_of(task, split):
 
 
 def nudge(checker, states, rng):
-    """Configurations (n, 7) moved to within `ACTIVATION_DISTANCE` of contact; fewer, where no line leads there."""
+    """Configurations (n, 7) moved to within `CONTACT_RANGE` of contact; fewer if lines miss it."""
     others = rng.uniform(-1.0, 1.0, states.shape)
-    wanted = rng.uniform(-ACTIVATION_DISTANCE, ACTIVATION_DISTANCE, len(states))
+    wanted = rng.uniform(-CONTACT_RANGE, CONTACT_RANGE, len(states))
 
     def beyond(shares):
         there = states + shares[:, None] * (others - states)
@@ -74,14 +71,14 @@ def nudge(checker, states, rng):
 
 
 def pybullet_distance(env):
-    """Least distance (m) that PyBullet reports after `in_collision`; NaN if it reports none."""
+    """Smallest distance (m) that PyBullet reports after `in_collision`; NaN without contacts."""
     contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
     return min((contact[8] for contact in contacts), default=np.nan)
 
 
 def compare(env, scenes, num, rng, progress):
-    """(configurations, depths in m of the disagreements) in the scenes, `num` in all."""
-    asked, depths = 0, []
+    """Number of configurations, `num` over all scenes, and depths (m) of the disagreements."""
+    compared, depths = 0, []
     shares = np.diff(np.linspace(0, num, len(scenes) + 1).round().astype(int))
     for scene, count in zip(scenes, shares.tolist(), strict=True):
         env.set_scene(scene)
@@ -97,9 +94,9 @@ def compare(env, scenes, num, rng, progress):
             if env.in_collision(panda.denormalise(state)) == is_free:
                 ours = abs(checker.signed_distances(state).distance.min())
                 depths.append(float(np.nanmax([ours, abs(pybullet_distance(env))])))
-        asked += count
+        compared += count
         progress.update(count)
-    return asked, depths
+    return compared, depths
 
 
 def pybullet_check(env, configuration):
@@ -109,7 +106,7 @@ def pybullet_check(env, configuration):
     return any(contact[8] < 0.0 for contact in contacts)
 
 
-def ask(check, configurations):
+def run(check, configurations):
     for configuration in configurations:
         check(configuration)
 
@@ -121,31 +118,33 @@ def timed(function, *arguments):
 
 
 def speed(rounds, rng):
-    """Microseconds of processor time per configuration: dict way -> median over rounds."""
-    env, ours = envs.make("random_boxes_hard"), 10_000
+    """Microseconds of processor time per configuration: dict name -> median over rounds."""
+    env, batch = envs.make("random_boxes_hard"), 10_000
     scenes = scenes_of("random_boxes_hard", "validation")[:SCENES]
     checkers = [CollisionChecker(scene) for scene in scenes]
     checkers[0].is_free(np.zeros(7))  # compiles
     checkers[0].signed_distances(np.zeros(7))
-    seeing_checkers = [observed_checker(scene) for scene in scenes]
-    told_checkers = [decoded_checker(scene, "field") for scene in scenes]
-    seeing_checkers[0].link_distances(np.zeros(7))
-    near = {"link_distances": checkers, "link_distances, points": seeing_checkers}
-    near |= {"link_distances, field": told_checkers}
-    seconds = {name: [] for name in ("is_free", "nearest", *near, "pybullet", "in_collision")}
+    per_source = {
+        f"link_distances, {name}": [find_geometry_source(name)(scene) for scene in scenes]
+        for name in ("ground_truth", "point_cloud", "field")
+    }
+    for ones in per_source.values():
+        ones[0].link_distances(np.zeros(7))
+    names = "is_free", "signed_distances", *per_source, "pybullet", "in_collision"
+    seconds = {name: [] for name in names}
     for _ in range(rounds):
         total = dict.fromkeys(seconds, 0.0)
         for i, (scene, checker) in enumerate(zip(scenes, checkers, strict=True)):
-            states = rng.uniform(-1.0, 1.0, (ours, 7))
-            total["is_free"] += timed(checker.is_free, states) / ours
-            total["nearest"] += timed(checker.nearest, states[:500]) / 500
+            states = rng.uniform(-1.0, 1.0, (batch, 7))
+            total["is_free"] += timed(checker.is_free, states) / batch
+            total["signed_distances"] += timed(checker.signed_distances, states[:500]) / 500
             free = states[:1000][checker.is_free(states[:1000])][:100]
-            for name, ones in near.items():
-                total[name] += timed(ask, ones[i].link_distances, free) / len(free)
+            for name, ones in per_source.items():
+                total[name] += timed(run, ones[i].link_distances, free) / len(free)
             env.set_scene(scene)
             configurations = panda.denormalise(states[:100]).tolist()
-            total["pybullet"] += timed(ask, partial(pybullet_check, env), configurations) / 100
-            total["in_collision"] += timed(ask, env.in_collision, configurations) / 100
+            total["pybullet"] += timed(run, partial(pybullet_check, env), configurations) / 100
+            total["in_collision"] += timed(run, env.in_collision, configurations) / 100
         for name, value in total.items():
             seconds[name].append(value / len(scenes))
     env.close()
@@ -163,7 +162,7 @@ def main():
     rng = np.random.default_rng(args.seed)
     groups = [(task, "validation") for task in envs.TASKS]
     groups += [(task, "original") for task in envs.TASKS if task.startswith("benchmaker")]
-    env, asked, depths = envs.RoboArmEnv(), 0, []
+    env, compared, depths = envs.RoboArmEnv(), 0, []
     print(f"{'scenes':38}{'configurations':>15}{'disagree':>10}{'deepest':>12}")
     with tqdm(total=args.num, unit=" configurations") as progress:
         for i, (task, split) in enumerate(groups):
@@ -174,24 +173,24 @@ def main():
             count, found = compare(env, scenes, share, rng, progress)
             deepest = f"{1e3 * max(found):.3f} mm" if found else "-"
             progress.write(f"{task + ', ' + split:38}{count:15,}{len(found):10}{deepest:>12}")
-            asked += count
+            compared += count
             depths += found
     env.close()
     micros = speed(args.rounds, rng)
     print()
     for name, value in micros.items():
-        print(f"{name:20}{value:10.2f} us")
+        print(f"{name:30}{value:10.2f} us")
     print()
     result = {
-        "configurations": asked,
-        "disagreement": len(depths) / asked,
+        "configurations": compared,
+        "disagreement": len(depths) / compared,
         "deepest_mm": 1e3 * max(depths, default=0.0),
         "checks_per_second": 1e6 / micros["is_free"],
         "ratio_to_pybullet": micros["pybullet"] / micros["is_free"],
         "ratio_to_in_collision": micros["in_collision"] / micros["is_free"],
-        "nearest_per_second": 1e6 / micros["nearest"],
-        "link_distances_us": micros["link_distances"],
-        "link_distances_points_us": micros["link_distances, points"],
+        "signed_distances_per_second": 1e6 / micros["signed_distances"],
+        "link_distances_us": micros["link_distances, ground_truth"],
+        "link_distances_point_cloud_us": micros["link_distances, point_cloud"],
         "link_distances_field_us": micros["link_distances, field"],
         "python": platform.python_version(),
     }

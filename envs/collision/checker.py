@@ -1,28 +1,28 @@
-"""Collision checks and distances, compiled: hundreds of thousands of configurations a second.
+"""Compiled collision checks and signed distances: hundreds of thousands of configurations a second.
 
     from roboarm_nmp.envs.collision.checker import CollisionChecker
 
     checker = CollisionChecker(scene)
     checker.is_free(states)                  # normalised (n, 7) -> bool (n,)
     checker.is_motion_free(starts, ends)     # straight motions, checked every `RESOLUTION`
-    checker.signed_distances(states)                  # per link: how far, which way is out, from what
-    checker.link_distances(states)                # the same as observations have it, and quicker
+    checker.signed_distances(states)         # `SignedDistances`, a row per link
+    checker.link_distances(states)           # as in observations, and faster
 
-The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`, but no PyBullet
-world is moved. They are: the convex hulls of the links' collision meshes, `BULLET_MARGIN` thicker
-on all sides; boxes and cylinders, with edges rounded by as much; spheres; the table and the floor;
-and `panda.SELF_COLLISION_PAIRS`. As in PyBullet, the base touches nothing but the arm itself. How
-often the two disagree: docs/benchmarks.md.
+The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`, without a PyBullet
+world. The shapes are: the convex hulls of the links' collision meshes, `BULLET_MARGIN` thicker on
+all sides; boxes and cylinders, with edges rounded by as much; spheres; the table and the floor; and
+`panda.SELF_COLLISION_PAIRS`. As in PyBullet, the base collides only with the arm itself. How often
+the two disagree: docs/benchmarks.md.
 
-Two shapes are looked at in three stages, each only if the one before could not tell them apart: the
+Two shapes are compared in three stages, each only if the one before could not separate them: the
 link's bounding sphere against the box around the obstacle; the link's bounding box against that
 box, by their faces; then GJK (Gilbert, Johnson, Keerthi, 1988) on the shapes themselves, which
-stops as soon as it knows on which side of the margin their distance is. Where shapes overlap,
-`nearest` needs the depth, which EPA (van den Bergen, 2001) finds.
+stops as soon as their distance is certain to be above or below the margin. Where shapes overlap,
+`signed_distances` needs the depth, which EPA (van den Bergen, 2001) computes.
 
-The functions below are compiled by Numba when they are first called, once per machine
+Numba compiles the functions in `kernels` at their first call, once per machine
 (docs/environment.md, "Collision checks"). They compute in float64, and an answer does not depend on
-the batch in which it was asked for.
+the batch around it.
 """
 
 import functools
@@ -47,32 +47,33 @@ RESOLUTION = 0.021
 """Motions are checked at points at most this far apart, L2 in the normalised space: less than one
 step of the arm (0.03)."""
 LINK_DISTANCE_RANGE = 0.3
-"""m. In observations, things farther away than that are as good as none."""
+"""m. Observed link distances are clipped to this, and beyond it their gradient is zero."""
 NOTHING, TABLE, FLOOR, ARM, POINT = -1, -2, -3, -4, -5
-"""What `SignedDistances.geometry` says where it is not the index of an obstacle."""
+"""Values of `SignedDistances.geometry` that are not the index of an obstacle."""
 
 
 class SignedDistances(NamedTuple):
-    """How near each of `panda.COLLISION_LINKS` is to something, for a batch of configurations of shape (...).
+    """Signed distances of each of `panda.COLLISION_LINKS`, for configurations of shape (...).
+
+    The ten links of a configuration have a row each. Where nothing is in range, the distance is
+    infinite, and normal, witness and gradient are zeros.
 
     Attributes:
-        distance: m, (..., 10); negative in a collision: minus the way that the link, or what it
-            hits, has to be moved. Infinite where there is nothing.
-        direction: unit vectors (..., 10, 3), in the base's frame: which way is out, the way to move
-            the link to get away. Zeros where there is nothing.
-        point: m, (..., 10, 3), in the base's frame: the point of the link's hull that is nearest,
-            or deepest. Zeros where there is nothing.
-        gradient: m per unit of normalised configuration, (..., 10, 7): how `distance` changes with
-            each joint. Zeros where there is nothing.
-        thing: (..., 10): the index of an obstacle, or `TABLE`, `FLOOR`, `ARM` (another link),
-            `POINT` (one of the points), `NOTHING`.
+        distance: m, (..., 10), from the nearest geometry; in a collision, minus the depth.
+        normal: unit vectors (..., 10, 3), in the base's frame, along which the link moves away.
+        witness: m, (..., 10, 3), in the base's frame: the nearest or deepest point of the link's
+            hull.
+        gradient: m per unit of normalised configuration, (..., 10, 7): the derivative of `distance`
+            with respect to each joint.
+        geometry: int64 (..., 10): the index of an obstacle, or `TABLE`, `FLOOR`, `ARM` (another
+            link), `POINT` (one of the points), `NOTHING`.
     """
 
     distance: np.ndarray
-    direction: np.ndarray
-    point: np.ndarray
+    normal: np.ndarray
+    witness: np.ndarray
     gradient: np.ndarray
-    thing: np.ndarray
+    geometry: np.ndarray
 
 
 class CollisionChecker:
@@ -83,45 +84,45 @@ class CollisionChecker:
 
     Args:
         scene: a `Scene`.
-        points: m, (n, 3), in the base's frame: balls that are there, too, such as the points of
-            obstacles that a sensor saw.
-        point_radius: m, theirs, in [0, `MAX_MARGIN`).
+        points: m, (n, 3), in the base's frame: the centres of additional balls, for example an
+            observed point cloud.
+        point_radius: m, of the balls, in [0, `MAX_MARGIN`).
 
     Raises:
-        TypeError: the scene is none.
-        ValueError: an obstacle, the table or the floor has a size that is not positive, or numbers
-            that are not finite; so with the points. Of all methods: states of another shape, not
-            finite, or outside the limits; a margin out of its range.
+        TypeError: `scene` is not a `Scene`.
+        ValueError: an obstacle, the table, the floor or a point has numbers that are not finite, or
+            a size that is not positive. From all methods: states of another shape, not finite, or
+            outside the limits; a margin out of its range.
     """
 
     def __init__(self, scene, points=(), point_radius=0.0):
         if not isinstance(scene, Scene):
             raise TypeError(
-                f"a scene must be an roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
+                f"a scene must be a roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
             )
         self.scene = scene
-        shapes, things = list(scene.obstacles), list(range(len(scene.obstacles)))
+        shapes, geometries = list(scene.obstacles), list(range(len(scene.obstacles)))
         if scene.table is not None:
             shapes.append(scene.table)
-            things.append(TABLE)
+            geometries.append(TABLE)
         if scene.floor is not None:
             shapes.append(floor_box(scene.floor))
-            things.append(FLOOR)
-        self._things = np.array([*things, ARM, POINT, NOTHING])
+            geometries.append(FLOOR)
+        self._geometries = np.array([*geometries, ARM, POINT, NOTHING])
         self._world = shape_rows(shapes), *group_points(points, point_radius)
 
     def is_free(self, states, margin=0.0, clearance=0.0, endpoint_margins=None):
-        """Whether the arm is at least `margin` away from everything: bool (...).
+        """Whether the arm keeps a margin from the scene and from itself: bool (...).
 
-        Without a margin, it is free where `RoboArmEnv.in_collision` says that it does not collide.
+        Without a margin, the answer is that of `not RoboArmEnv.in_collision(...)`.
 
         Args:
             states: (..., 7), normalised.
             margin: m, in [0, `MAX_MARGIN`): from the scene, and between the links.
             clearance: m, in [0, `MAX_MARGIN`): from the scene, in addition.
-            endpoint_margins: None, or `(states (k, 7), distances (k,), growth)`. Near these states the
-                margin is smaller: `distance + growth * d` at most, where d is how far away they are
-                (L2, normalised). For queries that begin or end nearer to something than `margin`.
+            endpoint_margins: None, or `(states (k, 7), distances (k,), growth)`: smaller margins
+                around endpoints that are nearer to geometry than `margin`. At L2 distance d
+                (normalised) from one of the states, the margin is at most `distance + growth * d`.
                 Each configuration, or motion, may have its own: (..., k, 7) and (..., k).
         """
         states = _states("states", states)
@@ -142,14 +143,14 @@ class CollisionChecker:
     ):
         """Whether straight motions are free: bool (...).
 
-        Checked are both ends, then points between them that are no more than `resolution` apart:
-        first in the middle, then in the middle of each half, and so on, until one is not free.
+        The ends are checked first, then points between them that are at most `resolution` apart:
+        the middle, then the middle of each half, and so on, until one is not free.
 
         Args:
             starts, ends: (..., 7), normalised; one may be broadcast to the other.
             margin, clearance, endpoint_margins: as for `is_free`.
             resolution: L2, normalised, > 0.
-            ends_known: both ends are known to be free, and not looked at.
+            ends_known: both ends are known to be free, and are not checked.
         """
         arguments = starts, ends, margin, clearance, endpoint_margins, resolution, ends_known
         return self.motion_checks(*arguments) >= 0
@@ -164,7 +165,7 @@ class CollisionChecker:
         resolution=RESOLUTION,
         ends_known=False,
     ):
-        """How many configurations `is_motion_free` looks at, int64 (...); negative: not free."""
+        """How many configurations `is_motion_free` checks, int64 (...); negative: not free."""
         starts, ends = np.broadcast_arrays(_states("starts", starts), _states("ends", ends))
         rule = _rule(margin, clearance, endpoint_margins, resolution, batch=starts.shape[:-1])
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
@@ -175,26 +176,25 @@ class CollisionChecker:
     def motion_checker(
         self, margin=0.0, clearance=0.0, endpoint_margins=None, resolution=RESOLUTION
     ):
-        """For planners, which ask for one motion at a time: a function of two tuples of 7 floats.
+        """`motion_checks` of one motion, for planners: a function of two tuples of 7 floats.
 
-        It is `motion_checks` for one motion from a start that is known to be free, which is not
-        looked at again; and it does not look at its arguments.
+        The function assumes that the start is free, and does not validate its arguments.
         """
         rule, endpoint_margins = _rule(margin, clearance, endpoint_margins, resolution)
         return functools.partial(motion, rule, endpoint_margins[0], arm_hulls(), self._world, False)
 
     def signed_distances(self, states, self_collisions=True, within=math.inf):
-        """How far each of `panda.COLLISION_LINKS` is from the nearest thing, and which way is out: a `SignedDistances`.
+        """The `SignedDistances` of `panda.COLLISION_LINKS` from the nearest geometry.
 
         Args:
             states: (..., 7), normalised.
-            self_collisions: whether other links are things, too (`panda.SELF_COLLISION_PAIRS`).
-            within: m; nothing is said of what is farther away than that.
+            self_collisions: whether other links count (`panda.SELF_COLLISION_PAIRS`).
+            within: m; geometry farther away counts as `NOTHING`.
         """
         states = _states("states", states)
         batch = (*states.shape[:-1], NUM_LINKS)
-        distance, which = np.empty(batch), np.empty(batch, dtype=np.int64)
-        direction, point = np.empty((*batch, 3)), np.empty((*batch, 3))
+        distance, geometry = np.empty(batch), np.empty(batch, dtype=np.int64)
+        normal, witness = np.empty((*batch, 3)), np.empty((*batch, 3))
         gradient = np.empty((*batch, panda.NUM_JOINTS))
         signed_distances_batch(
             states.reshape(-1, 7),
@@ -203,30 +203,29 @@ class CollisionChecker:
             arm_hulls(),
             self._world,
             distance.reshape(-1, NUM_LINKS),
-            direction.reshape(-1, NUM_LINKS, 3),
-            point.reshape(-1, NUM_LINKS, 3),
+            normal.reshape(-1, NUM_LINKS, 3),
+            witness.reshape(-1, NUM_LINKS, 3),
             gradient.reshape(-1, NUM_LINKS, panda.NUM_JOINTS),
-            which.reshape(-1, NUM_LINKS),
+            geometry.reshape(-1, NUM_LINKS),
         )
-        return SignedDistances(distance, direction, point, gradient, self._things[which])
+        return SignedDistances(distance, normal, witness, gradient, self._geometries[geometry])
 
     def link_distances(self, states, self_collisions=False, within=LINK_DISTANCE_RANGE):
-        """`link_distances` as `envs.wrappers.LinkDistancesWrapper` has it: float32 (..., 10, 8).
+        """The observation of `envs.wrappers.LinkDistancesWrapper`: float32 (..., 10, 8).
 
-        A row per one of `panda.COLLISION_LINKS`: `SignedDistances.distance` in m, clipped to `within`, and
-        `SignedDistances.gradient`, in m per unit of normalised configuration.
+        Each of `panda.COLLISION_LINKS` has a row: `SignedDistances.distance` in m, clipped to
+        `within`, and `SignedDistances.gradient`, in m per unit of normalised configuration.
 
         Args:
-            states: (..., 7), normalised; beyond the limits, which an arm may be a little, it is
-                that of the limits.
-            self_collisions, within: as for `nearest`.
+            states: (..., 7), normalised. An arm may exceed its limits a little: such states are
+                clipped to the limits.
+            self_collisions, within: as for `signed_distances`.
         """
         states = _numbers("states", states)
         rows = np.empty((*states.shape[:-1], NUM_LINKS, 8), dtype=np.float32)
         flat = states.reshape(-1, 7), rows.reshape(-1, NUM_LINKS, 8)
-        if not link_distances_batch(
-            *flat, bool(self_collisions), float(within), arm_hulls(), self._world
-        ):
+        options = bool(self_collisions), float(within)
+        if not link_distances_batch(*flat, *options, arm_hulls(), self._world):
             raise ValueError("states must be normalised configurations, not NaN")
         return rows
 
@@ -247,17 +246,17 @@ def _numbers(name, states):
 def _states(name, states):
     """Normalised configurations as a contiguous float64 array. Raises ValueError."""
     states = _numbers(name, states)
-    # float32 may round a limit to just beyond it. NaN is not at most anything.
+    # float32 may round a limit to just beyond it. (A comparison with NaN is false.)
     if states.size and not np.abs(states).max() <= 1.0 + 1e-6:
         raise ValueError(f"{name} must be normalised configurations: finite, in [-1, 1]")
     return states
 
 
 def _rule(margin, clearance, endpoint_margins, resolution=RESOLUTION, batch=()):
-    """What is asked for, as the compiled functions take it. Raises ValueError.
+    """The arguments of `is_free` and `is_motion_free` as arrays. Raises ValueError.
 
-    Returns float64 (4,): margin, clearance, growth, resolution; and (n, k, 8): states and distances
-    for each of a batch, or n = 1 for all of it.
+    Returns float64 (4,): margin, clearance, growth, resolution; and the endpoints' states and
+    distances, (n, k, 8), with n = 1 if they hold for the whole batch.
     """
     for name, value in (("margin", margin), ("clearance", clearance)):
         if not 0 <= value < MAX_MARGIN:

@@ -11,8 +11,8 @@ from roboarm_nmp.envs.collision.kernels import BULLET_MARGIN, CELLS, ROW, SPHERE
 from roboarm_nmp.envs.scenes.primitives import Cylinder, Sphere, to_array
 
 MAX_MARGIN = 0.5
-"""m. Larger margins are refused."""
-# Points are looked at in groups of about this size (m).
+"""m. Margins and radii of points must be smaller."""
+# Edge (m) of the cubes that group points.
 _GROUP_SIZE = 0.16
 
 
@@ -20,17 +20,18 @@ _GROUP_SIZE = 0.16
 def arm_hulls():
     """The links' hulls as PyBullet makes them: `(bodies, pairs, vertices, cells)`.
 
-    `bodies`: float64 (11, 8), the base and `panda.COLLISION_LINKS`: the frame in which it moves (0: the base's, or
-    the number of a joint), the centre of its bounding box there 3, the radius of the sphere around
-    that, half edges 3. `pairs`: int64 (n, 2), the bodies that may touch each other. `vertices`:
-    float64 (v, 3), m, from their body's centre. `cells`: see `_cells`.
+    `bodies`: float64 (11, 8), the base and `panda.COLLISION_LINKS`: the frame in which a body moves
+    (0 for the base's, otherwise the number of a joint), the centre of its bounding box there 3, the
+    radius of the sphere around that centre, half edges 3. `pairs`: int64 (n, 2), the bodies that
+    may collide. `vertices`: float64 (v, 3), m, relative to their body's centre. `cells`: see
+    `_cells`.
     """
     client = p.connect(p.DIRECT)
     try:
         robot = panda.load(client)
         meshes = []
         for link in (-1, *panda.COLLISION_LINKS):
-            # PyBullet gives them relative to the link's centre of mass.
+            # PyBullet's vertices are relative to the link's centre of mass.
             mass_centre = p.getDynamicsInfo(robot, link, physicsClientId=client)[3]
             flags = p.MESH_DATA_SIMULATION_MESH
             mesh = p.getMeshData(robot, link, flags=flags, physicsClientId=client)[1]
@@ -56,14 +57,14 @@ def arm_hulls():
 
 
 def _cells(meshes):
-    """Which vertices can be the farthest one of their hull, for each cell of directions.
+    """The vertices that can be the farthest one of their hull, for each cell of directions.
 
-    A cell's directions are mixtures of those of its four corners, so what another vertex beats in
-    all four of them is never the farthest: some five vertices of 150 are left.
+    A cell's directions are mixtures of those of its four corners, so a vertex that another one
+    beats in all four is never the farthest: about five vertices of 150 remain.
 
     Returns:
-        An int64 array: for each cell (body by body, face by face) where in this array the indices
-        of its vertices begin; where the last ones end; and then these indices.
+        An int64 array: for each cell (body by body, face by face) the position in this array where
+        the indices of its vertices begin; the position where the last ones end; then the indices.
     """
     steps = np.linspace(-1.0, 1.0, CELLS + 1)
     u, v = np.meshgrid(steps, steps, indexing="ij")
@@ -107,12 +108,12 @@ def shape_rows(obstacles):
 
 
 def group_points(points, radius):
-    """Points, in groups that lie together, as the compiled functions take them. Raises ValueError.
+    """Points in groups of neighbours, as the compiled functions take them. Raises ValueError.
 
     Returns:
-        `points`: float64 (n, 3), m. `groups`: float64 (g, 6): the centre (m) of a group, how far
-        its points are from it at most, the first of them, and the one after the last. `ball`:
-        float64 (1, `ROW`), a point as a shape.
+        `points`: float64 (n, 3), m. `groups`: float64 (g, 6): the centre (m) of a group, the
+        largest distance (m) of its points from the centre, the index of its first point, and the
+        index after its last. `ball`: float64 (1, `ROW`), a point as a shape.
     """
     points = np.asarray(points, dtype=np.float64)
     if not points.size:
@@ -120,7 +121,7 @@ def group_points(points, radius):
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points must have shape (n, 3), got {points.shape}")
     if not (np.isfinite(points).all() and 0 <= radius < MAX_MARGIN):
-        raise ValueError("points need finite numbers, and a radius from 0 to under half a metre")
+        raise ValueError(f"points must be finite, with a radius in [0, {MAX_MARGIN}) m")
     _, cell = np.unique(
         np.floor(points / _GROUP_SIZE).astype(np.int64), axis=0, return_inverse=True
     )

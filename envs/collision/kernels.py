@@ -1,42 +1,34 @@
-"""Everything that Numba compiles: collision checks, signed distances, the projection of the safety filter.
+"""All that Numba compiles: collision checks, signed distances, the safety filter's projection.
 
-All of it stands in one file, because Numba's cache on disk does not notice changes in other files.
-All functions compute in float64. Working memory is float64: `frames` (8, 12), a rotation (row-major) and a position
-each; `centres` (11, 3), of the bodies; `pose` (12,), of a shape in a body's frame; `simplex`, see
-`_gjk`; `other` (1, `ROW`), a link as the shape that another link may hit.
+One file holds all of it, because Numba's cache on disk does not notice changes in other files.
+
+All functions compute in float64. Their working memory: `frames` (8, 12), a rotation (row-major) and
+a position each; `centres` (11, 3), of the bodies; `pose` (12,), of a shape in a body's frame;
+`simplex`, see `_gjk`; `other` (1, `ROW`), a link as the shape that another link may hit. What `arm`
+and `world` hold: `arm_hulls`, `shape_rows` and `group_points` in `hulls`.
 """
 
 import math
 
-import numba
 import numpy as np
 
 from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.collision.numba_cache import compiled
 
 BULLET_MARGIN = 0.001
 """m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
 FAR = 1e9  # m: farther than anything
 # A row describes a convex shape: kind, centre 3, rotation 9 (row-major), half edges of its core 3,
-# rounding, and of a link which one. The shape is all that is within `rounding` of the core, which
-# is a box or a cylinder less its rounding, a sphere's centre, or a link's hull.
-# Kinds are those of `envs.scenes.primitives.to_array`, and one more.
+# rounding, and the body's index if it is a link. The shape is the set of points within `rounding`
+# of its core: a box or a cylinder less its rounding, a sphere's centre, or a link's hull.
+# Kinds are those of `envs.scenes.primitives.to_array`, and `LINK`.
 CYLINDER, SPHERE, LINK = 1, 2, 3
 ROW = 18
-# Directions fall into this many cells squared on each face of a cube, see `_cells`.
+# Each face of the cube of directions has this many cells squared, see `hulls._cells`.
 CELLS = 8
 # GJK stops at this precision (m), after 3 to 10 iterations in nearly all cases; EPA at its own.
 _TOLERANCE, _MAX_ITERATIONS = 1e-8, 64
 _EPA_TOLERANCE, _EPA_VERTICES, _EPA_FACES = 1e-7, 128, 768
-
-
-def compiled(function):
-    """Numba's `njit`, cached on disk if there is a folder for that which can be written to."""
-    options = {"nogil": True, "error_model": "numpy"}
-    try:
-        return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # neither beside this file nor in the user's own cache
-        return numba.njit(**options)(function)
-
 
 _LOWER, _SPAN = tuple(panda.LOWER.tolist()), tuple((panda.UPPER - panda.LOWER).tolist())
 _JOINTS = tuple(
@@ -69,7 +61,7 @@ def _place(q, bodies, frames, centres):
         for i in range(0, 9, 3):
             rx, ry, rz = here[i], here[i + 1], here[i + 2]
             there[9 + i // 3] = here[9 + i // 3] + rx * x + ry * y + rz * z
-            # Turned by the roll about x, then by the joint about its z.
+            # Rotated by the roll about x, then by the joint about its z.
             ty, tz = cr * ry + sr * rz, cr * rz - sr * ry
             there[i] = c * rx + s * ty
             there[i + 1] = c * ty - s * rx
@@ -93,7 +85,7 @@ def _sphere_gap(rows, j, centres, k):
 
 @compiled
 def _box_gap(bodies, k, frames, centres, points, j, pose):
-    """Distance (m) of a point from the box around a body. Writes its place to `pose`."""
+    """Distance (m) of a point from the box around a body. Writes its position to `pose`."""
     f = frames[int(bodies[k, 0])]
     x, y, z = (
         points[j, 0] - centres[k, 0],
@@ -126,7 +118,7 @@ def _box_gaps(bodies, k, frames, centres, points, begin, end, gaps):
 
 @compiled
 def _relative(rows, j, frames, f, centres, k, pose):
-    """Write the pose of a shape as a body sees it: rotation (row-major) and place."""
+    """Write the pose of a shape in a body's frame: rotation (row-major) and position."""
     x, y, z = rows[j, 1] - centres[k, 0], rows[j, 2] - centres[k, 1], rows[j, 3] - centres[k, 2]
     for i in range(3):
         a, b, c = frames[f, i], frames[f, 3 + i], frames[f, 6 + i]
@@ -137,7 +129,7 @@ def _relative(rows, j, frames, f, centres, k, pose):
 
 @compiled
 def _boxes_apart(bodies, k, rows, j, pose, gap):
-    """Whether a face of the body's box, or of that around the core, lies between them by `gap`."""
+    """Whether a face of the body's box, or of the box around the core, separates them by `gap`."""
     for i in range(3):
         reach = bodies[k, 5 + i]
         for n in range(3):
@@ -156,7 +148,7 @@ def _boxes_apart(bodies, k, rows, j, pose, gap):
 
 @compiled
 def _begin(rows, j, pose, s):
-    """Write to s[28:31] a vector from a core towards a body, for `_gjk` to begin with."""
+    """Write a vector from a core towards a body to s[28:31], where `_gjk` begins."""
     # From the nearest point of the box around the core to the body's centre, in the core's axes.
     u = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
     v = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
@@ -271,9 +263,9 @@ def _triangle(s, a, b, c):
 
 @compiled
 def _reduce(s, n):
-    """Keep of a simplex of `n` points those that span its point nearest to the origin.
+    """Reduce a simplex of `n` points to those that span its point nearest to the origin.
 
-    Their weights go to s[24:28]. Returns how many are left; 4 if the origin is inside.
+    Their weights go to s[24:28]. Returns their number; 4 if the origin is inside.
     """
     if n == 4:
         best, without = FAR, -1
@@ -294,7 +286,7 @@ def _reduce(s, n):
                 best, without, u, v, w = squared, face, x, y, z
         if without < 0:
             return 4
-        # In the order of `_triangle`: a, b, c are the points after `without`, around and around.
+        # In the order of `_triangle`: a, b, c are the points after `without`, cyclically.
         if without == 0:
             s[24], s[25], s[26], s[27] = 0.0, u, v, w
         elif without == 1:
@@ -329,11 +321,11 @@ def _reduce(s, n):
 def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
     """Distance (m) of a body's hull from a shape's core; 0 where they overlap.
 
-    It may stop early: at a lower bound of the distance that is at least `far`, or at an upper bound
-    that is below `near`, which it then returns. Writes to `s`: the simplex's points (3 x 4) of body
-    minus core, the body's vertices they come from (3 x 4), weights (4), and at the end the vector
-    from the core to the hull (3) and how far away the hull is at least along it (or -`FAR`). On
-    entry, the vector is any one to begin with. `pose` is the core's.
+    It stops early, and returns the bound, where a lower bound of the distance is at least `far` or
+    an upper bound is below `near`. Writes to `s`: the simplex's points (3 x 4) of body minus core,
+    the body's vertices that they come from (3 x 4), weights (4), the vector from the core to the
+    hull (3), and a lower bound of the distance along that vector (or -`FAR`). On entry, the vector
+    is any initial one. `pose` is the core's.
 
     Returns the distance and the number of points in the simplex.
     """
@@ -356,7 +348,7 @@ def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
             y += s[24 + i] * s[3 * i + 1]
             z += s[24 + i] * s[3 * i + 2]
         distance = math.sqrt(x * x + y * y + z * z)
-        if distance < 1e-9:  # they touch, in a way that tells no direction
+        if distance < 1e-9:  # contact: the vector has no direction
             return 0.0, n
         s[28], s[29], s[30] = x, y, z
         if distance < near or distance >= bound:
@@ -377,7 +369,7 @@ def _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap
 
 @compiled
 def _as_row(bodies, k, frames, centres, row):
-    """Write a body as a shape."""
+    """Write a body as a shape to `row` (1, `ROW`)."""
     row[0, 0], row[0, 16], row[0, 17] = LINK, BULLET_MARGIN, k
     for i in range(3):
         row[0, 1 + i], row[0, 13 + i] = centres[k, i], bodies[k, 5 + i]
@@ -432,6 +424,7 @@ def _is_free(q, rule, endpoint_margins, arm, world, memory):
 
 @compiled
 def free_batch(states, rule, endpoint_margins, arm, world, free):
+    """Write `CollisionChecker.is_free` of states (n, 7) to `free` (n,)."""
     memory = _memory()
     for i in range(states.shape[0]):
         near = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
@@ -440,37 +433,38 @@ def free_batch(states, rule, endpoint_margins, arm, world, free):
 
 @compiled
 def motion(rule, endpoint_margins, arm, world, end_known, start, end):
-    """How many states of a motion were looked at, not counting its start; negative: not free."""
+    """Number of states of a motion that were checked, without its start; negative: not free."""
     memory, q = _memory(), np.empty(7)
     squared = 0.0
     for j in range(7):
         squared += (end[j] - start[j]) ** 2
     pieces = int(math.ceil(math.sqrt(squared) / rule[3]))
-    looked_at, parts, part = 0, 1, 1
+    checks, parts, part = 0, 1, 1
     if end_known:
         parts = 2
         if pieces < 2:
             return 0
     while True:
         i = part * pieces // parts  # of `pieces`: first the end, then the middle, ...
-        # Unless an earlier, coarser round has looked at that.
+        # Unless an earlier, coarser round has checked that state.
         before, after = (part - 1) * pieces // parts, (part + 1) * pieces // parts
         if parts == 1 or (i != before and i != after):
             share = i / pieces if pieces > 0 else 1.0
             for j in range(7):
                 q[j] = start[j] + (end[j] - start[j]) * share
-            looked_at += 1
+            checks += 1
             if not _is_free(q, rule, endpoint_margins, arm, world, memory):
-                return -looked_at
+                return -checks
         part += 2
         if part > parts:
             if parts >= pieces:
-                return looked_at
+                return checks
             parts, part = 2 * parts, 1
 
 
 @compiled
 def motion_batch(starts, stops, rule, endpoint_margins, arm, world, ends_known, checks):
+    """Write `CollisionChecker.motion_checks` of motions (n, 7), (n, 7) to `checks` (n,)."""
     memory = _memory()
     for i in range(starts.shape[0]):
         near = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
@@ -484,7 +478,7 @@ def motion_batch(starts, stops, rule, endpoint_margins, arm, world, ends_known, 
         checks[i] = more + 1 if more > 0 else more - 1
 
 
-# --- Compiled: distances
+# --- Signed distances
 
 
 @compiled
@@ -509,8 +503,9 @@ def _add_face(s, faces, n, a, b, c):
 def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
     """Depth (m) of a body's hull in a shape's core, from a simplex of `_gjk` around the origin.
 
-    Writes the way out to s[28:31], and the body's deepest point to s[24:27]. `points`:
-    (`_EPA_VERTICES`, 6), `faces`: (`_EPA_FACES`, 7), `edges`: (`_EPA_FACES`, 2).
+    Writes the normal, along which the body leaves the core, to s[28:31], and the body's deepest
+    point to s[24:27]. Working memory: `points` (`_EPA_VERTICES`, 6), `faces` (`_EPA_FACES`, 7),
+    `edges` (`_EPA_FACES`, 2).
     """
     for i in range(4):
         for n in range(3):
@@ -519,7 +514,7 @@ def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
     for face in range(4):
         a, b, c = (face + 1) % 4, (face + 2) % 4, (face + 3) % 4
         num_faces = _add_face(points, faces, num_faces, a, b, c)
-        if faces[num_faces - 1, 6] < 0.0:  # it looked inwards
+        if faces[num_faces - 1, 6] < 0.0:  # its normal points inwards
             num_faces = _add_face(points, faces, num_faces - 1, a, c, b)
     while True:
         nearest = 0
@@ -530,23 +525,23 @@ def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
         x, y, z = face[3], face[4], face[5]
         px, py, pz, ax, ay, az = _support(vertices, cells, k, rows, j, pose, x, y, z)
         further = x * px + y * py + z * pz - face[6]
-        # (At most three times as many faces come out of the next round.)
+        # (The next round has at most three times as many faces.)
         full = num_points == points.shape[0] or 3 * num_faces > faces.shape[0]
         if further <= _EPA_TOLERANCE or full:
             break
         new = points[num_points]
         new[0], new[1], new[2], new[3], new[4], new[5] = px, py, pz, ax, ay, az
-        # Faces that the new point sees make room for those between it and their outline.
+        # Faces visible from the new point are replaced by faces between it and their outline.
         num_edges, f = 0, 0
         while f < num_faces:
-            seen = faces[f, 3] * px + faces[f, 4] * py + faces[f, 5] * pz - faces[f, 6]
-            if seen <= 1e-12:
+            height = faces[f, 3] * px + faces[f, 4] * py + faces[f, 5] * pz - faces[f, 6]
+            if height <= 1e-12:
                 f += 1
                 continue
             for i in range(3):
                 a, b = int(faces[f, i]), int(faces[f, (i + 1) % 3])
                 for e in range(num_edges):
-                    if edges[e, 0] == b and edges[e, 1] == a:  # between two that are seen
+                    if edges[e, 0] == b and edges[e, 1] == a:  # between two visible faces
                         num_edges -= 1
                         edges[e, 0], edges[e, 1] = edges[num_edges, 0], edges[num_edges, 1]
                         break
@@ -559,7 +554,7 @@ def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
             num_faces = _add_face(points, faces, num_faces, edges[e, 0], edges[e, 1], num_points)
         num_points += 1
     depth = face[6]
-    # The origin's shadow on that face, as a mean of its corners, and so of the body's vertices.
+    # The origin's projection on that face, as a mean of its corners, so of the body's vertices.
     triangle = np.empty(9)
     for i in range(3):
         for n in range(3):
@@ -579,12 +574,13 @@ def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
 def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope):
     """Distance (m) of a body's hull from a shape's core, minus the depth where they overlap.
 
-    `FAR` if that is not less than `far`. Else s[28:31] is the way out and s[24:27] the hull's
-    nearest or deepest point, both in the body's axes and the latter from its centre.
+    `FAR` if that is not less than `far`. Otherwise s[28:31] is the normal, along which the body
+    moves away, and s[24:27] the witness: the hull's nearest or deepest point, relative to the
+    body's centre. Both are in the body's axes.
     """
     squared = _sphere_gap(rows, j, centres, k)
     reach = bodies[k, 4] + far
-    # From outside, no way out is longer than the radius less the distance.
+    # If the centre is outside of the box, the depth is at most the radius less the distance.
     if squared > 0.0 and (reach <= 0.0 or squared >= reach * reach):
         return FAR
     _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
@@ -595,10 +591,10 @@ def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose,
 
 @compiled
 def _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope):
-    """`_signed_distance` of a shape that may be near; `pose` is the core's."""
+    """`_signed_distance` without the bounds that exclude distant shapes; `pose` is the core's."""
     _begin(rows, j, pose, s)
     distance, n = _gjk(vertices, cells, k, rows, j, pose, s, -1.0, far)
-    if distance != 0.0 and distance >= far:  # (where they overlap, only the depth tells)
+    if distance != 0.0 and distance >= far:  # (where they overlap, the depth decides)
         return FAR
     if distance == 0.0:
         if n < 4:  # the origin is on a face or an edge of the simplex: move it off, by 0.1 um
@@ -622,28 +618,31 @@ def _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope):
 
 
 @compiled
-def _gradient(frames, first, last, direction, point, gradient):
-    """Write how fast a point moves along a direction with each joint, from `first` to `last`."""
+def _gradient(frames, first, last, normal, witness, gradient):
+    """Write the speed of a point along a direction per unit of each joint, `first` to `last`."""
     gradient[:] = 0.0
     for joint in range(first, last):
-        f = frames[joint + 1]  # it turns about its z
-        x, y, z = point[0] - f[9], point[1] - f[10], point[2] - f[11]
+        f = frames[joint + 1]  # the joint turns about its z
+        x, y, z = witness[0] - f[9], witness[1] - f[10], witness[2] - f[11]
         gradient[joint] = (
-            direction[0] * (f[5] * z - f[8] * y)
-            + direction[1] * (f[8] * x - f[2] * z)
-            + direction[2] * (f[2] * y - f[5] * x)
+            normal[0] * (f[5] * z - f[8] * y)
+            + normal[1] * (f[8] * x - f[2] * z)
+            + normal[2] * (f[2] * y - f[5] * x)
         ) * (0.5 * _SPAN[joint])
 
 
 @compiled
-def _write(frames, f, centres, k, s, sign, back, direction, point):
-    """Direction and point of `_signed_distance`, in the base's frame; `back` (m) from the point."""
+def _to_base(frames, f, centres, k, s, sign, back, normal, witness):
+    """Write normal and witness of `_signed_distance` in the base's frame.
+
+    `sign`: of the normal. `back`: m, from the hull's point to the shape's, which is the witness.
+    """
     for i in range(3):
         out = at = 0.0
         for n in range(3):
             out += frames[f, 3 * i + n] * s[28 + n]
             at += frames[f, 3 * i + n] * s[24 + n]
-        direction[i], point[i] = sign * out, centres[k, i] + at - back * out
+        normal[i], witness[i] = sign * out, centres[k, i] + at - back * out
 
 
 @compiled
@@ -652,8 +651,8 @@ def _cloud_distance(
 ):
     """`_signed_distance` from the nearest point of the cloud.
 
-    `gaps`: two arrays to write to, for all groups and for all points: how far (m) they are from the
-    box around the body; so they are at least that far from its hull.
+    `gaps`: working memory, two arrays for all groups and all points: their distance (m) from the
+    box around the body, a lower bound of their distance from its hull.
     """
     _, points, groups, ball = world
     of_groups, of_points = gaps
@@ -663,28 +662,28 @@ def _cloud_distance(
         of_groups[g] -= groups[g, 3]
         if middle < 0 or of_groups[g] < of_groups[middle]:
             middle = g
-    # What is probably nearest goes first: it rules out the others.
+    # The point that is probably nearest comes first: it rules out the others.
     first, least = -1, far
     for n in range(groups.shape[0]):
         g = middle if n == 0 else n - 1 if n <= middle else n
         begin, end = int(groups[g, 4]), int(groups[g, 5])
-        of_points[begin] = -1.0  # not known
+        of_points[begin] = -1.0  # not computed yet
         if of_groups[g] < least:
             _box_gaps(bodies, k, frames, centres, points, begin, end, of_points)
             for j in range(begin, end):
                 if of_points[j] < least:
                     first, least = j, of_points[j]
     nearest = FAR
-    # Planes that all of the hull is behind, seen from points that were looked at: through the
-    # hull's point that is nearest to the nearest one, and of the last one that is farther away.
+    # Two planes with the whole hull behind them: through the witness of the nearest point so far,
+    # and of the last point that turned out to be farther away.
     ax = ay = az = bx = by = bz = 0.0
     a = b = -FAR
-    x = y = z = 0.0  # the hull's point
+    x = y = z = 0.0  # the witness
     for g in range(-1 if first >= 0 else groups.shape[0], groups.shape[0]):
         begin, end = first, first + 1
         if g >= 0:
             begin, end = int(groups[g, 4]), int(groups[g, 5])
-            # (From inside of the box, no length is known to be a way out.)
+            # (Inside of the box, the gap does not bound the depth.)
             if of_groups[g] + groups[g, 3] > 0.0 and of_groups[g] >= far:
                 continue
             if of_points[begin] < 0.0:
@@ -717,11 +716,16 @@ def signed_distances_batch(
     arm,
     world,
     distance,
-    direction,
-    point,
+    normal,
+    witness,
     gradient,
-    which,
+    geometry,
 ):
+    """Write `CollisionChecker.signed_distances` of states (n, 7).
+
+    `geometry`: the index of a row, or the number of rows for another link, one more for a point,
+    two more for nothing.
+    """
     bodies, pairs, vertices, cells = arm
     rows, points, groups, ball = world
     frames, centres, pose, s, other = _memory()
@@ -732,12 +736,13 @@ def signed_distances_batch(
     )
     gaps = np.empty(groups.shape[0]), np.empty(points.shape[0])
     of_arm = rows.shape[0]
-    distance[:], direction[:], point[:], which[:] = within, 0.0, 0.0, of_arm + 2
+    distance[:], normal[:], witness[:], geometry[:] = within, 0.0, 0.0, of_arm + 2
     for i in range(states.shape[0]):
         _place(states[i], bodies, frames, centres)
         for k in range(1, bodies.shape[0]):
             f, link = int(bodies[k, 0]), k - 1
-            first, least = 0, FAR  # what is probably nearest goes first: it rules out the others
+            # The shape that is probably nearest comes first: it rules out the others.
+            first, least = 0, FAR
             for j in range(rows.shape[0]):
                 squared = _sphere_gap(rows, j, centres, k)
                 if squared < least:
@@ -750,17 +755,17 @@ def signed_distances_batch(
                     bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope
                 )
                 if core < far:
-                    distance[i, link], which[i, link] = core - rounding, j
-                    _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
+                    distance[i, link], geometry[i, link] = core - rounding, j
+                    _to_base(frames, f, centres, k, s, 1.0, 0.0, normal[i, link], witness[i, link])
             rounding = ball[0, 16] + BULLET_MARGIN
             far = min(distance[i, link] + rounding, FAR)
             core = _cloud_distance(
                 bodies, vertices, cells, k, world, frames, centres, pose, s, far, polytope, gaps
             )
             if core < far:
-                distance[i, link], which[i, link] = core - rounding, of_arm + 1
-                _write(frames, f, centres, k, s, 1.0, 0.0, direction[i, link], point[i, link])
-            _gradient(frames, 0, f, direction[i, link], point[i, link], gradient[i, link])
+                distance[i, link], geometry[i, link] = core - rounding, of_arm + 1
+                _to_base(frames, f, centres, k, s, 1.0, 0.0, normal[i, link], witness[i, link])
+            _gradient(frames, 0, f, normal[i, link], witness[i, link], gradient[i, link])
         rounding = 2 * BULLET_MARGIN
         for j in range(pairs.shape[0] if self_collisions else 0):
             a, b = pairs[j, 0], pairs[j, 1]
@@ -774,22 +779,25 @@ def signed_distances_batch(
             for body, sign, back in ((a, 1.0, 0.0), (b, -1.0, core)):
                 link = body - 1
                 if link >= 0 and core < FAR and core - rounding < distance[i, link]:
-                    distance[i, link], which[i, link] = core - rounding, of_arm
-                    there, at = direction[i, link], point[i, link]
-                    _write(frames, fa, centres, a, s, sign, back, there, at)
-                    # Joints that move both change nothing. What those between them move is one of
-                    # the two: the other way round for the one that they do not move.
+                    distance[i, link], geometry[i, link] = core - rounding, of_arm
+                    there, at = normal[i, link], witness[i, link]
+                    _to_base(frames, fa, centres, a, s, sign, back, there, at)
+                    # Joints that move both links change nothing. A joint between them moves one of
+                    # the two: the sign is the opposite for the link that it does not move.
                     _gradient(frames, min(fa, fb), max(fa, fb), there, at, gradient[i, link])
                     if bodies[body, 0] < max(fa, fb):
                         gradient[i, link] *= -1.0
         for link in range(distance.shape[1]):
-            if which[i, link] == of_arm + 2:
+            if geometry[i, link] == of_arm + 2:
                 distance[i, link] = np.inf
 
 
 @compiled
 def link_distances_batch(states, rows, self_collisions, within, arm, world):
-    """Write what `CollisionChecker.link_distances` returns, unless a state is NaN: whether none is."""
+    """Write `CollisionChecker.link_distances` of states (n, 7) to `rows` (n, 10, 8).
+
+    Returns False, and writes nothing, if a state is NaN.
+    """
     clipped = np.empty(states.shape)
     for i in range(states.shape[0]):
         for j in range(states.shape[1]):
@@ -797,10 +805,10 @@ def link_distances_batch(states, rows, self_collisions, within, arm, world):
                 return False
             clipped[i, j] = min(max(states[i, j], -1.0), 1.0)
     batch = rows.shape[0], rows.shape[1]
-    distance, which = np.empty(batch), np.empty(batch, np.int64)
-    direction, point = np.empty((batch[0], batch[1], 3)), np.empty((batch[0], batch[1], 3))
+    distance, geometry = np.empty(batch), np.empty(batch, np.int64)
+    normal, witness = np.empty((batch[0], batch[1], 3)), np.empty((batch[0], batch[1], 3))
     gradient = np.empty((batch[0], batch[1], 7))
-    found = distance, direction, point, gradient, which
+    found = distance, normal, witness, gradient, geometry
     signed_distances_batch(clipped, self_collisions, within, arm, world, *found)
     for i in range(batch[0]):
         for link in range(batch[1]):
@@ -814,21 +822,34 @@ def link_distances_batch(states, rows, self_collisions, within, arm, world):
 
 
 @compiled
-def project(actions, link_distances, keep, max_step, brake, near, push, sweeps):
-    """Change actions (n, 7) in place."""
+def project(
+    actions,
+    link_distances,
+    margins,
+    max_step,
+    cbf_gain,
+    activation_distance,
+    max_recovery,
+    projection_sweeps,
+):
+    """Change actions (n, 7) in place: `envs.policies.safety_filter.SafetyFilter.__call__`.
+
+    Each sweep projects an action onto one link's half-space after the other.
+    `link_distances`: (n, rows, 8); `margins`: m, (n, rows).
+    """
     for i in range(actions.shape[0]):
         action = actions[i]
         _shorten(action, max_step)
-        for _ in range(sweeps):
+        for _ in range(projection_sweeps):
             for link in range(link_distances.shape[1]):
                 row = link_distances[i, link]
-                if row[0] >= near:
+                if row[0] >= activation_distance:
                     continue
                 squared = along = 0.0
                 for j in range(7):
                     squared += row[1 + j] * row[1 + j]
                     along += row[1 + j] * action[j]
-                short = min(brake * (keep[i, link] - row[0]), push) - along
+                short = min(cbf_gain * (margins[i, link] - row[0]), max_recovery) - along
                 if short > 0.0 and squared > 1e-12:
                     for j in range(7):
                         action[j] += row[1 + j] * short / squared
@@ -837,6 +858,7 @@ def project(actions, link_distances, keep, max_step, brake, near, push, sweeps):
 
 @compiled
 def _shorten(action, max_step):
+    """Scale an action to a norm of at most `max_step`, in place."""
     squared = 0.0
     for j in range(7):
         squared += action[j] * action[j]

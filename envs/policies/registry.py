@@ -178,7 +178,7 @@ def make_policy(
     def begin_safely(number, query):
         act, found = begin(number, query)
         rng = np.random.default_rng([seed, number])
-        return EpisodePolicy(act and safety_filter.around(act, env, rng), found)
+        return EpisodePolicy(act and safety_filter.filter_policy(act, env, rng), found)
 
     return begin_safely
 
@@ -279,11 +279,11 @@ def _load(path):
     """A policy network, the arguments of the environment it was trained in, its last layer."""
     from roboarm_nmp.envs.networks.exported_networks import load_network
     from roboarm_nmp.envs.networks.operations import NetworkError
-    from roboarm_nmp.envs.policies.safety_filter import safety_filter_of
+    from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 
     try:
         network = load_network(path)
-        safety_filter = safety_filter_of(network.metadata)
+        safety_filter = SafetyFilter.from_metadata(network.metadata)
         recurrent_size(network)  # or it raises
     except NetworkError as error:
         raise PolicyError(str(error)) from error

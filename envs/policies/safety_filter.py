@@ -1,17 +1,29 @@
-"""A last layer for any policy: it lets no link come too near to anything, and leaves dead ends.
+"""A safety filter for any policy: a minimum clearance of every link, and escapes from local minima.
 
-    env = envs.make("random_boxes_hard", link_distances="points")
-    act = SafetyFilter().around(act, env, np.random.default_rng(0))      # at the start of an episode
+    env = roboarm_nmp.make(
+        "random_boxes_hard", geometry_source="point_cloud", link_distances=True
+    )
+    act = SafetyFilter(margin=0.01).filter_policy(act, env, rng)  # at the start of an episode
     action = act(observation)
 
-An action is changed as little as possible (L2) such that, as far as the gradients of the links'
-distances tell, each link slows down towards whatever it comes near to, none comes nearer than
-`keep`, and one that is nearer than that moves away. Things are what `link_distances` tells of, and the
-other links, of which it does not: where they are is known. As a link's nearest point may be another
-one after the step, the layer looks once more, at where the action leads.
+An action a displaces the normalised configuration q. For each link with the signed distance d(q),
+the filter enforces a discrete-time control barrier function (Agrawal and Sreenath, 2017),
 
-That alone stands still where it cannot go on; so where the arm has hardly moved for some steps, it
-goes into a random direction for a while, and does not come near that dead end again.
+    d(q + a) - d_min >= (1 - gamma) (d(q) - d_min),
+
+linearised by the gradient of d: one half-space of actions per link. d_min is the margin, and gamma
+`CBF_GAIN`. A link nearer than the margin has to move away, by at most `MAX_RECOVERY` per step.
+
+Cyclic projection onto the half-spaces finds an action that satisfies them, where there is one. The
+change is close to the smallest one (L2), and exact for a single half-space; for two, it is at most
+15 % longer (docs/experiments.md, "Projection").
+
+The nearest point of a link may change during the step. So the distances at q + a are computed, too,
+and add a second half-space per link. Distances come from the observation's geometry source, table
+and floor; those between links need no observation.
+
+Such a filter stands still in local minima. Where the arm has hardly moved for some steps, a random
+walk escapes (Barraquand and Latombe, 1991), and a virtual obstacle then keeps the arm from there.
 """
 
 import functools
@@ -26,43 +38,45 @@ from roboarm_nmp.envs.collision.kernels import project
 from roboarm_nmp.envs.scenes.primitives import Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 
-# Of what the layer does, in results: with 1 it left dead ends otherwise, and did not remember them;
-# with 2 it took slow arrivals for dead ends, and braked as much near a goal as elsewhere.
+# Of the filter's behaviour, recorded in results. 1: other escapes, no virtual obstacles. 2: slow
+# arrivals counted as local minima, and the gain was the same near a goal as elsewhere.
 VERSION = 3
 
 # The numbers below were chosen on validation and fresh queries: docs/experiments.md.
-ACTIVATION_DISTANCE = 0.15  # m, from where on a link is looked at
-# Share of the way that is left that one step may take: the arm does not stop at once.
-CBF_GAIN = 0.2
-ARRIVING = 0.2  # L2, normalised: nearer to the goal than that, it may be more: all of it in the end
-MAX_RECOVERY = 0.002  # m per step, by which a link that is too near moves away
-# Near a goal that is itself nearer to something than what is kept, as much is kept as there, and
-# this much (m) more per unit of normalised distance from it, as planners do.
-GROWTH = 0.03
-PROJECTION_SWEEPS = 12  # of projections, one link after the other
-# A dead end is where so many steps have moved the arm by less than this (L2, normalised), and by
-# less than this share of what was left to the goal: it arrives slowly where there is little room.
-PATIENCE, PROGRESS, ARRIVAL = 10, 0.06, 0.3
-DETOUR = 10  # steps into one random direction, to get out
-CARRYING = 4  # joints, from the base on, that decide where the arm is; the others turn the hand
-# After a detour the arm's own direction counts beside the policy's action: so many times as much as
-# the longest one, fading over so many steps.
-MOMENTUM, FADING = 2.0, 40
-# The carrying joints stay so far from where the arm was stuck (L2, normalised), at most this share
-# of the goal's distance from there. Beside links' distances a unit of that counts as so many m.
-AVOIDED, SHARE, METRES = 0.5, 0.9, 0.3
+ACTIVATION_DISTANCE = 0.15  # m. Links with larger distances are not constrained.
+CBF_GAIN = 0.2  # gamma: share of the remaining clearance that one step may use
+ARRIVAL_DISTANCE = 0.2  # L2, normalised: from here to the goal, the gain grows linearly to 1
+MAX_RECOVERY = 0.002  # m per step, by which a link nearer than the margin has to move away
+# If a link is nearer than the margin at the goal, its margin is smaller around the goal: its
+# distance there, and this much (m) more per unit of normalised distance from the goal.
+MARGIN_GROWTH = 0.03
+PROJECTION_SWEEPS = 12  # of cyclic projection
+
+# A local minimum is a configuration where PATIENCE steps moved the arm by less than PROGRESS (L2,
+# normalised). Close to the goal, they also have to be less than this share of the remaining
+# distance: where there is little room, the arm arrives slowly.
+PATIENCE, PROGRESS, PROGRESS_SHARE = 10, 0.06, 0.3
+ESCAPE_STEPS = 10  # into one random direction
+ESCAPE_JOINTS = 4  # from the base on: they move the arm, the others turn the hand
+# After an escape, the last action's direction is added to the policy's action: at first MOMENTUM
+# times as long as the longest action, fading over MOMENTUM_STEPS.
+MOMENTUM, MOMENTUM_STEPS = 2.0, 40
+# A virtual obstacle is a ball of the escape joints around a local minimum. Its radius (L2,
+# normalised) is at most this share of the distance to the goal. The projection takes distances in m
+# and those to virtual obstacles in normalised units, scaled by VIRTUAL_SCALE (m per unit).
+VIRTUAL_RADIUS, VIRTUAL_RADIUS_SHARE, VIRTUAL_SCALE = 0.5, 0.9, 0.3
 
 
 @dataclass(frozen=True)
 class SafetyFilter:
-    """A last layer.
+    """A filter of actions.
 
     Attributes:
-        keep: m, the distance that links keep from everything.
-        escape: whether it leaves dead ends.
+        margin: m, minimum distance of every link from the scene and from other links.
+        escape: whether to escape from local minima.
 
     Raises:
-        ValueError: `keep` is no distance below `ACTIVATION_DISTANCE`, or `escape` not a bool.
+        ValueError: `margin` is not in [0, `ACTIVATION_DISTANCE`), or `escape` is not a bool.
     """
 
     margin: float = 0.01
@@ -70,173 +84,181 @@ class SafetyFilter:
 
     def __post_init__(self):
         if not (is_number(self.margin) and 0 <= self.margin < ACTIVATION_DISTANCE):
-            raise ValueError(
-                f"keep must be a distance below {ACTIVATION_DISTANCE} m, got {self.margin!r}"
-            )
+            raise ValueError(f"margin must be in [0, {ACTIVATION_DISTANCE}) m, got {self.margin!r}")
         if not isinstance(self.escape, bool):
             raise ValueError(f"escape must be a bool, got {self.escape!r}")
 
-    def __call__(self, actions, link_distances, margin=None, max_step=MAX_STEP, brake=CBF_GAIN):
-        """Actions (..., 7), changed as little as needed: float32.
+    @classmethod
+    def from_metadata(cls, metadata):
+        """The `SafetyFilter` of a policy, from its file's metadata; None if it has none.
+
+        Its options are in `safety_filter`, a dict with `margin` and `escape`. Raises ValueError if
+        they are invalid.
+        """
+        options = metadata.get("safety_filter")
+        if options is None:
+            return None
+        try:
+            return cls(float(options["margin"]), bool(options["escape"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"invalid safety_filter in its metadata: {options!r}") from error
+
+    def __call__(self, actions, link_distances, margins=None, max_step=MAX_STEP, cbf_gain=CBF_GAIN):
+        """Actions (..., 7), float32, that satisfy the constraints of all rows, to first order.
+
+        They are close to the given actions, but not always the closest. Where the constraints
+        conflict, or the sweeps do not suffice, some are violated.
 
         Args:
             actions: (..., 7), displacements of the normalised configuration.
-            link_distances: (..., rows, 8), as `envs.wrappers.LinkDistancesWrapper` has it.
-            keep: m, (..., rows), instead of the layer's.
+            link_distances: (..., rows, 8), as from `envs.wrappers.LinkDistancesWrapper`: m, and
+                gradients in m per unit of normalised configuration.
+            margins: m, (..., rows), instead of the filter's `margin`.
             max_step: longest action (L2, normalised).
-            brake: share of the way that is left to what is kept, that one step may take.
+            cbf_gain: gamma.
         """
-        actions, link_distances = (
-            np.array(actions, np.float64),
-            np.asarray(link_distances, np.float64),
-        )
+        actions = np.array(actions, np.float64)
+        link_distances = np.asarray(link_distances, np.float64)
         rows = link_distances.shape[-2]
-        margin = np.broadcast_to(
-            self.margin if margin is None else margin, link_distances.shape[:-1]
-        )
-        margin = margin.astype(np.float64).reshape(-1, rows)
+        margins = self.margin if margins is None else margins
+        margins = np.broadcast_to(margins, link_distances.shape[:-1]).astype(np.float64)
         project(
             actions.reshape(-1, 7),
             link_distances.reshape(-1, rows, 8),
-            margin,
+            margins.reshape(-1, rows),
             max_step,
-            brake,
+            cbf_gain,
             ACTIVATION_DISTANCE,
             MAX_RECOVERY,
             PROJECTION_SWEEPS,
         )
         return actions.astype(np.float32)
 
-    def around(self, act, env, rng):
-        """`act`, a function from an observation to an action (7,), with this layer: another one.
-
-        For one episode.
+    def filter_policy(self, act, env, rng):
+        """A policy through this filter, for one episode.
 
         Args:
-            act: the function.
-            env: the `RoboArmEnv` that the episode is in. See `check_env`.
-            rng: a NumPy Generator, for the directions out of dead ends.
+            act: the policy, a function from an observation to an action (7,).
+            env: the `RoboArmEnv` of the episode. See `check_env`.
+            rng: a NumPy Generator, for the directions of escapes.
+
+        Returns:
+            A function like `act`.
         """
         link_distances_at, max_step = env.get_wrapper_attr("link_distances_at"), env.max_step
-        dead_ends, goal_distances = _DeadEnds(rng, max_step), None
+        local_minima, goal_distances = _LocalMinima(rng, max_step), None
 
         def act_safely(observation):
             nonlocal goal_distances
             state, goal = observation["observation"][: panda.NUM_JOINTS], None
             here = np.concatenate([observation["link_distances"], _self_distances(state)])
-            margin, brake = np.broadcast_to(self.margin, len(here)), CBF_GAIN
+            margins, cbf_gain = np.broadcast_to(self.margin, len(here)), CBF_GAIN
             if "goal_link_distances" in observation:
                 goal = observation["desired_goal"][: panda.NUM_JOINTS]
                 if goal_distances is None:
                     rows = observation["goal_link_distances"], _self_distances(goal)
                     goal_distances = np.concatenate(rows)[:, 0]
-                away = np.linalg.norm(state - goal)
-                margin = self.margins_near_goal(goal_distances, away)
-                brake = max(CBF_GAIN, 1.0 - (1.0 - CBF_GAIN) * away / ARRIVING)
-            action = dead_ends.detour(state, goal) if self.escape else None
+                remaining = np.linalg.norm(state - goal)
+                margins = self.margins_near_goal(goal_distances, remaining)
+                cbf_gain = max(CBF_GAIN, 1.0 - (1.0 - CBF_GAIN) * remaining / ARRIVAL_DISTANCE)
+            action = local_minima.escape(state, goal) if self.escape else None
             if action is None:
-                action = dead_ends.with_momentum(act(observation))
-            # Dead ends come first: things have the last word.
-            avoided = dead_ends.rows(state)
-            here = np.concatenate([avoided, here])
-            kept_here = np.concatenate([np.zeros(len(avoided)), margin])
-            move = self(action, here, kept_here, max_step, brake)
-            # The second look: what is near there, as if its gradient were the same all the way.
+                action = local_minima.add_momentum(act(observation))
+            # Virtual obstacles come first: the last projections of a sweep prevail.
+            virtual = local_minima.virtual_obstacles(state)
+            here = np.concatenate([virtual, here])
+            margins_here = np.concatenate([np.zeros(len(virtual)), margins])
+            move = self(action, here, margins_here, max_step, cbf_gain)
+            # Distances at the end of the step, extrapolated back to its start.
             there = np.concatenate([link_distances_at(state + move), _self_distances(state + move)])
             there[:, 0] -= there[:, 1:] @ move
-            rows, kept = np.concatenate([here, there]), np.concatenate([kept_here, margin])
-            dead_ends.last_action = self(action, rows, kept, max_step, brake)
-            return dead_ends.last_action
+            rows = np.concatenate([here, there])
+            margins = np.concatenate([margins_here, margins])
+            local_minima.last_action = self(action, rows, margins, max_step, cbf_gain)
+            return local_minima.last_action
 
         return act_safely
 
-    def margins_near_goal(self, goal_distances, away):
-        """m that each link keeps, (rows,): less near a goal that is nearer to something itself.
+    def margins_near_goal(self, goal_distances, remaining):
+        """Margins of the links, m, (rows,): smaller near a goal that violates the filter's margin.
 
         Args:
             goal_distances: m, (rows,), at the goal.
-            away: from the goal, L2, normalised.
+            remaining: distance from the goal, L2, normalised.
         """
-        return np.minimum(self.margin, goal_distances + GROWTH * away)
+        return np.minimum(self.margin, goal_distances + MARGIN_GROWTH * remaining)
 
 
-class _DeadEnds:
-    """Those of one episode: how to leave them, and where not to come again."""
+class _LocalMinima:
+    """The local minima of one episode: escapes from them, and virtual obstacles around them."""
 
     def __init__(self, rng, max_step):
         self.rng, self.max_step = rng, max_step
-        self.before, self.left, self.direction = deque(maxlen=PATIENCE + 1), 0, None
+        self.states = deque(maxlen=PATIENCE + 1)  # since the last escape
+        self.steps_left, self.direction = 0, None  # of an escape
         self.momentum, self.last_action = 0.0, None
-        self.avoided = []  # configurations of the carrying joints, and how far they stay from there
+        self.obstacles = []  # configuration of the escape joints, radius
 
-    def detour(self, state, goal):
-        """The next action of a way out (7,), or None: there is none to leave.
+    def escape(self, state, goal):
+        """The next action of an escape, (7,); None where none is needed.
 
         Args:
             state: configuration (7,), normalised.
-            goal: the goal's configuration, or None: nobody knows where not to go.
+            goal: the goal's configuration, or None if it is unknown: then there are no virtual
+                obstacles, which might contain it.
         """
-        self.before.append(state)
-        moved, least = np.linalg.norm(state - self.before[0]), PROGRESS
+        self.states.append(state)
+        moved, progress = np.linalg.norm(state - self.states[0]), PROGRESS
         if goal is not None:
-            least = min(PROGRESS, ARRIVAL * np.linalg.norm(goal - self.before[0]))
-        if self.left == 0 and len(self.before) > PATIENCE and moved < least:
-            direction = self.rng.standard_normal(CARRYING)
-            self.left, self.direction = DETOUR, np.zeros(panda.NUM_JOINTS)
-            self.direction[:CARRYING] = direction * (self.max_step / np.linalg.norm(direction))
+            remaining = np.linalg.norm(goal - self.states[0])
+            progress = min(PROGRESS, PROGRESS_SHARE * remaining)
+        if self.steps_left == 0 and len(self.states) > PATIENCE and moved < progress:
+            direction = self.rng.standard_normal(ESCAPE_JOINTS)
+            self.steps_left, self.direction = ESCAPE_STEPS, np.zeros(panda.NUM_JOINTS)
+            self.direction[:ESCAPE_JOINTS] = direction * (self.max_step / np.linalg.norm(direction))
             if goal is not None:
-                away = np.linalg.norm((goal - state)[:CARRYING])
-                self.avoided.append((state[:CARRYING], min(AVOIDED, SHARE * away)))
-        if self.left == 0:
+                remaining = np.linalg.norm((goal - state)[:ESCAPE_JOINTS])
+                radius = min(VIRTUAL_RADIUS, VIRTUAL_RADIUS_SHARE * remaining)
+                self.obstacles.append((state[:ESCAPE_JOINTS], radius))
+        if self.steps_left == 0:
             return None
-        self.left -= 1
-        if self.left == 0:
-            self.before.clear()
+        self.steps_left -= 1
+        if self.steps_left == 0:
+            self.states.clear()
             self.momentum = MOMENTUM
         return self.direction
 
-    def with_momentum(self, action):
-        """The policy's action (7,) with what is left of the momentum of the last detour."""
+    def add_momentum(self, action):
+        """The policy's action (7,) and what is left of the momentum of the last escape."""
         if self.momentum <= 0.0:
             return action
-        self.momentum -= MOMENTUM / FADING
+        self.momentum -= MOMENTUM / MOMENTUM_STEPS
         length = max(np.linalg.norm(self.last_action), 1e-6)
         return action + self.momentum * self.max_step / length * self.last_action
 
-    def rows(self, state):
-        """(dead ends, 8), as `envs.wrappers.LinkDistancesWrapper` has links; none in a detour."""
-        rows = np.zeros((len(self.avoided) if self.left == 0 else 0, 8))
-        for row, (centre, radius) in zip(rows, self.avoided, strict=False):
-            away = state[:CARRYING] - centre
-            distance = np.linalg.norm(away)
-            row[0] = METRES * (distance - radius)
-            row[1 : 1 + CARRYING] = METRES * away / max(distance, 1e-6)
+    def virtual_obstacles(self, state):
+        """Their distances and gradients, (n, 8), as those of links; none during an escape."""
+        rows = np.zeros((len(self.obstacles) if self.steps_left == 0 else 0, 8))
+        for row, (centre, radius) in zip(rows, self.obstacles, strict=False):
+            offset = state[:ESCAPE_JOINTS] - centre
+            distance = np.linalg.norm(offset)
+            row[0] = VIRTUAL_SCALE * (distance - radius)
+            row[1 : 1 + ESCAPE_JOINTS] = VIRTUAL_SCALE * offset / max(distance, 1e-6)
         return rows
 
 
 def check_env(env):
-    """Raises ValueError: a last layer cannot act in this environment."""
+    """Raises ValueError if a safety filter cannot act in this environment."""
     if "link_distances" not in env.observation_space.spaces:
         raise ValueError(
-            "a last layer needs link_distances in observations: envs.make(link_distances=...)"
+            "a safety filter needs link_distances in observations: "
+            "roboarm_nmp.make(..., link_distances=True)"
         )
     if env.action_mode != "relative":
-        raise ValueError(f"a last layer changes displacements: action_mode {env.action_mode!r}")
-
-
-def safety_filter_of(metadata):
-    """The `SafetyFilter` that is part of a policy, from its file's metadata; None: it has none.
-
-    Its options are in `safety_filter`, a dict with `keep` and `escape`. Raises ValueError: they make
-    no sense.
-    """
-    options = metadata.get("safety_filter")
-    if options is None:
-        return None
-    try:
-        return SafetyFilter(float(options["margin"]), bool(options["escape"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"its last layer makes no sense: {options!r}") from error
+        raise ValueError(
+            f"a safety filter needs action_mode 'relative', not {env.action_mode!r}: it changes "
+            "displacements"
+        )
 
 
 @functools.cache
@@ -245,5 +267,5 @@ def _arm_alone():
 
 
 def _self_distances(state):
-    """How far each link is from the other ones, as `link_distances` has it."""
+    """Link distances from the other links, (10, 8)."""
     return _arm_alone().link_distances(state, self_collisions=True, within=ACTIVATION_DISTANCE)

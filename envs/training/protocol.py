@@ -21,7 +21,7 @@ from roboarm_nmp.envs.datasets.episodes import DemoQueriesWrapper, load_demos_fo
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
 from roboarm_nmp.envs.policies.registry import recurrent_size
-from roboarm_nmp.envs.policies.safety_filter import safety_filter_of
+from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
 from roboarm_nmp.envs.training.runs import check_finite, write_json
@@ -213,7 +213,8 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0):
             running[env] = env.reset_specific(*queries[i])[0]
             acts[env], states[env] = act, np.zeros(size, np.float32)
             if safety_filter is not None:
-                acts[env] = safety_filter.around(acts[env], env, np.random.default_rng([seed, i]))
+                rng = np.random.default_rng([seed, i])
+                acts[env] = safety_filter.filter_policy(acts[env], env, rng)
 
     for env in envs:
         start(env)
@@ -267,7 +268,7 @@ def rollout_image(policy, env, query, device, safety_filter=None, frames=8):
         return actions[0]
 
     if safety_filter is not None:
-        act = safety_filter.around(act, env, np.random.default_rng([0, 0]))
+        act = safety_filter.filter_policy(act, env, np.random.default_rng([0, 0]))
     observation, _ = env.reset_specific(*query)
     pictures, done = [env.render()], False
     while not done:
@@ -354,7 +355,7 @@ def final_test(run, args, env_arguments, queries, device, progress, steps):
     policy = load_network(run / "policy.pt").to(device)
     own = {name: value for name, value in env_arguments.items() if name not in RULES}
     test_envs = make_eval_envs(args.task, len(queries), **own)
-    safety_filter = safety_filter_of(policy.metadata)
+    safety_filter = SafetyFilter.from_metadata(policy.metadata)
     result = evaluate(policy, test_envs, queries, device, safety_filter)
     rules = {name: getattr(test_envs[0], name) for name in RULES}
     trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}

@@ -213,14 +213,14 @@ def test_saved_with_its_layer_it_acts_alone_as_in_a_batch(some, tmp_path):
         np.testing.assert_allclose(act(observation), together[row], atol=1e-6)
         env.reset(seed=row)  # the layer looks where the action leads
         safe, _ = make_policy(path, env)(0, None)
-        kept = layer.around(act, env, None)(observation)
+        kept = layer.filter_policy(act, env, None)(observation)
         np.testing.assert_array_equal(safe(observation), kept)
         changed += np.abs(kept - together[row]).max() > 1e-4
     assert changed
     content = torch.load(path, weights_only=True)
     content["metadata"]["safety_filter"] = {"keep": "far"}
     torch.save(content, tmp_path / "bad.pt")
-    with pytest.raises(PolicyError, match="bad.pt: its last layer makes no sense"):
+    with pytest.raises(PolicyError, match="bad.pt: invalid safety_filter"):
         find_policy(tmp_path / "bad.pt")
 
 

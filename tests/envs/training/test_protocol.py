@@ -77,7 +77,7 @@ def test_a_safety_filter_has_its_own_state_in_every_episode():
         def act(seen):
             return policy(**protocol.stack([seen], "cpu"))[0].numpy()
 
-        act = layer.around(act, one[0], np.random.default_rng([0, i]))
+        act = layer.filter_policy(act, one[0], np.random.default_rng([0, i]))
         observation, _ = one[0].reset_specific(*query)
         over = False
         while not over:

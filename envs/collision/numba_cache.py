@@ -1,0 +1,68 @@
+"""The decorator `compiled`: Numba's `njit` with a cache on disk that survives damaged files.
+
+Numba trusts its cache. A truncated file raises `EOFError` in every process from then on, and a
+file with a few wrong bytes can crash the process. Here each entry has a checksum. A damaged file is
+named on stderr, ignored, and replaced by a new compilation.
+"""
+
+import contextlib
+import hashlib
+import pickle
+import sys
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.serialize import dumps
+
+
+def compiled(function):
+    """Numba's `njit`, cached on disk where a folder for that can be written to."""
+    dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
+    # (RuntimeError: neither the folder of the source nor the user's cache folder can be.)
+    with contextlib.suppress(RuntimeError):
+        dispatcher._cache = _CheckedCache(function)
+    return dispatcher
+
+
+class _CheckedResult(CompileResultCacheImpl):
+    """A compiled function as bytes and their checksum."""
+
+    def reduce(self, result):
+        payload = dumps(super().reduce(result))
+        return hashlib.sha256(payload).digest(), payload
+
+    def rebuild(self, target_context, data):
+        checksum, payload = data
+        if hashlib.sha256(payload).digest() != checksum:
+            raise ValueError("wrong checksum")
+        return super().rebuild(target_context, pickle.loads(payload))
+
+
+class _CheckedCache(FunctionCache):
+    """The cache of one function: an index file, and a data file for each signature."""
+
+    _impl_class = _CheckedResult
+
+    def load_overload(self, sig, target_context):
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # unpickling wrong bytes raises exceptions of many types
+            path = self._damaged_path(sig, target_context)
+            print(f"{path}: damaged, the function is compiled again", file=sys.stderr)
+            with contextlib.suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig, data):
+        try:
+            super().save_overload(sig, data)
+        except Exception as error:  # a full disk, or a folder where a file should be
+            print(f"{self.cache_path}: {self._name} is not cached: {error}", file=sys.stderr)
+
+    def _damaged_path(self, sig, target_context):
+        file = self._cache_file
+        try:
+            name = file._load_index()[self._index_key(sig, target_context.codegen())]
+        except Exception:
+            return file._index_path
+        return file._data_path(name)
