@@ -39,9 +39,9 @@ import tyro
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from roboarm_nmp.clean_rl_scripts.evaluate import wilson_interval
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.networks.exported_networks import to_float16
+from roboarm_nmp.envs.training.evaluation import wilson_interval
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, check
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
 

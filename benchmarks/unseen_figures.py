@@ -19,7 +19,8 @@ from unseen_obstacles import BASELINES, HARD, load_results, others_results
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
-from roboarm_nmp.envs.show import film, rollout
+from roboarm_nmp.envs.policies.rollout import rollout
+from roboarm_nmp.envs.show import render_configurations
 from roboarm_nmp.envs.utils.files import write_atomically
 
 matplotlib.use("Agg")
@@ -49,13 +50,13 @@ def animation(policy, numbers, size):
         columns = []
         for number in numbers:
             query = queries[number]
-            configurations, info = rollout(env, query, begin(number, query).act)
+            trajectory = rollout(env, query, begin(number, query).act)
             # All at the same speed: what arrives early stands still for the rest.
             steps = np.linspace(0, 200, FRAMES).round().astype(int)
-            steps = np.minimum(steps, len(configurations) - 1)
-            columns.append(list(film(env, query, configurations[steps], size)))
-            ended = "reached" if info["is_success"] else "not reached"
-            print(f"{name}, query {number}: {ended} in {len(configurations) - 1} steps")
+            configurations = trajectory.configurations[np.minimum(steps, len(trajectory))]
+            columns.append(list(render_configurations(env, query, configurations, size)))
+            ended = "reached" if trajectory.success else "not reached"
+            print(f"{name}, query {number}: {ended} in {len(trajectory)} steps")
         env.close()
         rows.append(np.concatenate(columns, axis=2))
     frames = [Image.fromarray(frame) for frame in np.concatenate(rows, axis=1)]

@@ -19,7 +19,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.scenes.primitives import Scene
-from roboarm_nmp.envs.show import picture
+from roboarm_nmp.envs.show import render_query
 
 SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls
@@ -56,14 +56,14 @@ def main():
             for _ in range(ROWS * COLUMNS):
                 env.sample_scene(rng)
                 query = Query(*env.sample_query(rng), env.scene)
-                pixels.append(picture(env, query, SIZE)[::2, ::2])
+                pixels.append(render_query(env, query, SIZE)[::2, ::2])
             height, width, channels = pixels[0].shape
             grid = np.reshape(pixels, (ROWS, COLUMNS, height, width, channels)).swapaxes(1, 2)
             save(grid.reshape(ROWS * height, COLUMNS * width, channels), f"{task}.png")
             env.close()
             continue
         query = load_queries(task)[QUERY]
-        pixels = picture(env, query, SIZE)
+        pixels = render_query(env, query, SIZE)
         save(pixels, f"{task}.png")
         if demo_path(task).exists():
             fixed.append(pixels[::2, ::2])
@@ -72,7 +72,7 @@ def main():
                 positions = panda.forward_kinematics(panda.denormalise(demos[i].states))
                 draw_path(env.client, positions, COLOURS[i % len(COLOURS)])
                 everywhere.append(positions)
-            pixels = picture(env, query, SIZE, np.concatenate(everywhere))
+            pixels = render_query(env, query, SIZE, np.concatenate(everywhere))
             save(pixels, f"{task}_demos.png")
         env.close()
     save(np.concatenate(fixed, axis=1), "fixed_tasks.png")

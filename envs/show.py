@@ -1,14 +1,14 @@
-"""Look at a task: in PyBullet's window, as a picture, or as an animation of a policy.
+"""Show a task in PyBullet's window, as an image, or as an animation of a policy.
 
     python -m roboarm_nmp.envs.show double_walls
-    python -m roboarm_nmp.envs.show double_walls --output picture.png
-    python -m roboarm_nmp.envs.show my_scene.yaml --output pictures.png --draws 9
+    python -m roboarm_nmp.envs.show double_walls --output image.png
+    python -m roboarm_nmp.envs.show my_scene.yaml --output images.png --draws 9
     python -m roboarm_nmp.envs.show wall --output episode.gif --policy runs/my_run
     python -m roboarm_nmp.envs.show double_walls --output episode.gif --policy planner
 
-The arm is white where it is, transparent green where it has to go; the green ball is the goal
-position of its end-effector. A picture shows the start. The window shows the policy's episodes one
-after another, in real time, until it is closed, or Escape or Ctrl-C is pressed.
+The arm is white; at the goal it is transparent green. The green ball is the goal position of the
+end effector. An image shows the start. The window shows the policy's episodes one after another, in
+real time, until it is closed, or Escape or Ctrl-C is pressed.
 """
 
 import io
@@ -32,6 +32,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import Demos, demo_path, load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
+from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import to_array
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeInt, Pixels, PositiveInt, Seed
@@ -40,7 +41,7 @@ from roboarm_nmp.envs.world import why_no_window
 
 SIZE = (640, 480)
 OVERSAMPLING = 2  # the software renderer has jagged edges
-FIELD_OF_VIEW, PITCH, MARGIN = 40.0, -28.0, 0.05  # degrees, degrees, share of the picture
+FIELD_OF_VIEW, PITCH, MARGIN = 40.0, -28.0, 0.05  # degrees, degrees, share of the image
 # From the front right, as long as the obstacles do not hide more of the arm's surroundings from
 # there than from one of the other corners.
 YAWS = (55.0, 125.0, -55.0, -125.0)
@@ -49,9 +50,9 @@ AROUND_THE_ARM = [
 ]
 # Obstacles that reach beyond this box (m) are cut off.
 LOWEST, HIGHEST = (-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)
-SAME_DEPTH = 1e-4  # about a centimetre: where arm and ghost coincide, the arm is seen
+SAME_DEPTH = 1e-4  # about a centimetre: where arm and ghost coincide, the arm is visible
 GHOST_COLOUR, GHOST_OPACITY = (0.25, 1.0, 0.4), 0.6
-# Of an animation. At the default size a file has some 0.3 MB.
+# Of an animation. At the default size a file has about 0.3 MB.
 MAX_FRAMES, COLOURS = 60, 128
 PAUSE = 1.5  # s, at the end of an episode
 
@@ -61,21 +62,22 @@ class Args:
     task: tyro.conf.Positional[str]
     """The task's name, or the path of a scene file (.yaml)."""
     output: Path | None = None
-    """Write this file instead of opening a window: a picture (.png) or an animation (.gif)."""
+    """Write this file instead of opening a window: an image (.png) or an animation (.gif)."""
     policy: str = "go-to-goal"
-    """Who moves the arm, in the window and in an animation: `go-to-goal` (straight to the goal
+    """The policy in the window and in an animation: `go-to-goal` (straight to the goal
     configuration), `random`, `via-points`, `planner` (as in clean_rl_scripts/evaluate.py), a policy
-    network, a run's folder with a `policy.pt` in it, or a pretrained one's name (docs/results.md).
-    `demo` replays the task's demonstrations; --query is the number of one of these then."""
+    network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy
+    (docs/results.md). `demo` replays the task's demonstrations; --query is then the number of a
+    demonstration."""
     query: NonNegativeInt = 0
     """Number of the (first) query to show, from 0."""
     split: Literal["test", "validation", "original"] = "test"
-    """Which of the task's queries. If it has no query file, random ones are shown."""
+    """Which of the task's queries. Without a query file, random queries are shown."""
     draws: PositiveInt = 1
-    """Pictures in a .png: so many queries, from --query on, side by side. Where scenes vary, each
+    """Images in a .png: this many queries, from --query on, side by side. Where scenes vary, each
     query has its own."""
     size: tuple[Pixels, Pixels] = SIZE
-    """Width and height of one picture in pixels."""
+    """Width and height of one image in pixels."""
     seed: Seed = 0
     """Of random queries, and of `random`, `via-points` and `planner`."""
 
@@ -84,7 +86,7 @@ class ShowError(ValueError):
     """Something that cannot be shown; the message says why."""
 
 
-# --- Pictures
+# --- Images
 
 
 class _Camera(NamedTuple):
@@ -103,17 +105,17 @@ class _Shot(NamedTuple):
     arm: np.ndarray
 
 
-def picture(env, query, size=SIZE, points=()):
-    """A picture of a query: the arm at the start, and as a transparent ghost at the goal.
+def render_query(env, query, size=SIZE, points=()):
+    """An image of a query: the arm at the start, and a transparent ghost of it at the goal.
 
-    The camera stands where all of the scene and the arm are seen. Bodies that were added to
-    `env.client` are seen too. Moves the arm: go on with a reset.
+    The camera stands where the whole scene and the arm are visible, and with them bodies that were
+    added to `env.client`. It moves the arm: reset the environment afterwards.
 
     Args:
         env: a `RoboArmEnv`, with `render_mode="rgb_array"` to have the goal marked by a ball.
-        query: an `envs.datasets.Query`; a goal that is a position (3,) has no ghost.
+        query: an `envs.datasets.queries.Query`; a goal that is a position (3,) has no ghost.
         size: (width, height) in pixels.
-        points: (n, 3), m: positions that should be in the picture, too.
+        points: (n, 3), m: further positions that must be in the image.
 
     Returns:
         uint8 (height, width, 3).
@@ -121,26 +123,26 @@ def picture(env, query, size=SIZE, points=()):
     Raises:
         ValueError: the environment refuses the query.
     """
-    return next(film(env, query, [query.start], size, points))
+    return next(render_configurations(env, query, [query.start], size, points))
 
 
-def film(env, query, configurations, size=SIZE, points=()):
-    """Pictures like `picture`, from one point of view, with the arm at each of `configurations`.
+def render_configurations(env, query, configurations, size=SIZE, points=()):
+    """Images as of `render_query`, from one point of view, with the arm in each configuration.
 
     Args:
-        configurations: (n, 7), joint angles in rad, e.g. from `rollout`.
-        env, query, size, points: see `picture`.
+        configurations: (n, 7), joint angles in rad, e.g. of a `Trajectory`.
+        env, query, size, points: see `render_query`.
 
     Yields:
-        n pictures, uint8 (height, width, 3).
+        n images, uint8 (height, width, 3).
     """
     env.world.draw()
     env.reset_specific(*query)
     has_ghost = len(query.goal) == panda.NUM_JOINTS
     poses = [*configurations, *[query.goal] * has_ghost]
-    seen = np.concatenate([_extent(env, poses), np.reshape(points, (-1, 3))])
+    points = np.concatenate([_extent(env, poses), np.reshape(points, (-1, 3))])
     slope = math.tan(math.radians(FIELD_OF_VIEW / 2))
-    camera = _camera(env, seen, (slope * size[0] / size[1], slope))
+    camera = _camera(env, points, (slope * size[0] / size[1], slope))
     if has_ghost:
         panda.set_configuration(env.client, env.robot, query.goal)
         ghost = _shoot(env, camera, size)
@@ -175,11 +177,11 @@ def _extent(env, configurations):
 
 
 def _camera(env, points, slopes):
-    """The nearest camera that has all points (n, 3), m, in its picture. Moves the arm.
+    """The nearest camera with all points (n, 3), m, in its image. Moves the arm.
 
     `slopes` are those of the right and upper edge of its field of view.
     """
-    # So that all queries of a scene are seen from the same side, whatever the arm hides.
+    # So that all queries of a scene are rendered from the same side, whatever the arm hides.
     panda.set_configuration(env.client, env.robot, (panda.LOWER + panda.UPPER) / 2)
     yaw = min(YAWS, key=lambda yaw: _hidden(env, yaw))
     rotation = _rotation(yaw)
@@ -225,7 +227,7 @@ def _shoot(env, camera, size):
         lightDirection=(1.4 * math.cos(light), 1.4 * math.sin(light), 2.5),
         lightAmbientCoeff=0.7,
         lightSpecularCoeff=0.02,
-        shadow=0,  # its shadows have steps, and make the picture dark
+        shadow=0,  # its shadows have steps, and make the image dark
         renderer=p.ER_TINY_RENDERER,
         physicsClientId=env.client,
     )
@@ -234,32 +236,6 @@ def _shoot(env, camera, size):
         np.reshape(depth, (height, width)),
         np.reshape(bodies, (height, width)) == env.robot,
     )
-
-
-# --- Episodes
-
-
-def rollout(env, query, act):
-    """An episode of a policy.
-
-    Args:
-        env: a `RoboArmEnv`.
-        query: an `envs.datasets.Query`.
-        act: a function from an observation to an action (7,); None: nothing is done.
-
-    Returns:
-        The configurations (n, 7), rad, from the start on, and the last step's info.
-
-    Raises:
-        ValueError: the environment refuses the query or an action.
-    """
-    observation, info = env.reset_specific(*query)
-    states, ended = [observation["observation"][:7]], info["is_success"] or act is None
-    while not ended:
-        observation, _, terminated, truncated, info = env.step(act(observation))
-        states.append(observation["observation"][:7])
-        ended = terminated or truncated
-    return panda.denormalise(states), info
 
 
 # --- The command
@@ -271,9 +247,9 @@ class _Queries:
 
     Attributes:
         get: function from a number to a `Query`.
-        count: how many there are; None for no end of random ones.
-        name: what one of them is.
-        demos: the `Demos` that they are of, if they are.
+        count: the number of queries; None for random ones without end.
+        name: of one of them, in messages.
+        demos: the `Demos` of these queries, or None.
     """
 
     get: Callable
@@ -312,7 +288,7 @@ def _find_queries(args):
 
 
 def _check(args):
-    """Raises ValueError for arguments that cannot work, without any work."""
+    """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
     envs.get_task(args.task)
     if args.output is not None:
@@ -354,10 +330,10 @@ def _show(args):
 
 def _draw(args, env, queries, begin):
     bar = tqdm(range(args.query, args.query + args.draws), "drawing", disable=None)
-    pictures = [picture(env, queries.get(number), args.size) for number in bar]
+    images = [render_query(env, queries.get(number), args.size) for number in bar]
     columns = math.ceil(math.sqrt(args.draws))
-    blank = [np.full_like(pictures[0], 255)] * (-args.draws % columns)
-    grid = np.stack(pictures + blank)
+    blank = [np.full_like(images[0], 255)] * (-args.draws % columns)
+    grid = np.stack(images + blank)
     rows, (height, width) = len(grid) // columns, grid.shape[1:3]
     grid = grid.reshape(rows, columns, height, width, 3).swapaxes(1, 2)
     grid = Image.fromarray(grid.reshape(rows * height, columns * width, 3))
@@ -367,16 +343,17 @@ def _draw(args, env, queries, begin):
 
 
 def _animate(args, env, queries, begin):
-    query = queries.get(args.query)
+    query, trajectory = queries.get(args.query), None
     if queries.demos is None:
-        configurations, info = rollout(env, query, begin(args.query, query).act)
+        trajectory = rollout(env, query, begin(args.query, query).act)
+        configurations = trajectory.configurations
     else:
-        configurations, info = panda.denormalise(queries.demos[args.query].states), None
+        configurations = panda.denormalise(queries.demos[args.query].states)
     last = len(configurations) - 1
     steps = [*range(0, last, max(1, math.ceil(last / MAX_FRAMES))), last]
-    frames = film(env, query, configurations[steps], args.size)
+    frames = render_configurations(env, query, configurations[steps], args.size)
     frames = [Image.fromarray(frame) for frame in tqdm(frames, "drawing", len(steps), disable=None)]
-    # One palette and no dithering, so that what stands still has the same pixels in all frames.
+    # One palette and no dithering: still parts of the scene have the same pixels in all frames.
     # This method keeps the green of the small ball.
     palette = frames[0].quantize(COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=3)
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -390,7 +367,7 @@ def _animate(args, env, queries, begin):
         duration=[round(1000 * one) for one in seconds],
         loop=0,
     )
-    text = _outcome(args, queries, args.query, last, info)
+    text = _outcome(args, queries, args.query, last, trajectory)
     print(f"{args.output}: written, {args.task}, {text}")
 
 
@@ -401,7 +378,7 @@ def _window(args, env, queries, begin):
     numbers = itertools.count() if queries.count is None else itertools.cycle(range(queries.count))
     try:
         for number in itertools.islice(numbers, args.query, None):
-            query, info = queries.get(number), None
+            query, trajectory = queries.get(number), None
             env.reset_specific(*query)
             projection = p.getDebugVisualizerCamera(physicsClientId=client)[3]
             slopes = (1 / projection[0], 1 / projection[5])
@@ -410,13 +387,15 @@ def _window(args, env, queries, begin):
                 camera.distance, camera.yaw, PITCH, camera.target, physicsClientId=client
             )
             if queries.demos is None:
-                configurations, info = rollout(env, query, begin(number, query).act)
+                trajectory = rollout(env, query, begin(number, query).act)
+                configurations = trajectory.configurations
             else:
                 configurations = panda.denormalise(queries.demos[number].states)
                 for configuration in configurations:
                     panda.set_configuration(client, env.robot, configuration)
                     time.sleep(1 / env.metadata["render_fps"])
-            print(_outcome(args, queries, number, len(configurations) - 1, info), flush=True)
+            text = _outcome(args, queries, number, len(configurations) - 1, trajectory)
+            print(text, flush=True)
             time.sleep(PAUSE)
     except KeyboardInterrupt:
         pass
@@ -425,13 +404,13 @@ def _window(args, env, queries, begin):
             raise  # otherwise Escape was pressed
 
 
-def _outcome(args, queries, number, steps, info):
-    """How an episode went, in words; `info` is None for a demonstration."""
-    if info is None:
+def _outcome(args, queries, number, steps, trajectory):
+    """The result of an episode in words; `trajectory` is None for a demonstration."""
+    if trajectory is None:
         return f"{queries.name} {number}: {steps} steps"
-    reached = "reached the goal" if info["is_success"] else "did not reach the goal"
-    touched = "something" if info["collision_so_far"] else "nothing"
-    return f"{queries.name} {number}, {args.policy}: {reached} in {steps} steps, touching {touched}"
+    reached = "reached the goal" if trajectory.success else "did not reach the goal"
+    contact = "with contact" if trajectory.collides else "collision-free"
+    return f"{queries.name} {number}, {args.policy}: {reached} in {steps} steps, {contact}"
 
 
 def _save(image, path, kind, **options):
@@ -441,7 +420,7 @@ def _save(image, path, kind, **options):
 
 
 def main(arguments=None):
-    """The command. Returns the exit code: 0, or 2 for something that cannot be shown."""
+    """The command. Returns the exit code: 0, or 2 where nothing can be shown."""
     args = tyro.cli(
         Args, args=arguments, prog="python -m roboarm_nmp.envs.show", description=__doc__
     )

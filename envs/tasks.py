@@ -48,6 +48,8 @@ def get_task(task):
         if has_name(task_name(task)):
             raise ValueError(f"{task}: a scene file may not have the name of a task")
         return Task(load_scene(task), f"the scene in {task}")
+    if Path(task).suffix or Path(task).name != str(task):
+        raise ValueError(f"scene files are .yaml or .yml (docs/your_own_scene.md), got {task}")
     raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}, or a scene file (.yaml)")
 
 

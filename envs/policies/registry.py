@@ -1,62 +1,41 @@
-"""Policies by name: those that learn nothing, and trained ones from their files.
+"""Policies by name: non-learning baselines, and trained policies from their files.
 
-    policy, arguments = find_policy("via-points")        # or a file, a run's folder, a pretrained name
-    env = envs.make("wall", **arguments)
+    policy, arguments = find_policy("via-points")        # or a file, a folder, a pretrained name
+    env = roboarm_nmp.make("wall", **arguments)
     begin = make_policy(policy, env)
-    act, found = begin(0, load_queries("wall")[0])       # at the start of an episode, once
+    act, plan_found = begin(0, load_queries("wall")[0])  # once, at the start of an episode
     action = act(observation)                            # at every step
 
-- go-to-goal: straight to the goal configuration, whatever is in the way (paper, section 5.1);
-- random: a random action at every step;
-- via-points: straight to the goal configuration if that motion is free of collisions, or else by
-  way of the first of some random configurations for which the motion is free; if there is none,
-  straight all the same;
-- planner: OMPL's RRT-Connect plans, within a time limit, and the plan is followed.
-
-The last two know the true obstacles, or only the points that sensors see of them. CircularConv any of
-them there may be a last layer, which keeps the arm away from things (`envs.policies.safety_filter`); a trained
-policy may have one of its own.
+A safety filter may be put around any policy (`envs.policies.safety_filter`); a trained policy may
+include one. Baselines: `envs.policies.baselines`. Whole episodes: `envs.policies.rollout`.
 """
 
-import itertools
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.envs.policies.baselines import (
+    BASELINES,
+    TIME_LIMIT,
+    TRIES,
+    EpisodePolicy,
+    import_planning,
+    make_baseline,
+)
 
-PLANNING = ("via-points", "planner")
-"""The policies that look for a motion before they move."""
-BASELINES = ("go-to-goal", "random", *PLANNING)
-DISPLACING = ("go-to-goal", *PLANNING)
-# What a policy's metadata may say about its environment. Tolerances and horizon are not among it:
-# they decide what a success is.
+# The arguments of an environment that a policy's metadata may contain. Tolerances and horizon are
+# not among them: they define what a success is.
 ENV_ARGUMENTS = (
     *("goal_type", "action_mode", "max_step", "velocities"),
     *("encoder", "num_points", "geometry_source", "link_distances", "append_link_distances"),
 )
 PRETRAINED = Path(__file__).parent / "pretrained"
-TRIES = 16  # of `via-points`, by default
-TIME_LIMIT = 5.0  # s, of `planner`, by default
 MAX_RECURRENT_SIZE = 65_536  # numbers
 
 
 class PolicyError(ValueError):
-    """A policy that cannot be had or used; the message says why."""
-
-
-class EpisodePolicy(NamedTuple):
-    """What a policy does in one episode.
-
-    act: act(observation) -> action (7,); None: it gives up.
-    found: whether it found a motion; None if it did not look for one.
-    """
-
-    act: Callable | None
-    found: bool | None = None
+    """A policy that cannot be found or used; the message says why."""
 
 
 def pretrained_policies():
@@ -84,16 +63,19 @@ def policy_file(name):
 
 
 def find_policy(name):
-    """What `make_policy` takes, and the arguments of `envs.make` that it was trained with.
+    """The policy as `make_policy` takes it, and the arguments of `envs.make` it was trained with.
 
     Args:
-        name: one of `BASELINES`, which have no arguments, or what `policy_file` takes.
+        name: one of `BASELINES`, which have no arguments, or a name or path as for `policy_file`.
 
     Raises:
         PolicyError: there is no such policy, its file is not one, or `planner` lacks OMPL.
     """
     if name == "planner":
-        _import_planning()
+        try:
+            import_planning()
+        except ValueError as error:
+            raise PolicyError(str(error)) from error
     if name in BASELINES:
         return name, {}
     path = policy_file(name)
@@ -101,7 +83,7 @@ def find_policy(name):
 
 
 def own_safety_filter(policy):
-    """The `envs.policies.safety_filter.SafetyFilter` that is part of a policy; None if it has none.
+    """The `envs.policies.safety_filter.SafetyFilter` that a policy includes; None without one.
 
     `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
     """
@@ -119,11 +101,10 @@ def recurrent_size(policy):
         PolicyError: it is no integer from 0 to `MAX_RECURRENT_SIZE`.
     """
     metadata = getattr(policy, "metadata", None)
-    size = (
-        getattr(policy, "recurrent_size", 0)
-        if metadata is None
-        else metadata.get("recurrent_size", 0)
-    )
+    if metadata is None:
+        size = getattr(policy, "recurrent_size", 0)
+    else:
+        size = metadata.get("recurrent_size", 0)
     if type(size) is not int or not 0 <= size <= MAX_RECURRENT_SIZE:
         raise PolicyError(
             f"a policy's recurrent state has 0 to {MAX_RECURRENT_SIZE:,} numbers, not {size!r}"
@@ -137,146 +118,70 @@ def make_policy(
     seed=0,
     tries=TRIES,
     time_limit=TIME_LIMIT,
-    geometry_source=None,
+    geometry_source="ground_truth",
     safety_filter=None,
 ):
     """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
 
-    It is called once per episode, before the environment is put to the start: `planner` moves
-    the arm.
+    It is called once per episode, before the environment's reset to the query: `planner` moves the
+    arm.
 
     Args:
         policy: one of `BASELINES`, the path of a policy network, or a function from an observation
             to an action (7,).
         env: the `RoboArmEnv` it will act in.
-        seed: of what is random; each query has its own generator.
+        seed: of random numbers, >= 0; each query has its own generator.
         tries: random configurations that `via-points` tries per query.
         time_limit: seconds that `planner` may search per query.
-        geometry_source: of `via-points` and `planner`: `ground_truth`, `point_cloud` or an
-            encoder's name (`envs.perception.geometry_source`); None for `ground_truth`.
-        safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None: the one that is part of
-            a trained policy, if it has one; False: none. With one, the environment must have
-            `link_distances`.
+        geometry_source: where `via-points` and `planner` take the obstacles from: `ground_truth`,
+            `point_cloud` or an encoder's name (`envs.perception.geometry_source`).
+        safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
+            one that a trained policy includes, if any; False for none. The environment must have
+            `link_distances`, whose geometry source is the filter's.
 
     Raises:
         PolicyError: the policy cannot act in this environment.
     """
-    begin = _make_policy(policy, env, seed, tries, time_limit, geometry_source)
+    if callable(policy):
+        begin = _same(policy)
+    elif policy in BASELINES:
+        try:
+            begin = make_baseline(policy, env, seed, tries, time_limit, geometry_source)
+        except ValueError as error:
+            raise PolicyError(str(error)) from error
+    else:
+        begin = _trained(policy, env)
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
-    if not safety_filter:
-        return begin
-    from roboarm_nmp.envs.policies.safety_filter import (
-        check_env,  # here, because Numba takes a while to import
-    )
+    return _filtered(begin, env, seed, safety_filter) if safety_filter else begin
+
+
+def _same(act):
+    return lambda number, query: EpisodePolicy(act)
+
+
+def _filtered(begin, env, seed, safety_filter):
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.envs.policies.safety_filter import check_env
 
     try:
         check_env(env)
     except ValueError as error:
         raise PolicyError(str(error)) from error
 
-    def begin_safely(number, query):
-        act, found = begin(number, query)
+    def begin_filtered(number, query):
+        act, plan_found = begin(number, query)
         rng = np.random.default_rng([seed, number])
-        return EpisodePolicy(act and safety_filter.filter_policy(act, env, rng), found)
+        return EpisodePolicy(act and safety_filter.filter_policy(act, env, rng), plan_found)
 
-    return begin_safely
-
-
-def _make_policy(policy, env, seed, tries, time_limit, geometry_source):
-    if policy in DISPLACING and env.action_mode != "relative":
-        raise PolicyError(f"{policy} gives displacements, not actions of mode {env.action_mode!r}")
-    if policy == "go-to-goal":
-        return lambda number, query: EpisodePolicy(_go_to_goal(query.goal))
-    if policy == "random":
-        return lambda number, query: EpisodePolicy(_random(np.random.default_rng([seed, number])))
-    if policy == "via-points":
-        return _via_points(seed, tries, _checker_source(geometry_source))
-    if policy == "planner":
-        return _planner(env, seed, time_limit, _checker_source(geometry_source))
-    if callable(policy):
-        return lambda number, query: EpisodePolicy(policy)
-    begin = _trained(policy, env)
-    return lambda number, query: EpisodePolicy(begin())
+    return begin_filtered
 
 
-# --- Those that learn nothing
-
-
-def _go_to_goal(goal):
-    target = panda.normalise(goal)
-    return lambda observation: target - observation["observation"][:7]
-
-
-def _random(rng):
-    return lambda observation: rng.uniform(-1.0, 1.0, panda.NUM_JOINTS)
-
-
-def _checker_source(name):
-    # Here, because Numba takes a while to import.
-    from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
-
-    try:
-        return find_geometry_source(name or "ground_truth")
-    except ValueError as error:
-        raise PolicyError(str(error)) from error
-
-
-def _via_points(seed, tries, geometry_source):
-    # No margin is kept, which would reject more than it saves: with 3 mm, clean success was 2 to 5
-    # points lower on `wall`, `double_walls` and `boxes`.
-    def begin(number, query):
-        checker = geometry_source(query.scene)
-        # float32 may round a limit to just beyond it.
-        start, goal = np.clip(panda.normalise(np.stack([query.start, query.goal])), -1.0, 1.0)
-        if checker.is_motion_free(start, goal):
-            return EpisodePolicy(_go_to_goal(query.goal), found=True)
-        for via in np.random.default_rng([seed, number]).uniform(-1.0, 1.0, (tries, 7)):
-            if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
-                path = panda.denormalise(np.stack([start, via, goal]))
-                return EpisodePolicy(_follow(path), found=True)
-        return EpisodePolicy(_go_to_goal(query.goal), found=False)
-
-    return begin
-
-
-def _planner(env, seed, time_limit, geometry_source):
-    planning = _import_planning()
-    planner = planning.Planner(env, geometry_source=geometry_source)
-
-    def begin(number, query):
-        rng = np.random.default_rng([seed, number])
-        try:
-            path = planner.plan_within(time_limit, *query, rng=rng)
-        except planning.PlanningError:
-            return EpisodePolicy(None, found=False)
-        return EpisodePolicy(_follow(path), found=True)
-
-    return begin
-
-
-def _import_planning():
-    # The one place where `envs` uses `demo_generation`, which is built on it: only when somebody
-    # asks for this policy by name, so that neither it nor OMPL is needed by anything else.
-    try:
-        from roboarm_nmp.demo_generation import planning
-    except ImportError as error:
-        raise PolicyError(f"the policy planner needs OMPL, and {error}") from error
-    return planning
-
-
-def _follow(path):
-    """One sub-goal per step along a path (n, 7), rad, and then the goal again and again."""
-    targets = subgoals(path)[1:]
-    left = itertools.chain(targets, itertools.repeat(targets[-1]))
-    return lambda observation: next(left) - observation["observation"][:7]
-
-
-# --- Trained ones. PyTorch is imported only here: it takes seconds.
+# --- Trained policies. PyTorch is imported only here: it takes seconds.
 
 
 def _load(path):
-    """A policy network, the arguments of the environment it was trained in, its last layer."""
+    """A policy network, the arguments of the environment it was trained in, its safety filter."""
     from roboarm_nmp.envs.networks.exported_networks import load_network
     from roboarm_nmp.envs.networks.operations import NetworkError
     from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
@@ -294,18 +199,12 @@ def _load(path):
         raise PolicyError(f"{path}: a network, but not a policy")
     if "goal_type" not in trained:
         raise PolicyError(f"{path}: does not say which goal type it was trained with")
-    return (
-        network,
-        {name: trained[name] for name in ENV_ARGUMENTS if name in trained},
-        safety_filter,
-    )
+    arguments = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
+    return network, arguments, safety_filter
 
 
 def _trained(path, env):
-    """A policy network as a function without arguments, called at the start of an episode.
-
-    It returns another one, from an observation to an action.
-    """
+    """`make_policy` of a policy network."""
     import torch
 
     from roboarm_nmp.envs.networks.operations import NetworkError
@@ -316,7 +215,7 @@ def _trained(path, env):
         raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
     size = recurrent_size(network)
 
-    def begin():
+    def begin(number, query):
         recurrent_state = np.zeros(size, np.float32)
 
         # One observation at a time: in a batch its last bits would depend on the batch's size, for
@@ -330,14 +229,14 @@ def _trained(path, env):
             action, recurrent_state = network.predict_one(inputs, (panda.NUM_JOINTS, size))
             return action
 
-        return act
+        return EpisodePolicy(act)
 
     space = env.observation_space
     unknown = set(network.inputs) - {*space, *(["recurrent_state"] if size else [])}
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
     try:
-        begin()({name: np.zeros(one.shape, np.float32) for name, one in space.items()})
+        begin(0, None).act({name: np.zeros(one.shape, np.float32) for name, one in space.items()})
     except NetworkError as error:
         raise PolicyError(str(error)) from error
     return begin

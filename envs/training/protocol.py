@@ -21,6 +21,7 @@ from roboarm_nmp.envs.datasets.episodes import DemoQueriesWrapper, load_demos_fo
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
 from roboarm_nmp.envs.policies.registry import recurrent_size
+from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
@@ -176,7 +177,6 @@ def log_episode(writer, step, episode_return, info, recent_success):
     writer.add_scalar("charts/success", np.mean(recent_success), step)
 
 
-@torch.no_grad()
 def evaluate(policy, envs, queries, device, safety_filter=None, seed=0):
     """Run a deterministic policy on every query, each env one at a time; mean results.
 
@@ -185,62 +185,83 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0):
             tensors (N, ...), to actions (N, 7); a module or an exported network. A recurrent one
             (`envs.policies.registry.recurrent_size`) also receives its state, and returns the next.
         envs: the environments to do it in.
-        queries: `envs.datasets.Queries`, or a list of `Query`.
+        queries: `envs.datasets.queries.Queries`, or a list of `Query`.
         device: of the policy.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy, or None.
-        seed: of the layer's ways out, >= 0.
+        seed: of the filter's escapes from local minima, >= 0.
 
     Returns:
-        A dict of floats: `success_rate`, `collision_free_success_rate` (without a touch), `collision_rate`
-        and `episode_length` in steps.
+        A dict of floats: `success_rate`, `collision_free_success_rate`, `collision_rate`, and
+        `episode_length` in steps.
 
     Raises:
-        FloatingPointError: the policy's actions are not finite, or its recurrent state.
+        FloatingPointError: the policy's actions or its recurrent state are not finite.
     """
-    waiting, size = iter(range(len(queries))), recurrent_size(policy)
-    running, states, proposed = {}, {}, {}  # env -> observation, memory, action and next memory
-    acts, results = {}, []  # env -> function
-
-    def start(env):
-        i = next(waiting, None)
-        running.pop(env, None)
-
-        def act(observation):  # (In a detour the last layer does not ask: its state stays.)
-            action, states[env] = proposed[env]
-            return action
-
-        if i is not None:
-            running[env] = env.reset_specific(*queries[i])[0]
-            acts[env], states[env] = act, np.zeros(size, np.float32)
-            if safety_filter is not None:
-                rng = np.random.default_rng([seed, i])
-                acts[env] = safety_filter.filter_policy(acts[env], env, rng)
-
-    for env in envs:
-        start(env)
-    while running:
-        before = [states[env] for env in running]
-        actions, after = _actions(policy, list(running.values()), before, device)
-        for env, action, state in zip(list(running), actions, after, strict=True):
-            proposed[env] = action, state
-            action = acts[env](running[env])
-            running[env], _, terminated, truncated, info = env.step(action)
-            if terminated or truncated:
-                results.append(
-                    (info["is_success"], info["collision_so_far"], info["elapsed_steps"])
-                )
-                start(env)
-    success, touched, steps = np.array(results, dtype=np.float64).T
+    results = [
+        (trajectory.success, trajectory.collides, len(trajectory))
+        for trajectory in _rollouts(policy, envs, queries, device, safety_filter, seed)
+    ]
+    success, collides, steps = np.array(results, dtype=np.float64).T
     return {
         "success_rate": float(success.mean()),
-        "collision_free_success_rate": float((success * (1 - touched)).mean()),
-        "collision_rate": float(touched.mean()),
+        "collision_free_success_rate": float((success * (1 - collides)).mean()),
+        "collision_rate": float(collides.mean()),
         "episode_length": float(steps.mean()),
     }
 
 
+class _Running:
+    """One of the episodes whose actions one call of the policy predicts.
+
+    Args:
+        episode: the `Episode`.
+        size: of the policy's recurrent state.
+        safety_filter, rng: the filter around the policy, or None, and its random numbers.
+    """
+
+    def __init__(self, episode, size, safety_filter, rng):
+        self.episode, self.recurrent_state = episode, np.zeros(size, np.float32)
+        self._act = self._predicted
+        if safety_filter is not None:
+            self._act = safety_filter.filter_policy(self._predicted, episode.env, rng)
+
+    def _predicted(self, observation):
+        # During an escape the filter does not call this: the recurrent state stays as it is.
+        action, self.recurrent_state = self._prediction
+        return action
+
+    def step(self, action, recurrent_state):
+        """One step with the policy's prediction for the current observation."""
+        self._prediction = action, recurrent_state
+        self.episode.step(self._act(self.episode.observation))
+
+
+@torch.no_grad()
+def _rollouts(policy, envs, queries, device, safety_filter, seed=0):
+    """Yield the `Trajectory` of every query, in any order; arguments as for `evaluate`."""
+    waiting, size = iter(range(len(queries))), recurrent_size(policy)
+
+    def begin(idle):
+        for env, i in zip(idle, waiting, strict=False):  # as long as there are queries
+            rng = np.random.default_rng([seed, i])
+            yield _Running(Episode(env, queries[i]), size, safety_filter, rng)
+
+    running = list(begin(envs))
+    while running:
+        observations = [one.episode.observation for one in running]
+        states = [one.recurrent_state for one in running]
+        actions, states = _actions(policy, observations, states, device)
+        for one, action, state in zip(running, actions, states, strict=True):
+            one.step(action, state)
+        ended = [one.episode for one in running if one.episode.ended]
+        for episode in ended:
+            yield episode.trajectory()
+        running = [one for one in running if not one.episode.ended]
+        running += begin(episode.env for episode in ended)
+
+
 def _actions(policy, observations, states, device):
-    """Actions (n, 7) for n observations, and the policy's states after them, n arrays."""
+    """Actions (n, 7) for n observations, and the policy's n recurrent states after them."""
     if not len(states[0]):
         actions = policy(**stack(observations, device)).cpu().numpy()
     else:
@@ -253,32 +274,15 @@ def _actions(policy, observations, states, device):
     return actions, states
 
 
-@torch.no_grad()
 def rollout_image(policy, env, query, device, safety_filter=None, frames=8):
     """An image strip (height, frames * width, 3), uint8, of the policy on one query.
 
     `env`: one that renders.
     """
-
-    states = [np.zeros(recurrent_size(policy), np.float32)]
-
-    def act(observation):
-        nonlocal states
-        actions, states = _actions(policy, [observation], states, device)
-        return actions[0]
-
-    if safety_filter is not None:
-        act = safety_filter.filter_policy(act, env, np.random.default_rng([0, 0]))
-    observation, _ = env.reset_specific(*query)
-    pictures, done = [env.render()], False
-    while not done:
-        action = act(observation)
-        observation, _, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        if info["elapsed_steps"] % 10 == 0 or done:
-            pictures.append(env.render())
-    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
-    return np.concatenate([pictures[i] for i in chosen], axis=1)
+    [trajectory] = _rollouts(policy, [env], [query], device, safety_filter)
+    steps = [*range(0, len(trajectory), 10), len(trajectory)]
+    chosen = np.linspace(0, len(steps) - 1, frames).round().astype(int)
+    return render_strip(env, query, trajectory.actions, [steps[i] for i in chosen])
 
 
 def validate(policy, envs, queries, device, writer, step, progress, safety_filter=None):

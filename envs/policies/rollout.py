@@ -1,0 +1,129 @@
+"""Rollouts: one episode of a policy on one query, recorded as a `Trajectory`.
+
+    begin = make_policy("go-to-goal", env)
+    trajectory = rollout(env, query, begin(0, query).act)
+    trajectory.success, trajectory.collides, trajectory.configurations
+
+`rollout` runs one episode. `Episode` is the same step by step, for a network that predicts the
+actions of several episodes at once. Metrics and images are derived from trajectories.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from roboarm_nmp.envs import panda
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """An episode of T steps.
+
+    Attributes:
+        states: float32 (T + 1, 7), normalised configurations, from the start on.
+        actions: float64 (T, 7), as the environment received them.
+        contacts: bool (T,), whether the arm was in contact during each step.
+        times: float64 (T,), s, from each observation to its action.
+        success: whether the goal was reached.
+    """
+
+    states: np.ndarray
+    actions: np.ndarray
+    contacts: np.ndarray
+    times: np.ndarray
+    success: bool
+
+    def __len__(self):
+        """The number of steps."""
+        return len(self.actions)
+
+    @property
+    def configurations(self):
+        """Joint angles (T + 1, 7), rad."""
+        return panda.denormalise(self.states)
+
+    @property
+    def collides(self):
+        """Whether there was a contact in any step."""
+        return bool(self.contacts.any())
+
+
+class Episode:
+    """An episode on one query, recorded step by step.
+
+    Args:
+        env: a `RoboArmEnv`, possibly wrapped. It is reset to the query.
+        query: an `envs.datasets.queries.Query`.
+
+    Attributes:
+        observation: the last one.
+        ended: whether the episode is over, possibly at its start.
+
+    Raises:
+        ValueError: the environment refuses the query.
+    """
+
+    def __init__(self, env, query):
+        self.env = env
+        self.observation, info = env.reset_specific(*query)
+        self.ended = self._success = info["is_success"]
+        self._states, self._actions = [self.observation["observation"][:7]], []
+        self._contacts, self._times = [], []
+        self._observed = time.perf_counter()
+
+    def step(self, action):
+        """One step of the environment. Raises ValueError: it refuses the action."""
+        seconds = time.perf_counter() - self._observed
+        self.observation, _, terminated, truncated, info = self.env.step(action)
+        self.ended, self._success = terminated or truncated, info["is_success"]
+        self._states.append(self.observation["observation"][:7])
+        self._actions.append(np.array(action, dtype=np.float64))
+        self._contacts.append(info["collision"])
+        self._times.append(seconds)
+        self._observed = time.perf_counter()
+
+    def trajectory(self):
+        """The `Trajectory` so far."""
+        return Trajectory(
+            np.array(self._states),
+            np.array(self._actions).reshape(-1, panda.NUM_JOINTS),
+            np.array(self._contacts, dtype=bool),
+            np.array(self._times),
+            self._success,
+        )
+
+
+def rollout(env, query, policy):
+    """The `Trajectory` of a policy on a query.
+
+    Args:
+        env: a `RoboArmEnv`, possibly wrapped.
+        query: an `envs.datasets.queries.Query`.
+        policy: a function from an observation to an action (7,); None: no step is made.
+
+    Raises:
+        ValueError: the environment refuses the query or an action.
+    """
+    episode = Episode(env, query)
+    while policy is not None and not episode.ended:
+        episode.step(policy(episode.observation))
+    return episode.trajectory()
+
+
+def render_strip(env, query, actions, steps):
+    """Images of an episode side by side, uint8 (h, n * w, 3). The episode is replayed, exactly.
+
+    Args:
+        env: an environment like the episode's, which renders to `rgb_array`.
+        query: the episode's.
+        actions: (T, 7), of its `Trajectory`.
+        steps: n numbers from 0 (the start) to T: the steps after which there is an image.
+    """
+    env.reset_specific(*query)
+    images = {0: env.render()}
+    for step, action in enumerate(actions, start=1):
+        env.step(action)
+        if step in steps:
+            images[step] = env.render()
+    return np.concatenate([images[step] for step in steps], axis=1)

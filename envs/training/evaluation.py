@@ -1,0 +1,424 @@
+"""Evaluation of a policy on the queries of a task.
+
+    result = evaluate("go-to-goal", "wall", num_queries=100, workers=2)
+    result["success_rate"], result["collision_free_success_rate"]
+
+An episode is one query, in the query's scene, under the task's standard rules: goal tolerances,
+horizon and longest step of `RoboArmEnv`'s defaults, contacts allowed. The same arguments give the
+same numbers, times excepted, whatever the number of workers.
+"""
+
+import math
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.arm_env import deviations
+from roboarm_nmp.envs.datasets.format import QueryScenes
+from roboarm_nmp.envs.datasets.queries import Query, load_queries, validate
+from roboarm_nmp.envs.perception.encoders import ORACLE
+from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
+from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
+from roboarm_nmp.envs.policies.baselines import PLANNERS, TIME_LIMIT, TRIES
+from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
+from roboarm_nmp.envs.policies.rollout import render_strip, rollout
+from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.tasks import get_task, task_name
+from roboarm_nmp.envs.utils import workers
+
+CHUNK = 10  # queries a worker takes at a time
+
+
+class EvaluationError(ValueError):
+    """An evaluation that is not possible; the message says why."""
+
+
+@dataclass(frozen=True)
+class EvaluationOptions:
+    """The options of `evaluate`.
+
+    Attributes:
+        goal_type: `ee`, `config`, `combined`; None for the policy's own, otherwise `ee`.
+        queries: queries instead of the task's own: the path of a query file, or an object with
+            `start` and `goal`, float32 (n, 7), rad, and `scenes`, a sequence of n `Scene`s, like
+            `envs.datasets.queries.Queries`. Without `scenes` they are in the task's scene, which
+            must then not be random.
+        split: `test`, `validation` or `original`; which queries of the file.
+        num_queries: only the first so many of them; None for all.
+        stop_on_collision: end an episode at the first contact.
+        seed: of random numbers, >= 0; each query has its own generator.
+        tries: random configurations that `via-points` tries per query, >= 1.
+        time_limit: seconds that `planner` may search per query, > 0.
+        geometry_source: where `planner`, `via-points`, the safety filter and the policy's
+            observations take the obstacles from (`envs.perception.geometry_source`); None for the
+            policy's own, otherwise `ground_truth`.
+        safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
+            one that the policy includes, if any; False for none.
+        workers: processes, >= 1. More than one needs the caller's script to be importable
+            (`if __name__ == "__main__":`), as always with `multiprocessing`.
+        env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
+            defaults. A policy network brings its own.
+
+    Raises:
+        EvaluationError: a number is out of its range.
+    """
+
+    goal_type: str | None = None
+    queries: Any = None
+    split: str = "test"
+    num_queries: int | None = None
+    stop_on_collision: bool = False
+    seed: int = 0
+    tries: int = TRIES
+    time_limit: float = TIME_LIMIT
+    geometry_source: str | None = None
+    safety_filter: SafetyFilter | bool | None = None
+    workers: int = 1
+    env: dict | None = None
+
+    def __post_init__(self):
+        for name in ("workers", "tries"):
+            if getattr(self, name) < 1:
+                raise EvaluationError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.time_limit < math.inf:
+            raise EvaluationError(
+                f"time_limit must be a positive number of seconds, got {self.time_limit}"
+            )
+
+
+def evaluate(policy, task, *, progress=False, **options):
+    """Run a policy on a task's queries.
+
+    Args:
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy network or of
+            a folder with a `policy.pt`, the name of a pretrained policy, or a function from an
+            observation (dict of `RoboArmEnv`) to an action (7,); with several workers, one that can
+            be pickled.
+        task: name of the task, or path of a scene file.
+        progress: show a progress bar, with the success rate so far.
+        options: the fields of `EvaluationOptions`.
+
+    Returns:
+        A dict that fits into JSON. Means over nothing (no successful episode, say) are None, and so
+        is what a policy lacks.
+
+        - `success_rate`, `collision_free_success_rate`, `collision_rate`, each with its 95% Wilson
+          interval, `..._interval`;
+        - `mean_steps`, `path_length` (rad), `smoothness` (rad per step^2): means over successes;
+        - `ms_per_action`: of the policy alone, without the simulator and without planning;
+        - `planning_seconds`, `planning_seconds_solved`: means over all queries, and over those with
+          a motion found; `free_motion_rate`, only of `via-points`;
+        - `policy`, `task`, `goal_type`, `split`, `num_queries`, `env`, `deviations` (from the
+          standard rules), `safety_filter`, `seed`, `tries`, `time_limit`, `versions`;
+        - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
+          whether policy, filter or observations received the ground-truth obstacles.
+
+    Raises:
+        EvaluationError: the policy, the task or the queries cannot be used.
+    """
+    job = _prepare(policy, task, EvaluationOptions(**options))
+    return _summary(job, _run(job, progress))
+
+
+def first_episode_image(policy, task, frames=8, **options):
+    """The first query's episode as an image strip, uint8 (height, frames * width, 3).
+
+    Arguments and errors as for `evaluate`. Short episodes have fewer frames.
+    """
+    job = _prepare(policy, task, EvaluationOptions(**options))
+    env, begin = job.make(render_mode="rgb_array")
+    query = job.query(0)
+    actions = rollout(env, query, begin(0, query).act).actions
+    steps = np.linspace(0, len(actions), frames).round().astype(int)
+    image = render_strip(env, query, actions, sorted(set(steps.tolist())))
+    env.close()
+    return image
+
+
+def is_privileged(env_arguments):
+    """Whether observations contain ground-truth obstacles.
+
+    Args:
+        env_arguments: dict of arguments of `envs.make`.
+    """
+    distances = env_arguments.get("link_distances") and env_arguments.get("geometry_source")
+    return env_arguments.get("encoder") == ORACLE or distances == GROUND_TRUTH
+
+
+# --- Metrics
+
+
+def wilson_interval(successes, n):
+    """The 95% Wilson score interval (low, high) of a share, for `successes` out of `n` >= 1."""
+    z = 1.959964
+    share = successes / n
+    centre = share + z * z / (2 * n)
+    spread = z * (share * (1 - share) / n + z * z / (4 * n * n)) ** 0.5
+    scale = 1 + z * z / n
+    return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
+
+
+def path_length(configurations):
+    """Sum of the L2 distances, in rad, between successive configurations (T + 1, 7), rad."""
+    return float(np.linalg.norm(np.diff(configurations, axis=0), axis=1).sum())
+
+
+def smoothness(configurations):
+    """Mean L2 norm of the second differences, rad per step^2, of configurations (T + 1, 7), rad.
+
+    Zero for fewer than three configurations.
+    """
+    if len(configurations) < 3:
+        return 0.0
+    return float(np.linalg.norm(np.diff(configurations, n=2, axis=0), axis=1).mean())
+
+
+# --- Arguments
+
+
+@dataclass(frozen=True)
+class _Job:
+    """An evaluation whose arguments were checked, for the workers.
+
+    `options` are those in use: `env` has all arguments of `envs.make`, `geometry_source` is None
+    where nothing takes obstacles from one. `start`, `goal` and `scenes` stand for its `queries`.
+    """
+
+    policy: str | Path | Callable
+    task: str
+    options: EvaluationOptions
+    start: np.ndarray
+    goal: np.ndarray
+    scenes: Sequence[Scene]
+
+    def make(self, **kwargs):
+        """The environment, and the policy in it as `make_policy` returns it."""
+        env, o = envs.make(self.task, **self.options.env, **kwargs), self.options
+        source, safety_filter = o.geometry_source or GROUND_TRUTH, o.safety_filter or False
+        options = o.seed, o.tries, o.time_limit, source, safety_filter
+        return env, make_policy(self.policy, env, *options)
+
+    def query(self, index):
+        return Query(self.start[index], self.goal[index], self.scenes[index])
+
+
+def _prepare(policy, task, options):
+    """The `_Job` of an evaluation, once all of its arguments have been checked."""
+    try:
+        get_task(task)  # or it raises
+        if not callable(policy):
+            policy, trained = find_policy(policy)
+            if trained and options.goal_type not in (None, trained["goal_type"]):
+                raise EvaluationError(
+                    f"{policy} was trained with the goal type {trained['goal_type']!r}, it cannot "
+                    f"be evaluated with {options.goal_type!r}"
+                )
+            options = replace(options, env=trained or options.env)
+        queries, scenes = _queries(task, options)
+        options = replace(
+            _in_use(policy, options), queries=None, split=getattr(queries, "split", None)
+        )
+        start, goal = queries.start[: options.num_queries], queries.goal[: options.num_queries]
+        job = _Job(policy, str(task), options, start, goal, scenes)
+        job.make()[0].close()  # or it raises
+    except (TypeError, ValueError) as error:
+        raise EvaluationError(str(error)) from error
+    return job
+
+
+def _in_use(policy, options):
+    """The options with environment, safety filter and geometry source as they will be used."""
+    env, safety_filter = dict(options.env or {}), options.safety_filter
+    env["goal_type"] = options.goal_type or env.get("goal_type", "ee")
+    env["stop_on_collision"] = options.stop_on_collision
+    if safety_filter is None:
+        safety_filter = own_safety_filter(policy)
+    if safety_filter:
+        env["link_distances"] = True
+    source = options.geometry_source or env.get("geometry_source")
+    if env.get("link_distances"):
+        source = env["geometry_source"] = source or GROUND_TRUTH
+    elif env.get("encoder") == POINT_CLOUD and source != GROUND_TRUTH:
+        source = env["geometry_source"] = source or POINT_CLOUD
+    elif policy in PLANNERS:
+        source = source or GROUND_TRUTH
+    elif options.geometry_source is not None:
+        raise EvaluationError(
+            "geometry_source is for via-points, planner, a safety filter, and policies that "
+            "observe points or link distances"
+        )
+    return replace(options, env=env, geometry_source=source, safety_filter=safety_filter)
+
+
+def _queries(task, options):
+    """The object with the queries' starts and goals, and their scenes."""
+    queries = options.queries
+    if queries is None:
+        queries = load_queries(task, options.split)
+    elif isinstance(queries, (str, Path)):
+        validate(queries, task)  # they are for this task, with the scene it has now
+        queries = load_queries(queries, options.split)
+    name = task_name(task)
+    if getattr(queries, "task", name) != name:
+        raise EvaluationError(f"these queries are for the task {queries.task!r}, not {name!r}")
+    available = len(queries.start)
+    if options.num_queries is not None and not 1 <= options.num_queries <= available:
+        raise EvaluationError(f"num_queries must be 1 to {available}, got {options.num_queries}")
+    scenes, scene = getattr(queries, "scenes", None), get_task(task).scene
+    if scenes is None:
+        if not isinstance(scene, Scene):
+            raise EvaluationError(f"{name} has random scenes: these queries need `scenes` as well")
+        scenes = QueryScenes(scene)
+    return queries, scenes
+
+
+# --- Episodes
+
+
+class _Outcome(NamedTuple):
+    """The result of one episode; lengths are NaN where the goal was not reached.
+
+    `plan_found`: see `EpisodePolicy`.
+    """
+
+    success: bool
+    collision: bool
+    steps: int
+    path_length: float
+    smoothness: float
+    policy_seconds: float
+    planning_seconds: float
+    plan_found: bool | None
+
+
+class _Worker:
+    """Runs the queries of a job, chunk by chunk."""
+
+    def __init__(self, job):
+        torch.set_num_threads(1)
+        self.job = job
+        self.env, self.begin = job.make()
+
+    def __call__(self, indices):
+        """`indices`, a range, and their outcomes."""
+        outcomes = []
+        for index in indices:
+            try:
+                outcomes.append(self._outcome(index, self.job.query(index)))
+            except ValueError as error:  # the environment refuses the query or an action
+                raise EvaluationError(f"query {index}: {error}") from error
+        return indices, outcomes
+
+    def _outcome(self, index, query):
+        self.env.reset_specific(*query)  # it refuses an invalid query before planning
+        began = time.perf_counter()
+        act, plan_found = self.begin(index, query)
+        planning_seconds = time.perf_counter() - began
+        trajectory = rollout(self.env, query, act)
+        lengths = [np.nan, np.nan]
+        if trajectory.success:
+            configurations = trajectory.configurations
+            lengths = [path_length(configurations), smoothness(configurations)]
+        return _Outcome(
+            trajectory.success,
+            trajectory.collides,
+            len(trajectory),
+            *lengths,
+            float(trajectory.times.sum()),
+            planning_seconds,
+            plan_found,
+        )
+
+
+def _run(job, progress):
+    """The outcomes of all queries, in their order."""
+    count = len(job.start)
+    chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
+    outcomes, successes = [None] * count, 0
+    bar = tqdm(total=count, unit="query", disable=None if progress else True)
+    threads = torch.get_num_threads()
+    try:
+        with bar:
+            for indices, chunk in _results(job, chunks, bar.write):
+                outcomes[indices.start : indices.stop] = chunk
+                successes += sum(outcome.success for outcome in chunk)
+                bar.update(len(chunk))
+                if bar.n:  # 0 as long as no bar is shown
+                    bar.set_postfix(success=f"{successes / bar.n:.3f}")
+    finally:
+        torch.set_num_threads(threads)
+    return outcomes
+
+
+def _results(job, chunks, warn):
+    """The chunks and their outcomes, in any order."""
+    count = job.options.workers
+    if count == 1:
+        return map(_Worker(job), chunks)
+    return workers.run(_Worker, (job,), chunks, min(count, len(chunks)), warn)
+
+
+# --- The result
+
+
+def _summary(job, outcomes):
+    options, count = job.options, len(outcomes)
+    columns = _Outcome(*(np.array(column) for column in zip(*outcomes, strict=True)))
+    reached = columns.success
+    actions = int(columns.steps.sum())
+
+    def share(name, hits):
+        low, high = wilson_interval(int(hits.sum()), count)
+        return {name: float(hits.mean()), f"{name}_interval": [low, high]}
+
+    def mean(values, which=reached):
+        return float(values[which].mean()) if which.any() else None
+
+    plans, safety_filter = job.policy in PLANNERS, options.safety_filter
+    planning = {"planning_seconds": None, "planning_seconds_solved": None, "free_motion_rate": None}
+    if plans:
+        found = columns.plan_found.astype(bool)
+        planning["planning_seconds"] = float(columns.planning_seconds.mean())
+        planning["planning_seconds_solved"] = mean(columns.planning_seconds, found)
+        if job.policy == "via-points":
+            planning["free_motion_rate"] = float(found.mean())
+    random = plans or job.policy == "random" or safety_filter
+    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy == "planner")
+    return {
+        "policy": getattr(job.policy, "__name__", str(job.policy)),
+        "task": job.task,
+        "goal_type": options.env["goal_type"],
+        "split": options.split,
+        "num_queries": count,
+        **share("success_rate", reached),
+        **share("collision_free_success_rate", reached & ~columns.collision),
+        **share("collision_rate", columns.collision),
+        "mean_steps": mean(columns.steps),
+        "path_length": mean(columns.path_length),
+        "smoothness": mean(columns.smoothness),
+        "ms_per_action": 1e3 * float(columns.policy_seconds.sum()) / actions if actions else None,
+        **planning,
+        "env": options.env,
+        "deviations": deviations(options.env),
+        "geometry_source": options.geometry_source,
+        "privileged": is_privileged(options.env)
+        or (plans and options.geometry_source == GROUND_TRUTH),
+        "safety_filter": asdict(safety_filter) | {"version": VERSION} if safety_filter else None,
+        "seed": options.seed if random else None,
+        "tries": options.tries if job.policy == "via-points" else None,
+        "time_limit": options.time_limit if job.policy == "planner" else None,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in packages},
+        },
+    }
