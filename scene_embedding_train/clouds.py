@@ -1,4 +1,4 @@
-"""Point clouds for the trainers of point-cloud encoders: loading, batches, thinning, a figure.
+"""Point clouds for the trainers of point-cloud encoders: loading, thinning, classes, a figure.
 
 Clouds are thinned out to save time: the loaders thin out those of a training set once, and
 `thin_out` is a part of the exported encoders.
@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE, PointCloud, deproject
 from roboarm_nmp.scene_embedding_train.training_data import unpack
@@ -17,6 +18,8 @@ from roboarm_nmp.scene_embedding_train.training_data import unpack
 MAX_RADIUS = 1.1  # m from the robot's axis: the arm does not reach further
 TABLE_TOP = 0.01  # m: table and floor are most of a cloud, so points above it are sampled apart
 NO_HIT = 65_535  # a stored depth: `far` of the sensor, where its ray hits nothing
+ABSENT_DISTANCE = 0.05  # m: a point is absent from a cloud whose points are all further away
+IGNORED = -100  # label of points that have no class
 # Of the classes robot, table and floor, obstacle, nothing (as in the paper's figure).
 COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [150, 150, 150]], np.uint8)
 
@@ -146,6 +149,15 @@ def example_clouds(observations, names):
     return example
 
 
+def scene_cloud(observations, scene, name):
+    """A sensor's whole cloud of one scene: points (p, 3), m, that hit something, and labels (p)."""
+    shard = np.searchsorted(observations.offsets, scene, side="right") - 1
+    row = scene - observations.offsets[shard]
+    points, labels = (one[row] for one in whole_clouds(observations, shard, name))
+    hit = labels != NOTHING
+    return points[hit], labels[hit]
+
+
 def whole_clouds(observations, shard, name):
     """A sensor's clouds of the scenes of a shard, as the environment's `PointCloud` returns them.
 
@@ -198,11 +210,74 @@ def thin_out(mask, number):
     return order.gather(1, (steps * counts).div(number, rounding_mode="floor"))
 
 
+def distances_to(points, clouds):
+    """From points (n, p, 3) to the nearest of each scene's cloud (n, q, 3): distances (n, p)."""
+    squares = [  # without those of the points; a scene at a time, for the CPU's cache
+        torch.addmm(cloud.square().sum(1), scene, cloud.T, alpha=-2).amin(1)
+        for scene, cloud in zip(points, clouds, strict=True)
+    ]
+    return (torch.stack(squares) + points.square().sum(2)).clamp(min=0).sqrt()
+
+
+def queries_of(points, labels, whole, number=None):
+    """Points to classify (n, q, 3) and their classes (n, q), from one sensor's of `batch_of`.
+
+    They are the scene's own, (n, 2, p), and those above the table of the scene before it in the
+    batch. Of the latter, points of obstacles with nothing near them in the whole cloud have the
+    class `NOTHING`. Points without a class are `IGNORED`. There are all 3p, or a random sample of
+    `number`, a third of it from the other scene.
+    """
+    own, classes = points.flatten(1, 2), labels.flatten(1, 2)
+    others, other_labels = points[:, 1].roll(1, dims=0), labels[:, 1].roll(1, dims=0)
+    if number is not None:
+        chosen = torch.randperm(own.shape[1], device=own.device)[: number - number // 3]
+        own, classes = own[:, chosen], classes[:, chosen]
+        chosen = torch.randperm(others.shape[1], device=own.device)[: number // 3]
+        others, other_labels = others[:, chosen], other_labels[:, chosen]
+    absent = (other_labels == OBSTACLE) & (distances_to(others, whole) > ABSENT_DISTANCE)
+    truth = [torch.where(classes == NOTHING, IGNORED, classes)]
+    truth.append(torch.where(absent, NOTHING, IGNORED))
+    return torch.cat([own, others], dim=1), torch.cat(truth, dim=1)
+
+
+@torch.no_grad()
+def classification_scores(model, clouds, rows, batch_size, device):
+    """How well points of scenes `rows` are classified.
+
+    Returns:
+        `accuracy` and the intersection over union of each class, `iou_robot`, `iou_static`,
+        `iou_obstacle`, over points evenly spaced among those that hit something; and `absent`, the
+        share of other scenes' obstacle points that are predicted to be absent.
+    """
+    model.eval()
+    number = clouds.points.shape[3]
+    confusion = torch.zeros(NOTHING, NOTHING + 1, dtype=torch.int64)  # truth, prediction
+    predicted_absent = all_absent = 0
+    for start in range(0, len(rows), batch_size):
+        batch = batch_of(clouds, rows[start : start + batch_size], device)
+        for logits, truth in zip(*model(batch), strict=True):
+            predicted = logits.argmax(2)
+            one_hot = F.one_hot(predicted, NOTHING + 1)[:, :number]
+            own = [(truth[:, :number] == label).unsqueeze(2) for label in range(NOTHING)]
+            confusion += torch.stack([(one * one_hot).sum((0, 1)) for one in own]).cpu()
+            absent = truth == NOTHING
+            all_absent += absent.sum().item()
+            predicted_absent += (absent & (predicted == NOTHING)).sum().item()
+    model.train()
+    both = confusion.diagonal()
+    iou = both / (confusion[:, :NOTHING].sum(0) + confusion.sum(1) - both).clamp(min=1)
+    result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
+    result["absent"] = predicted_absent / max(1, all_absent)
+    names = ("iou_robot", "iou_static", "iou_obstacle")
+    return result | dict(zip(names, iou.tolist(), strict=True))
+
+
 def comparison(points, truth, predicted, size=160):
-    """A figure, uint8 (size, 2 size, 3): points (p, 3) from above, true and predicted classes.
+    """A figure, uint8 (size, 2 size, 3): points (p, 3), m, from above, true classes on the left.
 
     Robot red, table and floor orange, obstacles yellow, as in the paper's figure; nothing grey.
     """
+    points, truth, predicted = (one.cpu().numpy() for one in (points, truth, predicted))
     images = []
     for labels in (truth, predicted):
         image = np.full((size, size, 3), 255, np.uint8)

@@ -16,13 +16,14 @@ docs/sensors.md.)
 
 What is saved: `encoder.pt`, an exported network from the clouds to z_E, and `encoder.decoder.pt`,
 one from z_E and points to distances. To make an encoder of your own, copy this file and change the
-parts under `# MODEL`. Parts between `# SHARED` and `# END SHARED` are those of `vae.py`.
+parts under `# MODEL`.
 """
 
 import contextlib
+import functools
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -31,35 +32,29 @@ import torch.nn.functional as F
 
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.training.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
-from roboarm_nmp.envs.training.runs import (
-    check_finite,
-    elapsed,
-    load_checkpoint,
-    parse_args,
-    progress_bar,
-    rate,
-    resolve_bf16,
-    run_folder,
-    save_checkpoint,
-    seed_torch,
-    summary_writer,
-    write_json,
-)
+from roboarm_nmp.envs.training.runs import Run, check_finite, parse_args, resolve_bf16, seed_torch
 from roboarm_nmp.scene_embedding_train.clouds import (
     example_clouds,
     load_obstacle_points,
     obstacle_points,
 )
+from roboarm_nmp.scene_embedding_train.obstacles import (
+    MAX_DISTANCE,
+    MIN_DISTANCE,
+    comparison,
+    distances,
+    load_obstacles,
+    rotation_matrices,
+)
 from roboarm_nmp.scene_embedding_train.training_data import (
     EncoderFlags,
     encoder_metadata,
     load_observations,
-    load_obstacles,
+    write_result,
 )
 
-# The field is around the robot's axis, m. Distances are clipped at both ends, m.
+# The field is around the robot's axis, m.
 REACH, HEIGHT = 1.0, 1.5
-MIN_DISTANCE, MAX_DISTANCE = -0.05, 0.4
 NEAR = 0.1  # m: the distances that matter most
 # Cells of angle, distance from the axis, and height; sectors, each with an equal part of z_E.
 ANGLES, RADII, HEIGHTS = 64, 16, 12
@@ -197,40 +192,9 @@ class Field(nn.Module):
         z = self.encoder(points, valid)
         return F.layer_norm(z, z.shape[1:])
 
-
-def rotation_matrices(quaternions):
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), x, y, z, w."""
-    x, y, z, w = quaternions.unbind(-1)
-    rows = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
-        (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
-        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
-def distances(obstacles, points):
-    """Distances (n, q), m, from points (n, q, 3), m, to the nearest of obstacles (n, k, 12).
-
-    Obstacles are rows of `load_obstacles`. Distances are negative inside an obstacle, and clipped
-    to [`MIN_DISTANCE`, `MAX_DISTANCE`].
-    """
-    exists, kind, position, quaternion, size = obstacles.split((1, 1, 3, 4, 3), dim=2)
-    # Into the obstacles' own frames, all in one product.
-    axes = rotation_matrices(quaternion)
-    offset = (points @ axes.transpose(1, 2).flatten(2)).unflatten(2, (-1, 3))
-    offset = offset - (position.unsqueeze(2) @ axes).transpose(1, 2)
-    exists, kind, size = exists.unsqueeze(1), kind.unsqueeze(1), size.unsqueeze(1)
-    x, y, z = offset.unbind(-1)
-    # A cylinder is a rectangle in radius and height; the second of three axes is always inside.
-    flat = torch.stack([(x.square() + y.square()).sqrt(), torch.zeros_like(x), z], dim=-1)
-    half_flat = size * size.new_tensor([1.0, 0.0, 0.5]) + size.new_tensor([0.0, 1.0, 0.0])
-    cylinder = kind == 1.0
-    beyond = torch.where(cylinder, flat, offset).abs() - torch.where(cylinder, half_flat, size / 2)
-    distance = beyond.clamp(min=0.0).norm(dim=-1) + beyond.amax(dim=-1).clamp(max=0.0)
-    distance = torch.where(kind[..., 0] == 2.0, offset.norm(dim=-1) - size[..., 0], distance)
-    distance = torch.where(exists[..., 0] > 0.0, distance, MAX_DISTANCE)
-    return distance.amin(dim=2).clamp(MIN_DISTANCE, MAX_DISTANCE)
+    def forward(self, points, valid, queries):
+        """Observed points, points (n, q, 3), m -> distances (n, q), m."""
+        return self.decoder(self.encode(points, valid), queries)
 
 
 def sample_queries(obstacles, number, spread):
@@ -324,7 +288,7 @@ def evaluate(model, data, queries, rows, batch_size, device):
         points, valid, obstacles = batch_of(data, rows[part], device)
         at = queries[part].to(device)
         truth = distances(obstacles, at)
-        predicted = model.decoder(model.encode(points, valid), at)
+        predicted = model(points, valid, at)
         error = (predicted.clamp(MIN_DISTANCE, MAX_DISTANCE) - truth).abs()
         for name, (low, high) in spans.items():
             inside = (truth > low) & (truth <= high)
@@ -342,28 +306,6 @@ def batch_of(data, rows, device):
     return [torch.as_tensor(array[rows], device=device) for array in data]
 
 
-@torch.no_grad()
-def comparison(model, points, valid, obstacles, size=96):
-    """A figure of the field at three heights, truth above: uint8 (2 size, 3 size, 3).
-
-    Seen from above, x up. Dark is near, and the inside of obstacles is red.
-    """
-    device = obstacles.device
-    axis = torch.linspace(REACH, -REACH, size, device=device)  # x is up, y to the left
-    x, y = torch.meshgrid(axis, axis, indexing="ij")
-    rows = []
-    z = model.encode(points, valid)
-    for field in (lambda at: distances(obstacles, at), lambda at: model.decoder(z, at)):
-        images = []
-        for height in (0.2, 0.5, 0.8):
-            at = torch.stack([x, y, torch.full_like(x, height)], dim=2).reshape(1, -1, 3)
-            grey = (255 * (field(at) / MAX_DISTANCE).clamp(0.0, 1.0)).reshape(size, size, 1)
-            red = torch.tensor([200.0, 30.0, 30.0], device=device)
-            images.append(torch.where(grey > 0.0, grey, red))
-        rows.append(torch.cat(images, dim=1))
-    return torch.cat(rows).byte().cpu().numpy()
-
-
 if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     if args.latent_size % SECTORS:
@@ -374,7 +316,7 @@ if __name__ == "__main__":
     data = points, valid, load_obstacles(observations)
     example = example_clouds(observations, names)
     metadata = encoder_metadata(args, observations, names)
-    run, device = run_folder(args, observations.task), seed_torch(args)
+    device = seed_torch(args)
     rng = np.random.default_rng(args.seed)
 
     # MODEL: network and optimiser
@@ -385,59 +327,43 @@ if __name__ == "__main__":
         obstacles = torch.as_tensor(data[-1][validation])
         queries = sample_queries(obstacles, 4 * args.num_queries, args.spread)
 
-    # SHARED: checkpoint and log
-    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
-    checkpoint_state = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
-    load_checkpoint(args, checkpoint_state)
-    seconds_before = progress["seconds"]
-    writer = summary_writer(run, args, progress["updates"])
-    bar = progress_bar(args.total_updates, progress["updates"], "update")
-    # END SHARED
+    run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
+    run.start(args.total_updates, "update")
 
-    while progress["updates"] < args.total_updates:
+    while run.step < args.total_updates:
         # MODEL: learn
-        remaining = 1.0 - progress["updates"] / args.total_updates
+        remaining = 1.0 - run.step / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = batch_of(data, rng.integers(num_training, size=args.batch_size), device)
         losses = update(model, optimizer, batch, args)
-        progress["updates"] = step = progress["updates"] + 1
-        bar.update()
+        step = run.advance()
         if step % 100 == 0:
-            for name, value in losses.items():
-                writer.add_scalar(f"losses/{name}", value.item(), step)
-            writer.add_scalar("charts/updates_per_second", rate(bar), step)
+            run.log({f"losses/{name}": value for name, value in losses.items()})
+            run.log({"charts/updates_per_second": run.rate})
 
-        # Evaluate, keep the best encoder
-        if step % args.eval_every == 0 or step == args.total_updates:
+        # Evaluate, keep the best encoder and its decoder, checkpoint
+        evaluating = step % args.eval_every == 0 or step == args.total_updates
+        if evaluating:
             check_finite("the losses", losses["loss"])
             result = evaluate(model, data, queries, validation, args.batch_size, device)
-            for name, value in result.items():
-                writer.add_scalar(f"eval/{name}", value, step)
-            figure = comparison(model, *batch_of(data, validation[:1], device))
-            writer.add_image("eval/slices", figure, step, dataformats="HWC")
-            if result["error_near"] < progress["best_error"]:
-                progress["best_error"], progress["best_update"] = result["error_near"], step
-                progress["best"] = result
+            run.log({f"eval/{name}": value for name, value in result.items()})
+            points, valid, obstacles = batch_of(data, validation[:1], device)
+            field = functools.partial(model, points, valid)
+            run.log_image("eval/slices", comparison(obstacles, field, REACH))
+            run.show(near=f"{result['error_near']:.4f}")
+            if run.is_best(-result["error_near"], result):
                 encoder = ExportedEncoder(model, tuple(names), args.num_points)
-                described = metadata | {"step": step} | result
-                save_network(run / "encoder.pt", encoder, example, described)
+                details = metadata | {"step": step} | result
+                save_network(run.folder / "encoder.pt", encoder, example, details)
                 inputs = {"latent": torch.zeros(2, args.latent_size), "points": queries[:2]}
-                described |= {"kind": "field"}
-                save_network(run / "encoder.decoder.pt", model.decoder, inputs, described)
-            bar.set_postfix(near=f"{result['error_near']:.4f}")
-            # SHARED: checkpoint and result
-            progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, checkpoint_state, device)
-    bar.close()
+                details |= {"kind": "field"}
+                save_network(run.folder / "encoder.decoder.pt", model.decoder, inputs, details)
+        if evaluating or run.interrupted:
+            run.checkpoint()
+    run.close()
 
-    result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}
-    result |= {name: progress[name] for name in ("updates", "best_update")}
-    result["seconds"] = round(progress["seconds"])
-    write_json(run / "result.json", result | {"args": asdict(args)})
-    # END SHARED
+    result = write_result(run, num_training)
     summary = "mean error {error_near:.4f} m within 10 cm of an obstacle; up to 5 cm "
-    summary += (
-        "{error_5cm:.4f}, 10 cm {error_10cm:.4f}, 20 cm {error_20cm:.4f}, 40 cm {error_40cm:.4f}"
-    )
-    print(f"{summary.format(**result)}. {run / 'result.json'}")
-    writer.close()
+    summary += "{error_5cm:.4f}, 10 cm {error_10cm:.4f}, 20 cm {error_20cm:.4f}, "
+    summary += "40 cm {error_40cm:.4f}"
+    print(f"{summary.format(**result)}. {run.folder / 'result.json'}")

@@ -15,12 +15,12 @@ also enter as sines and cosines (as in NeRF), without which the network hardly l
 
 What is saved, `encoder.pt`, is an exported network from the clouds to z_E, the sensors' latent
 codes side by side. To make an encoder of your own, copy this file and change the parts under
-`# MODEL`. Parts between `# SHARED` and `# END SHARED` are those of `vae.py`.
+`# MODEL`.
 """
 
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -28,39 +28,28 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE
+from roboarm_nmp.envs.perception.sensors import NOTHING
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Width
-from roboarm_nmp.envs.training.runs import (
-    check_finite,
-    elapsed,
-    load_checkpoint,
-    parse_args,
-    progress_bar,
-    rate,
-    run_folder,
-    save_checkpoint,
-    seed_torch,
-    summary_writer,
-    write_json,
-)
+from roboarm_nmp.envs.training.runs import Run, check_finite, parse_args, seed_torch
 from roboarm_nmp.scene_embedding_train.clouds import (
+    IGNORED,
     batch_of,
+    classification_scores,
     comparison,
     example_clouds,
     gather,
     hits,
     load_clouds,
+    queries_of,
+    scene_cloud,
     thin_out,
-    whole_clouds,
 )
 from roboarm_nmp.scene_embedding_train.training_data import (
     EncoderFlags,
     encoder_metadata,
     load_observations,
+    write_result,
 )
-
-ABSENT_DISTANCE = 0.05  # m: a point is absent from a cloud whose points are all further away
-IGNORED = -100  # label of points that have no class
 
 
 @dataclass
@@ -200,36 +189,6 @@ class Decoder(nn.Module):
         return torch.cat([waves(points, self.args.num_waves), spread], dim=2)
 
 
-def distances_to(points, clouds):
-    """From points (n, p, 3) to the nearest of each scene's cloud (n, q, 3): distances (n, p)."""
-    squares = [  # without those of the points; a scene at a time, for the CPU's cache
-        torch.addmm(cloud.square().sum(1), scene, cloud.T, alpha=-2).amin(1)
-        for scene, cloud in zip(points, clouds, strict=True)
-    ]
-    return (torch.stack(squares) + points.square().sum(2)).clamp(min=0).sqrt()
-
-
-def queries_of(points, labels, whole, number=None):
-    """Points to classify (n, q, 3) and their classes (n, q), from one sensor's of `batch_of`.
-
-    They are the scene's own, (n, 2, p), and those above the table of the scene before it in the
-    batch. Of the latter, points of obstacles with nothing near them in the whole cloud have the
-    class `NOTHING`. Points without a class are `IGNORED`. There are all 3p, or a random sample of
-    `number`, a third of it from the other scene.
-    """
-    own, classes = points.flatten(1, 2), labels.flatten(1, 2)
-    others, other_labels = points[:, 1].roll(1, dims=0), labels[:, 1].roll(1, dims=0)
-    if number is not None:
-        chosen = torch.randperm(own.shape[1], device=own.device)[: number - number // 3]
-        own, classes = own[:, chosen], classes[:, chosen]
-        chosen = torch.randperm(others.shape[1], device=own.device)[: number // 3]
-        others, other_labels = others[:, chosen], other_labels[:, chosen]
-    absent = (other_labels == OBSTACLE) & (distances_to(others, whole) > ABSENT_DISTANCE)
-    truth = [torch.where(classes == NOTHING, IGNORED, classes)]
-    truth.append(torch.where(absent, NOTHING, IGNORED))
-    return torch.cat([own, others], dim=1), torch.cat(truth, dim=1)
-
-
 class PointNet2(nn.Module):
     """An encoder and a decoder per sensor."""
 
@@ -286,38 +245,6 @@ def update(model, optimizer, batch, args):
     return loss
 
 
-@torch.no_grad()
-def evaluate(model, clouds, rows, batch_size, device):
-    """How well points of scenes `rows` are classified.
-
-    Returns:
-        `accuracy` and the intersection over union of each class, `iou_robot`, `iou_static`,
-        `iou_obstacle`, over points evenly spaced among those that hit something; and `absent`, the
-        share of other scenes' obstacle points that are predicted to be absent.
-    """
-    model.eval()
-    number = clouds.points.shape[3]
-    confusion = torch.zeros(NOTHING, NOTHING + 1, dtype=torch.int64)  # truth, prediction
-    predicted_absent = all_absent = 0
-    for start in range(0, len(rows), batch_size):
-        batch = batch_of(clouds, rows[start : start + batch_size], device)
-        for logits, truth in zip(*model(batch), strict=True):
-            predicted = logits.argmax(2)
-            one_hot = F.one_hot(predicted, NOTHING + 1)[:, :number]
-            own = [(truth[:, :number] == label).unsqueeze(2) for label in range(NOTHING)]
-            confusion += torch.stack([(one * one_hot).sum((0, 1)) for one in own]).cpu()
-            absent = truth == NOTHING
-            all_absent += absent.sum().item()
-            predicted_absent += (absent & (predicted == NOTHING)).sum().item()
-    model.train()
-    both = confusion.diagonal()
-    iou = both / (confusion[:, :NOTHING].sum(0) + confusion.sum(1) - both).clamp(min=1)
-    result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
-    result["absent"] = predicted_absent / max(1, all_absent)
-    names = ("iou_robot", "iou_static", "iou_obstacle")
-    return result | dict(zip(names, iou.tolist(), strict=True))
-
-
 if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     many, few = args.num_centres
@@ -329,70 +256,49 @@ if __name__ == "__main__":
     clouds = load_clouds(observations, args.num_points)
     example = example_clouds(observations, clouds.sensors)
     metadata = encoder_metadata(args, observations, clouds.sensors)
-    run, device = run_folder(args, observations.task), seed_torch(args)
+    device = seed_torch(args)
     rng = np.random.default_rng(args.seed)
 
     # MODEL: network and optimiser
     model = PointNet2(len(clouds.sensors), args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
-    # For the figure: the first sensor's whole cloud of the first validation scene.
-    shard = np.searchsorted(observations.offsets, validation[0], side="right") - 1
-    cloud = whole_clouds(observations, shard, next(iter(clouds.sensors)))
-    row = validation[0] - observations.offsets[shard]
-    hit = cloud[1][row] != NOTHING
-    shown, classes = (one[row][hit].unsqueeze(0).to(device) for one in cloud)
+    shown, classes = scene_cloud(observations, validation[0], next(iter(clouds.sensors)))
+    shown = shown.to(device).unsqueeze(0)
 
-    # SHARED: checkpoint and log
-    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
-    checkpoint_state = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
-    load_checkpoint(args, checkpoint_state)
-    seconds_before = progress["seconds"]
-    writer = summary_writer(run, args, progress["updates"])
-    bar = progress_bar(args.total_updates, progress["updates"], "update")
-    # END SHARED
+    run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
+    run.start(args.total_updates, "update")
 
-    while progress["updates"] < args.total_updates:
+    while run.step < args.total_updates:
         # MODEL: learn
-        remaining = 1.0 - progress["updates"] / args.total_updates
+        remaining = 1.0 - run.step / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = batch_of(clouds, rng.integers(num_training, size=args.batch_size), device)
         loss = update(model, optimizer, batch, args)
-        progress["updates"] = step = progress["updates"] + 1
-        bar.update()
+        step = run.advance()
         if step % 100 == 0:
-            writer.add_scalar("losses/loss", loss.item(), step)
-            writer.add_scalar("charts/updates_per_second", rate(bar), step)
+            run.log({"losses/loss": loss, "charts/updates_per_second": run.rate})
 
-        # Evaluate, keep the best encoder
-        if step % args.eval_every == 0 or step == args.total_updates:
+        # Evaluate, keep the best encoder, checkpoint
+        evaluating = step % args.eval_every == 0 or step == args.total_updates
+        if evaluating:
             check_finite("the losses", loss)
-            result = evaluate(model, clouds, validation, args.batch_size, device)
-            for name, value in result.items():
-                writer.add_scalar(f"eval/{name}", value, step)
+            result = classification_scores(model, clouds, validation, args.batch_size, device)
+            run.log({f"eval/{name}": value for name, value in result.items()})
             with torch.no_grad():
                 points = batch_of(clouds, validation[:1], device)[0][0]
                 predicted = model.decoders[0](model.encoders[0](points[:, 1]), shown).argmax(2)
-            figure = comparison(*(a[0].cpu().numpy() for a in (shown, classes, predicted)))
-            writer.add_image("eval/classification", figure, step, dataformats="HWC")
+            run.log_image("eval/classification", comparison(shown[0], classes, predicted[0]))
+            run.show(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
             error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
-            if error < progress["best_error"]:
-                progress["best_error"], progress["best_update"] = error, step
-                progress["best"] = result
+            if run.is_best(-error, result):
                 encoder = ExportedEncoder(model, tuple(clouds.sensors))
-                described = metadata | {"step": step} | result
-                save_network(run / "encoder.pt", encoder, example, described)
-            bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
-            # SHARED: checkpoint and result
-            progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, checkpoint_state, device)
-    bar.close()
+                details = metadata | {"step": step} | result
+                save_network(run.folder / "encoder.pt", encoder, example, details)
+        if evaluating or run.interrupted:
+            run.checkpoint()
+    run.close()
 
-    result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}
-    result |= {name: progress[name] for name in ("updates", "best_update")}
-    result["seconds"] = round(progress["seconds"])
-    write_json(run / "result.json", result | {"args": asdict(args)})
-    # END SHARED
+    result = write_result(run, num_training)
     summary = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor "
     summary += "{iou_static:.3f}, obstacles {iou_obstacle:.3f}; absent points {absent:.3f}"
-    print(f"{summary.format(**result)}. {run / 'result.json'}")
-    writer.close()
+    print(f"{summary.format(**result)}. {run.folder / 'result.json'}")

@@ -16,7 +16,6 @@ from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.observations import Observations
 from roboarm_nmp.envs.datasets.shards import shard_path
 from roboarm_nmp.envs.perception.sensors import sensors_to_json
-from roboarm_nmp.envs.scenes.primitives import padded_rows
 from roboarm_nmp.envs.training.flags import PositiveInt, Share
 from roboarm_nmp.envs.training.runs import RunFlags
 from roboarm_nmp.envs.utils.files import new_contents
@@ -70,6 +69,19 @@ def encoder_metadata(args, observations, names):
     return metadata | {"sensors": sensors, "seed": args.seed}
 
 
+def write_result(run, num_training):
+    """Write `result.json`: the best evaluation and the size of the run. Returns its dict.
+
+    Args:
+        run: the `Run`, whose `best_result` is a dict of the best evaluation.
+        num_training: number of scenes that it trained on.
+    """
+    result = run.best_result | {"scenes": num_training, "encoder": str(run.folder / "encoder.pt")}
+    result |= {"updates": run.step, "best_update": run.best_step, "seconds": round(run.seconds)}
+    run.write_result(result)
+    return result
+
+
 def unpack(observations, name, arrays, shards):
     """Arrays with a row per scene, made once, kept in files beside the shards and memory-mapped.
 
@@ -109,21 +121,6 @@ def unpack(observations, name, arrays, shards):
             for array in whole.values():
                 array.flush()
     return {one: np.load(path, mmap_mode="r") for one, path in paths.items()}
-
-
-def load_obstacles(observations):
-    """The ground-truth obstacles: float32 (scenes, n, 12), n of the scene that has most.
-
-    An obstacle's row is 1 and its row of `to_array`, with a quaternion of length 1; the rows after
-    a scene's last obstacle are zeros.
-    """
-    shards = range(len(observations.offsets) - 1)
-    scenes = [scene for shard in shards for scene in observations.scenes(shard)]
-    most = max(len(scene.obstacles) for scene in scenes)
-    obstacles = np.stack([padded_rows(scene.obstacles, most) for scene in scenes])
-    quaternions = obstacles[..., 5:9]
-    quaternions /= np.maximum(np.linalg.norm(quaternions, axis=-1, keepdims=True), 1e-9)
-    return obstacles
 
 
 def contents_key(observations):

@@ -10,9 +10,8 @@ mean of z_E. To make an encoder of your own, copy this file and change the parts
 Parts between `# SHARED` and `# END SHARED` are those of `vqvae.py`.
 """
 
-import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,18 +19,7 @@ import torch.nn as nn
 
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.training.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
-from roboarm_nmp.envs.training.runs import (
-    elapsed,
-    load_checkpoint,
-    parse_args,
-    progress_bar,
-    rate,
-    run_folder,
-    save_checkpoint,
-    seed_torch,
-    summary_writer,
-    write_json,
-)
+from roboarm_nmp.envs.training.runs import Run, parse_args, seed_torch
 from roboarm_nmp.scene_embedding_train.images import (
     average_down,
     batch_of,
@@ -46,6 +34,7 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     EncoderFlags,
     encoder_metadata,
     load_observations,
+    write_result,
 )
 
 
@@ -198,7 +187,7 @@ if __name__ == "__main__":
     images, cameras = load_images(observations, size)
     example = example_images(observations, cameras)
     metadata = encoder_metadata(args, observations, cameras)
-    run, device = run_folder(args, observations.task), seed_torch(args)
+    device = seed_torch(args)
     rng = np.random.default_rng(args.seed)
     mean_image = mean_of_images(images, num_training, device)
     # END SHARED
@@ -206,56 +195,39 @@ if __name__ == "__main__":
     # MODEL: network and optimiser
     model = VAE(len(cameras), size, args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
+    run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
+    run.start(args.total_updates, "update")
 
-    # SHARED: checkpoint and log
-    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
-    checkpoint_state = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
-    load_checkpoint(args, checkpoint_state)
-    seconds_before = progress["seconds"]
-    writer = summary_writer(run, args, progress["updates"])
-    bar = progress_bar(args.total_updates, progress["updates"], "update")
-    # END SHARED
-
-    while progress["updates"] < args.total_updates:
+    while run.step < args.total_updates:
         # MODEL: learn
-        remaining = 1.0 - progress["updates"] / args.total_updates
+        remaining = 1.0 - run.step / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = batch_of(images, rng.integers(num_training, size=args.batch_size), device)
         losses = update(model, optimizer, batch, mean_image, args)
-        progress["updates"] = step = progress["updates"] + 1
-        bar.update()
+        step = run.advance()
         if step % 100 == 0:
-            for name, value in losses.items():
-                writer.add_scalar(f"losses/{name}", value.item(), step)
-            writer.add_scalar("charts/updates_per_second", rate(bar), step)
+            run.log({f"losses/{name}": value for name, value in losses.items()})
+            run.log({"charts/updates_per_second": run.rate})
 
-        # SHARED: evaluate, keep the best encoder
-        if step % args.eval_every == 0 or step == args.total_updates:
+        # SHARED: evaluate, keep the best encoder, checkpoint
+        evaluating = step % args.eval_every == 0 or step == args.total_updates
+        if evaluating:
             errors = (model, images, validation, mean_image, args.batch_size, device)
             result = reconstruction_errors(*errors)
-            for name, value in result.items():
-                writer.add_scalar(f"eval/{name}", value, step)
+            run.log({f"eval/{name}": value for name, value in result.items()})
             figure = comparison(model, batch_of(images, validation[:1], device))
-            writer.add_image("eval/reconstruction", figure, step, dataformats="HWC")
-            if result["error_foreground"] < progress["best_error"]:
-                progress["best_error"], progress["best_update"] = result["error_foreground"], step
-                progress["best"] = result
+            run.log_image("eval/reconstruction", figure)
+            run.show(error=f"{result['error_foreground']:.4f}")
+            if run.is_best(-result["error_foreground"], result):
                 encoder = ExportedEncoder(model, tuple(cameras), size)
-                described = metadata | {"step": step} | result
-                save_network(run / "encoder.pt", encoder, example, described)
-            bar.set_postfix(error=f"{result['error_foreground']:.4f}")
-            # END SHARED
-            # SHARED: checkpoint and result
-            progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, checkpoint_state, device)
-    bar.close()
+                details = metadata | {"step": step} | result
+                save_network(run.folder / "encoder.pt", encoder, example, details)
+        if evaluating or run.interrupted:
+            run.checkpoint()
+    run.close()
 
-    result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}
-    result |= {name: progress[name] for name in ("updates", "best_update")}
-    result["seconds"] = round(progress["seconds"])
-    write_json(run / "result.json", result | {"args": asdict(args)})
-    # END SHARED
+    result = write_result(run, num_training)
     summary = "error {error:.5f} (mean image {mean_image_error:.5f}); foreground "
     summary += "{error_foreground:.4f} ({mean_image_error_foreground:.4f})"
-    print(f"{summary.format(**result)}. {run / 'result.json'}")
-    writer.close()
+    print(f"{summary.format(**result)}. {run.folder / 'result.json'}")
+    # END SHARED
