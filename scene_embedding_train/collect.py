@@ -23,9 +23,8 @@ from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
-
-# Streams 1 to 3 of random numbers are those of the queries and demonstrations.
-STREAM = 4
+from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
 
 
 @dataclass
@@ -75,7 +74,7 @@ class Collector:
         number, first, end = job
         scenes, configurations, observations = [], [], []
         for index in range(first, end):
-            rng = np.random.default_rng([self.seed, STREAM, index])
+            rng = np.random.default_rng([self.seed, Stream.OBSERVATIONS, index])
             self.env.sample_scene(rng)
             configurations.append(self.env.sample_feasible(rng))
             scenes.append(self.env.scene)
@@ -115,9 +114,8 @@ def collect(args, progress=True):
 def main(args):
     try:
         made = collect(args)
-    except KeyboardInterrupt:
-        print("interrupted; the same command continues from here", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as interrupt:
+        exit_interrupted(interrupt, "the same command continues from here")
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
@@ -125,4 +123,5 @@ def main(args):
 
 
 if __name__ == "__main__":
+    raise_on_sigterm()
     main(tyro.cli(Args, prog="roboarm observations", description=__doc__))

@@ -41,7 +41,7 @@ def load(name):
 def command(name, observations, folder, *flags):
     """A run of seconds; later flags win."""
     script = [sys.executable, str(FOLDER / f"{name}.py"), "--observations", str(observations)]
-    tiny = [*TINY, *(TINY_CLOUDS if name in OF_CLOUDS else ["--picture-size", "16"])]
+    tiny = [*TINY, *(TINY_CLOUDS if name in OF_CLOUDS else ["--image-size", "16"])]
     tiny += TINY_POINTNET if name == "pointnet2" else []
     return [*script, "--runs-dir", str(folder), *tiny, *flags]
 

@@ -19,7 +19,8 @@ from roboarm_nmp.envs.datasets.observations import Observations
 from roboarm_nmp.envs.networks.exported_networks import load_network
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.sensors import PointCloud
-from roboarm_nmp.scene_embedding_train import clouds, pictures
+from roboarm_nmp.envs.training.runs import Run
+from roboarm_nmp.scene_embedding_train import clouds, images
 
 
 @pytest.fixture(scope="module", params=SCRIPTS)
@@ -45,12 +46,7 @@ def shared_blocks(name):
 
 def test_shared_blocks_have_not_drifted_apart():
     blocks = shared_blocks("vae")
-    assert shared_blocks("vqvae") == blocks and len(blocks) == 8
-    of_clouds = shared_blocks("pointnet2")
-    assert len(of_clouds) == 4 and all(blocks[name] == of_clouds[name] for name in of_clouds)
-    of_field = shared_blocks("field")
-    assert of_field.keys() - of_clouds.keys() == {"# SHARED: networks for pictures"}
-    assert len(of_field) == 5 and all(blocks[name] == of_field[name] for name in of_field)
+    assert shared_blocks("vqvae") == blocks and len(blocks) == 4
 
 
 def test_run_writes_an_encoder_a_result_and_events(run):
@@ -96,7 +92,7 @@ def test_keep_encoders_copies_network_scores_and_figure(run, tmp_path):
     text = (tmp_path / f"{name}.json").read_text()
     result = json.loads(text)
     assert result["scenes"] == 14 and result["args"]["seed"] == 1 and str(folder.parent) not in text
-    assert "roboarm_nmp.scene_embedding_train.collect" in result["observations"]
+    assert result["observations"].startswith("roboarm observations --task random_boxes_hard")
     unfinished = subprocess.run([*command[:2], str(tmp_path)], capture_output=True, text=True)
     assert unfinished.returncode != 0 and "no finished run" in unfinished.stderr
 
@@ -115,8 +111,8 @@ def test_saved_encoder_runs_without_its_script(run, observations):
                 points, labels = (torch.cat(one) for one in zip(*shards, strict=True))
                 inputs |= {f"{sensor}_points": points, f"{sensor}_labels": labels}
     else:
-        images, cameras = pictures.load_images(read, 32)
-        inputs = {one: torch.from_numpy(images[:, i].copy()) for i, one in enumerate(cameras)}
+        data, cameras = images.load_images(read, 32)
+        inputs = {one: torch.from_numpy(data[:, i].copy()) for i, one in enumerate(cameras)}
     together = encoder(**inputs)
     assert together.shape == (20, 64) and together.dtype == torch.float32
     alone = [encoder(**{key: value[i : i + 1] for key, value in inputs.items()}) for i in range(20)]
@@ -124,18 +120,41 @@ def test_saved_encoder_runs_without_its_script(run, observations):
     assert together.std(0).max() > 0
     scenes = read.scenes(0)
     assert encode.size == 64 and (encode(scenes[0]) != encode(scenes[1])).any()
+    if name == "field":
+        assert encode.distances(scenes[0], np.random.rand(7, 3)).shape == (7,)
 
 
-def test_field_trains_on_images(observations, tmp_path):
-    flags = ["--sees", "images", "--picture-size", "16", "--latent-size", "16"]
-    run_here(*command("field", observations, tmp_path, *flags)[1:])
-    (folder,) = tmp_path.iterdir()
-    encoder = make_encoder(folder / "encoder.pt")
-    assert set(encoder.sensors) == {"front", "left", "back", "right"} and encoder.size == 16
-    scene = Observations(observations).scenes(0)[0]
-    assert encoder.distances(scene, np.random.rand(7, 3)).shape == (7,)
+def test_latent_size_that_sectors_do_not_divide_is_rejected(observations, tmp_path):
     with pytest.raises(SystemExit, match="--latent-size must be a multiple of 8, got 12"):
         run_here(*command("field", observations, tmp_path, "--latent-size", "12")[1:])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_terminated_run_writes_a_checkpoint_after_its_update(
+    name, observations, tmp_path, monkeypatch, capsys
+):
+    """SIGTERM in update 2, before the first evaluation."""
+    advance = Run.advance
+
+    def advance_and_terminate(self, number=1):
+        step = advance(self, number)
+        if step == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return step
+
+    monkeypatch.setattr(Run, "advance", advance_and_terminate)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with pytest.raises(SystemExit) as end:
+            run_here(*command(name, observations, tmp_path)[1:])
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    assert end.value.code == 143 and "terminated; checkpoint" in capsys.readouterr().err
+    (folder,) = tmp_path.iterdir()
+    checkpoint = torch.load(folder / "checkpoint.pt", weights_only=True)
+    assert checkpoint["progress"]["step"] == 2 and not (folder / "encoder.pt").exists()
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])

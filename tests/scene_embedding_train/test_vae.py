@@ -8,7 +8,7 @@ import torch
 from encoder_trainers import check_learning, check_step, load, one_update
 
 from roboarm_nmp.envs.datasets.observations import Observations
-from roboarm_nmp.scene_embedding_train import pictures
+from roboarm_nmp.scene_embedding_train import images
 
 vae = load("vae")
 
@@ -46,14 +46,14 @@ def test_one_update_follows_the_losses_written_out():
 
 def test_vae_overfits_a_few_scenes(observations):
     rows, args = np.arange(20), vae.Args(width=8)
-    model, (data, _) = vae.VAE(4, 16, args), pictures.load_images(Observations(observations), 16)
-    mean_image = pictures.mean_picture(data, 20, "cpu")
+    model, (data, _) = vae.VAE(4, 16, args), images.load_images(Observations(observations), 16)
+    mean_image = images.mean_of_images(data, 20, "cpu")
 
     def error():
         measured = (model, data, rows, mean_image, 20, "cpu")
-        return pictures.reconstruction_errors(*measured)["error_foreground"]
+        return images.reconstruction_errors(*measured)["error_foreground"]
 
-    check_learning(vae, model, pictures.batch_of(data, rows, "cpu"), (mean_image,), args, error)
+    check_learning(vae, model, images.batch_of(data, rows, "cpu"), (mean_image,), args, error)
 
 
 @pytest.mark.parametrize(("size", "halvings"), [(224, 5), (64, 4), (112, 4), (16, 2), (8, 1)])

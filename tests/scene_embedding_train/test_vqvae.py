@@ -7,7 +7,7 @@ import torch
 from encoder_trainers import check_learning, check_step, load, one_update
 
 from roboarm_nmp.envs.datasets.observations import Observations
-from roboarm_nmp.scene_embedding_train import pictures
+from roboarm_nmp.scene_embedding_train import images
 
 vqvae = load("vqvae")
 
@@ -77,14 +77,14 @@ def test_one_update_follows_the_losses_written_out():
 def test_vqvae_overfits_a_few_scenes(observations):
     rows, args = np.arange(20), vqvae.Args(width=8)
     read = Observations(observations)
-    model, (data, _) = vqvae.VQVAE(4, 16, args), pictures.load_images(read, 16)
-    mean_image = pictures.mean_picture(data, 20, "cpu")
+    model, (data, _) = vqvae.VQVAE(4, 16, args), images.load_images(read, 16)
+    mean_image = images.mean_of_images(data, 20, "cpu")
 
     def error():
         measured = (model, data, rows, mean_image, 20, "cpu")
-        return pictures.reconstruction_errors(*measured)["error_foreground"]
+        return images.reconstruction_errors(*measured)["error_foreground"]
 
-    check_learning(vqvae, model, pictures.batch_of(data, rows, "cpu"), (mean_image,), args, error)
+    check_learning(vqvae, model, images.batch_of(data, rows, "cpu"), (mean_image,), args, error)
 
 
 def test_each_decoder_depends_on_its_own_camera_only():
