@@ -62,7 +62,7 @@ SECTORS = 8
 
 
 @dataclass
-class Args(EncoderFlags):  # flags of the run, the data and evaluations are in `training_data.py`
+class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
     exp_name: str = "field"
     """name of the experiment, part of the run's folder"""
 
@@ -193,7 +193,7 @@ class Field(nn.Module):
         return F.layer_norm(z, z.shape[1:])
 
     def forward(self, points, valid, queries):
-        """Observed points, points (n, q, 3), m -> distances (n, q), m."""
+        """Observed points, queried points (n, q, 3), m -> distances (n, q), m."""
         return self.decoder(self.encode(points, valid), queries)
 
 
@@ -312,8 +312,8 @@ if __name__ == "__main__":
         sys.exit(f"--latent-size must be a multiple of {SECTORS}, got {args.latent_size}")
     resolve_bf16(args)
     observations, num_training, validation = load_observations(args)
-    names, points, valid = load_obstacle_points(observations, args.num_points)
-    data = points, valid, load_obstacles(observations)
+    names, *data = load_obstacle_points(observations, args.num_points)
+    data.append(load_obstacles(observations))
     example = example_clouds(observations, names)
     metadata = encoder_metadata(args, observations, names)
     device = seed_torch(args)
@@ -323,7 +323,7 @@ if __name__ == "__main__":
     model = Field(args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
+        torch.manual_seed(0)  # the same queries to validate on in all runs
         obstacles = torch.as_tensor(data[-1][validation])
         queries = sample_queries(obstacles, 4 * args.num_queries, args.spread)
 

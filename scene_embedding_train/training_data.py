@@ -1,6 +1,6 @@
-"""What the encoders' trainers share: flags, observations, and the metadata of a saved encoder.
+"""Shared parts of the encoders' trainers: flags, observations, metadata and results.
 
-These functions are for scripts: they end the program with a message where the user is wrong.
+These functions are for scripts: on a mistake of the user, they end the program with a message.
 """
 
 import contextlib
@@ -55,11 +55,8 @@ def load_observations(args):
     num_training = len(observations) - max(1, round(args.validation_share * len(observations)))
     if num_training < 1:
         sys.exit(f"--observations: {len(observations)} scenes are too few")
-    return (
-        observations,
-        num_training,
-        np.arange(num_training, len(observations))[: args.eval_scenes],
-    )
+    validation = np.arange(num_training, len(observations))[: args.eval_scenes]
+    return observations, num_training, validation
 
 
 def encoder_metadata(args, observations, names):

@@ -41,7 +41,7 @@ from roboarm_nmp.scene_embedding_train.training_data import (
 
 
 @dataclass
-class Args(EncoderFlags):  # flags of the run, the data and evaluations are in `training_data.py`
+class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
     exp_name: str = "vqvae"
     """name of the experiment, part of the run's folder"""
 
