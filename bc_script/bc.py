@@ -25,7 +25,6 @@ from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.episodes import observed
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.envs.training import flags, protocol, runs
 
 
@@ -237,7 +236,6 @@ if __name__ == "__main__":
         "num_points": args.num_points,
     }
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
-    run = runs.run_folder(args, task_name(args.task))
 
     # ALGO LOGIC: data
     parts = [transitions(demos, args.goal_type, args.num_demos) for demos in files]
@@ -261,18 +259,14 @@ if __name__ == "__main__":
     actor_average.load_state_dict(actor.state_dict())
     parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
-    progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
-    checkpoint_state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
-    checkpoint_state |= {"progress": progress}
-    runs.load_checkpoint(args, checkpoint_state)
-    writer = runs.summary_writer(run, args, progress["updates"])
-    seconds_before = progress["seconds"]
-    bar = runs.progress_bar(args.total_updates, progress["updates"], "update")
+    state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
+    run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
+    run.start(args.total_updates, "update")
 
-    while progress["updates"] < args.total_updates:
+    while run.step < args.total_updates:
         # ALGO LOGIC: learn
         if args.anneal:
-            remaining = 1.0 - progress["updates"] / args.total_updates
+            remaining = 1.0 - run.step / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         rows = torch.randint(len(data[0]), (args.batch_size,), device=device)
         observation, goal, action, demo_index = (tensor[rows] for tensor in data)
@@ -280,27 +274,16 @@ if __name__ == "__main__":
             observation = torch.cat([observation, latents[demo_index]], dim=1)
         loss = update(actor, optimizer, observation, goal, action)
         polyak_update(average_parameters, parameters, args.policy_average)
-        progress["updates"] += 1
-        bar.update()
-
-        step = progress["updates"]
+        step = run.advance()
         if step % 1000 == 0:
-            writer.add_scalar("losses/negative_log_likelihood", loss.item(), step)
-            writer.add_scalar("charts/learning_rate", optimizer.param_groups[0]["lr"], step)
-            writer.add_scalar("charts/SPS", int(runs.rate(bar)), step)
+            run.log({"losses/negative_log_likelihood": loss})
+            learning_rate = optimizer.param_groups[0]["lr"]
+            run.log({"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
 
         # Evaluate, keep the best policy, checkpoint
-        if step % args.eval_every == 0 or step == args.total_updates:
-            success = protocol.validate(
-                actor_average, eval_envs, validation, device, writer, step, progress
-            )
-            if progress["best_step"] == step:
-                protocol.save_policy(
-                    run, actor_average, eval_envs, device, args, env_arguments, step
-                )
-            bar.set_postfix(eval=success, best=progress["best_success"])
-            progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, checkpoint_state, device)
-    bar.close()
-    protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
-    writer.close()
+        evaluating = step % args.eval_every == 0 or step == args.total_updates
+        if evaluating and run.validate(actor_average):
+            run.save_policy(actor_average)
+        if evaluating or run.interrupted:
+            run.checkpoint()
+    run.final_test(test)

@@ -35,7 +35,6 @@ from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, ground_truth_checker
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.envs.training import flags, protocol, runs
 
 
@@ -370,7 +369,6 @@ if __name__ == "__main__":
     env_arguments |= {"link_distances": True}
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     safety_filter = SafetyFilter(args.safety_margin, args.escape)
-    run = runs.run_folder(args, task_name(args.task))
 
     # ALGO LOGIC: network and optimiser
     actor = Actor(args).to(device)
@@ -378,32 +376,31 @@ if __name__ == "__main__":
     actor_average.load_state_dict(actor.state_dict())
     parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
     optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
-    progress = {"updates": 0, "seconds": 0.0, "best_success": -1.0, "best_step": 0}
     visited = {}  # examples of all rounds
-    checkpoint_state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
-    checkpoint_state |= {"progress": progress, "visited": visited}
-    runs.load_checkpoint(args, checkpoint_state)
+    state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
+    state |= {"visited": visited}
+    run = protocol.PolicyRun(
+        args, state, device, env_arguments, eval_envs, validation, safety_filter
+    )
     visited |= {name: tensor.to(device) for name, tensor in visited.items()}
 
     # ALGO LOGIC: data. The pool is not in checkpoints: what was drawn is drawn again.
     latents = torch.as_tensor(eval_envs[0].encoder.encode_demos(paths), device=device)
     examples = Examples(paths, args, device)
     pool = [None] * num_draws
-    firsts = range(progress["updates"], progress["updates"] + num_draws)
+    firsts = range(run.step, run.step + num_draws)
     for number in tqdm(firsts, desc="drawing examples", mininterval=2.0):
         pool[number % num_draws] = examples.draw(number)
     pool = concat(pool)
 
-    writer = runs.summary_writer(run, args, progress["updates"])
-    seconds_before = progress["seconds"]
-    bar = runs.progress_bar(args.total_updates, progress["updates"], "update")
+    run.start(args.total_updates, "update")
     background = ThreadPoolExecutor(1)
 
-    while progress["updates"] < args.total_updates:
+    while run.step < args.total_updates:
         # ALGO LOGIC: learn, while the next examples are drawn
-        drawn = background.submit(examples.draw, progress["updates"] + num_draws)
+        drawn = background.submit(examples.draw, run.step + num_draws)
         if args.anneal:
-            remaining = 1.0 - progress["updates"] / args.total_updates
+            remaining = 1.0 - run.step / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = sample(pool, args.batch_size)
         if visited and len(visited["scene"]):
@@ -414,39 +411,27 @@ if __name__ == "__main__":
         batch = with_scene(batch, latents, actor.token_size)
         direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
         polyak_update(average_parameters, parameters, args.policy_average)
-        oldest = progress["updates"] % num_draws * args.examples_per_update
+        oldest = run.step % num_draws * args.examples_per_update
         for name, tensor in drawn.result().items():
             pool[name][oldest : oldest + len(tensor)] = tensor
-        progress["updates"] += 1
-        bar.update()
-
-        step = progress["updates"]
+        step = run.advance()
         if step % 100 == 0:
-            writer.add_scalar("losses/direction", direction_loss.item(), step)
-            writer.add_scalar("losses/length", length_loss.item(), step)
-            writer.add_scalar("charts/learning_rate", optimizer.param_groups[0]["lr"], step)
-            writer.add_scalar("charts/SPS", int(runs.rate(bar)), step)
+            run.log({"losses/direction": direction_loss, "losses/length": length_loss})
+            learning_rate = optimizer.param_groups[0]["lr"]
+            run.log({"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
 
         # ALGO LOGIC: a round of DAgger
         if args.round_every and step % args.round_every == 0 and step < args.total_updates:
             # In the last environment: the first one draws, and is slower to change its scene.
             found, reached = examples.visit(actor_average, eval_envs[-1], safety_filter, step)
             visited |= concat([visited, found]) if visited else found
-            writer.add_scalar("charts/round_success", reached, step)
+            run.log({"charts/round_success": reached})
 
         # Evaluate, keep the best policy, checkpoint
-        if step % args.eval_every == 0 or step == args.total_updates:
-            success = protocol.validate(
-                actor_average, eval_envs, validation, device, writer, step, progress, safety_filter
-            )
-            if progress["best_step"] == step:
-                protocol.save_policy(
-                    run, actor_average, eval_envs, device, args, env_arguments, step, safety_filter
-                )
-            bar.set_postfix(eval=success, best=progress["best_success"])
-            progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, checkpoint_state, device)
-    bar.close()
+        evaluating = step % args.eval_every == 0 or step == args.total_updates
+        if evaluating and run.validate(actor_average):
+            run.save_policy(actor_average)
+        if evaluating or run.interrupted:
+            run.checkpoint()
     background.shutdown()
-    protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
-    writer.close()
+    run.final_test(test)

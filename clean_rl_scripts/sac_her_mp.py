@@ -22,7 +22,6 @@ import torch.nn.functional as F
 
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
-from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.envs.training import flags, protocol, runs
 
 
@@ -102,8 +101,6 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     """validation queries per evaluation"""
     test_queries: flags.PositiveInt = 1_000
     """test queries for the best policy at the end"""
-    stop_at_success: flags.Share | None = None
-    """stop as soon as a validation success rate is this high, e.g. 0.9; by default never"""
     # END SHARED
 
 
@@ -454,7 +451,7 @@ class SAC:
 
 if __name__ == "__main__":
     # SHARED: checks, environments, folder
-    args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
+    args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries"})
     device = runs.seed_torch(args)
     runs.resolve_bf16(args)
     if args.buffer_size < args.horizon:
@@ -463,33 +460,25 @@ if __name__ == "__main__":
     env_arguments = protocol.env_arguments_of(args)
     envs = protocol.make_training_envs(args, args.demo_prob, args.demos)
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
-    run = runs.run_folder(args, task_name(args.task))
     rng = np.random.default_rng(args.seed)
     buffer = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
-    progress = {"global_step": 0, "updates": 0, "seconds": 0.0}
-    progress |= {"best_success": -1.0, "best_step": 0, "demos_injected": 0}
+    counts = {"updates": 0, "demos_injected": 0}
     # END SHARED
 
     agent = SAC(args, eval_envs[0].observation_space["observation"].shape[0], device)
 
     # SHARED: resuming and episodes
-    checkpoint_state = agent.checkpoint_state() | {
-        "buffer": buffer,
-        "rng": rng,
-        "progress": progress,
-    }
-    runs.load_checkpoint(args, checkpoint_state)
-    writer = runs.summary_writer(run, args, progress["global_step"])
-    observations = protocol.begin_episodes(envs, args.seed, progress["global_step"])
+    state = agent.checkpoint_state() | {"buffer": buffer, "rng": rng, "counts": counts}
+    run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
+    run.start(args.total_timesteps, "step")
+    observations = protocol.begin_episodes(envs, args.seed, run.step)
     episodes, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
-    recent_success, losses, stop = [], {}, False
-    seconds_before = progress["seconds"]
-    bar = runs.progress_bar(args.total_timesteps, progress["global_step"], "step")
+    losses = {}
     # END SHARED
 
-    while progress["global_step"] < args.total_timesteps and not stop:
+    while run.step < args.total_timesteps:
         # ALGO LOGIC: act
-        if progress["global_step"] < args.learning_starts:
+        if run.step < args.learning_starts:
             actions = (2 * torch.rand(args.num_envs, 7) - 1).numpy() * agent.actor.action_scale
         else:
             actions = agent.explore(protocol.stack(observations, device))
@@ -503,43 +492,32 @@ if __name__ == "__main__":
             returns[i] += reward
             if terminated or truncated:
                 buffer.add_episode(episodes[i])
-                step = progress["global_step"] + i + 1
-                protocol.log_episode(writer, step, returns[i], info, recent_success)
+                step = run.step + i + 1
+                run.log_episode(step, returns[i], info)
                 if args.demo_prob is not None:
                     if inject_demonstration(info["is_success"], args.demo_prob, env.np_random):
                         buffer.add_episode(demo_transitions(env.demo, env.env))
-                        progress["demos_injected"] += 1
-                    writer.add_scalar("charts/demos_injected", progress["demos_injected"], step)
+                        counts["demos_injected"] += 1
+                    run.log({"charts/demos_injected": counts["demos_injected"]}, step)
                 episodes[i], returns[i], observations[i] = [], 0.0, env.reset()[0]
-        progress["global_step"] += args.num_envs
-        bar.update(args.num_envs)
-        step = progress["global_step"]
+        step = run.advance(args.num_envs)
         for batch in batches(buffer, updates_due(step, buffer, args), args.batch_size, device):
-            losses |= agent.update(batch, progress["updates"])
-            progress["updates"] += 1
-            if progress["updates"] % 1000 == 0:
-                for name, value in losses.items():
-                    writer.add_scalar(f"losses/{name}", value.mean().item(), step)
-                writer.add_scalar("charts/SPS", int(runs.rate(bar)), step)
+            losses |= agent.update(batch, counts["updates"])
+            counts["updates"] += 1
+            if counts["updates"] % 1000 == 0:
+                run.log({f"losses/{name}": value for name, value in losses.items()})
+                run.log({"charts/SPS": int(run.rate)})
 
         # Evaluate, keep the best policy, checkpoint
-        if step % args.eval_every < args.num_envs or step >= args.total_timesteps:
-            policy = agent.actor_average
-            success = protocol.validate(
-                policy, eval_envs, validation, device, writer, step, progress
-            )
-            if progress["best_step"] == step:
-                protocol.save_policy(run, policy, eval_envs, device, args, env_arguments, step)
-            bar.set_postfix(eval=success, best=progress["best_success"])
+        evaluating = step % args.eval_every < args.num_envs or step >= args.total_timesteps
+        if evaluating and run.validate(agent.actor_average):
+            run.save_policy(agent.actor_average)
+        if evaluating or run.interrupted:
+            # A resumed run continues exactly like this one: with new episodes.
             for episode in filter(None, episodes):
                 buffer.add_episode(episode)
-            episodes, returns = [[] for _ in envs], [0.0 for _ in envs]
-            progress["seconds"] = seconds_before + runs.elapsed(bar)
-            runs.save_checkpoint(run, checkpoint_state, device)
-            # A resumed run goes on exactly as this one does: with new episodes.
+            run.checkpoint()
             observations = protocol.begin_episodes(envs, args.seed, step)
-            stop = args.stop_at_success is not None and success >= args.stop_at_success
-    bar.close()
-    protocol.final_test(run, args, env_arguments, test, device, progress, bar.n)
-    writer.close()
+            episodes, returns = [[] for _ in envs], [0.0 for _ in envs]
+    run.final_test(test)
     # END SHARED

@@ -1,7 +1,7 @@
-"""Point clouds, as the trainer of PointNet++ uses them: batches, thinning, a picture.
+"""Point clouds for the trainers of point-cloud encoders: loading, thinning, classes, a figure.
 
-Clouds are thinned out, to save time. `load_clouds` does it once for what is trained on, `thin_out`
-in the encoder that is saved.
+Clouds are thinned out to save time: the loaders thin out those of a training set once, and
+`thin_out` is a part of the exported encoders.
 """
 
 import math
@@ -10,26 +10,29 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE, PointCloud, deproject
-from roboarm_nmp.scene_embedding_train.training_data import unpacked
+from roboarm_nmp.scene_embedding_train.training_data import unpack
 
-WITHIN = 1.1  # m from the robot's axis: what is further away it does not reach
-TABLE_TOP = 0.01  # m: what is higher is seen better, because most of a cloud is table and floor
-DEEPEST = 65_535  # how far a sensor sees, in the units of stored depths: there was nothing
-# Of the classes, robot, table and floor, obstacle, nothing (as in the paper's figure).
+MAX_RADIUS = 1.1  # m from the robot's axis: the arm does not reach further
+TABLE_TOP = 0.01  # m: table and floor are most of a cloud, so points above it are sampled apart
+NO_HIT = 65_535  # a stored depth: `far` of the sensor, where its ray hits nothing
+ABSENT_DISTANCE = 0.05  # m: a point is absent from a cloud whose points are all further away
+IGNORED = -100  # label of points that have no class
+# Of the classes robot, table and floor, obstacle, nothing (as in the paper's figure).
 COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [150, 150, 150]], np.uint8)
 
 
 class Clouds(NamedTuple):
-    """What point cloud sensors saw, in arrays that are mapped into memory.
+    """Observed point clouds, in memory-mapped arrays.
 
     Attributes:
         sensors: dict of name -> `PointCloud`.
         points: float32 (scenes, sensors, 2, num_points, 3), m: evenly spaced among those that hit
             something, and among those of them above the table.
-        labels: theirs, uint8 (scenes, sensors, 2, num_points).
-        depths: all that was seen, uint16 (scenes, sensors, samples), see `ends_of_rays`.
+        labels: the points' classes, uint8 (scenes, sensors, 2, num_points).
+        depths: of all samples, uint16 (scenes, sensors, samples), see `ray_ends`.
     """
 
     sensors: dict
@@ -39,65 +42,27 @@ class Clouds(NamedTuple):
 
 
 def load_clouds(observations, num_points):
-    """The `Clouds` of `Observations`, thinned out to `num_points` points once."""
+    """The `Clouds` of `Observations`, thinned out to `num_points` points once.
+
+    Raises:
+        SystemExit: there are no clouds, or they differ in size.
+    """
     sensors = {k: one for k, one in observations.sensors.items() if isinstance(one, PointCloud)}
     samples = {one.num_samples for one in sensors.values()}
     if len(samples) != 1:
         why = "the clouds differ in size" if sensors else "no clouds (collect with --sensors)"
         sys.exit(f"--observations: {observations.folder}: {why}")
     shards = (
-        thinned_clouds(observations, shard, sensors, num_points)
+        _clouds_of_shard(observations, shard, sensors, num_points)
         for shard in range(len(observations.offsets) - 1)
     )
     shape = (len(sensors), 2, num_points)
     arrays = {"points": (np.float32, (*shape, 3)), "labels": (np.uint8, shape)}
     arrays["depths"] = (np.uint16, (len(sensors), samples.pop()))
-    return Clouds(sensors, **unpacked(observations, f"clouds_{num_points}", arrays, shards))
+    return Clouds(sensors, **unpack(observations, f"clouds_{num_points}", arrays, shards))
 
 
-def load_obstacle_points(observations, num_points):
-    """What the sensors saw of obstacles: their names, and `points` and `there`, mapped into memory.
-
-    `points`: float32 (scenes, sensors * num_points, 3), m, evenly spaced among a sensor's points on
-    obstacles `WITHIN` reach; `there`: bool (scenes, sensors * num_points), false where a sensor saw
-    none.
-    """
-    sensors = [k for k, one in observations.sensors.items() if isinstance(one, PointCloud)]
-    if not sensors:
-        sys.exit(f"--observations: {observations.folder}: no clouds (collect with --sensors)")
-
-    def rows(shard):
-        seen = [whole_clouds(observations, shard, name) for name in sensors]
-        points, there = on_obstacles(seen, num_points)
-        return {"points": points.numpy(), "there": there.numpy()}
-
-    count = len(sensors) * num_points
-    arrays = {"points": (np.float32, (count, 3)), "there": (np.bool_, (count,))}
-    shards = (rows(shard) for shard in range(len(observations.offsets) - 1))
-    found = unpacked(observations, f"obstacle_points_{num_points}_{WITHIN}", arrays, shards)
-    return sensors, found["points"], found["there"]
-
-
-def on_obstacles(clouds, num_points):
-    """Of each cloud `num_points` points on obstacles `WITHIN` reach, evenly spaced among those.
-
-    Args:
-        clouds: list of a sensor's points (n, p, 3), m, and labels (n, p).
-
-    Returns:
-        Points (n, sensors * num_points, 3), and where there are any: bool (n, sensors *
-        num_points).
-    """
-    all_points, all_there = [], []
-    for points, labels in clouds:
-        wanted = (labels == OBSTACLE) & (points[..., :2].square().sum(2) < WITHIN**2)
-        chosen = thin_out(wanted, num_points)
-        all_points.append(gather(points, chosen))
-        all_there.append(gather(wanted.unsqueeze(2), chosen).squeeze(2))
-    return torch.cat(all_points, dim=1), torch.cat(all_there, dim=1)
-
-
-def thinned_clouds(observations, shard, names, num_points):
+def _clouds_of_shard(observations, shard, names, num_points):
     """`load_clouds`'s arrays of one shard, a dict."""
     rows = {"points": [], "labels": [], "depths": []}
     for name in names:
@@ -113,50 +78,116 @@ def thinned_clouds(observations, shard, names, num_points):
 def batch_of(clouds, rows, device):
     """Rows of `Clouds`: a list of (points, labels, whole) per sensor.
 
-    Labels are int64; `whole`, (n, samples, 3), are the points that were not thinned out.
+    Labels are int64; `whole`, (n, samples, 3), are the points before thinning.
     """
     rows = np.sort(rows)
     points = torch.as_tensor(clouds.points[rows], device=device)
     labels = torch.as_tensor(clouds.labels[rows], device=device).long()
     depths = torch.as_tensor(clouds.depths[rows].astype(np.float32), device=device)
     return [
-        (points[:, i], labels[:, i], ends_of_rays(sensor, depths[:, i]))
+        (points[:, i], labels[:, i], ray_ends(sensor, depths[:, i]))
         for i, sensor in enumerate(clouds.sensors.values())
     ]
 
 
-def whole_clouds(observations, shard, name):
-    """All that a sensor saw in the scenes of a shard, as `envs.perception.sensors.PointCloud.points` has it.
+def load_obstacle_points(observations, num_points):
+    """Evenly spaced points on obstacles, `num_points` of each cloud, thinned out once.
 
-    Points, float32 (n, samples, 3), and labels, uint8 (n, samples).
+    Returns:
+        The sensors' names; points, float32 (scenes, sensors * num_points, 3), m; and which of them
+        are valid, bool (scenes, sensors * num_points): none of a cloud without obstacles. The
+        arrays are memory-mapped.
+
+    Raises:
+        SystemExit: there are no clouds.
+    """
+    sensors = [k for k, one in observations.sensors.items() if isinstance(one, PointCloud)]
+    if not sensors:
+        sys.exit(f"--observations: {observations.folder}: no clouds (collect with --sensors)")
+
+    def rows(shard):
+        clouds = [whole_clouds(observations, shard, name) for name in sensors]
+        points, valid = obstacle_points(clouds, num_points)
+        return {"points": points.numpy(), "valid": valid.numpy()}
+
+    count = len(sensors) * num_points
+    arrays = {"points": (np.float32, (count, 3)), "valid": (np.bool_, (count,))}
+    shards = (rows(shard) for shard in range(len(observations.offsets) - 1))
+    name = f"obstacle_points_{num_points}_{MAX_RADIUS}"
+    unpacked = unpack(observations, name, arrays, shards)
+    return sensors, unpacked["points"], unpacked["valid"]
+
+
+def obstacle_points(clouds, num_points):
+    """Of each cloud `num_points` points on obstacles within `MAX_RADIUS`, evenly spaced.
+
+    Args:
+        clouds: list of a sensor's points (n, p, 3), m, and labels (n, p).
+
+    Returns:
+        Points (n, sensors * num_points, 3), and which are valid: bool (n, sensors * num_points),
+        none of a cloud without such points.
+    """
+    all_points, all_valid = [], []
+    for points, labels in clouds:
+        wanted = (labels == OBSTACLE) & (points[..., :2].square().sum(2) < MAX_RADIUS**2)
+        chosen = thin_out(wanted, num_points)
+        all_points.append(gather(points, chosen))
+        all_valid.append(gather(wanted.unsqueeze(2), chosen).squeeze(2))
+    return torch.cat(all_points, dim=1), torch.cat(all_valid, dim=1)
+
+
+def example_clouds(observations, names):
+    """Two scenes' whole clouds, as an encoder receives them: a dict of tensors.
+
+    `<name>_points`, float32 (2, samples, 3), m, and `<name>_labels`, uint8 (2, samples).
+    """
+    example = {}
+    for name in names:
+        points, labels = (one[:2].clone() for one in whole_clouds(observations, 0, name))
+        example |= {f"{name}_points": points, f"{name}_labels": labels}
+    return example
+
+
+def scene_cloud(observations, scene, name):
+    """A sensor's whole cloud of one scene: points (p, 3), m, that hit something, and labels (p)."""
+    shard = np.searchsorted(observations.offsets, scene, side="right") - 1
+    row = scene - observations.offsets[shard]
+    points, labels = (one[row] for one in whole_clouds(observations, shard, name))
+    hit = labels != NOTHING
+    return points[hit], labels[hit]
+
+
+def whole_clouds(observations, shard, name):
+    """A sensor's clouds of the scenes of a shard, as the environment's `PointCloud` returns them.
+
+    Points, float32 (n, samples, 3), m, and labels, uint8 (n, samples).
     """
     sensor = observations.sensors[name]
-    pictures = (
-        observations.read(shard, f"{name}/{output}") for output in ("depth", "segmentation")
-    )
-    seen = [
-        sensor.points(depth * (sensor.far / DEEPEST), segmentation)
-        for depth, segmentation in zip(*pictures, strict=True)
+    images = (observations.read(shard, f"{name}/{output}") for output in ("depth", "segmentation"))
+    clouds = [
+        sensor.points(depth * (sensor.far / NO_HIT), segmentation)
+        for depth, segmentation in zip(*images, strict=True)
     ]
     return tuple(
-        torch.from_numpy(np.stack([one[key] for one in seen])) for key in ("points", "labels")
+        torch.from_numpy(np.stack([one[key] for one in clouds])) for key in ("points", "labels")
     )
 
 
-def ends_of_rays(sensor, depths):
-    """Where a `PointCloud`'s rays end: float32 (n, samples, 3), m; far away, if they hit nothing.
+def ray_ends(sensor, depths):
+    """Where a `PointCloud`'s rays end: float32 (n, samples, 3), m; far away if they hit nothing.
 
     `depths` (n, samples), float32, are in the units in which they are stored.
     """
     edge = math.isqrt(sensor.num_samples)
     eye = torch.tensor(sensor.eye, device=depths.device)
     rays = deproject(sensor, np.ones((edge, edge))).reshape(-1, 3) - sensor.eye
-    metres = torch.where(depths < DEEPEST, depths * (sensor.far / DEEPEST), 1e6)
+    metres = torch.where(depths < NO_HIT, depths * (sensor.far / NO_HIT), 1e6)
     return eye + metres.unsqueeze(2) * torch.as_tensor(rays, dtype=torch.float32, device=eye.device)
 
 
 def gather(values, indices):
-    """Rows of values (n, p, f) at indices (n, ...), each row with its own: (n, ..., f)."""
+    """Rows of values (n, p, f) at indices (n, ...), each scene's at its own: (n, ..., f)."""
     flat = indices.flatten(1).unsqueeze(-1).expand(-1, -1, values.shape[2])
     return torch.gather(values, 1, flat).unflatten(1, indices.shape[1:])
 
@@ -170,27 +201,90 @@ def hits(points, labels):
 def thin_out(mask, number):
     """Indices (n, number) evenly spaced among those where mask (n, p) is true.
 
-    If there are fewer, they are repeated; if there are none, it is the first index.
+    Fewer are repeated; where none is true, all are the first index.
     """
     index = torch.arange(mask.shape[1], device=mask.device)
-    order = (index + mask.shape[1] * ~mask).argsort(1)  # those first
+    order = (index + mask.shape[1] * ~mask).argsort(1)  # true ones first
     steps = torch.arange(number, device=mask.device)
     counts = mask.sum(1, keepdim=True).clamp(min=1)
     return order.gather(1, (steps * counts).div(number, rounding_mode="floor"))
 
 
+def distances_to(points, clouds):
+    """From points (n, p, 3) to the nearest of each scene's cloud (n, q, 3): distances (n, p)."""
+    squares = [  # without those of the points; a scene at a time, for the CPU's cache
+        torch.addmm(cloud.square().sum(1), scene, cloud.T, alpha=-2).amin(1)
+        for scene, cloud in zip(points, clouds, strict=True)
+    ]
+    return (torch.stack(squares) + points.square().sum(2)).clamp(min=0).sqrt()
+
+
+def queries_of(points, labels, whole, number=None):
+    """Points to classify (n, q, 3) and their classes (n, q), from one sensor's of `batch_of`.
+
+    They are the scene's own, (n, 2, p), and those above the table of the scene before it in the
+    batch. Of the latter, points of obstacles with nothing near them in the whole cloud have the
+    class `NOTHING`. Points without a class are `IGNORED`. There are all 3p, or a random sample of
+    `number`, a third of it from the other scene.
+    """
+    own, classes = points.flatten(1, 2), labels.flatten(1, 2)
+    others, other_labels = points[:, 1].roll(1, dims=0), labels[:, 1].roll(1, dims=0)
+    if number is not None:
+        chosen = torch.randperm(own.shape[1], device=own.device)[: number - number // 3]
+        own, classes = own[:, chosen], classes[:, chosen]
+        chosen = torch.randperm(others.shape[1], device=own.device)[: number // 3]
+        others, other_labels = others[:, chosen], other_labels[:, chosen]
+    absent = (other_labels == OBSTACLE) & (distances_to(others, whole) > ABSENT_DISTANCE)
+    truth = [torch.where(classes == NOTHING, IGNORED, classes)]
+    truth.append(torch.where(absent, NOTHING, IGNORED))
+    return torch.cat([own, others], dim=1), torch.cat(truth, dim=1)
+
+
+@torch.no_grad()
+def classification_scores(model, clouds, rows, batch_size, device):
+    """How well points of scenes `rows` are classified.
+
+    Returns:
+        `accuracy` and the intersection over union of each class, `iou_robot`, `iou_static`,
+        `iou_obstacle`, over points evenly spaced among those that hit something; and `absent`, the
+        share of other scenes' obstacle points that are predicted to be absent.
+    """
+    model.eval()
+    number = clouds.points.shape[3]
+    confusion = torch.zeros(NOTHING, NOTHING + 1, dtype=torch.int64)  # truth, prediction
+    predicted_absent = all_absent = 0
+    for start in range(0, len(rows), batch_size):
+        batch = batch_of(clouds, rows[start : start + batch_size], device)
+        for logits, truth in zip(*model(batch), strict=True):
+            predicted = logits.argmax(2)
+            one_hot = F.one_hot(predicted, NOTHING + 1)[:, :number]
+            own = [(truth[:, :number] == label).unsqueeze(2) for label in range(NOTHING)]
+            confusion += torch.stack([(one * one_hot).sum((0, 1)) for one in own]).cpu()
+            absent = truth == NOTHING
+            all_absent += absent.sum().item()
+            predicted_absent += (absent & (predicted == NOTHING)).sum().item()
+    model.train()
+    both = confusion.diagonal()
+    iou = both / (confusion[:, :NOTHING].sum(0) + confusion.sum(1) - both).clamp(min=1)
+    result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
+    result["absent"] = predicted_absent / max(1, all_absent)
+    names = ("iou_robot", "iou_static", "iou_obstacle")
+    return result | dict(zip(names, iou.tolist(), strict=True))
+
+
 def comparison(points, truth, predicted, size=160):
-    """A picture, uint8: a sensor's points (p, 3) seen from above; true classes left, ours right.
+    """A figure, uint8 (size, 2 size, 3): points (p, 3), m, from above, true classes on the left.
 
     Robot red, table and floor orange, obstacles yellow, as in the paper's figure; nothing grey.
     """
-    pictures = []
+    points, truth, predicted = (one.cpu().numpy() for one in (points, truth, predicted))
+    images = []
     for labels in (truth, predicted):
-        picture = np.full((size, size, 3), 255, np.uint8)
+        image = np.full((size, size, 3), 255, np.uint8)
         order = np.argsort(points[:, 2])  # the highest is drawn last
         pixels = ((1.2 - points[order, :2]) / 2.4 * size).astype(int)
         inside = ((pixels >= 0) & (pixels < size - 1)).all(1)
         for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            picture[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
-        pictures.append(picture)
-    return np.concatenate(pictures, axis=1)
+            image[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
+        images.append(image)
+    return np.concatenate(images, axis=1)

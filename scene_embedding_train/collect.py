@@ -1,13 +1,13 @@
-"""Collect what sensors see of random scenes, to train encoders on.
+"""Collect observations: camera images and point clouds of random scenes, to train encoders on.
 
-    python -m roboarm_nmp.scene_embedding_train.collect --num 20000 --image-size 128 --output observations
-    python -m roboarm_nmp.scene_embedding_train.collect --num 200000 --ray-address auto   # the paper's number
+    roboarm observations --num 20000 --image-size 128 --output observations
+    roboarm observations --num 200000 --ray-address auto   # the paper's number
 
 Paper: appendix "Training and verifying the encoders": four sensors around the robot, images and
-point clouds of 200,000 environments. Scene i, with the arm in a feasible configuration, depends on
-the seed and i only, so the files are the same whatever the number of workers. They are written a
-shard at a time, each in one piece; a run that was interrupted or killed goes on when it is started
-again, and one that is finished can be continued with a larger `--num`.
+point clouds of 200,000 environments. Scene i, with the arm in a feasible configuration, depends
+only on the seed and i, so the files are the same for every number of workers. They are written in
+shards, each atomically. After an interruption the same command continues; a finished collection is
+extended by a larger `--num`.
 """
 
 import sys
@@ -23,9 +23,8 @@ from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
-
-# Streams 1 to 3 of random numbers are those of the queries and demonstrations.
-STREAM = 4
+from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
 
 
 @dataclass
@@ -39,7 +38,7 @@ class Args:
     image_size: PositiveInt = 224
     """Width and height of the images in pixels."""
     num_samples: PositiveInt = 10_000
-    """Rays of a point cloud, a square number."""
+    """Rays of a point cloud: a square number."""
     shard_size: PositiveInt = 500
     """Scenes in each file."""
     seed: Seed = 0
@@ -49,11 +48,11 @@ class Args:
     output: Path = Path("observations")
     """Folder to write to."""
     ray_address: str | None = None
-    """Work on the Ray cluster at this address (`auto`, `HOST:PORT`) and not in local processes."""
+    """Address of a Ray cluster (`auto`, `HOST:PORT`) to use instead of local processes."""
 
 
-def sensors_of(args):
-    """The sensors that are asked for: dict of name -> sensor."""
+def make_sensors(args):
+    """The sensors of the flags: dict of name -> sensor."""
     sensors = {}
     if args.sensors != "clouds":
         sensors |= cardinal(Camera, size=(args.image_size, args.image_size))
@@ -64,7 +63,7 @@ def sensors_of(args):
 
 
 class Collector:
-    """Makes shards; a job is (number of the shard, first scene, scene after the last)."""
+    """Makes shards. A job is (number of the shard, first scene, scene after the last)."""
 
     def __init__(self, task, seed, sensors, made_by):
         self.task, self.seed, self.sensors, self.made_by = task, seed, sensors, made_by
@@ -73,31 +72,31 @@ class Collector:
     def __call__(self, job):
         """`(number, contents of the file)`."""
         number, first, end = job
-        seen, configurations, observations = [], [], []
+        scenes, configurations, observations = [], [], []
         for index in range(first, end):
-            rng = np.random.default_rng([self.seed, STREAM, index])
+            rng = np.random.default_rng([self.seed, Stream.OBSERVATIONS, index])
             self.env.sample_scene(rng)
             configurations.append(self.env.sample_feasible(rng))
-            seen.append(self.env.scene)
+            scenes.append(self.env.scene)
             self.world.show(self.env.scene, configurations[-1])
             observations.append(observe(self.world, self.sensors))
-        arguments = (self.sensors, seen, configurations, observations, self.made_by)
+        arguments = (self.sensors, scenes, configurations, observations, self.made_by)
         return number, shard_bytes(self.task, self.seed, first, *arguments)
 
 
 def collect(args, progress=True):
-    """Make the shards that are missing.
+    """Make the missing shards. Returns the `Observations`.
 
     Raises:
-        ValueError: arguments that cannot work; the folder holds other observations.
+        ValueError: the flags cannot work, or the folder holds other observations.
         ConnectionError: there is no Ray cluster.
-        OSError: the folder cannot be written. What was written is safe.
+        OSError: the folder cannot be written. Finished shards are kept.
     """
     shards.check_collection(args)
     names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
     given = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
-    made_by = " ".join(["python -m roboarm_nmp.scene_embedding_train.collect", *given])
-    arguments = (args.task, args.seed, sensors_of(args), made_by)
+    made_by = " ".join(["roboarm observations", *given])
+    arguments = (args.task, args.seed, make_sensors(args), made_by)
     shards.collect(
         args,
         args.num,
@@ -115,9 +114,8 @@ def collect(args, progress=True):
 def main(args):
     try:
         made = collect(args)
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as interrupt:
+        exit_interrupted(interrupt, "the same command continues from here")
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
@@ -125,8 +123,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(
-        tyro.cli(
-            Args, prog="python -m roboarm_nmp.scene_embedding_train.collect", description=__doc__
-        )
-    )
+    raise_on_sigterm()
+    main(tyro.cli(Args, prog="roboarm observations", description=__doc__))

@@ -1,25 +1,26 @@
-"""PointNet++ of four point clouds: a scene latent z_E of 64 numbers. Read it from the top.
+"""PointNet++ of four point clouds: a 64-dimensional latent code z_E. Read it from the top.
 
-    python -m roboarm_nmp.scene_embedding_train.collect --sensors clouds --num 20000
-    python scene_embedding_train/pointnet2.py --observations observations
+    roboarm observations --sensors clouds --num 20000
+    roboarm train pointnet2 --observations observations
 
 PointNet++ (Qi et al., 2017) as in the paper's appendix "Training and verifying the encoders": a
-network per sensor says of each point what it lies on: robot, table or floor, or another obstacle.
-Set abstraction (farthest point sampling, ball query) makes 16 numbers of a cloud; feature
-propagation classifies points from these numbers and the points' places alone, without the usual
-skip connections, which would lead around them. A point's place says most of its class, so it would
-hardly need the numbers; that is why it is also asked about points of another scene's obstacles,
-and has to say that nothing is there. Places enter as waves too (sines and cosines, as in NeRF),
-without which it learns next to nothing in the time. What is saved, `encoder.pt`, is an exported
-network from the clouds to z_E, the sensors' numbers side by side. To make an encoder
-of your own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
-`# END SHARED` are those of `vae.py`.
+network per sensor classifies each point: robot, table or floor, or another obstacle. Set
+abstraction (farthest point sampling, ball query) encodes a cloud in 16 dimensions. Feature
+propagation classifies points from these and the points' positions alone, without the usual skip
+connections, which would bypass the latent code.
+
+A point's position determines most of its class without the latent code. So the network also
+receives points of another scene's obstacles and has to predict that nothing is there. Positions
+also enter as sines and cosines (as in NeRF), without which the network hardly learns.
+
+What is saved, `encoder.pt`, is an exported network from the clouds to z_E, the sensors' latent
+codes side by side. To make an encoder of your own, copy this file and change the parts under
+`# MODEL`.
 """
 
 import math
 import sys
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -27,49 +28,34 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE, sensors_to_json
-from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Share, Width
-from roboarm_nmp.envs.training.runs import (
-    RunFlags,
-    check_finite,
-    elapsed,
-    load_checkpoint,
-    parse_args,
-    progress_bar,
-    rate,
-    run_folder,
-    save_checkpoint,
-    seed_torch,
-    summary_writer,
-    write_json,
-)
+from roboarm_nmp.envs.perception.sensors import NOTHING
+from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Width
+from roboarm_nmp.envs.training.runs import Run, check_finite, parse_args, seed_torch
 from roboarm_nmp.scene_embedding_train.clouds import (
+    IGNORED,
     batch_of,
+    classification_scores,
     comparison,
+    example_clouds,
     gather,
     hits,
     load_clouds,
+    queries_of,
+    scene_cloud,
     thin_out,
-    whole_clouds,
 )
-from roboarm_nmp.scene_embedding_train.training_data import open_observations, split
-
-APART = 0.05  # m between a cloud and what counts as not being in it
-IGNORED = -100  # label of points that have no class
+from roboarm_nmp.scene_embedding_train.training_data import (
+    EncoderFlags,
+    encoder_metadata,
+    load_observations,
+    write_result,
+)
 
 
 @dataclass
-class Args(RunFlags):  # those of the run's folder are in `envs/training/runs.py`
+class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
     exp_name: str = "pointnet2"
     """name of the experiment, part of the run's folder"""
-
-    # SHARED: the data
-    # The data
-    observations: Path = Path("observations")
-    """folder that `scene_embedding_train.collect` wrote"""
-    validation_share: Share = 0.05
-    """share of the scenes, the last ones, that is not trained on"""
-    # END SHARED
 
     # The algorithm
     total_updates: PositiveInt = 10_000
@@ -79,9 +65,9 @@ class Args(RunFlags):  # those of the run's folder are in `envs/training/runs.py
     learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
     latent_size: Width = 16
-    """numbers per sensor (paper: 16)"""
+    """dimensions of z_E per sensor (paper: 16)"""
     num_points: PositiveInt = 256
-    """points that the network gets, evenly spaced among those of a cloud above the table"""
+    """points that the network receives, evenly spaced among those of a cloud above the table"""
     num_queries: PositiveInt = 192
     """points that it classifies per cloud and batch"""
     num_centres: tuple[PositiveInt, PositiveInt] = (32, 12)
@@ -91,21 +77,14 @@ class Args(RunFlags):  # those of the run's folder are in `envs/training/runs.py
     num_neighbours: PositiveInt = 16
     """points that a ball query finds at most"""
     num_waves: PositiveInt = 4
-    """wavelengths with which places are described: 2 m, 1 m, ..."""
+    """wavelengths of the sines and cosines of positions: 2 m, 1 m, ..."""
     width: Width = 32
     """features at the first level; further ones have more"""
-
-    # SHARED: bookkeeping
-    eval_every: PositiveInt = 2_000
-    """batches between evaluations on validation scenes; the best encoder is kept"""
-    eval_scenes: PositiveInt = 512
-    """validation scenes per evaluation"""
-    # END SHARED
 
 
 # MODEL
 def farthest_point_sampling(points, number):
-    """Indices (n, number) of points (n, p, 3): the first, then always the one farthest from all."""
+    """Indices (n, number) of points (n, p, 3): the first, then the one farthest from all chosen."""
     chosen = [torch.zeros_like(points[:, 0, 0], dtype=torch.int64)]
     distance = torch.full_like(points[:, :, 0], math.inf)
     for _ in range(number - 1):
@@ -145,14 +124,14 @@ def mlp(*sizes):
     return nn.Sequential(*layers)
 
 
-def waves(places, number):
-    """Places (..., 3), m, and their sines and cosines, wavelengths 2, 1, ... m: 3 + 6 number."""
-    angles = torch.cat([places * (math.pi * 2**k) for k in range(number)], dim=-1)
-    return torch.cat([places, angles.sin(), angles.cos()], dim=-1)
+def waves(positions, number):
+    """Positions (..., 3), m, their sines and cosines, wavelengths 2, 1, ... m: 3 + 6 number."""
+    angles = torch.cat([positions * (math.pi * 2**k) for k in range(number)], dim=-1)
+    return torch.cat([positions, angles.sin(), angles.cos()], dim=-1)
 
 
 class Encoder(nn.Module):
-    """Set abstraction: a cloud (n, p, 3), m -> its latent (n, latent)."""
+    """Set abstraction: a cloud (n, p, 3), m -> its latent code (n, latent)."""
 
     def __init__(self, args):
         super().__init__()
@@ -168,80 +147,46 @@ class Encoder(nn.Module):
         ):
             centres = gather(points, farthest_point_sampling(points, number))
             neighbours = ball_query(points, centres, radius, self.args.num_neighbours)
-            # Places relative to the centre, in units of the radius.
+            # Positions relative to the centre, in units of the radius.
             inputs = (gather(points, neighbours) - centres.unsqueeze(2)) / radius
             if features is not None:
                 inputs = torch.cat([inputs, gather(features, neighbours)], dim=3)
             features, points = level(inputs).amax(2), centres
-        places = waves(points, self.args.num_waves)
-        return self.head(self.top(torch.cat([places, features], dim=2)).amax(1))
+        positions = waves(points, self.args.num_waves)
+        return self.head(self.top(torch.cat([positions, features], dim=2)).amax(1))
 
 
 class Decoder(nn.Module):
     """Feature propagation: a latent (n, latent), points (n, p, 3) -> logits (n, p, classes + 1).
 
-    The last class: nothing is there. Its levels are made of the points that it is asked about;
-    those of the encoder would say where the cloud is.
+    The last class is that nothing is there. The levels are sampled from the points to classify;
+    those of the encoder would reveal where the cloud is.
     """
 
     def __init__(self, args):
         super().__init__()
         self.args, width = args, args.width
-        given = args.latent_size + 3 + 6 * args.num_waves
-        self.top = mlp(given, 4 * width, 4 * width)
-        self.levels = nn.ModuleList(
-            [
-                mlp(given + 4 * width, 4 * width, 4 * width),
-                mlp(given + 4 * width, 4 * width, 2 * width),
-            ]
-        )
+        inputs = args.latent_size + 3 + 6 * args.num_waves
+        self.top = mlp(inputs, 4 * width, 4 * width)
+        sizes = inputs + 4 * width, 4 * width
+        self.levels = nn.ModuleList([mlp(*sizes, 4 * width), mlp(*sizes, 2 * width)])
         self.head = nn.Linear(2 * width, NOTHING + 1)
 
     def forward(self, latent, points):
-        places = [points]
+        levels = [points]
         for number in self.args.num_centres:
-            places.append(gather(places[-1], farthest_point_sampling(places[-1], number)))
-        *finer, points = places
-        features = self.top(self.given(latent, points))
+            levels.append(gather(levels[-1], farthest_point_sampling(levels[-1], number)))
+        *finer, points = levels
+        features = self.top(self.inputs(latent, points))
         for level, onto in zip(self.levels, reversed(finer), strict=True):
             near = interpolate(features, points, onto)
-            features, points = level(torch.cat([self.given(latent, onto), near], dim=2)), onto
+            features, points = level(torch.cat([self.inputs(latent, onto), near], dim=2)), onto
         return self.head(features)
 
-    def given(self, latent, points):
-        """What each point has: its place and the latent, (n, p, 3 + 6 waves + latent)."""
+    def inputs(self, latent, points):
+        """Each point's position and the latent code, (n, p, 3 + 6 waves + latent)."""
         spread = latent.unsqueeze(1).expand(-1, points.shape[1], -1)
         return torch.cat([waves(points, self.args.num_waves), spread], dim=2)
-
-
-def distances_to(points, clouds):
-    """From points (n, p, 3) to the nearest ones of clouds (n, q, 3), scene by scene: (n, p)."""
-    squares = [  # less those of the points; a scene at a time, it stays in a CPU's cache
-        torch.addmm(cloud.square().sum(1), asked, cloud.T, alpha=-2).amin(1)
-        for asked, cloud in zip(points, clouds, strict=True)
-    ]
-    return (torch.stack(squares) + points.square().sum(2)).clamp(min=0).sqrt()
-
-
-def queries_of(points, labels, whole, number=None):
-    """Points to classify (n, q, 3) and their classes (n, q), of `batch_of`'s for one sensor.
-
-    The scene's own, (n, 2, p), and those above the table of the scene before it in the batch: where
-    these are of an obstacle, and nothing in the whole cloud is near, they have the class `NOTHING`.
-    Points without a class are `IGNORED`. All 3p of them, or `number`, by chance, a third of them
-    the other scene's.
-    """
-    own, classes = points.flatten(1, 2), labels.flatten(1, 2)
-    others, seen = points[:, 1].roll(1, dims=0), labels[:, 1].roll(1, dims=0)
-    if number is not None:
-        chosen = torch.randperm(own.shape[1], device=own.device)[: number - number // 3]
-        own, classes = own[:, chosen], classes[:, chosen]
-        chosen = torch.randperm(others.shape[1], device=own.device)[: number // 3]
-        others, seen = others[:, chosen], seen[:, chosen]
-    absent = (seen == OBSTACLE) & (distances_to(others, whole) > APART)
-    truth = [torch.where(classes == NOTHING, IGNORED, classes)]
-    truth.append(torch.where(absent, NOTHING, IGNORED))
-    return torch.cat([own, others], dim=1), torch.cat(truth, dim=1)
 
 
 class PointNet2(nn.Module):
@@ -254,9 +199,9 @@ class PointNet2(nn.Module):
         self.decoders = nn.ModuleList(Decoder(args) for _ in range(num_sensors))
 
     def forward(self, clouds, num_queries=None):
-        """Of `batch_of`'s list, per sensor: lists of logits (n, q, 4) and classes (n, q).
+        """`batch_of`'s list -> per sensor, lists of logits (n, q, 4) and classes (n, q).
 
-        Of all of `queries_of`'s, or of `num_queries`.
+        They are of all points of `queries_of`, or of `num_queries` of them.
         """
         logits, truth = [], []
         for (points, labels, whole), encoder, decoder in zip(
@@ -268,10 +213,12 @@ class PointNet2(nn.Module):
         return logits, truth
 
 
-class SceneEncoder(nn.Module):
-    """What is saved: each sensor's points and labels, `<sensor>_points` (n, samples, 3) and
-    `<sensor>_labels` (n, samples), uint8 -> z_E (n, 64). Of the labels it uses only which points
-    hit something."""
+class ExportedEncoder(nn.Module):
+    """What is saved: each sensor's points and labels -> z_E (n, 64).
+
+    The inputs are `<sensor>_points` (n, samples, 3), m, and `<sensor>_labels` (n, samples), uint8.
+    The labels only serve to drop points that hit nothing.
+    """
 
     def __init__(self, model, names):
         super().__init__()
@@ -287,7 +234,7 @@ class SceneEncoder(nn.Module):
 
 
 def update(model, optimizer, batch, args):
-    """One step on a batch of `batch_of`; its loss, a scalar."""
+    """One step on a batch of `batch_of`. Returns its loss, a scalar."""
     logits, truth = model(batch, args.num_queries)
     loss = F.cross_entropy(
         torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=IGNORED
@@ -298,38 +245,6 @@ def update(model, optimizer, batch, args):
     return loss
 
 
-@torch.no_grad()
-def evaluate(model, clouds, rows, batch_size, device):
-    """How well points of scenes `rows` are classified.
-
-    Returns:
-        `accuracy` and the intersection over union of each class, `iou_robot`, `iou_static`,
-        `iou_obstacle`, over points evenly spaced among those that hit something; and `absent`, the
-        share of other scenes' points of which it is said that nothing is there.
-    """
-    model.eval()
-    number = clouds.points.shape[3]
-    confusion = torch.zeros(NOTHING, NOTHING + 1, dtype=torch.int64)  # truth, prediction
-    told = asked = 0
-    for start in range(0, len(rows), batch_size):
-        batch = batch_of(clouds, rows[start : start + batch_size], device)
-        for logits, truth in zip(*model(batch), strict=True):
-            predicted = logits.argmax(2)
-            said = F.one_hot(predicted, NOTHING + 1)[:, :number]
-            own = [(truth[:, :number] == label).unsqueeze(2) for label in range(NOTHING)]
-            confusion += torch.stack([(one * said).sum((0, 1)) for one in own]).cpu()
-            absent = truth == NOTHING
-            asked += absent.sum().item()
-            told += (absent & (predicted == NOTHING)).sum().item()
-    model.train()
-    both = confusion.diagonal()
-    iou = both / (confusion[:, :NOTHING].sum(0) + confusion.sum(1) - both).clamp(min=1)
-    result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
-    result["absent"] = told / max(1, asked)
-    names = ("iou_robot", "iou_static", "iou_obstacle")
-    return result | dict(zip(names, iou.tolist(), strict=True))
-
-
 if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     many, few = args.num_centres
@@ -337,79 +252,53 @@ if __name__ == "__main__":
         sys.exit("--num-points must be at least --num-centres, and these --num-neighbours")
     if few < NEAREST:
         sys.exit(f"--num-centres must be at least {NEAREST}")
-    observations = open_observations(args.observations)
-    num_training, validation = split(observations, args)
+    observations, num_training, validation = load_observations(args)
     clouds = load_clouds(observations, args.num_points)
-    run, device = run_folder(args, observations.task), seed_torch(args)
+    example = example_clouds(observations, clouds.sensors)
+    metadata = encoder_metadata(args, observations, clouds.sensors)
+    device = seed_torch(args)
     rng = np.random.default_rng(args.seed)
 
     # MODEL: network and optimiser
     model = PointNet2(len(clouds.sensors), args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
-    # All that the first sensor saw of the first validation scene, for the picture.
-    shard = np.searchsorted(observations.offsets, validation[0], side="right") - 1
-    cloud = whole_clouds(observations, shard, next(iter(clouds.sensors)))
-    row = validation[0] - observations.offsets[shard]
-    hit = cloud[1][row] != NOTHING
-    pictured, classes = (one[row][hit].unsqueeze(0).to(device) for one in cloud)
+    shown, classes = scene_cloud(observations, validation[0], next(iter(clouds.sensors)))
+    shown = shown.to(device).unsqueeze(0)
 
-    # SHARED: checkpoint and log
-    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
-    checkpoint_state = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
-    load_checkpoint(args, checkpoint_state)
-    seconds_before = progress["seconds"]
-    writer = summary_writer(run, args, progress["updates"])
-    bar = progress_bar(args.total_updates, progress["updates"], "update")
-    # END SHARED
+    run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
+    run.start(args.total_updates, "update")
 
-    while progress["updates"] < args.total_updates:
+    while run.step < args.total_updates:
         # MODEL: learn
-        remaining = 1.0 - progress["updates"] / args.total_updates
+        remaining = 1.0 - run.step / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = batch_of(clouds, rng.integers(num_training, size=args.batch_size), device)
         loss = update(model, optimizer, batch, args)
-        progress["updates"] = step = progress["updates"] + 1
-        bar.update()
+        step = run.advance()
         if step % 100 == 0:
-            writer.add_scalar("losses/loss", loss.item(), step)
-            writer.add_scalar("charts/updates_per_second", rate(bar), step)
+            run.log({"losses/loss": loss, "charts/updates_per_second": run.rate})
 
-        # Evaluate, keep the best encoder
-        if step % args.eval_every == 0 or step == args.total_updates:
+        # Evaluate, keep the best encoder, checkpoint
+        evaluating = step % args.eval_every == 0 or step == args.total_updates
+        if evaluating:
             check_finite("the losses", loss)
-            result = evaluate(model, clouds, validation, args.batch_size, device)
-            for name, value in result.items():
-                writer.add_scalar(f"eval/{name}", value, step)
+            result = classification_scores(model, clouds, validation, args.batch_size, device)
+            run.log({f"eval/{name}": value for name, value in result.items()})
             with torch.no_grad():
-                seen = batch_of(clouds, validation[:1], device)[0][0]
-                predicted = model.decoders[0](model.encoders[0](seen[:, 1]), pictured).argmax(2)
-            picture = comparison(*(a[0].cpu().numpy() for a in (pictured, classes, predicted)))
-            writer.add_image("eval/classification", picture, step, dataformats="HWC")
+                points = batch_of(clouds, validation[:1], device)[0][0]
+                predicted = model.decoders[0](model.encoders[0](points[:, 1]), shown).argmax(2)
+            run.log_image("eval/classification", comparison(shown[0], classes, predicted[0]))
+            run.show(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
             error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
-            if error < progress["best_error"]:
-                progress["best_error"], progress["best_update"] = error, step
-                progress["best"] = result
-                example = {}
-                for name in clouds.sensors:
-                    points, labels = (one[:2] for one in whole_clouds(observations, 0, name))
-                    example |= {f"{name}_points": points, f"{name}_labels": labels}
-                metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
-                sensors = sensors_to_json(clouds.sensors)
-                metadata |= {"sensors": sensors, "seed": args.seed, "step": step}
-                encoder = SceneEncoder(model, tuple(clouds.sensors))
-                save_network(run / "encoder.pt", encoder, example, metadata | result)
-            bar.set_postfix(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
-            # SHARED: checkpoint and result
-            progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, checkpoint_state, device)
-    bar.close()
+            if run.is_best(-error, result):
+                encoder = ExportedEncoder(model, tuple(clouds.sensors))
+                details = metadata | {"step": step} | result
+                save_network(run.folder / "encoder.pt", encoder, example, details)
+        if evaluating or run.interrupted:
+            run.checkpoint()
+    run.close()
 
-    result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}
-    result |= {name: progress[name] for name in ("updates", "best_update")}
-    result["seconds"] = round(progress["seconds"])
-    write_json(run / "result.json", result | {"args": asdict(args)})
-    # END SHARED
-    shown = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor {iou_static:.3f}, "
-    shown += "obstacles {iou_obstacle:.3f}; of other scenes' obstacles {absent:.3f} told"
-    print(f"{shown.format(**result)}. {run / 'result.json'}")
-    writer.close()
+    result = write_result(run, num_training)
+    summary = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor "
+    summary += "{iou_static:.3f}, obstacles {iou_obstacle:.3f}; absent points {absent:.3f}"
+    print(f"{summary.format(**result)}. {run.folder / 'result.json'}")

@@ -1,11 +1,13 @@
-"""What encoders are trained on: a folder's observations, unpacked; which are for validation.
+"""Shared parts of the encoders' trainers: flags, observations, metadata and results.
 
-Its functions are for the trainers: where the user is wrong, they end the program with a message.
+These functions are for scripts: on a mistake of the user, they end the program with a message.
 """
 
 import contextlib
 import hashlib
 import sys
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
@@ -13,52 +15,90 @@ from tqdm import tqdm
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.observations import Observations
 from roboarm_nmp.envs.datasets.shards import shard_path
-from roboarm_nmp.envs.scenes.primitives import padded_rows
+from roboarm_nmp.envs.perception.sensors import sensors_to_json
+from roboarm_nmp.envs.training.flags import PositiveInt, Share
+from roboarm_nmp.envs.training.runs import RunFlags
 from roboarm_nmp.envs.utils.files import new_contents
 
 
-def open_observations(folder):
-    """The `Observations` in a folder. Raises SystemExit: there are none, or they are damaged."""
-    try:
-        return Observations(folder)
-    except DatasetError as error:
-        sys.exit(f"--observations: {error}")
+@dataclass
+class EncoderFlags(RunFlags):
+    """The flags of every encoder's trainer, in addition to those of its run."""
+
+    observations: Path = Path("observations")
+    """folder that `roboarm observations` wrote"""
+    validation_share: Share = 0.05
+    """share of the scenes, the last ones, that is not trained on"""
+    eval_every: PositiveInt = 2_000
+    """batches between evaluations on validation scenes; the best encoder is kept"""
+    eval_scenes: PositiveInt = 512
+    """validation scenes per evaluation"""
 
 
-def split(observations, args):
-    """The number of scenes to train on, the first ones, and the rows to validate on.
+def load_observations(args):
+    """The observations to train and to validate on.
 
     Args:
-        observations: `Observations`.
-        args: the flags `validation_share` (of the scenes, the last ones, that is not trained on)
-            and `eval_scenes` (how many of these are looked at, at most).
+        args: `EncoderFlags`.
+
+    Returns:
+        The `Observations`; the number of scenes to train on, the first ones; and the rows to
+        validate on, an array.
+
+    Raises:
+        SystemExit: there are no observations, or too few, or they are damaged.
     """
+    try:
+        observations = Observations(args.observations)
+    except DatasetError as error:
+        sys.exit(f"--observations: {error}")
     num_training = len(observations) - max(1, round(args.validation_share * len(observations)))
     if num_training < 1:
         sys.exit(f"--observations: {len(observations)} scenes are too few")
-    return num_training, np.arange(num_training, len(observations))[: args.eval_scenes]
+    validation = np.arange(num_training, len(observations))[: args.eval_scenes]
+    return observations, num_training, validation
 
 
-def unpacked(observations, name, arrays, shards):
+def encoder_metadata(args, observations, names):
+    """The metadata of an encoder that receives the outputs of the sensors `names`: a dict."""
+    sensors = sensors_to_json({name: observations.sensors[name] for name in names})
+    metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
+    return metadata | {"sensors": sensors, "seed": args.seed}
+
+
+def write_result(run, num_training):
+    """Write `result.json`: the best evaluation and the size of the run. Returns its dict.
+
+    Args:
+        run: the `Run`, whose `best_result` is a dict of the best evaluation.
+        num_training: number of scenes that it trained on.
+    """
+    result = run.best_result | {"scenes": num_training, "encoder": str(run.folder / "encoder.pt")}
+    result |= {"updates": run.step, "best_update": run.best_step, "seconds": round(run.seconds)}
+    run.write_result(result)
+    return result
+
+
+def unpack(observations, name, arrays, shards):
     """Arrays with a row per scene, made once, kept in files beside the shards and memory-mapped.
 
-    The files, `<name>_<array>_<key>.npy`, may be larger than the memory. Their key is of the
-    shards' contents: other observations have other files.
+    The files, `<name>_<array>_<key>.npy`, may be larger than the memory. The key is a hash of the
+    shards' contents, so other observations have other files.
 
     Args:
         observations: `Observations`.
-        name: says what is in the arrays and how it was made.
+        name: of the arrays' contents, with the parameters that they depend on.
         arrays: dict from an array's name to its dtype and the shape of a row.
-        shards: iterable of dicts with the arrays' rows, shard after shard. It is not begun if the
-            files are there.
+        shards: iterable of dicts with the arrays' rows, shard after shard. It is not started if
+            the files exist.
 
     Returns:
-        A dict from an array's name to the array, which cannot be written to.
+        A dict from an array's name to the array, which is read-only.
     """
     key = contents_key(observations)
     paths = {one: observations.folder / f"{name}_{one}_{key}.npy" for one in arrays}
     if not all(path.exists() for path in paths.values()):
-        # Several trainers may be at this at once. Who is last replaces the same.
+        # Several trainers may do this at once: the last one replaces the files by equal ones.
         with contextlib.ExitStack() as stack:
             whole = {
                 one: np.lib.format.open_memmap(
@@ -80,22 +120,8 @@ def unpacked(observations, name, arrays, shards):
     return {one: np.load(path, mmap_mode="r") for one, path in paths.items()}
 
 
-def load_obstacles(observations):
-    """The true obstacles: float32 (scenes, most, 12), 1 and a row of `to_array`, zeros for none.
-
-    Quaternions have length 1.
-    """
-    shards = range(len(observations.offsets) - 1)
-    scenes = [scene for shard in shards for scene in observations.scenes(shard)]
-    most = max(len(scene.obstacles) for scene in scenes)
-    obstacles = np.stack([padded_rows(scene.obstacles, most) for scene in scenes])
-    turns = obstacles[..., 5:9]
-    turns /= np.maximum(np.linalg.norm(turns, axis=-1, keepdims=True), 1e-9)
-    return obstacles
-
-
 def contents_key(observations):
-    """A short name, a string, of all that is in the shards of `Observations`."""
+    """A hash of the contents of all shards of `Observations`, a string."""
     digest = hashlib.sha256()
     for shard in range(len(observations.offsets) - 1):
         with open(shard_path(observations.folder, shard), "rb") as file:

@@ -1,20 +1,18 @@
-"""VQ-VAE of what four cameras see: a scene latent z_E of 64 numbers. Read it from the top.
+"""VQ-VAE of four camera images: a 64-dimensional latent code z_E. Read it from the top.
 
-    python -m roboarm_nmp.scene_embedding_train.collect --sensors images --image-size 128 --num 20000
-    python scene_embedding_train/vqvae.py --observations observations
+    roboarm observations --sensors images --image-size 128 --num 20000
+    roboarm train vqvae --observations observations
 
 A vector-quantised autoencoder (van den Oord et al., 2017) as in the paper's appendix "Training and
-verifying the encoders": each camera has an encoder to 16 numbers, made of vectors from a codebook,
-and a decoder that sees these 16. What is saved, `encoder.pt`, is an exported network
-from the images to z_E, the cameras' numbers side by side. To make an encoder of your own, copy this
-file and change the parts under `# MODEL`. Parts between `# SHARED` and `# END SHARED` are those of
-`vae.py`.
+verifying the encoders": each camera has an encoder to 16 dimensions, which consist of vectors from
+a codebook, and a decoder that receives these 16. What is saved, `encoder.pt`, is an exported
+network from the images to z_E, the cameras' latent codes side by side. To make an encoder of your
+own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
+`# END SHARED` are those of `vae.py`.
 """
 
-import math
 import sys
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,88 +20,60 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.perception.sensors import sensors_to_json
-from roboarm_nmp.envs.training.flags import (
-    NonNegativeFloat,
-    PositiveFloat,
-    PositiveInt,
-    Share,
-    Width,
-)
-from roboarm_nmp.envs.training.runs import (
-    RunFlags,
-    elapsed,
-    load_checkpoint,
-    parse_args,
-    progress_bar,
-    rate,
-    run_folder,
-    save_checkpoint,
-    seed_torch,
-    summary_writer,
-    write_json,
-)
-from roboarm_nmp.scene_embedding_train.pictures import (
-    averaged,
+from roboarm_nmp.envs.training.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
+from roboarm_nmp.envs.training.runs import Run, parse_args, seed_torch
+from roboarm_nmp.scene_embedding_train.images import (
+    average_down,
     batch_of,
     comparison,
+    example_images,
     foreground,
     load_images,
-    mean_picture,
+    mean_of_images,
     reconstruction_errors,
 )
-from roboarm_nmp.scene_embedding_train.training_data import open_observations, split
+from roboarm_nmp.scene_embedding_train.training_data import (
+    EncoderFlags,
+    encoder_metadata,
+    load_observations,
+    write_result,
+)
 
 
 @dataclass
-class Args(RunFlags):  # those of the run's folder are in `envs/training/runs.py`
+class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
     exp_name: str = "vqvae"
     """name of the experiment, part of the run's folder"""
-
-    # SHARED: the data
-    # The data
-    observations: Path = Path("observations")
-    """folder that `scene_embedding_train.collect` wrote"""
-    validation_share: Share = 0.05
-    """share of the scenes, the last ones, that is not trained on"""
-    # END SHARED
 
     # The algorithm
     total_updates: PositiveInt = 20_000
     """batches of the whole run"""
     batch_size: PositiveInt = 32
     """scenes per batch"""
-    picture_size: Width = 64
-    """width and height (pixels) that pictures are averaged down to, as part of the encoder"""
+    image_size: Width = 64
+    """width and height (pixels) that images are averaged down to, as part of the encoder"""
     learning_rate: PositiveFloat = 1e-3
     """learning rate (Adam) at the start; it falls linearly to zero"""
     latent_size: Width = 16
-    """numbers per camera (paper: 16)"""
+    """dimensions of z_E per camera (paper: 16)"""
     width: Width = 12
     """channels of the first convolution; each further one has twice as many"""
     code_size: PositiveInt = 2
-    """numbers in a vector of the codebook; a camera's latent is made of latent_size / code_size"""
+    """dimensions of a codebook's vectors; latent_size / code_size of them are a camera's code"""
     num_codes: PositiveInt = 256
     """vectors in each camera's codebook"""
     commitment: NonNegativeFloat = 0.25
-    """weight of the encoder's loss for being far from its codes, beside 1 of the codes' own"""
+    """weight of the loss that draws latents to their codes, beside 1 for the one of the codes"""
     restart_every: PositiveInt = 500
-    """updates after which codes that were not used since start again as outputs of the encoder"""
+    """updates after which codes that were not used since are replaced by outputs of the encoder"""
     foreground_weight: NonNegativeFloat = 10.0
-    """weight of pixels that differ from the mean picture, beside 1 for the others: obstacles are
-    few pixels (0: all pixels count the same)"""
-
-    # SHARED: bookkeeping
-    eval_every: PositiveInt = 2_000
-    """batches between evaluations on validation scenes; the best encoder is kept"""
-    eval_scenes: PositiveInt = 512
-    """validation scenes per evaluation"""
-    # END SHARED
+    """additional weight of pixels that differ from the mean image, as obstacles are few pixels
+    (0: all pixels count the same)"""
 
 
-# SHARED: networks for pictures
+# SHARED: networks for images
 def num_halvings(size):
-    """How often pictures of `size` pixels can be halved until at most 7 are left."""
+    """How often images of `size` pixels can be halved until at most 7 are left."""
     halvings = 0
     while size > 7 and size % 2 == 0:
         size, halvings = size // 2, halvings + 1
@@ -111,7 +81,7 @@ def num_halvings(size):
 
 
 def convolutions(size, width):
-    """Pictures (n, 3, size, size) -> features (n, k), and k."""
+    """Images (n, 3, size, size) -> features (n, k), and k."""
     halvings = num_halvings(size)
     channels = [3, *(width * 2**i for i in range(halvings))]
     layers = []
@@ -123,9 +93,9 @@ def convolutions(size, width):
 # END SHARED
 
 
-# SHARED: a decoder of pictures
+# SHARED: a decoder of images
 class Decoder(nn.Module):
-    """A latent (n, inputs) -> one camera's pictures (n, 3, size, size) in [0, 1]."""
+    """A latent (n, inputs) -> one camera's images (n, 3, size, size) in [0, 1]."""
 
     def __init__(self, inputs, size, args):
         super().__init__()
@@ -148,7 +118,7 @@ class Decoder(nn.Module):
 
 # MODEL
 class Codebook(nn.Module):
-    """Quantises vectors: each becomes the nearest one of `num_codes`."""
+    """Quantises vectors: each becomes the nearest of `num_codes` codes."""
 
     def __init__(self, args):
         super().__init__()
@@ -162,7 +132,7 @@ class Codebook(nn.Module):
 
     @torch.no_grad()
     def restart(self, vectors):
-        """Codes not used since the last call start again as some of `vectors` (n, code_size).
+        """Replace codes not used since the last call by random ones of `vectors` (n, code_size).
 
         Returns the share of the codes that were used.
         """
@@ -175,12 +145,12 @@ class Codebook(nn.Module):
 
 
 def straight_through(latent, quantised):
-    """The quantised latent, whose gradient goes to the latent as if nothing had happened to it."""
+    """The quantised latent, whose gradient goes to the latent as if it was not quantised."""
     return latent + (quantised - latent).detach()
 
 
 class Encoder(nn.Module):
-    """One camera's pictures (n, 3, size, size) -> what is quantised (n, vectors, code_size)."""
+    """One camera's images (n, 3, size, size) -> its latent (n, vectors, code_size)."""
 
     def __init__(self, size, args):
         super().__init__()
@@ -188,8 +158,8 @@ class Encoder(nn.Module):
         self.head = nn.Linear(features, args.latent_size)
         self.code_size = args.code_size
 
-    def forward(self, pictures):
-        latent = self.head(self.convolutions(pictures))
+    def forward(self, images):
+        latent = self.head(self.convolutions(images))
         return latent.unflatten(1, (-1, self.code_size))
 
 
@@ -215,28 +185,28 @@ class VQVAE(nn.Module):
         return torch.stack([decoder(latent.flatten(1)) for decoder, latent in pairs], dim=1)
 
     def forward(self, images):
-        """Images as they come back from z_E."""
+        """Images as they are decoded from z_E."""
         return self.decode([quantised for _, quantised, _ in self.encode(images)])
 
 
-class SceneEncoder(nn.Module):
-    """What is saved: each camera's pictures uint8 (n, height, width, 3), by name -> z_E."""
+class ExportedEncoder(nn.Module):
+    """What is saved: each camera's images, uint8 (n, height, width, 3), by name -> z_E (n, 64)."""
 
     def __init__(self, vqvae, cameras, size):
         super().__init__()
         self.vqvae, self.cameras, self.size = vqvae, cameras, size
 
-    def forward(self, **pictures):
-        images = averaged(torch.stack([pictures[name] for name in self.cameras], 1), self.size)
-        encoded = self.vqvae.encode(images)
+    def forward(self, **images):
+        stacked = torch.stack([images[name] for name in self.cameras], dim=1)
+        encoded = self.vqvae.encode(average_down(stacked, self.size))
         return torch.cat([quantised.flatten(1) for _, quantised, _ in encoded], dim=1)
 
 
 def update(model, optimizer, batch, mean_image, args):
     """One step on a batch (n, cameras, 3, size, size).
 
-    Returns its losses, a dict of scalars, and what was quantised: (n, vectors, code_size) each
-    camera, a list.
+    Returns its losses, a dict of scalars, and the cameras' latents before quantisation, a list of
+    (n, vectors, code_size).
     """
     latents, quantised, indices = zip(*model.encode(batch), strict=True)
     weights = 1.0 + args.foreground_weight * foreground(batch, mean_image)
@@ -260,85 +230,62 @@ if __name__ == "__main__":
     if args.latent_size % args.code_size:
         sys.exit(f"--latent-size {args.latent_size} is no multiple of --code-size {args.code_size}")
 
-    # SHARED: pictures to train on
-    observations = open_observations(args.observations)
-    size = args.picture_size
+    # SHARED: images to train on
+    size = args.image_size
     if num_halvings(size) == 0:
-        sys.exit(f"--picture-size {size}: 8, 16, 32, 64, 128, ... pixels")
-    num_training, validation = split(observations, args)
+        sys.exit(f"--image-size {size}: 8, 16, 32, 64, 128, ... pixels")
+    observations, num_training, validation = load_observations(args)
     images, cameras = load_images(observations, size)
-    run, device = run_folder(args, observations.task), seed_torch(args)
+    example = example_images(observations, cameras)
+    metadata = encoder_metadata(args, observations, cameras)
+    device = seed_torch(args)
     rng = np.random.default_rng(args.seed)
-    mean_image = mean_picture(images, num_training, device)
-    # What the encoder that is saved gets: pictures as the cameras took them.
-    last = len(observations.offsets) - 2
-    example = {
-        name: torch.from_numpy(observations.read(last, f"{name}/rgb")[:2]) for name in cameras
-    }
+    mean_image = mean_of_images(images, num_training, device)
     # END SHARED
 
     # MODEL: network and optimiser
     model = VQVAE(len(cameras), size, args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
+    run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
+    run.start(args.total_updates, "update")
 
-    # SHARED: checkpoint and log
-    progress = {"updates": 0, "seconds": 0.0, "best_error": math.inf, "best_update": 0, "best": {}}
-    checkpoint_state = {"model": model, "optimizer": optimizer, "rng": rng, "progress": progress}
-    load_checkpoint(args, checkpoint_state)
-    seconds_before = progress["seconds"]
-    writer = summary_writer(run, args, progress["updates"])
-    bar = progress_bar(args.total_updates, progress["updates"], "update")
-    # END SHARED
-
-    while progress["updates"] < args.total_updates:
+    while run.step < args.total_updates:
         # MODEL: learn
-        remaining = 1.0 - progress["updates"] / args.total_updates
+        remaining = 1.0 - run.step / args.total_updates
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = batch_of(images, rng.integers(num_training, size=args.batch_size), device)
         losses, latents = update(model, optimizer, batch, mean_image, args)
-        progress["updates"] = step = progress["updates"] + 1
-        bar.update()
+        step = run.advance()
         if step % args.restart_every == 0:
             used = [
                 codebook.restart(vectors.flatten(0, 1))
                 for codebook, vectors in zip(model.codebooks, latents, strict=True)
             ]
         if step % 100 == 0:
-            for name, value in losses.items():
-                writer.add_scalar(f"losses/{name}", value.item(), step)
+            run.log({f"losses/{name}": value for name, value in losses.items()})
             if step % args.restart_every == 0:
-                writer.add_scalar("charts/codes_used", np.mean(used), step)
-            writer.add_scalar("charts/updates_per_second", rate(bar), step)
+                run.log({"charts/codes_used": np.mean(used)})
+            run.log({"charts/updates_per_second": run.rate})
 
-        # SHARED: evaluate, keep the best encoder
-        if step % args.eval_every == 0 or step == args.total_updates:
+        # SHARED: evaluate, keep the best encoder, checkpoint
+        evaluating = step % args.eval_every == 0 or step == args.total_updates
+        if evaluating:
             errors = (model, images, validation, mean_image, args.batch_size, device)
             result = reconstruction_errors(*errors)
-            for name, value in result.items():
-                writer.add_scalar(f"eval/{name}", value, step)
-            picture = comparison(model, batch_of(images, validation[:1], device))
-            writer.add_image("eval/reconstruction", picture, step, dataformats="HWC")
-            if result["error_foreground"] < progress["best_error"]:
-                progress["best_error"], progress["best_update"] = result["error_foreground"], step
-                progress["best"] = result
-                metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
-                sensors = {name: observations.sensors[name] for name in cameras}
-                metadata |= {"sensors": sensors_to_json(sensors), "seed": args.seed, "step": step}
-                encoder = SceneEncoder(model, tuple(cameras), size)
-                save_network(run / "encoder.pt", encoder, example, metadata | result)
-            bar.set_postfix(error=f"{result['error_foreground']:.4f}")
-            # END SHARED
-            # SHARED: checkpoint and result
-            progress["seconds"] = seconds_before + elapsed(bar)
-            save_checkpoint(run, checkpoint_state, device)
-    bar.close()
+            run.log({f"eval/{name}": value for name, value in result.items()})
+            figure = comparison(model, batch_of(images, validation[:1], device))
+            run.log_image("eval/reconstruction", figure)
+            run.show(error=f"{result['error_foreground']:.4f}")
+            if run.is_best(-result["error_foreground"], result):
+                encoder = ExportedEncoder(model, tuple(cameras), size)
+                details = metadata | {"step": step} | result
+                save_network(run.folder / "encoder.pt", encoder, example, details)
+        if evaluating or run.interrupted:
+            run.checkpoint()
+    run.close()
 
-    result = progress["best"] | {"scenes": num_training, "encoder": str(run / "encoder.pt")}
-    result |= {name: progress[name] for name in ("updates", "best_update")}
-    result["seconds"] = round(progress["seconds"])
-    write_json(run / "result.json", result | {"args": asdict(args)})
+    result = write_result(run, num_training)
+    summary = "error {error:.5f} (mean image {mean_image_error:.5f}); foreground "
+    summary += "{error_foreground:.4f} ({mean_image_error_foreground:.4f})"
+    print(f"{summary.format(**result)}. {run.folder / 'result.json'}")
     # END SHARED
-    shown = "error {error:.5f} (mean image {mean_image_error:.5f}); of what differs from it "
-    shown += "{error_foreground:.4f} ({mean_image_error_foreground:.4f})"
-    print(f"{shown.format(**result)}. {run / 'result.json'}")
-    writer.close()

@@ -8,8 +8,9 @@ The functions that take flags of the command line are for scripts: where the use
 the program with a message.
 """
 
+import collections
 import sys
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -24,8 +25,9 @@ from roboarm_nmp.envs.policies.registry import recurrent_size
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
-from roboarm_nmp.envs.training.runs import check_finite, write_json
+from roboarm_nmp.envs.training.runs import Run, check_finite
 
 NUM_ENVS = 8  # that an evaluation runs together at most; the first of them takes the pictures
 IMAGE_SIZE = (240, 180)
@@ -161,22 +163,6 @@ def stack(observations, device):
     }
 
 
-def log_episode(writer, step, episode_return, info, recent_success):
-    """Write a finished training episode to TensorBoard.
-
-    Args:
-        writer: TensorBoard's.
-        step: of the training.
-        episode_return: sum of its rewards.
-        info: of its last step.
-        recent_success: list of the outcomes of the last 100 episodes, which gets this one too.
-    """
-    recent_success[:] = [*recent_success[-99:], info["is_success"]]
-    writer.add_scalar("charts/episodic_return", episode_return, step)
-    writer.add_scalar("charts/episodic_length", info["elapsed_steps"], step)
-    writer.add_scalar("charts/success", np.mean(recent_success), step)
-
-
 def evaluate(policy, envs, queries, device, safety_filter=None, seed=0):
     """Run a deterministic policy on every query, each env one at a time; mean results.
 
@@ -285,101 +271,126 @@ def rollout_image(policy, env, query, device, safety_filter=None, frames=8):
     return render_strip(env, query, trajectory.actions, [steps[i] for i in chosen])
 
 
-def validate(policy, envs, queries, device, writer, step, progress, safety_filter=None):
-    """`evaluate` on validation queries, with results and a picture of the first in TensorBoard.
-
-    A policy with a last layer is evaluated without it, too (`eval/..._without_filter`).
+class PolicyRun(Run):
+    """A run that trains a policy, and validates, saves and tests it under the benchmark's protocol.
 
     Args:
-        policy, queries, device, safety_filter: as for `evaluate`.
-        envs: of `make_eval_envs`.
-        writer: TensorBoard's.
-        step: of the training.
-        progress: dict with `best_success` and `best_step`, which are set if none was better.
-
-    Returns:
-        The success rate.
+        args: the flags, `task`, `goal_type`, `exp_name` and `seed` among them.
+        state: dict from a name to what changes in the run, as for `runs.Run`.
+        device: of the run.
+        env_arguments: dict of `envs.make`'s arguments, which `policy.pt` is evaluated with.
+        eval_envs: of `make_eval_envs`, with these arguments.
+        validation: validation queries.
+        safety_filter: an `envs.policies.safety_filter.SafetyFilter` that is part of the policy, or
+            None.
     """
-    result = evaluate(policy, envs, queries, device, safety_filter)
-    for name, value in result.items():
-        writer.add_scalar(f"eval/{name}", value, step)
-    if safety_filter is not None:
-        for name, value in evaluate(policy, envs, queries, device).items():
-            writer.add_scalar(f"eval/{name}_without_filter", value, step)
-    picture = rollout_image(policy, envs[0], queries[0], device, safety_filter)
-    writer.add_image("eval/rollout", picture, step, dataformats="HWC")
-    success = result["success_rate"]
-    if success >= progress["best_success"]:
-        progress |= {"best_success": success, "best_step": step}
-    return success
 
+    def __init__(
+        self, args, state, device, env_arguments, eval_envs, validation, safety_filter=None
+    ):
+        super().__init__(args, task_name(args.task), state, device)
+        self.env_arguments, self.eval_envs = env_arguments, eval_envs
+        self.validation, self.safety_filter = validation, safety_filter
+        self._recent = collections.deque(maxlen=100)  # outcomes of training episodes
 
-def save_policy(run, policy, envs, device, args, env_arguments, step, safety_filter=None):
-    """Write `policy.pt` for `evaluate.py` and others.
+    def log_episode(self, step, episode_return, info):
+        """Log a training episode.
 
-    Args:
-        run: the run's folder.
-        policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else is
-            observed; with a `recurrent_size`, its `recurrent_state`, too.
-        envs: some of its environments, for examples of observations.
-        device: of the policy.
-        args: the flags; `task`, `exp_name` and `seed` are noted in the file.
-        env_arguments: of `envs.make`, noted too: the policy is evaluated with them.
-        step: of the training.
-        safety_filter: an `envs.policies.safety_filter.SafetyFilter` that is part of the policy, or None.
-    """
-    metadata = {"kind": "policy", "task": args.task, "env": env_arguments}
-    if safety_filter is not None:
-        metadata["safety_filter"] = {"margin": safety_filter.margin, "escape": safety_filter.escape}
-    metadata |= {"script": args.exp_name, "seed": args.seed, "step": step}
-    example = stack([env.reset(seed=0)[0] for env in envs[:2]], device)
-    if size := recurrent_size(policy):
-        metadata["recurrent_size"] = size
-        example["recurrent_state"] = torch.zeros(len(envs[:2]), size, device=device)
-    save_network(run / "policy.pt", policy, example, metadata)
+        Args:
+            step: of the training, at which the episode ended.
+            episode_return: sum of its rewards.
+            info: of its last step.
+        """
+        self._recent.append(info["is_success"])
+        values = {"episodic_return": episode_return, "episodic_length": info["elapsed_steps"]}
+        values["success"] = np.mean(self._recent)
+        self.log({f"charts/{name}": value for name, value in values.items()}, step)
 
+    def validate(self, policy):
+        """Evaluate a policy on the validation queries, and log results and images of the first.
 
-def final_test(run, args, env_arguments, queries, device, progress, steps):
-    """Test `policy.pt` on test queries: `result.json`, and a line on the console.
+        With a safety filter, the policy is evaluated without it, too: `eval/..._without_filter`.
 
-    Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed, also
-    where the policy was trained under others: results are to be compared. File and line say so,
-    and that they cannot be where its steps are longer or shorter (`deviations`).
+        Args:
+            policy: as for `evaluate`.
 
-    Args:
-        run: the run's folder.
-        args: the flags, written into the file.
-        env_arguments: of `envs.make`, in training.
-        queries: the test queries.
-        device: where to run the policy.
-        progress: dict with the run's `seconds`, `best_success` on validation queries, and
-            `best_step`, at which the policy was saved.
-        steps: of the run.
-    """
-    policy = load_network(run / "policy.pt").to(device)
-    own = {name: value for name, value in env_arguments.items() if name not in RULES}
-    test_envs = make_eval_envs(args.task, len(queries), **own)
-    safety_filter = SafetyFilter.from_metadata(policy.metadata)
-    result = evaluate(policy, test_envs, queries, device, safety_filter)
-    rules = {name: getattr(test_envs[0], name) for name in RULES}
-    trained = rules | {name: env_arguments[name] for name in RULES if name in env_arguments}
-    result |= {"rules": rules, "rules_in_training": trained, "deviations": deviations(own)}
-    result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
-    result |= {"policy": str(run / "policy.pt"), "policy_step": progress["best_step"]}
-    result |= {"validation_success_rate": progress["best_success"]}
-    result |= {"steps": steps, "seconds": round(progress["seconds"])}
-    write_json(run / "result.json", result | {"args": asdict(args)})
-    if rules != trained:
-        print(f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:")
-    for name, value in result["deviations"].items():
-        print(f"not comparable: {name} is {value}, not {STANDARD_RULES[name]}")
-    print(
-        f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: "
-        f"success {result['success_rate']:.3f}, clean {result['collision_free_success_rate']:.3f}; "
-        f"{steps} steps in {progress['seconds']:.0f} s. {run / 'result.json'}"
-    )
+        Returns:
+            Whether no policy of the run was better so far. False where a signal has interrupted the
+            evaluation.
+        """
+        queries, envs, device = self.validation, self.eval_envs, self.device
+        if self.interrupted:
+            return False
+        try:
+            with self.interruptible():
+                result = evaluate(policy, envs, queries, device, self.safety_filter)
+                self.log({f"eval/{name}": value for name, value in result.items()})
+                if self.safety_filter is not None:
+                    bare = evaluate(policy, envs, queries, device)
+                    self.log({f"eval/{name}_without_filter": v for name, v in bare.items()})
+                image = rollout_image(policy, envs[0], queries[0], device, self.safety_filter)
+                self.log_image("eval/rollout", image)
+        except KeyboardInterrupt:
+            return False
+        is_best = self.is_best(result["success_rate"])
+        self.show(eval=result["success_rate"], best=self.best_score)
+        return is_best
+
+    def save_policy(self, policy):
+        """Write `policy.pt` for `evaluate.py` and others.
+
+        Args:
+            policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else
+                is observed; with a `recurrent_size`, its `recurrent_state`, too.
+        """
+        args = self.args
+        metadata = {"kind": "policy", "task": args.task, "env": self.env_arguments}
+        if self.safety_filter is not None:
+            margin, escape = self.safety_filter.margin, self.safety_filter.escape
+            metadata["safety_filter"] = {"margin": margin, "escape": escape}
+        metadata |= {"script": args.exp_name, "seed": args.seed, "step": self.step}
+        example = stack([env.reset(seed=0)[0] for env in self.eval_envs[:2]], self.device)
+        if size := recurrent_size(policy):
+            metadata["recurrent_size"] = size
+            number = len(example["observation"])
+            example["recurrent_state"] = torch.zeros(number, size, device=self.device)
+        save_network(self.folder / "policy.pt", policy, example, metadata)
+
+    def final_test(self, queries):
+        """Test `policy.pt` on test queries: `result.json`, and a line on the console. Ends the run.
+
+        Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed,
+        also where the policy was trained under others: results are to be compared. File and line
+        say so, and they name the step length where it is not the standard one (`deviations`).
+        """
+        self.close()
+        args = self.args
+        policy = load_network(self.folder / "policy.pt").to(self.device)
+        own = {name: value for name, value in self.env_arguments.items() if name not in RULES}
+        test_envs = make_eval_envs(args.task, len(queries), **own)
+        safety_filter = SafetyFilter.from_metadata(policy.metadata)
+        result = evaluate(policy, test_envs, queries, self.device, safety_filter)
+        rules = {name: getattr(test_envs[0], name) for name in RULES}
+        trained = rules | {n: self.env_arguments[n] for n in RULES if n in self.env_arguments}
+        result |= {"rules": rules, "rules_in_training": trained, "deviations": deviations(own)}
+        result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
+        result |= {"policy": str(self.folder / "policy.pt"), "policy_step": self.best_step}
+        result |= {"validation_success_rate": self.best_score, "steps": self.step}
+        self.write_result(result | {"seconds": round(self.seconds)})
+        if rules != trained:
+            print(
+                f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:"
+            )
+        for name, value in result["deviations"].items():
+            print(f"not comparable: {name} is {value}, not {STANDARD_RULES[name]}")
+        success, collision_free = result["success_rate"], result["collision_free_success_rate"]
+        print(
+            f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: success "
+            f"{success:.3f}, collision-free success {collision_free:.3f}; {self.step} steps in "
+            f"{self.seconds:.0f} s. {self.folder / 'result.json'}"
+        )
 
 
 def _words(rules):
-    contacts = "ended by a touch" if rules["stop_on_collision"] else "contacts allowed"
+    contacts = "ended by a contact" if rules["stop_on_collision"] else "contacts allowed"
     return f"{rules['horizon']} steps, {contacts}"

@@ -1,17 +1,27 @@
-"""Run folders: what a training run leaves, and how it goes on after it was stopped.
+"""Run folders: flags, checkpoints, TensorBoard, and how a stopped run continues.
 
     args = parse_args(Args, may_change={"total_updates"})   # with --resume, those of the run
-    run, device = run_folder(args, "wall"), seed_torch(args)
-    progress = {"updates": 0, "seconds": 0.0}
-    checkpoint_state = {"model": model, "optimizer": optimizer, "progress": progress}
-    load_checkpoint(args, checkpoint_state)
-    writer = summary_writer(run, args, progress["updates"])
-    bar = progress_bar(args.total_updates, progress["updates"], "update")
-    ...
-    save_checkpoint(run, checkpoint_state, device)
+    device = seed_torch(args)
+    model, optimizer = ...
+    run = Run(args, "wall", {"model": model, "optimizer": optimizer}, device)
+    run.start(args.total_updates, "update")
+    while run.step < args.total_updates:
+        loss = ...
+        step = run.advance()
+        if step % 100 == 0:
+            run.log({"losses/loss": loss, "charts/SPS": run.rate})
+        evaluating = step % args.eval_every == 0 or step == args.total_updates
+        if evaluating:
+            error = ...
+            if run.is_best(-error):
+                save_network(run.folder / "encoder.pt", model, ...)
+        if evaluating or run.interrupted:   # Ctrl-C or SIGTERM
+            run.checkpoint()                # an interrupted run ends here
+    run.close()
 
 Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `exp_name` at least.
-These functions are for scripts: where the user is wrong, they end the program with a message.
+A trainer of a policy uses `envs.training.protocol.PolicyRun`. These functions are for scripts:
+on a mistake of the user, they end the program with a message.
 """
 
 import contextlib
@@ -20,8 +30,11 @@ import functools
 import importlib.util
 import itertools
 import json
+import math
 import os
+import signal
 import sys
+import threading
 import time
 import typing
 from dataclasses import asdict, dataclass, fields
@@ -30,7 +43,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from roboarm_nmp.envs.tasks import SCENE_FILES
@@ -43,6 +55,7 @@ from roboarm_nmp.envs.utils.files import (
     new_contents,
     write_atomically,
 )
+from roboarm_nmp.envs.utils.signals import Terminated, exit_interrupted, raise_on_sigterm
 
 
 @dataclass
@@ -78,6 +91,7 @@ def parse_args(Args, may_change=()):
     Raises:
         SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
     """
+    raise_on_sigterm()
     args = tyro.cli(Args)
     if args.resume is not None:
         args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
@@ -173,20 +187,21 @@ def run_folder(args, task):
 
 
 def _say_plainly(run, kind, error, trace):
-    """Python's `excepthook`: what is no mistake of the program's is said in a line or two."""
+    """Python's `excepthook`: one or two lines for errors that are no mistake of the program."""
+    checkpoint = ""
+    if (run / "checkpoint.pt").exists():
+        checkpoint = f"--resume {run} continues from the last checkpoint"
     if isinstance(error, KeyboardInterrupt):
-        text = "interrupted"
-    elif isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
+        exit_interrupted(error, checkpoint or f"{run} has no checkpoint yet")
+    if isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
         text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()
     elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
         text = f"error: {error}"
     elif isinstance(error, FloatingPointError):
-        text = f"error: training has diverged: {error}; what was made before is in {run}"
+        text, checkpoint = f"error: training has diverged: {error}; its files are in {run}", ""
     else:
         return sys.__excepthook__(kind, error, trace)
-    if (run / "checkpoint.pt").exists() and not isinstance(error, FloatingPointError):
-        text += f"\nwhat the last checkpoint has is safe: --resume {run} goes on from there"
-    print(f"\n{text}", file=sys.stderr)
+    print("\n".join(filter(None, ["", text, checkpoint])), file=sys.stderr)
 
 
 def seed_torch(args):
@@ -311,6 +326,8 @@ def summary_writer(run, args, step):
         # Under the run's name, so that a resumed run goes on there as well.
         names = {"project": "roboarm-nmp", "name": run.name, "id": run.name, "dir": str(run)}
         wandb.init(**names, config=config, resume="allow", sync_tensorboard=True)
+    from torch.utils.tensorboard import SummaryWriter  # slow to import, and not for --help
+
     writer = SummaryWriter(run, purge_step=step + 1)
     rows = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
     writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
@@ -331,3 +348,137 @@ def elapsed(bar):
 def rate(bar):
     """Mean steps per second since the bar began."""
     return (bar.n - bar.initial) / elapsed(bar)
+
+
+class Run:
+    """A training run: its folder, its progress, its checkpoints and what it logs.
+
+    Attributes:
+        folder: path of the run's folder.
+        device: of the run.
+        step: number of steps (or updates) so far, those of earlier processes included.
+        seconds: of training up to the last checkpoint, likewise.
+        best_step, best_score: of the best evaluation so far; 0 and -inf before the first.
+        best_result: dict of that evaluation's other results.
+        interrupted: whether Ctrl-C or SIGTERM has arrived. The trainer then calls `checkpoint` at
+            the end of the current step.
+    """
+
+    def __init__(self, args, name, state, device):
+        """Make the run's folder. With --resume, give `state` its contents in the checkpoint.
+
+        Args:
+            args: the flags.
+            name: of what is learned, the first part of the folder's name.
+            state: dict from a name to what changes in the run, as for `save_checkpoint`.
+            device: of the run.
+        """
+        self.args, self.device = args, device
+        self.folder = run_folder(args, name)
+        self._progress = {"step": 0, "seconds": 0.0}
+        self._progress |= {"best_step": 0, "best_score": -math.inf, "best_result": {}}
+        self._state = state | {"progress": self._progress}
+        load_checkpoint(args, self._state)
+        self._interrupt, self._may_raise = None, True
+
+    step = property(lambda self: self._progress["step"])
+    seconds = property(lambda self: self._progress["seconds"])
+    best_step = property(lambda self: self._progress["best_step"])
+    best_score = property(lambda self: self._progress["best_score"])
+    best_result = property(lambda self: self._progress["best_result"])
+    interrupted = property(lambda self: self._interrupt is not None)
+
+    def start(self, total, unit):
+        """Open TensorBoard's writer and a progress bar of `total` steps, called `unit`."""
+        self.writer = summary_writer(self.folder, self.args, self.step)
+        self._seconds_before = self.seconds
+        self._bar = progress_bar(total, self.step, unit)
+        self._may_raise = False
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) is not signal.SIG_IGN:  # as in a shell's background
+                    signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number, frame):
+        """The first signal lets the current step finish. The next one ends the program at once."""
+        interrupt = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
+        raises = self._may_raise or self.interrupted
+        self._interrupt = interrupt
+        if raises:
+            raise interrupt
+
+    @contextlib.contextmanager
+    def interruptible(self):
+        """Inside, the first signal raises KeyboardInterrupt at once."""
+        before, self._may_raise = self._may_raise, True
+        try:
+            yield
+        finally:
+            self._may_raise = before
+
+    def advance(self, number=1):
+        """Count `number` more steps; returns `step`."""
+        self._progress["step"] += number
+        self._bar.update(number)
+        return self.step
+
+    @property
+    def rate(self):
+        """Mean steps per second since `start`."""
+        return (self._bar.n - self._bar.initial) / self._bar.format_dict["elapsed"]
+
+    def log(self, values, step=None):
+        """Write a dict of numbers to TensorBoard. Of a tensor, its mean is written.
+
+        `step`: of the training; by default the present one.
+        """
+        for name, value in values.items():
+            value = value.mean().item() if isinstance(value, torch.Tensor) else value
+            self.writer.add_scalar(name, value, self.step if step is None else step)
+
+    def log_image(self, name, image):
+        """Write an image, uint8 (height, width, 3), to TensorBoard."""
+        self.writer.add_image(name, image, self.step, dataformats="HWC")
+
+    def show(self, **values):
+        """Show values at the end of the progress bar."""
+        self._bar.set_postfix(**values)
+
+    def is_best(self, score, result=None):
+        """Note an evaluation. Returns whether no earlier one had a higher score.
+
+        Args:
+            score: number; higher is better.
+            result: dict of other numbers, kept as `best_result`.
+        """
+        if not score >= self.best_score:
+            return False
+        best = {"best_step": self.step, "best_score": score, "best_result": result or {}}
+        self._progress |= best
+        return True
+
+    def checkpoint(self):
+        """Write `checkpoint.pt`. If the run was interrupted, end it with a line.
+
+        Raises:
+            FloatingPointError: as `save_checkpoint`.
+            SystemExit: the run was interrupted.
+        """
+        self._progress["seconds"] = self._seconds_before + self._bar.format_dict["elapsed"]
+        save_checkpoint(self.folder, self._state, self.device)
+        if self.interrupted:
+            unit = f"{self._bar.unit} {self.step:,}"
+            self.close()
+            exit_interrupted(
+                self._interrupt, f"checkpoint at {unit}; --resume {self.folder} continues there"
+            )
+
+    def write_result(self, result):
+        """Write `result.json`: a dict, and the flags."""
+        write_json(self.folder / "result.json", result | {"args": asdict(self.args)})
+
+    def close(self):
+        """Close progress bar and writer. From here on, a signal ends the program at once."""
+        self._may_raise = True
+        self._bar.close()
+        self.writer.close()

@@ -1,7 +1,7 @@
-"""Cameras' pictures, as the trainers of image encoders use them: batches, errors, comparisons.
+"""Camera images for the trainers of image encoders: loading, batches, errors, comparisons.
 
-Pictures are averaged down, to save time. `load_images` does it once for what is trained on,
-`averaged` in the encoder that is saved.
+Images are averaged down to save time: `load_images` averages those of a training set once,
+`average_down` is a part of the exported encoder.
 """
 
 import sys
@@ -11,13 +11,19 @@ import torch
 import torch.nn.functional as F
 
 from roboarm_nmp.envs.perception.sensors import Camera
-from roboarm_nmp.scene_embedding_train.training_data import unpacked
+from roboarm_nmp.scene_embedding_train.training_data import unpack
 
 
 def load_images(observations, size):
-    """What the cameras saw, averaged down: uint8 (scenes, cameras, size, size, 3); cameras' names.
+    """The camera images of `Observations`, averaged down to `size` pixels.
 
-    Unpacked once into a file beside the shards, which is then mapped into memory.
+    They are unpacked once into a file beside the shards, which is memory-mapped.
+
+    Returns:
+        Images, uint8 (scenes, cameras, size, size, 3), and the names of the cameras.
+
+    Raises:
+        SystemExit: there are no images, or their size does not fit.
     """
     cameras = [name for name, one in observations.sensors.items() if isinstance(one, Camera)]
     if not cameras:
@@ -27,24 +33,30 @@ def load_images(observations, size):
         sys.exit(f"--observations: {observations.folder}: the cameras differ in size, or lack rgb")
     width, height = sizes.pop()
     if width != height or width % size:
-        sys.exit(f"--picture-size {size}: the pictures have {width} x {height} pixels")
+        sys.exit(f"--image-size {size}: the observations' images have {width} x {height} pixels")
     shards = (
-        {"rgb": shrunk_pictures(observations, shard, cameras, size)}
+        {"rgb": _images_of_shard(observations, shard, cameras, size)}
         for shard in range(len(observations.offsets) - 1)
     )
     arrays = {"rgb": (np.uint8, (len(cameras), size, size, 3))}
-    return unpacked(observations, f"pictures_{size}", arrays, shards)["rgb"], cameras
+    return unpack(observations, f"images_{size}", arrays, shards)["rgb"], cameras
 
 
-def shrunk_pictures(observations, shard, cameras, size):
+def _images_of_shard(observations, shard, cameras, size):
     """`load_images`'s rows of one shard."""
-    shrunk = []
+    averaged = []
     for name in cameras:
-        pictures = observations.read(shard, f"{name}/rgb")
-        block = pictures.shape[1] // size
-        blocks = pictures.reshape(-1, size, block, size, block, 3)
-        shrunk.append(blocks.mean((2, 4)).round().astype(np.uint8))
-    return np.stack(shrunk, axis=1)
+        images = observations.read(shard, f"{name}/rgb")
+        block = images.shape[1] // size
+        blocks = images.reshape(-1, size, block, size, block, 3)
+        averaged.append(blocks.mean((2, 4)).round().astype(np.uint8))
+    return np.stack(averaged, axis=1)
+
+
+def example_images(observations, cameras):
+    """Two scenes' images in full size, as an encoder receives them: camera -> (2, h, w, 3)."""
+    last = len(observations.offsets) - 2
+    return {name: torch.from_numpy(observations.read(last, f"{name}/rgb")[:2]) for name in cameras}
 
 
 def batch_of(images, rows, device):
@@ -53,38 +65,39 @@ def batch_of(images, rows, device):
     return chosen.permute(0, 1, 4, 2, 3).float() / 255.0
 
 
-def averaged(images, size):
+def average_down(images, size):
     """uint8 (n, cameras, height, width, 3) -> float32 (n, cameras, 3, size, size) in [0, 1]."""
-    pictures = images.flatten(0, 1).permute(0, 3, 1, 2).float() / 255.0
-    return F.avg_pool2d(pictures, images.shape[2] // size).unflatten(0, images.shape[:2])
+    flat = images.flatten(0, 1).permute(0, 3, 1, 2).float() / 255.0
+    return F.avg_pool2d(flat, images.shape[2] // size).unflatten(0, images.shape[:2])
 
 
-def mean_picture(images, num_training, device):
-    """The mean of the first `num_training` rows (of some 1,000 of them), as `batch_of` has one."""
+def mean_of_images(images, num_training, device):
+    """The mean of at most 1,000 of the first `num_training` rows: (cameras, 3, size, size)."""
     rows = np.linspace(0, num_training - 1, min(num_training, 1000)).astype(int)
     return batch_of(images, rows, device).mean(0)
 
 
 def foreground(batch, mean_image):
-    """Which pixels are unlike the mean picture: bool (n, cameras, 1, size, size)."""
+    """Which pixels differ from the mean image: bool (n, cameras, 1, size, size)."""
     return (batch - mean_image).abs().amax(2, keepdim=True) > 0.1
 
 
 @torch.no_grad()
 def reconstruction_errors(model, images, rows, mean_image, batch_size, device):
-    """Mean squared errors of `model(batch)` and of the mean picture, on scenes `rows`: a dict.
+    """Mean squared errors of `model(batch)` and of the mean image on scenes `rows`.
 
-    `error` and `mean_image_error`, of all pixels, and, of those that are unlike the mean picture,
-    `error_foreground` and `mean_image_error_foreground`.
+    Returns:
+        A dict: `error` and `mean_image_error` of all pixels, and `error_foreground` and
+        `mean_image_error_foreground` of those that differ from the mean image.
     """
     model.eval()
     sums, counts = torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     for start in range(0, len(rows), batch_size):
         batch = batch_of(images, rows[start : start + batch_size], device)
-        unlike = foreground(batch, mean_image).float()
+        differs = foreground(batch, mean_image).float()
         errors = [(model(batch) - batch).square().mean(2, keepdim=True)]
         errors.append((mean_image - batch).square().mean(2, keepdim=True))
-        for j, mask in enumerate((torch.ones_like(unlike), unlike)):
+        for j, mask in enumerate((torch.ones_like(differs), differs)):
             counts[j] += mask.sum().item()
             for i, error in enumerate(errors):
                 sums[i, j] += (error * mask).sum().item()
@@ -100,7 +113,7 @@ def reconstruction_errors(model, images, rows, mean_image, batch_size, device):
 
 @torch.no_grad()
 def comparison(model, batch):
-    """For TensorBoard, uint8 (2 height, cameras * width, 3): a scene above, `model`'s of it below.
+    """A figure, uint8 (2 height, cameras * width, 3): a scene's images above their reconstruction.
 
     `batch` is of one scene, (1, cameras, 3, height, width).
     """
