@@ -1,19 +1,19 @@
 """Behavioural cloning (BC) of demonstrations. One file: read it top to bottom.
 
-    python bc_script/bc.py --task no_obstacles --goal-type combined
+    roboarm train bc --task no_obstacles --goal-type combined
     python bc_script/bc.py --task double_walls --goal-type config --demos a.h5 b.h5
 
 Maximum likelihood of the demonstrated actions under a Gaussian policy, or with `--num-modes` a
-mixture of Gaussians (paper, sections 2 and 5, appendix "Parameter sweeps"). To make an algorithm of
+mixture of Gaussians (paper, sections 2 and 5, appendix "Parameter sweeps"). For an algorithm of
 your own, copy this file and change the parts under `# ALGO LOGIC`. Parts between `# SHARED` and
-`# END SHARED` are those of `clean_rl_scripts/sac_her_mp.py`.
+`# END SHARED` are the same in `clean_rl_scripts/sac_her_mp.py`.
 """
 
 import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -29,128 +29,109 @@ from roboarm_nmp.envs.training import flags, protocol, runs
 
 
 @dataclass
-class Args(runs.RunFlags):  # those of the run's folder are in `envs/training/runs.py`
+class Args(protocol.PolicyFlags):
+    # More flags are in `envs/training/protocol.py` (task) and `envs/training/runs.py` (run).
     exp_name: str = "bc"
-    """name of the experiment, part of the run's folder"""
-
-    # The task (the paper's MDP; `docs/environment.md`)
-    task: str = "no_obstacles"
-    """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
+    """name of the experiment, part of the name of the run's folder"""
     goal_type: Literal["ee", "config", "combined"] = "combined"
     """what the goal is: end-effector position, configuration, or both"""
     demos: tuple[Path, ...] = ()
     """demonstration files of the task; by default the task's own"""
     num_demos: flags.PositiveInt | None = None
-    """only the first so many demonstrations of each file"""
-
-    # The algorithm
+    """number of demonstrations of each file, the first ones; by default all"""
     total_updates: flags.PositiveInt = 1_000_000
-    """batches of the whole run (paper: 1,000,000); a resumed run may have more, and has then the
+    """batches of the whole run (paper: 1,000,000); a resumed run may have more, and then has the
     learning rate of that longer run"""
     batch_size: flags.PositiveInt = 256
     """transitions per batch"""
     learning_rate: flags.PositiveFloat = 1e-3
     """learning rate (Adam) at the start"""
     anneal: bool = True
-    """let the learning rate fall linearly, to zero at the end"""
+    """decrease the learning rate linearly to zero"""
     num_modes: flags.Width = 1
     """Gaussians of the policy's mixture; the most likely one's mean is the action in evaluation"""
     policy_average: flags.PositiveShare = 0.001
-    """share of the policy that moves into its running average per update; the average is what is
+    """share of the policy that moves, in each of its updates, into the running average that is
     evaluated and saved (1: no averaging)"""
     hidden_size: flags.Width = 256
     """width of the hidden layers"""
     num_hidden_layers: flags.Layers = 2
     """number of hidden layers"""
-    relative_goal: bool = True
-    """add goal minus end-effector position, times 5, to the network's inputs"""
-    relative_configuration: bool = False
-    """add goal minus configuration, times 5, to the network's inputs, where goals have one"""
-    trigonometric: bool = True
-    """add the joint angles' sines and cosines to the network's inputs"""
+    plain_networks: bool = False
+    """raw observations and goals as inputs"""
     bf16: bool = False
-    """train with hidden layers in bfloat16 (first layer, head and weights stay in float32)"""
+    """train with hidden layers in bfloat16"""
     encoder: str | None = None
-    """what the policy sees of the scene, appended to the observation: a trained encoder (`vae`,
-    `vqvae`, `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `points`
-    of what sensors see (docs/safety_filter.md), or `oracle`, the obstacles themselves; by default
-    nothing"""
+    """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
+    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `point_cloud` for
+    observed points, or `oracle` for the ground-truth obstacles; by default nothing"""
     num_points: flags.PositiveInt = 64
     """points of the encoder `point_cloud`"""
-    velocities: ClassVar[bool] = False  # demonstrations have none
-    link_distances: ClassVar[str | None] = None
-
-    # Evaluation and bookkeeping
     eval_every: flags.PositiveInt = 50_000
-    """updates between evaluations on validation queries; the best policy is kept"""
-    eval_queries: flags.PositiveInt = 200
-    """validation queries per evaluation"""
-    test_queries: flags.PositiveInt = 1_000
-    """test queries for the best policy at the end"""
+    """updates between evaluations on validation queries; the best policy is saved"""
 
 
 # ALGO LOGIC: the policy
-# SHARED: features and layers
-class Features(nn.Module):
-    """Network inputs: observation, desired goal, and functions of them that speed up learning."""
+# SHARED: bfloat16 and averaging
+class Bf16Linear(nn.Linear):
+    """A linear layer whose product is computed in bfloat16 in training, if `bf16`."""
 
-    def __init__(self, args, observation_size):
-        super().__init__()
-        self.relative_goal = args.relative_goal and args.goal_type != "config"
-        self.relative_configuration = args.relative_configuration and args.goal_type != "ee"
-        self.trigonometric = args.trigonometric
-        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
-        self.register_buffer("middle", ((high + low) / 2).float())
-        self.register_buffer("half_range", ((high - low) / 2).float())
-        goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
-        self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
-        self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.link_distances else None
-        self.size = observation_size + goal_size + 14 * args.trigonometric + 10 * bool(self.near)
-        self.size += 3 * self.relative_goal + 7 * self.relative_configuration
-
-    def forward(self, observation, desired_goal):
-        """(N, o), (N, g) -> (N, size)."""
-        inputs = [observation, desired_goal]
-        if self.trigonometric:
-            angles = observation[:, :7] * self.half_range + self.middle
-            inputs += [torch.sin(angles), torch.cos(angles)]
-        if self.relative_goal:
-            inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
-        if self.relative_configuration:
-            inputs.append(5.0 * (desired_goal[:, :7] - observation[:, :7]))
-        if self.near is not None:
-            inputs.append(10.0 * observation[:, self.near])  # the links' distances, which are small
-        return torch.cat(inputs, dim=1)
-
-
-class MLP(nn.Module):
-    def __init__(self, num_inputs, num_outputs, args, layer_norm):
-        super().__init__()
-        sizes = [num_inputs] + [args.hidden_size] * args.num_hidden_layers
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
-        norm = nn.LayerNorm if layer_norm else lambda _: nn.Identity()
-        self.norms = nn.ModuleList(norm(args.hidden_size) for _ in self.layers)
-        self.head = nn.Linear(args.hidden_size, num_outputs)
-        self.bf16 = args.bf16
+    def __init__(self, num_inputs, num_outputs, bf16):
+        super().__init__(num_inputs, num_outputs)
+        self.bf16 = bf16
 
     def forward(self, x):
-        bf16 = self.bf16 and self.training
-        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
-            # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
-            # No kernel gets two types: CUDA's refuse that.
-            if bf16 and i > 0:
-                x = F.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
-            else:
-                x = layer(x)
-            x = F.relu(norm(x))
-        return self.head(x)
+        if not (self.bf16 and self.training):
+            return super().forward(x)
+        return F.linear(x.bfloat16(), self.weight.bfloat16(), self.bias.bfloat16()).float()
+
+
+def polyak_update(target, network, tau):
+    """target <- (1 - tau) target + tau network, all parameters at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
 
 
 # END SHARED
 
 
-LOG_STD_MAX = 2
-LOG_STD_MIN = -5
+# SHARED: MLP
+def mlp(num_inputs, num_outputs, args, layer_norm=False):
+    """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
+    size, layers = args.hidden_size, []
+    for i in range(args.num_hidden_layers):
+        layers.append(nn.Linear(num_inputs, size) if i == 0 else Bf16Linear(size, size, args.bf16))
+        layers += [nn.LayerNorm(size), nn.ReLU()] if layer_norm else [nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(size, num_outputs))
+
+
+# END SHARED
+
+
+class Features(nn.Module):
+    """Network inputs: observation, goal and, unless plain, functions of them that ease learning."""
+
+    def __init__(self, args, observation_size):
+        super().__init__()
+        self.plain, self.goal_type = args.plain_networks, args.goal_type
+        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        self.register_buffer("middle", ((high + low) / 2).float())
+        self.register_buffer("half_range", ((high - low) / 2).float())
+        goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
+        self.size = self(torch.zeros(1, observation_size), torch.zeros(1, goal_size)).shape[1]
+
+    def forward(self, observation, desired_goal):
+        """(N, o), (N, g) -> (N, size)."""
+        inputs = [observation, desired_goal]
+        if not self.plain:
+            angles = observation[:, :7] * self.half_range + self.middle
+            inputs += [torch.sin(angles), torch.cos(angles)]
+            if self.goal_type != "config":  # end-effector positions
+                inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, 7:10]))
+        return torch.cat(inputs, dim=1)
+
+
+LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
 
 class Actor(nn.Module):
@@ -160,15 +141,14 @@ class Actor(nn.Module):
         super().__init__()
         self.features = Features(args, observation_size)
         self.num_modes = args.num_modes
-        self.mlp = MLP(self.features.size, 15 * args.num_modes, args, layer_norm=False)
+        self.mlp = mlp(self.features.size, 15 * args.num_modes, args)
 
     def modes(self, observation, desired_goal):
         """Means and log standard deviations (N, K, 7), log weights (N, K)."""
         outputs = self.mlp(self.features(observation, desired_goal))
         outputs = outputs.unflatten(1, (self.num_modes, 15))
-        log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (
-            torch.tanh(outputs[..., 7:14]) + 1
-        )
+        log_std = torch.tanh(outputs[..., 7:14])
+        log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)
         return outputs[..., :7], log_std, F.log_softmax(outputs[..., 14], dim=1)
 
     def log_likelihood(self, observation, desired_goal, action):
@@ -179,7 +159,7 @@ class Actor(nn.Module):
         return torch.logsumexp(log_weight + log_density.sum(2), dim=1)
 
     def forward(self, observation, achieved_goal, desired_goal):
-        """The most likely mode's mean (N, 7), as an action; this is what policy.pt contains."""
+        """The most likely mode's mean (N, 7), as an action; policy.pt contains this function."""
         mean, _, log_weight = self.modes(observation, desired_goal)
         likeliest = log_weight.argmax(1).reshape(-1, 1, 1).expand(-1, 1, 7)
         return MAX_STEP * mean.gather(1, likeliest).squeeze(1)
@@ -187,34 +167,23 @@ class Actor(nn.Module):
 
 # ALGO LOGIC: demonstrations
 def transitions(demos, goal_type, num_demos=None):
-    """The observations, goals and actions of demonstrations: float32 (n, 10), (n, g), (n, 7).
+    """Observations, goals and actions of demonstrations: float32 (n, 10), (n, g), (n, 7).
 
-    And the index of the demonstration that each is of: int64 (n,).
-    All of a demonstration, beyond where its goal counts as reached: it goes on to the very goal.
-    Actions are in units of `MAX_STEP`.
+    And the index of each one's demonstration: int64 (n,). A demonstration is used to its end, also
+    after its goal counts as reached. Actions are in units of `MAX_STEP`.
     """
     number = len(demos) if num_demos is None else min(num_demos, len(demos))
     demo_index = np.repeat(np.arange(number), np.diff(demos.offsets[: number + 1]))
-    commanded = np.ones(len(demo_index), bool)
-    commanded[demos.offsets[1 : number + 1] - 1] = False  # from the last, nothing was
-    rows, demo_index = np.flatnonzero(commanded), demo_index[commanded]
+    has_action = np.ones(len(demo_index), bool)
+    has_action[demos.offsets[1 : number + 1] - 1] = False  # the last states
+    rows, demo_index = np.flatnonzero(has_action), demo_index[has_action]
     observation, _, goal = observed(demos.states[rows], demos.goal[:number], goal_type)
     return observation, goal[demo_index], demos.actions[rows] / MAX_STEP, demo_index
 
 
-# SHARED: averaging
-def polyak_update(target_parameters, parameters, tau):
-    """target <- (1 - tau) target + tau parameter, all tensors at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(target_parameters, parameters, tau)
-
-
-# END SHARED
-
-
 # ALGO LOGIC: one update
 def update(actor, optimizer, observation, goal, action):
-    """One step on a batch, (N, o), (N, g), (N, 7); the loss before it."""
+    """One step on a batch, (N, o), (N, g), (N, 7). Returns the loss before it."""
     loss = -actor.log_likelihood(observation, goal, action).mean()
     optimizer.zero_grad()
     loss.backward()
@@ -230,18 +199,15 @@ if __name__ == "__main__":
         files = [load_demos(file, args.task) for file in args.demos or (args.task,)]
     except DatasetError as error:
         sys.exit(f"--demos: {error}")
-    env_arguments = {
-        "goal_type": args.goal_type,
-        "encoder": args.encoder,
-        "num_points": args.num_points,
-    }
+    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
+    env_arguments["num_points"] = args.num_points
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
 
     # ALGO LOGIC: data
     parts = [transitions(demos, args.goal_type, args.num_demos) for demos in files]
     firsts = np.cumsum([0, *map(len, files[:-1])])
     for first, (*_, demo_index) in zip(firsts, parts, strict=True):
-        demo_index += first  # it counts on from file to file
+        demo_index += first  # indices continue from file to file
     data = [
         torch.as_tensor(np.concatenate(arrays), device=device)
         for arrays in zip(*parts, strict=True)
@@ -257,8 +223,7 @@ if __name__ == "__main__":
     actor = Actor(args, observation_size).to(device)
     actor_average = Actor(args, observation_size).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
-    parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
-    optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
+    optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
     state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
     run.start(args.total_updates, "update")
@@ -273,14 +238,14 @@ if __name__ == "__main__":
         if latents is not None:
             observation = torch.cat([observation, latents[demo_index]], dim=1)
         loss = update(actor, optimizer, observation, goal, action)
-        polyak_update(average_parameters, parameters, args.policy_average)
+        polyak_update(actor_average, actor, args.policy_average)
         step = run.advance()
         if step % 1000 == 0:
-            run.log({"losses/negative_log_likelihood": loss})
             learning_rate = optimizer.param_groups[0]["lr"]
+            run.log({"losses/negative_log_likelihood": loss})
             run.log({"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
 
-        # Evaluate, keep the best policy, checkpoint
+        # Evaluate, save the best policy, checkpoint
         evaluating = step % args.eval_every == 0 or step == args.total_updates
         if evaluating and run.validate(actor_average):
             run.save_policy(actor_average)

@@ -1,22 +1,22 @@
 """Imitation of a roadmap planner, with rounds of DAgger. One file: read it top to bottom.
 
-    python -m roboarm_nmp.demo_generation.roadmaps --task random_boxes_hard --scenes 800 --output roadmaps
-    python bc_script/dagger.py --paths roadmaps --encoder oracle
+    roboarm roadmaps --task random_boxes_hard --scenes 800 --output roadmaps
+    roboarm train dagger --paths roadmaps --encoder oracle
+    python bc_script/dagger.py --paths roadmaps --encoder oracle    # the same
 
-A policy for scenes that it never saw. It learns the direction in which a roadmap's smoothed path
-goes on, from configurations anywhere on such paths, and from those that it came to by itself
-(DAgger: Ross et al., 2011). It is told what is there (`--encoder`), and how far each link is from
-the nearest thing, here and at the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a last
-layer that keeps links away from things (`envs.policies.safety_filter`). To make an algorithm of your own, copy
-this file and change the parts under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are
-those of `bc_script/bc.py`.
+A policy for new scenes. It imitates the directions of a roadmap's smoothed paths, from random
+configurations near such paths and from those that the policy itself visits (DAgger: Ross et al.,
+2011). It observes the encoded scene (`--encoder`) and the signed distance of each link, here and at
+the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a safety filter
+(`envs.policies.safety_filter`). For an algorithm of your own, copy this file and change the parts
+under `# ALGO LOGIC`. The part between `# SHARED` and `# END SHARED` is the same in `bc.py`.
 """
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -24,13 +24,11 @@ import torch.nn as nn
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from roboarm_nmp.demo_generation.roadmaps import Roadmap
+from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.datasets.episodes import observed
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
-from roboarm_nmp.envs.networks.operations import NetworkError
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, ground_truth_checker
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
@@ -39,18 +37,16 @@ from roboarm_nmp.envs.training import flags, protocol, runs
 
 
 @dataclass
-class Args(runs.RunFlags):
-    # Those of the run's folder are in `envs/training/runs.py`.
+class Args(protocol.PolicyFlags):
+    # More flags are in `envs/training/protocol.py` (task) and `envs/training/runs.py` (run).
     exp_name: str = "dagger"
-    """name of the experiment, part of the run's folder"""
-
-    # The task (the paper's MDP; `docs/environment.md`)
+    """name of the experiment, part of the name of the run's folder"""
     task: str = "random_boxes_hard"
-    """task to evaluate on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
+    """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/your_own_scene.md)"""
     goal_type: Literal["config", "combined"] = "combined"
     """what the goal is: configuration, or that and the end-effector's position"""
     paths: Path = Path("roadmaps")
-    """folder of roadmap paths to learn from (demo_generation.roadmaps), in whatever scenes"""
+    """folder of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any task"""
 
     # The algorithm
     total_updates: flags.PositiveInt = 24_000
@@ -60,40 +56,42 @@ class Args(runs.RunFlags):
     learning_rate: flags.PositiveFloat = 1e-3
     """learning rate (Adam) at the start"""
     anneal: bool = True
-    """let the learning rate fall linearly, to zero at the end"""
+    """decrease the learning rate linearly to zero"""
     policy_average: flags.PositiveShare = 0.003
-    """share of the policy that moves into its running average per update; the average is what is
+    """share of the policy that moves, in each of its updates, into the running average that is
     evaluated and saved (1: no averaging)"""
     pool_size: flags.PositiveInt = 200_000
-    """examples at hand, of which batches are drawn"""
+    """examples in memory, from which batches are sampled"""
     examples_per_update: flags.PositiveInt = 256
-    """new examples per update, all of one scene; they replace the oldest. With an eighth of a batch
-    they are learned by heart (docs/experiments.md)"""
+    """new examples per update, all of one scene, which replace the oldest ones; with an eighth of a
+    batch, reusing them too often causes overfitting (docs/experiments.md)"""
     noise: flags.NonNegativeFloat = 0.03
-    """standard deviation of the configurations drawn around paths (normalised, each joint)"""
+    """standard deviation of the configurations around paths (normalised, each joint)"""
     length_weight: flags.NonNegativeFloat = 0.1
-    """of the second loss, that of the remaining length"""
+    """weight of the second loss, that of the remaining length"""
     encoder: str = "oracle"
-    """the scene as the policy receives it, as tokens: `point_cloud` for observed points, `oracle`
-    for the ground-truth obstacles, or an encoder's latent code, one token (`vae`, `vqvae`,
-    `pointnet2`, `field`, or the path of your own `encoder.pt`)"""
+    """the encoded scene as tokens: `point_cloud` for observed points, `oracle` for the ground-truth
+    obstacles, or an encoder's latent code, a single token (`vae`, `vqvae`, `pointnet2`, `field`, or
+    the path of your own `encoder.pt`)"""
     num_points: flags.PositiveInt = 64
     """points of the encoder `point_cloud`"""
-    token_size: flags.Width = 128
-    """width of the layers that look at one obstacle or point each"""
+    geometry_source: str | None = None
+    """where link distances take the obstacles from: `ground_truth`, `point_cloud`, or an encoder
+    with a decoder (`field`, or a path); by default the encoder's own"""
+    token_width: flags.Width = 128
+    """width of the layers that process each token"""
     hidden_size: flags.Width = 384
     """width of the residual blocks"""
     num_blocks: flags.Layers = 3
     """number of residual blocks"""
     bf16: bool | None = None
-    """train with hidden products in bfloat16; by default where the hardware has it"""
-    velocities: ClassVar[bool] = False  # paths have none
+    """train with hidden layers in bfloat16; by default where the hardware has it"""
 
-    # The last layer
+    # The safety filter
     safety_margin: flags.NonNegativeFloat = 0.01
-    """m, that it keeps"""
+    """minimum clearance of the links, m"""
     escape: bool = True
-    """whether it leaves dead ends"""
+    """escape from local minima"""
 
     # DAgger
     round_every: flags.NonNegativeInt = 2_000
@@ -101,21 +99,17 @@ class Args(runs.RunFlags):
     round_queries: flags.PositiveInt = 40
     """queries of a round, each in a scene of the paths"""
     round_labels: flags.NonNegativeInt = 16
-    """of the states that the policy came to on a query, how many are labelled"""
+    """number of states that are labelled, of those that the policy visits on a query"""
     round_weight: flags.NonNegativeFloat = 5.0
-    """how much likelier such a state is in a batch than an example of the pool"""
+    """probability of a visited state in a batch, relative to an example of the pool"""
 
-    # Evaluation and bookkeeping
     eval_every: flags.PositiveInt = 4_000
-    """updates between evaluations on validation queries; the best policy is kept"""
-    eval_queries: flags.PositiveInt = 200
-    """validation queries per evaluation"""
-    test_queries: flags.PositiveInt = 1_000
-    """test queries for the best policy at the end"""
+    """updates between evaluations on validation queries; the best policy is saved"""
 
 
 # ALGO LOGIC: the policy
-class Hidden(nn.Linear):
+# SHARED: bfloat16 and averaging
+class Bf16Linear(nn.Linear):
     """A linear layer whose product is computed in bfloat16 in training, if `bf16`."""
 
     def __init__(self, num_inputs, num_outputs, bf16):
@@ -128,61 +122,71 @@ class Hidden(nn.Linear):
         return F.linear(x.bfloat16(), self.weight.bfloat16(), self.bias.bfloat16()).float()
 
 
+def polyak_update(target, network, tau):
+    """target <- (1 - tau) target + tau network, all parameters at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
+
+
+# END SHARED
+
+
 class Block(nn.Module):
     """A residual block."""
 
     def __init__(self, size, bf16):
         super().__init__()
         self.norm = nn.LayerNorm(size)
-        self.first, self.second = Hidden(size, size, bf16), Hidden(size, size, bf16)
+        self.first, self.second = Bf16Linear(size, size, bf16), Bf16Linear(size, size, bf16)
 
     def forward(self, x):
         return x + self.second(F.relu(self.first(self.norm(x))))
 
 
 class Actor(nn.Module):
-    """Straight to the goal, and a learned direction added to that.
+    """The unit vector to the goal, plus a learned direction.
 
-    What is seen of the scene are tokens, obstacles or points, zeros where there is none, or a
-    single one, z_E. Each is looked at together with all that is known of the arm; of what comes
-    out, the maximum counts (PointNet: Qi et al., 2017).
+    The encoded scene is a set of tokens, a row each: obstacles, points, or a single latent code. A
+    row of zeros is no token. Each token is processed together with the features of the arm, and
+    max-pooling combines them (PointNet: Qi et al., 2017).
     """
 
-    def __init__(self, args):
+    def __init__(self, args, token_size):
         super().__init__()
-        self.token_size = make_encoder(args.encoder, args.num_points).token_size
+        self.token_size = token_size  # numbers per token
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         size = 10 + {"config": 7, "combined": 10}[args.goal_type] + 28 + 2 * 80
-        self.token_in = nn.Linear(self.token_size, args.token_size)
-        self.of_arm = nn.Linear(size, args.token_size)
-        self.fuse = Hidden(args.token_size, args.token_size, args.bf16)
-        self.first = nn.Linear(size + args.token_size, args.hidden_size)
+        self.token_in = nn.Linear(token_size, args.token_width)
+        self.arm_in = nn.Linear(size, args.token_width)
+        self.fuse = Bf16Linear(args.token_width, args.token_width, args.bf16)
+        self.first = nn.Linear(size + args.token_width, args.hidden_size)
         blocks = (Block(args.hidden_size, args.bf16) for _ in range(args.num_blocks))
         self.blocks = nn.Sequential(*blocks)
         self.head = nn.Linear(args.hidden_size, 8)
-        nn.init.zeros_(self.head.weight)  # it begins as go-to-goal
+        nn.init.zeros_(self.head.weight)  # the initial policy is go-to-goal
         nn.init.zeros_(self.head.bias)
 
     def features(self, observation, desired_goal, link_distances, goal_link_distances):
-        """What is known of the arm, and of the goal."""
+        """Features of the arm and of the goal (N, size)."""
         states = torch.cat([observation[:, :7], desired_goal[:, :7]], dim=1)
         angles = (states.unflatten(1, (2, 7)) * self.half_range + self.middle).flatten(1)
-        near = torch.stack([link_distances, goal_link_distances], dim=1)
-        near = torch.cat([10.0 * near[..., :1], near[..., 1:]], dim=-1)  # distances are small
+        distances = torch.stack([link_distances, goal_link_distances], dim=1)
+        # The distances themselves, the first of eight numbers a link, are small.
+        distances = torch.cat([10.0 * distances[..., :1], distances[..., 1:]], dim=-1)
         inputs = observation[:, :10], desired_goal, torch.sin(angles), torch.cos(angles)
-        return torch.cat([*inputs, near.flatten(1)], dim=1)
+        return torch.cat([*inputs, distances.flatten(1)], dim=1)
 
     def outputs(self, observation, desired_goal, link_distances, goal_link_distances):
-        """The direction (N, 7), of any length, and the length of the rest of the way (N,)."""
+        """The direction (N, 7), of any length, and the remaining length of the path (N,)."""
         features = self.features(observation, desired_goal, link_distances, goal_link_distances)
         tokens = observation[:, 10:].unflatten(1, (-1, self.token_size))
-        seen = F.relu(self.token_in(tokens) + self.of_arm(features).unsqueeze(1))
-        seen = F.relu(self.fuse(seen))
-        there = (tokens != 0.0).any(dim=2, keepdim=True)
-        seen = (seen * there).amax(1)  # (nothing is below zero)
-        x = self.blocks(F.relu(self.first(torch.cat([features, seen], dim=1))))
+        fused = F.relu(self.token_in(tokens) + self.arm_in(features).unsqueeze(1))
+        fused = F.relu(self.fuse(fused))
+        is_token = (tokens != 0.0).any(dim=2, keepdim=True)
+        pooled = (fused * is_token).amax(1)  # (no number is below zero)
+        x = self.blocks(F.relu(self.first(torch.cat([features, pooled], dim=1))))
         outputs = self.head(x)
         to_goal = desired_goal[:, :7] - observation[:, :7]
         direction = F.normalize(to_goal, dim=1) + outputs[:, :7]
@@ -191,153 +195,15 @@ class Actor(nn.Module):
     def forward(
         self, observation, achieved_goal, desired_goal, link_distances, goal_link_distances
     ):
-        """The action (N, 7); this is what policy.pt contains."""
+        """The action (N, 7); policy.pt contains this function."""
         direction, _ = self.outputs(observation, desired_goal, link_distances, goal_link_distances)
         to_goal = (desired_goal[:, :7] - observation[:, :7]).norm(dim=1, keepdim=True)
         return F.normalize(direction, dim=1) * to_goal.clamp(max=MAX_STEP)
 
 
-# ALGO LOGIC: examples
-AHEAD = 0.1  # normalised: an example's direction is to where its path is after so much
-PER_PATH = 4  # examples of each path that is chosen: its goal's link_distances serves all of them
-STUCK = 5.0  # states that the policy was stuck in are so much likelier to be labelled
-DRAW, ROUND = 6, 7  # streams of random numbers; those before belong to demo_generation's files
-
-
-class Examples:
-    """Makes examples, dicts of tensors, a row each:
-
-    `observation` (n, 10), `desired_goal` (n, g), `link_distances` and `goal_link_distances` (n, 10, 8); the
-    unit vector to go on, `direction` (n, 7), and the `length` of the rest of the way (n,); the
-    number of the `scene` (n,), int64.
-
-    Args:
-        paths: `envs.datasets.roadmap_paths.RoadmapPaths`.
-        args: the flags.
-        device: of the tensors.
-    """
-
-    def __init__(self, paths, args, device):
-        self.paths, self.args, self.device = paths, args, device
-        self.geometry_source = find_geometry_source(
-            make_encoder(args.encoder, args.num_points).geometry_source
-        )
-        self.with_paths = np.flatnonzero(np.diff(paths.path_offsets))  # numbers of scenes
-        steps = np.linalg.norm(np.diff(paths.points, axis=0), axis=1)
-        steps[paths.offsets[1:-1] - 1] = 1.0  # from the end of a path to the next one: anything
-        # Length of all paths up to each point.
-        self.travelled = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
-
-    def draw(self, number):
-        """Examples anywhere on the paths of one scene; they depend on seed and `number` only."""
-        rng = np.random.default_rng([self.args.seed, DRAW, number])
-        scene, first, last = self._choose(rng, -(-self.args.examples_per_update // PER_PATH))
-        which = np.arange(self.args.examples_per_update) // PER_PATH
-        first, last = first[which], last[which]
-        backwards = (rng.random(len(first)) < 0.5)[which]
-        rest = rng.random(len(first)) * (self.travelled[last] - self.travelled[first])
-
-        def at(rest):  # the points on the paths from where so much is left
-            here = np.where(backwards, self.travelled[first] + rest, self.travelled[last] - rest)
-            i = np.clip(np.searchsorted(self.travelled, here, side="right") - 1, first, last - 1)
-            share = (here - self.travelled[i]) / (self.travelled[i + 1] - self.travelled[i])
-            tail, head = self.paths.points[i], self.paths.points[i + 1]
-            return tail + share[:, None] * (head - tail)
-
-        states = at(rest) + self.args.noise * rng.standard_normal((len(first), 7))
-        states = np.clip(states, -1.0, 1.0)
-        rest = np.maximum(rest - AHEAD, 0.0)
-        moves = at(rest) - states
-        lengths = np.linalg.norm(moves, axis=1)
-        goals = self.paths.points[np.where(backwards, first, last)]
-        return self._examples(scene, states, goals, moves / lengths[:, None], lengths + rest)
-
-    def visit(self, actor, env, safety_filter, step):
-        """Examples of a round of DAgger, and the share of its queries that the policy reached."""
-        rng = np.random.default_rng([self.args.seed, ROUND, step])
-        parts, reached, visited = [], [], []
-
-        def act(**observed):
-            visited.append(observed["observation"][0, :7].cpu().numpy())
-            return actor(**observed)
-
-        while len(reached) < self.args.round_queries:
-            number, first, last = self._choose(rng, 1)
-            scene, ends = self.paths.scenes[number], self.paths.points[np.r_[first, last]]
-            if not ground_truth_checker(scene).is_free(ends, margin=0.001).all():
-                continue  # rounded, the environment might refuse it
-            query = Query(*panda.denormalise(ends).astype(np.float32), scene)
-            visited.clear()
-            seed = int(rng.integers(2**32))  # of the ways out of dead ends
-            result = protocol.evaluate(act, [env], [query], self.device, safety_filter, seed)
-            reached.append(result["success_rate"])
-            states = np.array(visited)
-            chances = np.ones(len(states))
-            moved = np.linalg.norm(states[PATIENCE:] - states[:-PATIENCE], axis=1)
-            chances[PATIENCE:][moved < PROGRESS] = STUCK
-            count = min(self.args.round_labels, len(states))
-            states = states[rng.choice(len(states), count, False, chances / chances.sum())]
-            goals = np.repeat(ends[1:], count, axis=0)
-            directions, lengths = Roadmap(scene, rng).labels(states, goals, rng)
-            kept = lengths > 0.0  # there is a way, and it is not at the goal
-            labelled = (x[kept] for x in (states, goals, directions, lengths))
-            parts.append(self._examples(number, *labelled))
-        return concat(parts), np.mean(reached)
-
-    def _choose(self, rng, number):
-        """A scene, and the first and the last point of some of its paths (number,)."""
-        scene = int(rng.choice(self.with_paths))
-        path = rng.integers(*self.paths.path_offsets[scene : scene + 2], number)
-        return scene, self.paths.offsets[path], self.paths.offsets[path + 1] - 1
-
-    def _examples(self, scene, states, goals, directions, lengths):
-        checker = self.geometry_source(self.paths.scenes[scene])
-        ends, which = np.unique(goals, axis=0, return_inverse=True)
-        observation, _, goal = observed(states, panda.denormalise(goals), self.args.goal_type)
-        examples = {
-            "observation": observation,
-            "desired_goal": goal,
-            "link_distances": checker.link_distances(states),
-            "goal_link_distances": checker.link_distances(ends)[which],
-            "direction": directions.astype(np.float32),
-            "length": lengths.astype(np.float32),
-            "scene": np.full(len(states), scene),
-        }
-        return {name: torch.as_tensor(x, device=self.device) for name, x in examples.items()}
-
-
-def concat(parts):
-    """Examples of several dicts in one."""
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def sample(examples, number):
-    """So many random ones of them."""
-    rows = torch.randint(len(examples["scene"]), (number,), device=examples["scene"].device)
-    return {name: tensor[rows] for name, tensor in examples.items()}
-
-
-def with_scene(batch, latents, token_size):
-    """The batch with encoded scenes (scenes, z) in observations, as far as there are any tokens."""
-    tokens = latents[batch["scene"]].unflatten(1, (-1, token_size))
-    tokens = tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)]
-    observation = torch.cat([batch["observation"], tokens.flatten(1)], dim=1)
-    return batch | {"observation": observation}
-
-
-# SHARED: averaging
-def polyak_update(target_parameters, parameters, tau):
-    """target <- (1 - tau) target + tau parameter, all tensors at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(target_parameters, parameters, tau)
-
-
-# END SHARED
-
-
 # ALGO LOGIC: one update
 def update(actor, optimizer, batch, length_weight):
-    """One step on a batch of examples; the losses before it, of direction and length."""
+    """One step on a batch of examples. Returns the losses before it, of direction and length."""
     inputs = ("observation", "desired_goal", "link_distances", "goal_link_distances")
     direction, length = actor.outputs(*(batch[name] for name in inputs))
     direction_loss = 1.0 - F.cosine_similarity(direction, batch["direction"]).mean()
@@ -348,18 +214,83 @@ def update(actor, optimizer, batch, length_weight):
     return direction_loss, length_loss
 
 
+# ALGO LOGIC: a round of DAgger
+STUCK = 5.0  # states in which the policy makes no progress are so much likelier to be labelled
+ROUND = 7  # stream of random numbers; 6 is that of `RoadmapExamples.draw`
+
+
+def dagger_round(actor, env, safety_filter, examples, args, step, device):
+    """Let the policy act on random queries, and label states that it visits.
+
+    Returns the new examples, and the share of queries on which the policy reached the goal.
+    """
+    rng = np.random.default_rng([args.seed, ROUND, step])
+    parts, reached, visited = [], [], []
+
+    def act(**observation):
+        visited.append(observation["observation"][0, :7].cpu().numpy())
+        return actor(**observation)
+
+    while len(reached) < args.round_queries:
+        number, first, last = examples.choose_paths(rng, 1)
+        scene, ends = examples.paths.scenes[number], examples.paths.points[np.r_[first, last]]
+        if not ground_truth_checker(scene).is_free(ends, margin=0.001).all():
+            continue  # rounding might make the environment reject it
+        query = Query(*panda.denormalise(ends).astype(np.float32), scene)
+        visited.clear()
+        seed = int(rng.integers(2**32))  # of the random-walk escapes
+        result = protocol.evaluate(act, [env], [query], device, safety_filter, seed)
+        reached.append(result["success_rate"])
+        states = np.array(visited)
+        weights = np.ones(len(states))
+        moved = np.linalg.norm(states[PATIENCE:] - states[:-PATIENCE], axis=1)
+        weights[PATIENCE:][moved < PROGRESS] = STUCK
+        count = min(args.round_labels, len(states))
+        states = states[rng.choice(len(states), count, False, weights / weights.sum())]
+        parts.append(examples.label(number, states, np.repeat(ends[1:], count, axis=0), rng))
+    return concat([on_device(part, device) for part in parts]), np.mean(reached)
+
+
+# ALGO LOGIC: batches, dicts of tensors
+def on_device(examples, device):
+    return {name: torch.as_tensor(array, device=device) for name, array in examples.items()}
+
+
+def concat(parts):
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def sample(examples, number):
+    """`number` random examples, with replacement."""
+    rows = torch.randint(len(examples["scene"]), (number,), device=examples["scene"].device)
+    return {name: tensor[rows] for name, tensor in examples.items()}
+
+
+def with_scene(batch, latents, token_size):
+    """The batch with encoded scenes (scenes, z) in observations, without tokens that all lack."""
+    tokens = latents[batch["scene"]].unflatten(1, (-1, token_size))
+    tokens = tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)]
+    observation = torch.cat([batch["observation"], tokens.flatten(1)], dim=1)
+    return batch | {"observation": observation}
+
+
 if __name__ == "__main__":
     args = runs.parse_args(Args, may_change={"test_queries"})
     device = runs.seed_torch(args)
     runs.resolve_bf16(args)
     validation, test = protocol.load_task(args)
-    try:
-        geometry_source = make_encoder(args.encoder, args.num_points).geometry_source
-    except NetworkError as error:
-        sys.exit(f"--encoder: {error}")
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:
         sys.exit("--pool-size must be at least --examples-per-update")
+    try:
+        encoder = make_encoder(args.encoder, args.num_points)
+    except ValueError as error:
+        sys.exit(f"--encoder: {error}")
+    try:
+        geometry_source = args.geometry_source or encoder.geometry_source
+        find_checker = find_geometry_source(geometry_source)
+    except ValueError as error:
+        sys.exit(f"--geometry-source: {error}")
     try:
         paths = load_roadmap_paths(args.paths)
     except DatasetError as error:
@@ -371,34 +302,36 @@ if __name__ == "__main__":
     safety_filter = SafetyFilter(args.safety_margin, args.escape)
 
     # ALGO LOGIC: network and optimiser
-    actor = Actor(args).to(device)
-    actor_average = Actor(args).to(device).eval()  # evaluated and saved
+    actor = Actor(args, encoder.token_size).to(device)
+    actor_average = Actor(args, encoder.token_size).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
-    parameters, average_parameters = list(actor.parameters()), list(actor_average.parameters())
-    optimizer = torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
+    optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
     visited = {}  # examples of all rounds
     state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
     state |= {"visited": visited}
     run = protocol.PolicyRun(
         args, state, device, env_arguments, eval_envs, validation, safety_filter
     )
-    visited |= {name: tensor.to(device) for name, tensor in visited.items()}
+    visited |= on_device(visited, device)
 
-    # ALGO LOGIC: data. The pool is not in checkpoints: what was drawn is drawn again.
+    # ALGO LOGIC: data. The pool is not in checkpoints: a resumed run draws the same examples again.
     latents = torch.as_tensor(eval_envs[0].encoder.encode_demos(paths), device=device)
-    examples = Examples(paths, args, device)
-    pool = [None] * num_draws
-    firsts = range(run.step, run.step + num_draws)
-    for number in tqdm(firsts, desc="drawing examples", mininterval=2.0):
-        pool[number % num_draws] = examples.draw(number)
-    pool = concat(pool)
+    examples = RoadmapExamples(paths, find_checker, args.seed, args.goal_type)
 
-    run.start(args.total_updates, "update")
+    def draw(number):
+        return on_device(examples.draw(number, args.examples_per_update, args.noise), device)
+
+    pool = [None] * num_draws
+    numbers = range(run.step, run.step + num_draws)
+    for number in tqdm(numbers, desc="drawing examples", mininterval=2.0):
+        pool[number % num_draws] = draw(number)
+    pool = concat(pool)
     background = ThreadPoolExecutor(1)
+    run.start(args.total_updates, "update")
 
     while run.step < args.total_updates:
         # ALGO LOGIC: learn, while the next examples are drawn
-        drawn = background.submit(examples.draw, run.step + num_draws)
+        drawn = background.submit(draw, run.step + num_draws)
         if args.anneal:
             remaining = 1.0 - run.step / args.total_updates
             optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
@@ -410,24 +343,25 @@ if __name__ == "__main__":
             batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
         batch = with_scene(batch, latents, actor.token_size)
         direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
-        polyak_update(average_parameters, parameters, args.policy_average)
+        polyak_update(actor_average, actor, args.policy_average)
         oldest = run.step % num_draws * args.examples_per_update
         for name, tensor in drawn.result().items():
             pool[name][oldest : oldest + len(tensor)] = tensor
         step = run.advance()
         if step % 100 == 0:
-            run.log({"losses/direction": direction_loss, "losses/length": length_loss})
             learning_rate = optimizer.param_groups[0]["lr"]
+            run.log({"losses/direction": direction_loss, "losses/length": length_loss})
             run.log({"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
 
         # ALGO LOGIC: a round of DAgger
         if args.round_every and step % args.round_every == 0 and step < args.total_updates:
-            # In the last environment: the first one draws, and is slower to change its scene.
-            found, reached = examples.visit(actor_average, eval_envs[-1], safety_filter, step)
-            visited |= concat([visited, found]) if visited else found
+            # (The first environment renders, and is slower to change its scene.)
+            given = (actor_average, eval_envs[-1], safety_filter, examples, args, step, device)
+            new, reached = dagger_round(*given)
+            visited |= concat([visited, new]) if visited else new
             run.log({"charts/round_success": reached})
 
-        # Evaluate, keep the best policy, checkpoint
+        # Evaluate, save the best policy, checkpoint
         evaluating = step % args.eval_every == 0 or step == args.total_updates
         if evaluating and run.validate(actor_average):
             run.save_policy(actor_average)

@@ -1,13 +1,12 @@
 """SAC with hindsight experience replay (HER) and demonstrations. One file: read it top to bottom.
 
-    python clean_rl_scripts/sac_her_mp.py --task no_obstacles --goal-type ee
-    python clean_rl_scripts/sac_her_mp.py --task double_walls --demo-prob 1
+    roboarm train sac --task no_obstacles --goal-type ee
+    python clean_rl_scripts/sac_her_mp.py --task double_walls --demo-prob 1    # the same script
 
 Soft Actor-Critic (Haarnoja et al., 2018) in CleanRL's form, goals relabelled with the `future`
 strategy (Andrychowicz et al., 2017), demonstrations injected upon failure (SAC-MP), as in the
-paper's sections 2 and 5. To make an algorithm of your own, copy this file and change the parts
-under `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are those of `td3_her_mp.py`; what
-is imported from `envs` is the benchmark, not the algorithm.
+paper's sections 2 and 5. For an algorithm of your own, copy this file and change the parts under
+`# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are the same in `td3_her_mp.py`.
 """
 
 import math
@@ -26,18 +25,12 @@ from roboarm_nmp.envs.training import flags, protocol, runs
 
 
 @dataclass
-class Args(runs.RunFlags, protocol.EnvFlags):
-    # Those of the run's folder are in `envs/training/runs.py`, those of the MDP in `envs/training/protocol.py`.
+class Args(protocol.PolicyFlags, protocol.EnvFlags):
+    # More flags are in `envs/training/protocol.py` (task, MDP) and `envs/training/runs.py` (run).
     exp_name: str = "sac_her_mp"
-    """name of the experiment, part of the run's folder"""
-    # SHARED: the task
-    task: str = "no_obstacles"
-    """task to train on, one of `envs.TASKS`, or a scene file (docs/your_own_scene.md)"""
+    """name of the experiment, part of the name of the run's folder"""
     num_envs: flags.Environments = 4
     """environments stepped together; every one of their steps counts"""
-    # END SHARED
-
-    # The algorithm
     total_timesteps: flags.PositiveInt = 1_000_000
     """environment steps of the whole run"""
     learning_starts: flags.NonNegativeInt = 2_000
@@ -64,302 +57,235 @@ class Args(runs.RunFlags, protocol.EnvFlags):
     q_lr: flags.PositiveFloat = 1e-3
     """learning rate of the critics (Adam)"""
     alpha: flags.PositiveFloat = 0.2
-    """entropy coefficient; where tuning begins, if it is tuned"""
-    autotune: bool = True
-    """tune the entropy coefficient to the target entropy"""
-    target_entropy: flags.FiniteFloat = -7.0
-    """entropy that the tuning aims at, of the unscaled action (CleanRL: minus its dimensions)"""
+    """entropy coefficient; the initial one, if it is tuned"""
+    target_entropy: flags.FiniteFloat | None = -7.0
+    """entropy that alpha is tuned to, of the unscaled action; `None`: alpha is constant"""
     policy_frequency: flags.PositiveInt = 2
-    """updates of the critics per update of the policy (CleanRL: as often as the critics)"""
+    """updates of the critics per update of the policy (CleanRL: both are equally frequent)"""
     policy_average: flags.PositiveShare = 0.0003
-    """share of the policy that moves into its running average per update of the policy; the average
-    is what is evaluated and saved, the policy itself explores (1: no averaging, as CleanRL)"""
+    """share of the policy that moves, in each of its updates, into the running average that is
+    evaluated and saved (1: no averaging, as CleanRL)"""
     hidden_size: flags.Width = 256
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: flags.Layers = 2
     """number of hidden layers of policy and critics"""
-    layer_norm: bool = True
-    """LayerNorm in the critics' hidden layers (CleanRL: no)"""
-    action_scale: flags.PositiveFloat = 0.06
-    """the policy's outputs are in [-action_scale, action_scale]; the MDP clips a step at max_step,
-    so with the full range of 1 every step is a longest step, which overshoots the goal"""
-    relative_goal: bool = True
-    """add goal minus end-effector position, times 5, to the networks' inputs"""
-    relative_configuration: bool = True
-    """add goal minus configuration, times 5, to the networks' inputs, where goals have one"""
-    trigonometric: bool = True
-    """add the joint angles' sines and cosines to the networks' inputs"""
+    plain_networks: bool = False
+    """the networks of CleanRL: raw observations and goals as inputs, no LayerNorm in the critics,
+    and actions in [-1, 1] instead of twice the longest step"""
     bf16: bool | None = None
-    """train with hidden layers in bfloat16 (first layer, head and weights stay in float32); by
-    default where the hardware has it"""
-
-    # SHARED: flags of the evaluation
-    # Evaluation and bookkeeping
+    """train with hidden layers in bfloat16; by default where the hardware has it"""
     eval_every: flags.PositiveInt = 25_000
-    """environment steps between evaluations on validation queries; the best policy is kept"""
-    eval_queries: flags.PositiveInt = 200
-    """validation queries per evaluation"""
-    test_queries: flags.PositiveInt = 1_000
-    """test queries for the best policy at the end"""
-    # END SHARED
+    """environment steps between evaluations on validation queries; the best policy is saved"""
 
 
 # ALGO LOGIC: networks
-# SHARED: features and layers
-class Features(nn.Module):
-    """Network inputs: observation, desired goal, and functions of them that speed up learning."""
+# SHARED: bfloat16 and averaging
+class Bf16Linear(nn.Linear):
+    """A linear layer whose product is computed in bfloat16 in training, if `bf16`."""
 
-    def __init__(self, args, observation_size):
-        super().__init__()
-        self.relative_goal = args.relative_goal and args.goal_type != "config"
-        self.relative_configuration = args.relative_configuration and args.goal_type != "ee"
-        self.trigonometric = args.trigonometric
-        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
-        self.register_buffer("middle", ((high + low) / 2).float())
-        self.register_buffer("half_range", ((high - low) / 2).float())
-        goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
-        self.ee = slice(7 + 7 * args.velocities, 10 + 7 * args.velocities)  # end-effector
-        self.near = slice(self.ee.stop, self.ee.stop + 80, 8) if args.link_distances else None
-        self.size = observation_size + goal_size + 14 * args.trigonometric + 10 * bool(self.near)
-        self.size += 3 * self.relative_goal + 7 * self.relative_configuration
-
-    def forward(self, observation, desired_goal):
-        """(N, o), (N, g) -> (N, size)."""
-        inputs = [observation, desired_goal]
-        if self.trigonometric:
-            angles = observation[:, :7] * self.half_range + self.middle
-            inputs += [torch.sin(angles), torch.cos(angles)]
-        if self.relative_goal:
-            inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
-        if self.relative_configuration:
-            inputs.append(5.0 * (desired_goal[:, :7] - observation[:, :7]))
-        if self.near is not None:
-            inputs.append(10.0 * observation[:, self.near])  # the links' distances, which are small
-        return torch.cat(inputs, dim=1)
-
-
-class MLP(nn.Module):
-    def __init__(self, num_inputs, num_outputs, args, layer_norm):
-        super().__init__()
-        sizes = [num_inputs] + [args.hidden_size] * args.num_hidden_layers
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
-        norm = nn.LayerNorm if layer_norm else lambda _: nn.Identity()
-        self.norms = nn.ModuleList(norm(args.hidden_size) for _ in self.layers)
-        self.head = nn.Linear(args.hidden_size, num_outputs)
-        self.bf16 = args.bf16
+    def __init__(self, num_inputs, num_outputs, bf16):
+        super().__init__(num_inputs, num_outputs)
+        self.bf16 = bf16
 
     def forward(self, x):
-        bf16 = self.bf16 and self.training
-        for i, (layer, norm) in enumerate(zip(self.layers, self.norms, strict=True)):
-            # The first layer and the head stay in float32: 2 cm need more than bfloat16's 8 bits.
-            # No kernel gets two types: CUDA's refuse that.
-            if bf16 and i > 0:
-                x = F.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
-            else:
-                x = layer(x)
-            x = F.relu(norm(x))
-        return self.head(x)
+        if not (self.bf16 and self.training):
+            return super().forward(x)
+        return F.linear(x.bfloat16(), self.weight.bfloat16(), self.bias.bfloat16()).float()
+
+
+def polyak_update(target, network, tau):
+    """target <- (1 - tau) target + tau network, all parameters at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
 
 
 # END SHARED
 
 
-# SHARED: critics
+# SHARED: MLP
+def mlp(num_inputs, num_outputs, args, layer_norm=False):
+    """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
+    size, layers = args.hidden_size, []
+    for i in range(args.num_hidden_layers):
+        layers.append(nn.Linear(num_inputs, size) if i == 0 else Bf16Linear(size, size, args.bf16))
+        layers += [nn.LayerNorm(size), nn.ReLU()] if layer_norm else [nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(size, num_outputs))
+
+
+# END SHARED
+
+
+# SHARED: features and critics
+class Features(nn.Module):
+    """Network inputs: observation, goal and, unless plain, functions of them that ease learning."""
+
+    def __init__(self, args, observation_size):
+        super().__init__()
+        self.plain, self.goal_type = args.plain_networks, args.goal_type
+        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        self.register_buffer("middle", ((high + low) / 2).float())
+        self.register_buffer("half_range", ((high - low) / 2).float())
+        end = 10 + 7 * args.velocities  # of the end-effector position, before which are velocities
+        self.ee = slice(end - 3, end)
+        # Link distances follow, eight numbers a link, the first of which is the distance.
+        self.distances = slice(end, end + 80, 8) if args.link_distances else None
+        goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
+        self.size = self(torch.zeros(1, observation_size), torch.zeros(1, goal_size)).shape[1]
+
+    def forward(self, observation, desired_goal):
+        """(N, o), (N, g) -> (N, size)."""
+        inputs = [observation, desired_goal]
+        if not self.plain:
+            angles = observation[:, :7] * self.half_range + self.middle
+            inputs += [torch.sin(angles), torch.cos(angles)]
+            if self.goal_type != "config":
+                inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
+            if self.goal_type != "ee":
+                inputs.append(5.0 * (desired_goal[:, :7] - observation[:, :7]))
+        if self.distances is not None:
+            inputs.append(10.0 * observation[:, self.distances])  # they are small numbers
+        return torch.cat(inputs, dim=1)
+
+
+def action_scale(args):
+    """The policy's actions are in [-scale, scale]."""
+    is_plain = args.plain_networks or args.action_mode == "subgoal"
+    return 1.0 if is_plain else 2.0 * args.max_step
+
+
 class Critics(nn.Module):
     """Q1 and Q2."""
 
     def __init__(self, args, num_features):
         super().__init__()
-        self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
-        self.mlps = nn.ModuleList(MLP(num_features + 7, 1, args, args.layer_norm) for _ in range(2))
+        self.action_scale = action_scale(args)
+        norm = not args.plain_networks
+        self.mlps = nn.ModuleList(mlp(num_features + 7, 1, args, norm) for _ in range(2))
 
     def forward(self, features, action, number=2):
         """(N, f), (N, 7) -> (number, N); of Q1 only with `number` 1."""
         inputs = torch.cat([features, action / self.action_scale], dim=1)
-        return torch.stack([mlp(inputs).squeeze(-1) for mlp in self.mlps[:number]])
+        return torch.stack([qf(inputs).squeeze(-1) for qf in self.mlps[:number]])
 
 
 # END SHARED
 
 
-LOG_STD_MAX = 2
-LOG_STD_MIN = -5
+LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
 
 class Actor(nn.Module):
     def __init__(self, args, observation_size):
         super().__init__()
         self.features = Features(args, observation_size)
-        self.action_scale = args.action_scale if args.action_mode == "relative" else 1.0
-        self.mlp = MLP(self.features.size, 14, args, layer_norm=False)
+        self.action_scale = action_scale(args)
+        self.mlp = mlp(self.features.size, 14, args)
 
-    def sample(self, features):
-        """A random action (N, 7) and its log-density (N,) before scaling by `action_scale`."""
+    def get_action(self, features):
+        """A random action (N, 7), and its log-density (N,) before scaling by `action_scale`."""
         mean, log_std = self.mlp(features).chunk(2, dim=1)
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
         noise = torch.randn_like(mean)
-        unsquashed = mean + log_std.exp() * noise
+        x_t = mean + log_std.exp() * noise
         log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
-        # log(1 - tanh(u)^2) without cancellation
-        log_prob = log_prob - 2 * (math.log(2) - unsquashed - F.softplus(-2 * unsquashed))
-        return self.action_scale * torch.tanh(unsquashed), log_prob.sum(1)
+        # log(1 - tanh(x_t)^2) without cancellation
+        log_prob = log_prob - 2 * (math.log(2) - x_t - F.softplus(-2 * x_t))
+        return self.action_scale * torch.tanh(x_t), log_prob.sum(1)
 
     def forward(self, observation, achieved_goal, desired_goal, **_):
-        """The deterministic action (N, 7), for evaluation; this is what policy.pt contains."""
+        """The deterministic action (N, 7), for evaluation; policy.pt contains this function."""
         mean = self.mlp(self.features(observation, desired_goal))[:, :7]
         return self.action_scale * torch.tanh(mean)
 
 
-# SHARED: replay buffer and demonstrations
 # ALGO LOGIC: replay buffer
-class LatentTable:
-    """Latent codes of scenes, each stored once: `rows` (n, size), in the order they were added."""
-
-    def __init__(self, size):
-        self.size, self._row_of = size, {}  # the latent's bytes -> its row
-        self._latents = np.zeros((1, size), np.float32)
-
-    @property
-    def rows(self):
-        return self._latents[: len(self._row_of)]
-
-    def row_of(self, latent):
-        """The row of a latent (size,), which is added if it is new."""
-        latent = np.float32(latent)
-        row = self._row_of.setdefault(latent.tobytes(), len(self._row_of))
-        if row == len(self._latents):
-            self._latents = np.concatenate([self._latents, np.zeros_like(self._latents)])
-        self._latents[row] = latent
-        return row
-
-
+# SHARED: replay buffer
 class HerReplayBuffer:
     """Transitions of finished episodes in a ring; goals are relabelled when they are sampled.
 
-    One float32 row per transition. `remaining` counts the transitions that follow in the same
-    episode, so a goal reached later in it is found without storing episodes. New episodes
-    overwrite the oldest rows from an episode's start on, so what a row points to outlives it. The
-    encoded scene at the end of observations (its latent) is stored once per scene, in `latents`.
+    `remaining` counts the transitions that follow one in its episode. New episodes overwrite the
+    oldest ones from their start on, so that these transitions outlive it. The encoded scene at the
+    end of an observation is stored once per scene: `latents[latent]`.
     """
 
     def __init__(self, env, capacity, her_probability, rng):
         spaces, encoder = env.observation_space, getattr(env, "encoder", None)
-        self.latents = LatentTable(0 if encoder is None else encoder.size)
-        observation_size = spaces["observation"].shape[0] - self.latents.size
+        latent_size = 0 if encoder is None else encoder.size
+        observation_size = spaces["observation"].shape[0] - latent_size
         goal_size = spaces["desired_goal"].shape[0]
-        sizes = {"observation": observation_size, "action": 7}
-        sizes |= {"next_observation": observation_size, "next_achieved_goal": goal_size}
-        sizes |= {"desired_goal": goal_size, "collision": 1}
-        ends = np.cumsum(list(sizes.values())).tolist()
-        self.columns = {n: slice(end - sizes[n], end) for n, end in zip(sizes, ends, strict=True)}
-        self.rows = np.zeros((capacity, ends[-1]), np.float32)
-        self.remaining = np.zeros(capacity, np.int32)
-        self.latent_row = np.zeros(capacity, np.int32)  # of each transition
-        self.env, self.rng = env, rng
-        self.capacity, self.her_probability = capacity, her_probability
-        self.position, self.size = 0, 0
+        sizes = {"observation": observation_size, "next_observation": observation_size}
+        sizes |= {"next_achieved_goal": goal_size, "desired_goal": goal_size}
+        sizes |= {"action": 7, "collision": 1}
+        self.arrays = {name: np.zeros((capacity, n), np.float32) for name, n in sizes.items()}
+        self.arrays |= {name: np.zeros(capacity, np.int32) for name in ("remaining", "latent")}
+        self.latents, self.latent_numbers = np.zeros((1, latent_size), np.float32), {}
+        self.env, self.capacity, self.rng = env, capacity, rng
+        self.her_probability, self.position, self.size = her_probability, 0, 0
 
     def add_episode(self, transitions):
-        """`transitions`: a list of dicts with the columns' names as keys."""
+        """`transitions`: a list of dicts with the float arrays' names as keys."""
         index = (self.position + np.arange(len(transitions))) % self.capacity
-        for name, columns in self.columns.items():
-            width = columns.stop - columns.start  # without the encoded scene
+        for name in transitions[0]:
+            width = self.arrays[name].shape[1]  # that of an observation is without the latent
             values = [np.atleast_1d(transition[name])[:width] for transition in transitions]
-            self.rows[index, columns] = np.stack(values)
-        latent = transitions[0]["observation"][self.columns["observation"].stop :]
-        self.latent_row[index] = self.latents.row_of(latent)
-        self.remaining[index] = np.arange(len(transitions))[::-1]
+            self.arrays[name][index] = np.stack(values)
+        latent = transitions[0]["observation"][self.arrays["observation"].shape[1] :]
+        self.arrays["latent"][index] = self.latent_number(np.float32(latent))
+        self.arrays["remaining"][index] = np.arange(len(transitions))[::-1]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
+
+    def latent_number(self, latent):
+        """The row of a latent (z,) in `latents`, where a new one is added."""
+        number = self.latent_numbers.setdefault(latent.tobytes(), len(self.latent_numbers))
+        if number == len(self.latents):
+            self.latents = np.concatenate([self.latents, np.zeros_like(self.latents)])
+        self.latents[number] = latent
+        return number
 
     def sample(self, batch_size):
         """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
         index = self.rng.integers(self.size, size=batch_size)
-        rows = self.rows[index]
-        batch = {name: rows[:, columns] for name, columns in self.columns.items()}
-        later = self.rng.random(batch_size) * (self.remaining[index] + 1)
+        data = {name: array[index] for name, array in self.arrays.items()}
+        later = self.rng.random(batch_size) * (data.pop("remaining") + 1)
         later = (index + later.astype(np.int64)) % self.capacity
         relabel = self.rng.random(batch_size) < self.her_probability
-        hindsight_goal = self.rows[later, self.columns["next_achieved_goal"]]
-        batch["desired_goal"] = np.where(relabel[:, None], hindsight_goal, batch["desired_goal"])
-        goals = batch["next_achieved_goal"], batch["desired_goal"]
-        info = {"collision": batch["collision"][:, 0] > 0}
-        batch["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
-        batch["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
-        if self.latents.size > 0:
-            latent = self.latents.rows[self.latent_row[index]]
-            for name in ("observation", "next_observation"):
-                batch[name] = np.hstack([batch[name], latent])
-        return batch
+        hindsight_goal = self.arrays["next_achieved_goal"][later]
+        data["desired_goal"] = np.where(relabel[:, None], hindsight_goal, data["desired_goal"])
+        goals = data["next_achieved_goal"], data["desired_goal"]
+        info = {"collision": data["collision"][:, 0] > 0}
+        data["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
+        data["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
+        latent = self.latents[data.pop("latent")]
+        for name in ("observation", "next_observation"):
+            data[name] = np.hstack([data[name], latent])
+        return data
+
+    def batches(self, number, batch_size, device):
+        """Yield `number` batches, dicts of tensors; up to 64 are sampled together, for speed."""
+        for first in range(0, number, 64):
+            data = self.sample(min(64, number - first) * batch_size)
+            parts = [torch.as_tensor(a, device=device).split(batch_size) for a in data.values()]
+            for batch in zip(*parts, strict=True):
+                yield dict(zip(data, batch, strict=True))
 
     def state_dict(self):
-        return {
-            "rows": torch.from_numpy(self.rows[: self.size]),
-            "remaining": torch.from_numpy(self.remaining[: self.size]),
-            "latent_row": torch.from_numpy(self.latent_row[: self.size]),
-            "latents": torch.from_numpy(self.latents.rows),
-            "position": self.position,
-        }
+        arrays = {name: torch.from_numpy(a[: self.size]) for name, a in self.arrays.items()}
+        latents = torch.from_numpy(self.latents[: len(self.latent_numbers)])
+        return {"arrays": arrays, "latents": latents, "position": self.position}
 
     def load_state_dict(self, state):
-        self.size, self.position = len(state["rows"]), state["position"]
-        for name in ("rows", "remaining", "latent_row"):
-            getattr(self, name)[: self.size] = state[name].numpy()
+        self.size, self.position = len(state["arrays"]["remaining"]), state["position"]
+        for name, array in state["arrays"].items():
+            self.arrays[name][: self.size] = array.numpy()
         for latent in state["latents"].numpy():
-            self.latents.row_of(latent)
+            self.latent_number(latent)
 
 
-# ALGO LOGIC: demonstrations
-def inject_demonstration(is_success, demo_prob, rng):
-    """Whether a demonstration enters the buffer: after a failure, with probability `demo_prob`."""
-    return not is_success and rng.random() < demo_prob
-
-
-# END SHARED
-
-
-def td_target(reward, terminated, next_q, next_log_prob, alpha, gamma):
-    """The critics' target r + gamma (1 - terminated) (min(Q1', Q2') - alpha log pi').
-
-    `next_q` (2, N) has Q1' and Q2'; all others, and the target, are (N,).
-    """
-    next_value = next_q.amin(0) - alpha * next_log_prob
-    return reward + gamma * (1.0 - terminated) * next_value
-
-
-# SHARED: averaging
-def polyak_update(target_parameters, parameters, tau):
-    """target <- (1 - tau) target + tau parameter, all tensors at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(target_parameters, parameters, tau)
-
-
-# END SHARED
-
-
-# SHARED: batches
-def updates_due(step, buffer, args):
-    """Number of updates that fall due in the environment steps that led to `step`.
-
-    None before `learning_starts`, and none before the first episode has ended.
-    """
-    if buffer.size == 0:
-        return 0
-    before, now = (max(0, s - args.learning_starts) for s in (step - args.num_envs, step))
-    return int(now * args.updates_per_step) - int(before * args.updates_per_step)
-
-
-DRAWN_TOGETHER = 64  # batches
-
-
-def batches(buffer, number, batch_size, device):
-    """Draw `number` batches, dicts of tensors, from the buffer: some at once, which is faster."""
-    for first in range(0, number, DRAWN_TOGETHER):
-        count = min(DRAWN_TOGETHER, number - first)
-        drawn = buffer.sample(count * batch_size)
-        parts = [torch.as_tensor(a, device=device).split(batch_size) for a in drawn.values()]
-        for batch in zip(*parts, strict=True):
-            yield dict(zip(drawn, batch, strict=True))
+def updates_due(step, args):
+    """Number of updates in the last `num_envs` steps; the first `learning_starts` have none."""
+    begin, end = (max(0, s - args.learning_starts) for s in (step - args.num_envs, step))
+    return int(end * args.updates_per_step) - int(begin * args.updates_per_step)
 
 
 # END SHARED
@@ -377,80 +303,60 @@ class SAC:
         )
         self.critics_target.load_state_dict(self.critics.state_dict())
         self.log_alpha = torch.full((1,), math.log(args.alpha), device=device, requires_grad=True)
-
-        self.actor_parameters = list(self.actor.parameters())
-        self.average_parameters = list(self.actor_average.parameters())
-        self.q_parameters = list(self.critics.parameters())
-        self.target_parameters = list(self.critics_target.parameters())
-        self.q_optimizer = torch.optim.Adam(self.q_parameters, lr=args.q_lr, fused=True)
-        self.actor_optimizer = torch.optim.Adam(
-            [{"params": self.actor_parameters}, {"params": [self.log_alpha], "lr": args.q_lr}],
-            lr=args.policy_lr,
-            fused=True,
-        )
+        parameters = [{"params": self.actor.parameters(), "lr": args.policy_lr}]
+        parameters += [{"params": [self.log_alpha], "lr": args.q_lr}]
+        self.actor_optimizer = torch.optim.Adam(parameters, fused=True)
+        self.q_optimizer = torch.optim.Adam(self.critics.parameters(), lr=args.q_lr, fused=True)
 
     def checkpoint_state(self):
-        """What a checkpoint has of it."""
-        names = "actor actor_average critics critics_target q_optimizer actor_optimizer log_alpha"
-        return {name: getattr(self, name) for name in names.split()}
+        """The parts of a checkpoint, by name."""
+        return {name: part for name, part in vars(self).items() if name != "args"}
 
     @torch.no_grad()
-    def explore(self, observation):
+    def explore(self, observation, achieved_goal, desired_goal, **_):
         """Random actions (N, 7), a NumPy array, for training."""
         self.actor.eval()
-        features = self.actor.features(observation["observation"], observation["desired_goal"])
-        action, _ = self.actor.sample(features)
+        actions, _ = self.actor.get_action(self.actor.features(observation, desired_goal))
         self.actor.train()
-        return action.cpu().numpy()
+        return actions.cpu().numpy()
 
-    def update_critics(self, batch, features):
-        """One step on a batch of the replay buffer; tensors whose means are logged, by tag.
-
-        `features`: the networks' inputs for its observations and goals.
-        """
-        alpha = self.log_alpha.detach().exp()
+    def update(self, data, number):
+        """Update number `number` of the run, on a batch. Returns tensors whose means are logged."""
+        args, alpha = self.args, self.log_alpha.detach().exp()
+        features = self.actor.features(data["observation"], data["desired_goal"])
         with torch.no_grad():
-            next_features = self.actor.features(batch["next_observation"], batch["desired_goal"])
-            next_action, next_log_prob = self.actor.sample(next_features)
-            next_q = self.critics_target(next_features, next_action)
-            target = td_target(
-                batch["reward"], batch["terminated"], next_q, next_log_prob, alpha, self.args.gamma
-            )
-        q = self.critics(features, batch["action"])
-        loss = (q - target).square().mean(1)  # of Q1 and of Q2
+            next_features = self.actor.features(data["next_observation"], data["desired_goal"])
+            next_actions, next_log_pi = self.actor.get_action(next_features)
+            min_qf_next_target = self.critics_target(next_features, next_actions).amin(0)
+            next_value = min_qf_next_target - alpha * next_log_pi
+            next_q_value = data["reward"] + args.gamma * (1.0 - data["terminated"]) * next_value
+        qf_values = self.critics(features, data["action"])
+        qf_losses = (qf_values - next_q_value).square().mean(1)  # of Q1 and of Q2
         self.q_optimizer.zero_grad()
-        loss.sum().backward()
+        qf_losses.sum().backward()
         self.q_optimizer.step()
-        tensors = {"qf1_values": q[0], "qf2_values": q[1], "qf1_loss": loss[0], "qf2_loss": loss[1]}
-        return tensors | {"qf_loss": loss, "alpha": alpha}
+        losses = {"qf1_values": qf_values[0], "qf2_values": qf_values[1], "alpha": alpha}
+        losses |= {"qf1_loss": qf_losses[0], "qf2_loss": qf_losses[1], "qf_loss": qf_losses}
 
-    def update_policy(self, features):
-        """One step of the policy and of the entropy coefficient; as `update_critics`."""
-        alpha = self.log_alpha.detach().exp()
-        self.critics.requires_grad_(False)  # the policy's gradient needs none into the critics
-        action, log_prob = self.actor.sample(features)
-        actor_loss = (alpha * log_prob - self.critics(features, action).amin(0)).mean()
-        surplus = log_prob.detach().mean() + self.args.target_entropy
-        alpha_loss = -self.log_alpha.exp() * surplus * self.args.autotune
-        self.actor_optimizer.zero_grad()
-        (actor_loss + alpha_loss).backward()
-        self.actor_optimizer.step()
-        self.critics.requires_grad_(True)
-        polyak_update(self.average_parameters, self.actor_parameters, self.args.policy_average)
-        return {"actor_loss": actor_loss, "alpha_loss": alpha_loss}
-
-    def update(self, batch, count):
-        """Update number `count` of the run."""
-        features = self.actor.features(batch["observation"], batch["desired_goal"])
-        losses = self.update_critics(batch, features)
-        if count % self.args.policy_frequency == 0:
-            losses |= self.update_policy(features)
-        polyak_update(self.target_parameters, self.q_parameters, self.args.tau)
+        if number % args.policy_frequency == 0:
+            self.critics.requires_grad_(False)  # they need no gradient of the policy's loss
+            actions, log_pi = self.actor.get_action(features)
+            min_qf_pi = self.critics(features, actions).amin(0)
+            actor_loss = (alpha * log_pi - min_qf_pi).mean()
+            surplus = log_pi.detach().mean() + (args.target_entropy or 0.0)
+            alpha_loss = -self.log_alpha.exp() * surplus * (args.target_entropy is not None)
+            self.actor_optimizer.zero_grad()
+            (actor_loss + alpha_loss).backward()
+            self.actor_optimizer.step()
+            self.critics.requires_grad_(True)
+            polyak_update(self.actor_average, self.actor, args.policy_average)
+            losses |= {"actor_loss": actor_loss, "alpha_loss": alpha_loss}
+        polyak_update(self.critics_target, self.critics, args.tau)
         return losses
 
 
 if __name__ == "__main__":
-    # SHARED: checks, environments, folder
+    # SHARED: checks and environments
     args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries"})
     device = runs.seed_torch(args)
     runs.resolve_bf16(args)
@@ -460,20 +366,19 @@ if __name__ == "__main__":
     env_arguments = protocol.env_arguments_of(args)
     envs = protocol.make_training_envs(args, args.demo_prob, args.demos)
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
-    rng = np.random.default_rng(args.seed)
-    buffer = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
-    counts = {"updates": 0, "demos_injected": 0}
     # END SHARED
 
+    # ALGO LOGIC: networks, replay buffer
     agent = SAC(args, eval_envs[0].observation_space["observation"].shape[0], device)
-
-    # SHARED: resuming and episodes
-    state = agent.checkpoint_state() | {"buffer": buffer, "rng": rng, "counts": counts}
+    # SHARED: run and episodes
+    rng = np.random.default_rng(args.seed)
+    rb = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
+    counts, losses = {"updates": 0, "demos_injected": 0}, {}
+    state = agent.checkpoint_state() | {"buffer": rb, "rng": rng, "counts": counts}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
     run.start(args.total_timesteps, "step")
-    observations = protocol.begin_episodes(envs, args.seed, run.step)
+    obs = protocol.begin_episodes(envs, args.seed, run.step)
     episodes, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
-    losses = {}
     # END SHARED
 
     while run.step < args.total_timesteps:
@@ -481,43 +386,46 @@ if __name__ == "__main__":
         if run.step < args.learning_starts:
             actions = (2 * torch.rand(args.num_envs, 7) - 1).numpy() * agent.actor.action_scale
         else:
-            actions = agent.explore(protocol.stack(observations, device))
+            actions = agent.explore(**protocol.stack(obs, device))
 
         # SHARED: a step in every environment
         runs.check_finite("the policy's actions", actions)
         for i, env in enumerate(envs):
-            before = observations[i]
-            observations[i], reward, terminated, truncated, info = env.step(actions[i])
-            episodes[i].append(transition(before, actions[i], observations[i], info["collision"]))
+            next_obs, reward, termination, truncation, info = env.step(actions[i])
+            episodes[i].append(transition(obs[i], actions[i], next_obs, info["collision"]))
             returns[i] += reward
-            if terminated or truncated:
-                buffer.add_episode(episodes[i])
-                step = run.step + i + 1
-                run.log_episode(step, returns[i], info)
+            obs[i] = next_obs
+            if termination or truncation:
+                rb.add_episode(episodes[i])
+                run.log_episode(run.step + i + 1, returns[i], info)
                 if args.demo_prob is not None:
-                    if inject_demonstration(info["is_success"], args.demo_prob, env.np_random):
-                        buffer.add_episode(demo_transitions(env.demo, env.env))
+                    if not info["is_success"] and env.np_random.random() < args.demo_prob:
+                        rb.add_episode(demo_transitions(env.demo, env.env))
                         counts["demos_injected"] += 1
-                    run.log({"charts/demos_injected": counts["demos_injected"]}, step)
-                episodes[i], returns[i], observations[i] = [], 0.0, env.reset()[0]
-        step = run.advance(args.num_envs)
-        for batch in batches(buffer, updates_due(step, buffer, args), args.batch_size, device):
-            losses |= agent.update(batch, counts["updates"])
+                    run.log({"charts/demos_injected": counts["demos_injected"]}, run.step + i + 1)
+                episodes[i], returns[i], obs[i] = [], 0.0, env.reset()[0]
+        global_step = run.advance(args.num_envs)
+
+        # ALGO LOGIC: learn
+        due = updates_due(global_step, args) if rb.size > 0 else 0
+        for data in rb.batches(due, args.batch_size, device):
+            losses |= agent.update(data, counts["updates"])
             counts["updates"] += 1
             if counts["updates"] % 1000 == 0:
                 run.log({f"losses/{name}": value for name, value in losses.items()})
                 run.log({"charts/SPS": int(run.rate)})
 
-        # Evaluate, keep the best policy, checkpoint
-        evaluating = step % args.eval_every < args.num_envs or step >= args.total_timesteps
+        # Evaluate, save the best policy, checkpoint
+        over = global_step >= args.total_timesteps
+        evaluating = over or global_step % args.eval_every < args.num_envs
         if evaluating and run.validate(agent.actor_average):
             run.save_policy(agent.actor_average)
         if evaluating or run.interrupted:
-            # A resumed run continues exactly like this one: with new episodes.
+            # New episodes begin, in this run as in one that is resumed from the checkpoint.
             for episode in filter(None, episodes):
-                buffer.add_episode(episode)
+                rb.add_episode(episode)
             run.checkpoint()
-            observations = protocol.begin_episodes(envs, args.seed, step)
+            obs = protocol.begin_episodes(envs, args.seed, global_step)
             episodes, returns = [[] for _ in envs], [0.0 for _ in envs]
     run.final_test(test)
     # END SHARED

@@ -36,8 +36,7 @@ LARGEST = sys.float_info.max
 PositiveInt = _number(int, 1, 10**12, "at least 1", ">= 1")
 NonNegativeInt = _number(int, 0, 10**12, "at least 0", ">= 0")
 Seed = _number(int, 0, 2**32 - 1, "in [0, 2^32)", "IN [0, 2^32)")
-Threads = _number(int, 1, 256, "in [1, 256]", "IN [1, 256]")
-Workers = Threads
+Workers = _number(int, 1, 256, "in [1, 256]", "IN [1, 256]")
 Layers = _number(int, 1, 100, "in [1, 100]", "IN [1, 100]")
 Width = _number(int, 1, 2**16, "in [1, 65536]", "IN [1, 65536]")
 Pixels = _number(int, 1, 4096, "in [1, 4096]", "IN [1, 4096]")  # PyBullet gets slow long before

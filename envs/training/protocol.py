@@ -27,7 +27,7 @@ from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
-from roboarm_nmp.envs.training.runs import Run, check_finite
+from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite
 
 NUM_ENVS = 8  # that an evaluation runs together at most; the first of them takes the pictures
 IMAGE_SIZE = (240, 180)
@@ -36,8 +36,20 @@ RULES = [name for name in STANDARD_RULES if name != "max_step"]
 
 
 @dataclass
+class PolicyFlags(RunFlags):
+    """The flags of every trainer of a policy: those of its run, the task and the evaluations."""
+
+    task: str = "no_obstacles"
+    """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/your_own_scene.md)"""
+    eval_queries: PositiveInt = 200
+    """validation queries per evaluation"""
+    test_queries: PositiveInt = 1_000
+    """test queries for the best policy at the end"""
+
+
+@dataclass
 class EnvFlags:
-    """The arguments of `envs.make` among a trainer's flags: the paper's MDP and what is seen."""
+    """The arguments of `envs.make` among a trainer's flags: the paper's MDP, and observations."""
 
     goal_type: Literal["ee", "config", "combined"] = "ee"
     """what the goal is: end-effector position, configuration, or both"""
@@ -46,17 +58,15 @@ class EnvFlags:
     max_step: PositiveFloat = MAX_STEP
     """longest displacement per step (L2, normalised configuration)"""
     horizon: PositiveInt = HORIZON
-    """steps after which an episode is cut off"""
+    """steps after which an episode is truncated"""
     stop_on_collision: bool = False
-    """end an episode at the first touch"""
+    """end an episode at the first contact"""
     velocities: bool = False
     """joint velocities in the observation"""
     encoder: str | None = None
     """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
     `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `point_cloud` for
     observed points, or `oracle` for the ground-truth obstacles; by default nothing"""
-    num_points: PositiveInt = 64
-    """points of the encoder `point_cloud`"""
     geometry_source: str | None = None
     """where link distances take the obstacles from: `ground_truth`, `point_cloud`, or an encoder
     with a decoder (`field`, or a path), which then also gives the points of `point_cloud`"""

@@ -47,7 +47,7 @@ from tqdm import tqdm
 
 from roboarm_nmp.envs.tasks import SCENE_FILES
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import Seed, Threads
+from roboarm_nmp.envs.training.flags import Seed
 from roboarm_nmp.envs.utils.files import (
     check_archive,
     check_folder,
@@ -71,13 +71,11 @@ class RunFlags:
     """continue the run in this folder from its last checkpoint; its own flags are used"""
     device: str = "cpu"
     """`cpu`, `cuda` or one of several, `cuda:1`"""
-    threads: Threads = 1
-    """torch threads; one is fastest for small networks, and leaves the other cores alone"""
     track: bool = False
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-MAY_CHANGE = {"resume", "runs_dir", "threads", "track"}  # they do not change what is computed
+MAY_CHANGE = {"resume", "runs_dir", "track"}  # they do not change what is computed
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
@@ -206,7 +204,8 @@ def _say_plainly(run, kind, error, trace):
 
 def seed_torch(args):
     """Make torch repeat itself: seed, threads, deterministic kernels. Returns the device."""
-    torch.set_num_threads(args.threads)
+    if "OMP_NUM_THREADS" not in os.environ:  # one thread is fastest for small networks
+        torch.set_num_threads(1)
     torch.manual_seed(args.seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
     torch.use_deterministic_algorithms(True)
