@@ -10,18 +10,33 @@ promises less: it may unpickle objects, and evaluates strings of the file as Pyt
     z = load_network("encoder.pt")(points=points)
     to_float16("encoder.pt", "smaller.pt")
 
-A **policy** is a network from `observation` (N, 10 or 17), `achieved_goal` and `desired_goal`
-(N, 3, 7 or 10), float32 as `RoboArmEnv` gives them, to the deterministic action (N, 7), float32 in
-[-1, 1]. Its metadata hold `kind` ("policy"), `task`, and `env`, a dict of the arguments of
-`envs.make` it was trained with (`goal_type`, `action_mode`, `max_step`, `velocities`, `encoder`,
-`link_distances`, `append_link_distances`). With an encoder, `observation` is longer by z_E, and with appended
-link_distances by 80; with link_distances, `link_distances` and `goal_link_distances` (N, 10, 8) may be inputs, too.
-`safety_filter`, a dict of `margin` (m) and `escape`, is there where an `envs.policies.safety_filter.SafetyFilter` is
-part of the policy: whoever runs it by name (`envs.policies.registry`) has that around it. A policy with a
-`recurrent_size` takes an input `recurrent_state` (N, recurrent_size), zeros at an episode's start,
-and returns the next one beside the action: (action, recurrent_state).
+PyTorch's default dtype and default device change nothing: networks compute in float32, on the
+device that they were loaded for.
+
+A **policy** is a network from `observation` (N, 10 or more), `achieved_goal` and `desired_goal`
+(N, 3, 7 or 10), float32 as `RoboArmEnv` returns them, to the deterministic action (N, 7), float32
+in [-1, 1]. Other keys of the observation may be inputs, too. The metadata of a policy hold
+
+- `kind`: "policy";
+- `task`: name of the task it was trained on;
+- `env`: dict of the arguments of `envs.make` it was trained with: `goal_type`, and, where they
+  differ from the defaults, `action_mode`, `max_step`, `velocities`, `encoder`, `num_points`,
+  `geometry_source`, `link_distances` and `append_link_distances`. Others (`horizon`, tolerances)
+  are ignored: they define success. With `append_link_distances`, `observation` is longer by 80;
+  with an `encoder`, it then ends with z_E. With `link_distances`, `link_distances` and
+  `goal_link_distances` (N, 10, 8) may be inputs;
+- `safety_filter`, optional: dict of `margin` (m) and `escape` (bool). Whoever runs the policy by
+  name (`envs.policies.registry`) puts that `envs.policies.safety_filter.SafetyFilter` around it;
+- `recurrent_size`, optional: an int. The policy then has an input `recurrent_state`
+  (N, recurrent_size), zeros at the start of an episode, and returns [action, next recurrent_state].
+
+An **encoder** is a network from observations of sensors to z_E (N, size), float32. Inputs are the
+images of cameras, uint8 (N, height, width, 3), by the sensor's name, and `<name>_points` and
+`<name>_labels` of point clouds. Its metadata hold `kind` ("encoder") and `sensors`
+(`envs.perception.sensors.sensors_to_json`).
 """
 
+import contextlib
 import copy
 import io
 import json
@@ -52,17 +67,17 @@ _EXTRA = (
     _ATEN.cdist.default,
     _ATEN.linalg_vector_norm.default,
 )
-# Numbers of rows on which a network is compared with its module before it is saved.
-_ROWS = (1, 2, 32)
-# So many shapes of inputs are remembered as fitting.
-_MAX_KNOWN = 1_000
+# On batches of these sizes a network is compared with its module before it is saved.
+_BATCH_SIZES = (1, 2, 32)
+# So many shapes of inputs are remembered as checked.
+_MAX_CHECKED = 1_000
 
 
 def save_network(path, module, example_inputs, metadata):
     """Write a network as a network file, atomically. The module itself is not touched.
 
-    The network is exported in eval mode, on the CPU, for any batch size, and compared with the
-    module on the example inputs before anything is written.
+    The network is exported in eval mode, on the CPU, for any batch size; the default dtype is
+    float32. It is compared with the module on the example inputs before anything is written.
 
     Args:
         path: the file to write; its folder must exist.
@@ -77,14 +92,15 @@ def save_network(path, module, example_inputs, metadata):
     """
     path = Path(path)
     module = copy.deepcopy(getattr(module, "_orig_mod", module)).cpu().eval()  # undo torch.compile
+    numbers = torch.arange(max(_BATCH_SIZES), device="cpu")
     inputs = {
-        name: tensor.detach().cpu()[torch.arange(max(_ROWS)) % len(tensor)]
+        name: tensor.detach().cpu()[numbers % len(tensor)]
         for name, tensor in example_inputs.items()
     }
     try:
         metadata = json.loads(json.dumps(dict(metadata)))
         content = {"format": FORMAT, "version": VERSION, "metadata": metadata}
-        with torch.no_grad(), warnings.catch_warnings():
+        with torch.no_grad(), _float32_by_default(), torch.device("cpu"), warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # torch's, about itself
             content |= _export(module, inputs)
             _compare(ExportedNetwork(content), module, inputs)
@@ -96,27 +112,27 @@ def save_network(path, module, example_inputs, metadata):
 
 
 def to_float16(path, output):
-    """Write a network again with its float32 tensors rounded to float16: half as large a file.
+    """Write a network file again with float32 tensors rounded to float16: half as large.
 
-    It computes in float32 as before, from the rounded numbers (11 significant bits), so its results
-    differ: evaluate what is written, not what was read.
+    The network still computes in float32, from the rounded numbers (11 significant bits). So its
+    results differ: evaluate the new file.
 
     Raises:
         NetworkError: as `load_network`; or a number in it is too large for float16 (65,504).
         OSError: the file cannot be written.
     """
     content = _read(path)
-    ExportedNetwork(content, path)  # or it raises
-    halved = {
+    ExportedNetwork(content, path)  # raises NetworkError for a bad file
+    rounded = {
         name: tensor.half()
         for name, tensor in content["tensors"].items()
         if tensor.dtype == torch.float32
     }
-    for name, tensor in halved.items():
+    for name, tensor in rounded.items():
         if tensor.isinf().any() and not content["tensors"][name].isinf().any():
-            raise NetworkError(f"{path}: cannot be halved: {name} has numbers beyond float16")
-    tensors = content["tensors"] | halved
-    names = sorted({*halved, *content.get("halved", ())})
+            raise NetworkError(f"{path}: {name} has numbers too large for float16")
+    tensors = content["tensors"] | rounded
+    names = sorted({*rounded, *content.get("halved", ())})
     buffer = io.BytesIO()
     torch.save(content | {"tensors": tensors, "halved": names}, buffer)
     write_atomically(Path(output), buffer.getbuffer())
@@ -184,13 +200,13 @@ class ExportedNetwork:
 
     def _build(self, content, device):
         network_operations.check_file(content)
-        self._fitting = set()  # shapes of inputs
+        self._checked = set()  # shapes of inputs
         self.metadata = dict(copy.deepcopy(content["metadata"]))
         self.inputs = list(content["inputs"])
         # While it runs, its values lie in one list: tensors, inputs, the results of the nodes.
-        halved = set(content.get("halved", ()))  # names of tensors that are stored in float16
+        float16 = set(content.get("halved", ()))  # names of tensors that are stored in float16
         self._tensors = [
-            tensor.to(device, torch.float32 if name in halved else tensor.dtype)
+            tensor.to(device, torch.float32 if name in float16 else tensor.dtype)
             for name, tensor in content["tensors"].items()
         ]
         slots = {}
@@ -220,13 +236,14 @@ class ExportedNetwork:
         if not all(isinstance(tensor, torch.Tensor) for tensor in inputs):
             raise NetworkError(f"{self._path}: its inputs are tensors")
         shapes = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
-        if shapes not in self._fitting:
-            rehearsal = network_operations.ShapeCheck()
-            self.to("meta")._run([tensor.to("meta") for tensor in inputs], rehearsal)
-            if len(self._fitting) == _MAX_KNOWN:
-                self._fitting.clear()
-            self._fitting.add(shapes)
-        return self._run(inputs)
+        with torch.no_grad(), _float32_by_default():
+            if shapes not in self._checked:
+                check = network_operations.ShapeCheck()
+                self.to("meta")._run([tensor.to("meta") for tensor in inputs], check)
+                if len(self._checked) == _MAX_CHECKED:
+                    self._checked.clear()
+                self._checked.add(shapes)
+            return self._run(inputs)
 
     def predict_one(self, inputs, size=None):
         """The output for a batch of one: NumPy float32 (size,).
@@ -254,29 +271,39 @@ class ExportedNetwork:
             or output.shape != (1, size or output.shape[1])
         ):
             wanted = f"(1, {size or 'any'})"
-            raise NetworkError(f"{self._path}: its output is not float32 {wanted} for one row")
+            raise NetworkError(f"{self._path}: its output is not float32 {wanted} for a batch of 1")
         if not output.isfinite().all():
             raise NetworkError(f"{self._path}: its output is not finite")
         return output[0].numpy()
 
-    def _run(self, inputs, rehearsal=None):
+    def _run(self, inputs, check=None):
         values = self._tensors + inputs
-        with torch.no_grad():
-            for function, args, places, kwargs, filled, operation in self._nodes:
-                try:
-                    args = args.copy()
-                    for i in places:
-                        args[i] = _fill(args[i], values)
-                    if filled:
-                        kwargs = _fill(kwargs, values)
-                    if rehearsal is not None:
-                        rehearsal.before(operation, args)
-                    values.append(function(*args, **kwargs))
-                    if rehearsal is not None:
-                        rehearsal.after(function, values[-1])
-                except Exception as error:  # wrong shapes or types, of many kinds
-                    raise NetworkError(f"{self._path}: {operation} failed: {error}") from error
+        for function, args, places, kwargs, filled, operation in self._nodes:
+            try:
+                args = args.copy()
+                for i in places:
+                    args[i] = _fill(args[i], values)
+                if filled:
+                    kwargs = _fill(kwargs, values)
+                if check is not None:
+                    check.before(operation, args)
+                values.append(function(*args, **kwargs))
+                if check is not None:
+                    check.after(function, values[-1])
+            except Exception as error:  # wrong shapes or types, of many kinds
+                raise NetworkError(f"{self._path}: {operation} failed: {error}") from error
         return _fill(self._outputs, values)
+
+
+@contextlib.contextmanager
+def _float32_by_default():
+    """Inside, PyTorch's default dtype is float32, as where networks were exported."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 # --- Graph -> data
@@ -337,9 +364,9 @@ def _export(module, inputs):
 
 
 def _compare(network, module, inputs):
-    """Raise NetworkError unless both compute the same, whatever the number of rows."""
-    for rows in _ROWS:
-        batch = {name: tensor[:rows] for name, tensor in inputs.items()}
+    """Raise NetworkError unless both compute the same for all `_BATCH_SIZES`."""
+    for size in _BATCH_SIZES:
+        batch = {name: tensor[:size] for name, tensor in inputs.items()}
         saved, expected = pytree.tree_leaves(network(**batch)), pytree.tree_leaves(module(**batch))
         try:
             for one, other in zip(saved, expected, strict=True):

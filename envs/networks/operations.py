@@ -1,14 +1,14 @@
-"""Which operations a network file may name, and how much they may compute.
+"""Operations that a network file may name, and limits of what they may compute.
 
-PyTorch's kernels trust whoever calls them: some write where a size or an index says, some divide by
-a number of groups. A network file (`envs.networks.exported_networks`) may come from a stranger, so
+PyTorch's kernels trust their arguments: some write where a size or an index says, some divide by a
+number of groups. A network file (`envs.networks.exported_networks`) may come from a stranger, so
 
 - only the operations in `ALLOWED` are run: those that the trainers, the encoders and the examples
-  in the docs need, layers that others are likely to use, and harmless elementwise ones. `allow`
-  adds one, in your own code and for that process;
-- before a network runs on inputs of other shapes than before, it runs without numbers, on PyTorch's
-  meta device: what does not fit together is refused there, and so is what is too large;
-- what the meta device lets through is checked here.
+  in the docs need, common layers, and harmless elementwise ones. `allow` adds one, in your own code
+  and for that process;
+- before a network runs on inputs of new shapes, it runs on PyTorch's meta device, without numbers:
+  shapes that do not fit and tensors that are too large are rejected there;
+- arguments that the meta device does not check are checked here.
 """
 
 import operator
@@ -18,11 +18,11 @@ import torch
 MAX_NODES = 20_000
 """Operations in a network."""
 MAX_VALUES, MAX_DEPTH = 1_000_000, 32
-"""Values in a file, arguments and metadata counted, and lists or dicts in each other."""
+"""Values in a file, arguments and metadata included, and nested lists or dicts."""
 MAX_ELEMENTS = 2**26
 """Numbers in a tensor, stored or computed."""
 MAX_COMPUTED = 2**28
-"""Numbers in all tensors together that are computed on the way."""
+"""Numbers in all tensors together that a network computes."""
 DTYPES = (torch.float32, torch.int64, torch.bool, torch.uint8)
 """Of tensors, stored or computed."""
 
@@ -56,7 +56,7 @@ ALLOWED = {
         *("_softmax", "_log_softmax"),
     )
 }
-"""Names of the operations of `torch.ops.aten` that a network may have."""
+"""Names of the operations of `torch.ops.aten` that are allowed in a network."""
 
 
 class NetworkError(ValueError):
@@ -64,10 +64,10 @@ class NetworkError(ValueError):
 
 
 def allow(name):
-    """Let networks have one more operation, such as `aten.erf.default`: for networks of your own.
+    """Allow one more operation, such as `aten.erf.default`, in networks of your own.
 
-    Raises ValueError: there is none of that name, or it is none of those that only compute (random
-    ones, those that change their arguments, or take memory as it is).
+    Raises ValueError: there is none of that name, or it does more than compute (random operations,
+    those that change their arguments, or read uninitialised memory).
     """
     operation = _aten(name)
     if operation is None:
@@ -79,12 +79,12 @@ def allow(name):
         or packet.startswith(("as_strided", "empty", "from_file"))
         or packet.endswith("_backward")
     ):
-        raise ValueError(f"{name}: no network may have that, it does more than compute")
+        raise ValueError(f"{name} cannot be allowed in a network: it does more than compute")
     ALLOWED.add(name)
 
 
 def find(name):
-    """The function of an operation's name. Raises NetworkError: a network may not have it."""
+    """The function of an operation's name. Raises NetworkError: it is not allowed."""
     if isinstance(name, str):
         if name in PYTHON:
             return PYTHON[name]
@@ -106,8 +106,9 @@ def _aten(name):
 
 
 def check_file(content):
-    """Raises NetworkError: what was read is not plain data, or too much. (`weights_only` still
-    makes a few kinds of objects; a network has fewer.)
+    """Raise NetworkError unless the content of a file is plain data, and not too much of it.
+
+    `weights_only` still makes a few kinds of objects; a network has fewer.
     """
     left, count = [(content, 0)], 0
     while left:
@@ -115,8 +116,7 @@ def check_file(content):
         kind, count = type(value), count + 1
         if count + len(left) > MAX_VALUES or depth > MAX_DEPTH:
             raise NetworkError(
-                f"it has more than {MAX_VALUES:,} values, or more than {MAX_DEPTH} lists in each "
-                f"other"
+                f"it has more than {MAX_VALUES:,} values, or more than {MAX_DEPTH} nested lists"
             )
         if kind is dict or kind is list:
             inside = [*value, *value.values()] if kind is dict else value
@@ -128,7 +128,7 @@ def check_file(content):
                 raise NetworkError("it holds a tensor that is larger than its memory")
             _check_tensor(value, (*DTYPES, torch.float16))
         elif value is not None and kind not in (bool, int, float, str):
-            raise NetworkError(f"it holds something that is not plain data: {kind.__name__}")
+            raise NetworkError(f"it holds a {kind.__name__}, which is not plain data")
     if len(content["nodes"]) > MAX_NODES:
         raise NetworkError(f"it has more than {MAX_NODES:,} operations")
 
@@ -141,18 +141,18 @@ def constant(name):
 
 
 class ShapeCheck:
-    """Checks what a network does on the meta device, operation by operation."""
+    """Checks the operations of a network, one by one, while it runs on the meta device."""
 
     def __init__(self):
         self.computed = 0
 
     def before(self, name, args):
-        """Raises NetworkError: the arguments would be trusted, and should not be."""
+        """Raise NetworkError if a kernel would trust these arguments and should not."""
         if name in _RULES and not _RULES[name](*args):
-            raise NetworkError(f"{name}: its arguments make no sense")
+            raise NetworkError(f"{name}: its arguments are out of range")
 
     def after(self, function, result):
-        """Raises NetworkError: the result is no plain tensor, or there is too much of it."""
+        """Raise NetworkError if a result is no plain tensor, or too large."""
         schema = getattr(function, "_schema", None)
         view = schema is not None and any(one.alias_info is not None for one in schema.returns)
         for one in result if isinstance(result, (list, tuple)) else [result]:
@@ -170,10 +170,11 @@ def _check_tensor(tensor, dtypes):
         raise NetworkError(f"it has a tensor of more than {MAX_ELEMENTS:,} numbers")
 
 
-# --- Arguments that kernels or the meta device trust: at least so much, each
+# --- Arguments that kernels and the meta device trust
 
 
 def _at_least(least, *values):
+    """Whether all integers, or lists of them, are from `least` to 32,767."""
     flat = [one for value in values for one in (value if isinstance(value, list) else [value])]
     return all(type(one) is int and least <= one < 2**15 for one in flat)
 
@@ -205,21 +206,21 @@ _RULES = {
 
 
 def _divide(one, other, *, rounding_mode=None):
-    """The least integer divided by -1 ends the process."""
-    divisor = torch.as_tensor(other)
+    """Division that rejects integer divisors below 1: the least integer by -1 ends the process."""
+    divisor = torch.as_tensor(other, device=one.device)
     integers = not (one.is_floating_point() or divisor.is_floating_point())
     if integers and not divisor.is_meta and not (divisor > 0).all():
         raise NetworkError("integers are divided by something that is not positive")
     return torch.ops.aten.div.Tensor_mode(one, other, rounding_mode=rounding_mode)
 
 
-# --- Arithmetic on sizes, where a shape depends on the batch, and picking one of several results
+# --- Arithmetic on sizes, where a shape depends on the batch, and one of several results
 
 
 def _of_sizes(function):
     def compute(*sizes):
         if any(type(size) is not int for size in sizes):
-            raise NetworkError("arithmetic is for sizes")
+            raise NetworkError("arithmetic is allowed on sizes only")
         result = function(*sizes)
         if abs(result) >= 2**62:
             raise NetworkError("a size is too large")
@@ -228,14 +229,14 @@ def _of_sizes(function):
     return compute
 
 
-def _pick(several, i):
+def _select(several, i):
     if type(several) not in (list, tuple) or type(i) is not int:
-        raise NetworkError("only of several results one can be picked")
+        raise NetworkError("only one of several results can be selected")
     return several[i]
 
 
 PYTHON = {
     f"operator.{name}": _of_sizes(getattr(operator, name))
     for name in ("add", "sub", "mul", "floordiv", "mod", "neg")
-} | {"operator.getitem": _pick}
+} | {"operator.getitem": _select}
 """Name -> function."""

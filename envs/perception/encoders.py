@@ -1,18 +1,20 @@
-"""Scene encoders: a `Scene` -> z_E, the latent code that a policy receives of the scene.
+"""Scene encoders: from a `Scene` to z_E, the latent code that a policy receives of the scene.
 
-    encoder = make_encoder("vae")                        # pretrained, by name
-    encoder = make_encoder("runs/.../encoder.pt")        # trained by a script of your own
-    encoder = make_encoder("oracle")                     # ground-truth obstacles (privileged)
-    encoder = make_encoder("point_cloud", num_points=32) # points observed by four sensors
-    env = SceneEncodingWrapper(roboarm_nmp.make("random_boxes_hard"), encoder)
+    encoder = make_encoder("vae")                         # pretrained, by name
+    encoder = make_encoder("runs/RUN/encoder.pt")         # a network file
+    encoder = make_encoder("oracle")                      # ground-truth obstacles (privileged)
+    encoder = make_encoder("point_cloud", num_points=32)  # points that four sensors observe
+    encoder = make_encoder("point_cloud", geometry_source="field")  # points decoded from z_E
+    z = encoder(scene)                                    # float32 (encoder.size,)
 
-Paper: sections 5.1 and 5.3. `SceneEncodingWrapper` is in `envs.wrappers`.
+Paper: sections 5.1 and 5.3. `envs.wrappers.SceneEncodingWrapper` appends z_E to observations.
 """
 
 import contextlib
 import functools
 import hashlib
 import io
+import os
 import sys
 import zipfile
 from pathlib import Path
@@ -29,8 +31,8 @@ from roboarm_nmp.envs.perception.point_clouds import (
     observed_points,
     remember_points,
 )
-from roboarm_nmp.envs.perception.sensors import POSE, PointCloud, SensorWorld, sensors_from_json
-from roboarm_nmp.envs.scenes.primitives import ROW, padded_rows
+from roboarm_nmp.envs.perception.sensors import PointCloud, observe_scene, sensors_from_json
+from roboarm_nmp.envs.scenes.primitives import ROW, Scene, padded_rows
 from roboarm_nmp.envs.utils.files import write_atomically
 
 ORACLE = "oracle"
@@ -39,6 +41,7 @@ PRETRAINED = Path(__file__).parent / "pretrained"
 DECODER = ".decoder.pt"
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
+MAX_POINTS = 9_999
 CACHED_SCENES, CACHED_DECODED = 500, 1_000
 DECODED_CELL, DECODED_REACH = 0.025, 0.015  # m
 # The grid of decoded points: the arm's workspace above the table, m.
@@ -50,47 +53,78 @@ def pretrained_encoders():
     return sorted(path.stem for path in PRETRAINED.glob("*.pt") if not path.match(f"*{DECODER}"))
 
 
-@functools.lru_cache
 def make_encoder(name, num_points=NUM_POINTS, geometry_source=None):
     """The encoder of a name, one per process and set of arguments.
 
     Args:
-        name: `oracle`, `point_cloud`, the name of a pretrained encoder, or a network's path.
+        name: `oracle`, `point_cloud`, the name of a pretrained encoder, or the path of an encoder's
+            network file.
         num_points: of `point_cloud`.
-        geometry_source: of `point_cloud`: None for observed points, or the name or path of an
-            encoder whose decoder gives them.
+        geometry_source: of `point_cloud`: None or `point_cloud` for observed points, or the name or
+            path of an encoder with a decoder for points decoded from its latent code.
 
     Raises:
-        NetworkError: a file cannot be used, or has no decoder.
+        NetworkError: there is no such encoder, its file cannot be used, or it has no decoder.
         ValueError: `num_points` is out of range.
     """
-    if str(name) == ORACLE:
-        return OracleEncoder()
-    if str(name) == POINT_CLOUD:
-        return PointCloudEncoder(num_points, geometry_source)
-    return NetworkEncoder(name)
+    name = str(name)
+    if name == ORACLE:
+        return _shared(OracleEncoder)
+    if name == POINT_CLOUD:
+        observed = geometry_source is None or str(geometry_source) == POINT_CLOUD
+        encoder = None if observed else encoder_with_decoder(geometry_source)
+        return _shared(PointCloudEncoder, num_points, encoder)
+    if name in pretrained_encoders():
+        return _shared(NetworkEncoder, PRETRAINED / f"{name}.pt", name)
+    path = Path(name).absolute()  # a relative path is another file in another folder
+    if not os.path.exists(path):
+        raise NetworkError(
+            f"no such encoder: {name} (expected {ORACLE}, {POINT_CLOUD}, the path of an encoder's "
+            f"network file, or a pretrained encoder: {', '.join(pretrained_encoders())})"
+        )
+    return _shared(NetworkEncoder, path, name)
+
+
+def encoder_with_decoder(name):
+    """`make_encoder(name)`. Raises NetworkError, too, if it has no decoder."""
+    encoder = make_encoder(name)
+    if encoder.decoder is None:
+        raise _no_decoder(name)
+    return encoder
+
+
+def _no_decoder(name):
+    return NetworkError(f"{name} has no decoder: no obstacles can be decoded from its z_E")
+
+
+@functools.lru_cache
+def _shared(kind, *args):
+    """The encoder of a class and its arguments, one per process."""
+    return kind(*args)
 
 
 class SceneEncoder:
-    """Base class: caches z_E, so an equal scene is encoded once.
+    """Base class. It caches z_E, so that an equal scene is encoded once.
+
+    Copies, and unpickled encoders in other processes, are the one of `make_encoder`.
 
     Attributes:
         name: string.
         size: of z_E.
         token_size: numbers of z_E that belong together: those of one obstacle or point, or all.
+        decoder: the network from z_E and points to distances from obstacles (m); None: there is
+            none.
         geometry_source: the geometry source (`envs.perception.geometry_source`) with the same
-            information about a scene; `point_cloud` where the latent code cannot be decoded.
+            information about a scene; `point_cloud` where z_E cannot be decoded.
     """
 
+    decoder = None
     geometry_source = POINT_CLOUD
 
     def __init__(self, name, size, token_size):
-        self.name, self.size, self.token_size = str(name), size, token_size
+        self.name, self.size, self.token_size = name, size, token_size
         self._of_demos = {}  # scene -> z_E
         self._cached = functools.lru_cache(CACHED_SCENES)(self._encode)
-
-    def __reduce__(self):  # copies, and other processes, use their process's own
-        return make_encoder, (self.name,)
 
     def __call__(self, scene):
         """z_E of a `Scene`, float32 (size,); not to be changed."""
@@ -103,19 +137,16 @@ class SceneEncoder:
     def encode_demos(self, demos):
         """z_E of all scenes of `envs.datasets.demonstrations.Demos`: float32 (n, size).
 
-        Later calls of the encoder with these scenes return what was computed here.
+        Later calls of the encoder with these scenes return the same numbers.
         """
         scenes = [demos.scenes[i] for i in range(len(demos))]
-        self._of_demos |= {scene: self._encode(scene) for scene in dict.fromkeys(scenes)}
-        return np.stack([self._of_demos[scene] for scene in scenes])
+        latents = self._encode_all(scenes, demos.task)
+        self._of_demos |= zip(scenes, latents, strict=True)
+        return latents
 
-    @property
-    def decoder(self):
-        """The network from z_E and points to distances. Raises NetworkError: there is none."""
-        raise NetworkError(f"{self.name} has no decoder: no distances can be decoded from z_E")
-
-    def close(self):
-        """Close the simulated world it observes, if it has one."""
+    def _encode_all(self, scenes, task):
+        of_scene = {scene: self._encode(scene) for scene in _progress(scenes, f"encoding {task}")}
+        return np.stack([of_scene[scene] for scene in scenes])
 
 
 class OracleEncoder(SceneEncoder):
@@ -130,6 +161,9 @@ class OracleEncoder(SceneEncoder):
     def __init__(self):
         super().__init__(ORACLE, MAX_OBSTACLES * (1 + ROW), 1 + ROW)
 
+    def __reduce__(self):
+        return make_encoder, (ORACLE,)
+
     def _encode(self, scene):
         count = len(scene.obstacles)
         if count > MAX_OBSTACLES:
@@ -140,136 +174,121 @@ class OracleEncoder(SceneEncoder):
 class PointCloudEncoder(SceneEncoder):
     """Points of a scene's obstacles, as far apart as possible: float32 (`num_points` * 3,), m.
 
-    In the base's frame, see `envs.perception.point_clouds.farthest_points`.
+    In the base's frame, chosen by `envs.perception.point_clouds.farthest_points`.
 
     Args:
-        num_points: 1 to 9,999.
-        geometry_source: None for the points that four sensors observe, or the name or path of an
-            encoder whose decoder gives them.
+        num_points: 1 to `MAX_POINTS`.
+        encoder: None for points that four sensors observe; a `NetworkEncoder` with a decoder for
+            points decoded from its z_E.
+
+    Raises:
+        ValueError: `num_points` is out of range.
     """
 
-    def __init__(self, num_points=NUM_POINTS, geometry_source=None):
-        if not 1 <= num_points < 10_000:
-            raise ValueError(f"num_points must be 1 to 9,999, got {num_points}")
+    def __init__(self, num_points=NUM_POINTS, encoder=None):
+        if type(num_points) is not int or not 1 <= num_points <= MAX_POINTS:
+            raise ValueError(
+                f"num_points must be an integer from 1 to {MAX_POINTS:,}, got {num_points!r}"
+            )
         super().__init__(POINT_CLOUD, 3 * num_points, 3)
-        self.num_points, self._decoded_by = num_points, None
-        if geometry_source is not None:
-            self._decoded_by = make_encoder(geometry_source)
-            self._decoded_by.decoder  # noqa: B018 (or it raises)
-            self.geometry_source = str(geometry_source)
+        self.num_points, self._encoder = num_points, encoder
+        if encoder is not None:
+            self.geometry_source = encoder.name
 
     def __reduce__(self):
-        source = None if self._decoded_by is None else self.geometry_source
-        return make_encoder, (POINT_CLOUD, self.num_points, source)
+        return _shared, (PointCloudEncoder, self.num_points, self._encoder)
 
     def _encode(self, scene):
-        source = observed_points if self._decoded_by is None else self._decoded_by.decoded_points
-        return farthest_points(source(scene), self.num_points).ravel()
+        points = observed_points if self._encoder is None else self._encoder.decoded_points
+        return farthest_points(points(scene), self.num_points).ravel()
 
-    def encode_demos(self, demos):
-        """As `SceneEncoder.encode_demos`; the observed points are remembered, too."""
-        if self._decoded_by is None:
-            scenes = dict.fromkeys(demos.scenes[i] for i in range(len(demos)))
-            for scene in _progress(list(scenes), f"observing {demos.task}"):
+    def _encode_all(self, scenes, task):
+        if self._encoder is None:  # link distances may need all of them, too
+            for scene in _progress(scenes, f"observing {task}"):
                 remember_points(scene)
-        return super().encode_demos(demos)
+        return super()._encode_all(scenes, task)
 
 
 class NetworkEncoder(SceneEncoder):
     """A network's encoding of what its sensors observe of a scene.
 
     Args:
-        name: of a pretrained encoder, or the path of a network (encoder.pt).
+        path: of the network file; its metadata hold `kind` ("encoder") and `sensors`
+            (`envs.perception.sensors.sensors_to_json`). A decoder's file may be beside it.
+        name: string; by default the path.
 
     Attributes:
-        path: of the network.
+        path: of the network file.
         sensors: dict of name -> sensor.
 
     Raises:
         NetworkError: the file cannot be used.
     """
 
-    def __init__(self, name):
-        pretrained = PRETRAINED / f"{name}.pt"
-        self.path = pretrained if pretrained.exists() else Path(name)
-        self._network = load_network(self.path)
+    def __init__(self, path, name=None):
+        self.path = Path(path)
+        self._network = load_network(path)
         if self._network.metadata.get("kind") != "encoder":
-            raise NetworkError(f"{name}: not an encoder, but {self._network.metadata!r}")
+            raise NetworkError(f"{path}: not an encoder, but {self._network.metadata!r}")
         try:
             self.sensors = sensors_from_json(self._network.metadata["sensors"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise NetworkError(f"{name}: its sensors make no sense: {error!r}") from error
-        self._world = SensorWorld()
-        size = len(self.encode(self.observe(self._world.scene)))
-        super().__init__(name, size, size)
+            observed = self.observe(Scene())
+        except (KeyError, ValueError) as error:
+            raise NetworkError(f"{path}: its sensors are invalid: {error!r}") from error
+        size = len(self.encode(observed))
+        super().__init__(str(path) if name is None else name, size, size)
+        if self.path.with_suffix(DECODER).exists():
+            self.decoder = load_network(self.path.with_suffix(DECODER))
+            self.geometry_source = self.name
         self._decoded = functools.lru_cache(CACHED_DECODED)(self._decode_points)
 
-    def _encode(self, scene):
-        return self.encode(self.observe(scene))
+    def __reduce__(self):
+        if self.path == PRETRAINED / f"{self.name}.pt":  # elsewhere on another machine
+            return make_encoder, (self.name,)
+        return _shared, (NetworkEncoder, self.path.absolute(), self.name)
 
     def observe(self, scene):
-        """The network's inputs, a batch of 1: what the sensors observe of a `Scene`."""
-        self._world.show(scene, POSE)
+        """The network's inputs, a batch of one: what the sensors observe of a `Scene`."""
         inputs = {}
-        for name, sensor in self.sensors.items():
-            observed = sensor.observe(self._world)
-            if isinstance(sensor, PointCloud):
-                inputs |= {f"{name}_{output}": array for output, array in observed.items()}
+        for name, outputs in observe_scene(scene, self.sensors).items():
+            if isinstance(self.sensors[name], PointCloud):
+                inputs |= {f"{name}_{output}": array for output, array in outputs.items()}
             else:
-                inputs[name] = observed["rgb"]
+                inputs[name] = outputs["rgb"]
         return {name: torch.from_numpy(inputs[name])[None] for name in self._network.inputs}
 
     def encode(self, observed):
         """z_E, float32 (size,), of what `observe` returned. Raises NetworkError: it is none."""
         return self._network.predict_one(observed)
 
-    def encode_demos(self, demos):
-        """As `SceneEncoder.encode_demos`, with a progress bar.
+    def _encode(self, scene):
+        return self.encode(self.observe(scene))
 
-        The result is kept in a file beside the network, `<encoder>.<task>.npz`, which is made anew
-        when the encoder or the scenes change; where it cannot be written, it is not.
+    def _encode_all(self, scenes, task):
+        """Latents are stored beside the network, in `<encoder>.<task>.npz`, where that is possible.
+
+        The file counts only for the same network and the same scenes.
         """
-        scenes = [demos.scenes[i] for i in range(len(demos))]
-        path = self.path.with_suffix(f".{demos.task}.npz")
+        path = self.path.with_suffix(f".{task}.npz")
         key = hashlib.sha256(self.path.read_bytes() + repr(scenes).encode()).hexdigest()
         latents = _read_latents(path, key)
         if latents is None:
-            bar = _progress(scenes, f"encoding {demos.task}")
-            latents = np.stack([self(scene) for scene in bar])
+            latents = super()._encode_all(scenes, task)
             file = io.BytesIO()
             np.savez(file, key=key, latents=latents)
             with contextlib.suppress(OSError):
                 write_atomically(path, file.getvalue())
-        self._of_demos |= zip(scenes, latents, strict=True)
         return latents
 
-    # --- The decoder: from the latent code back to geometry
-
-    @property
-    def geometry_source(self):
-        """Its own name if it has a decoder, otherwise `point_cloud`."""
-        return self.name if self.has_decoder else POINT_CLOUD
-
-    @property
-    def has_decoder(self):
-        """Whether distances to obstacles can be decoded from z_E."""
-        return self.path.with_suffix(DECODER).exists()
-
-    @functools.cached_property
-    def decoder(self):
-        """The network from z_E and points to distances from obstacles (m), beside the encoder's.
-
-        Raises NetworkError: there is none.
-        """
-        if not self.has_decoder:
-            raise NetworkError(f"{self.name} has no decoder: no distances can be decoded from z_E")
-        return load_network(self.path.with_suffix(DECODER))
+    # --- The decoder: from z_E back to geometry
 
     def distances(self, scene, points):
         """Decoded distances of points (n, 3), m, from the nearest obstacle: float32 (n,), m.
 
         Raises NetworkError: there is no decoder, or it cannot be used.
         """
+        if self.decoder is None:
+            raise _no_decoder(self.name)
         inputs = {"latent": self(scene), "points": np.float32(points)}
         inputs = {name: torch.from_numpy(array)[None] for name, array in inputs.items()}
         return self.decoder.predict_one(inputs, len(points))
@@ -284,25 +303,22 @@ class NetworkEncoder(SceneEncoder):
 
     def _decode_points(self, scene):
         coarse = 3 * DECODED_CELL
-        middles = _grid(coarse)
+        centres = _grid(coarse)
         # Only where a coarse cell may contain such points, all 27 of its cells are decoded.
-        near = self.distances(scene, middles) < DECODED_REACH + coarse * 3**0.5 / 2
-        around = DECODED_CELL * (np.stack(np.indices((3, 3, 3)), axis=-1).reshape(-1, 3) - 1)
-        points = (middles[near][:, None] + around.astype(np.float32)).reshape(-1, 3)
+        near = self.distances(scene, centres) < DECODED_REACH + coarse * 3**0.5 / 2
+        offsets = DECODED_CELL * (np.stack(np.indices((3, 3, 3)), axis=-1).reshape(-1, 3) - 1)
+        points = (centres[near][:, None] + offsets.astype(np.float32)).reshape(-1, 3)
         return points[self.distances(scene, points) < DECODED_REACH] if len(points) else points
-
-    def close(self):
-        """Close the simulated world it observes."""
-        self._world.close()
 
 
 def _progress(scenes, description):
+    """The different ones of some scenes, with a progress bar."""
     quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
-    return tqdm(scenes, description, unit="scene", mininterval=quiet)
+    return tqdm(dict.fromkeys(scenes), description, unit="scene", mininterval=quiet)
 
 
 def _read_latents(path, key):
-    """What `NetworkEncoder.encode_demos` kept; None if there is none, or damaged or out of date."""
+    """The latents in a file; None if there is none, or it is damaged or of another key."""
     try:
         with np.load(path) as file:
             return file["latents"] if file["key"] == key else None

@@ -1,13 +1,13 @@
 """Geometry sources: where collision checks and link distances take a scene's obstacles from.
 
-    source = find_geometry_source("point_cloud")
-    checker = source(scene)                      # a CollisionChecker of the observed points alone
+    geometry_source = find_geometry_source("point_cloud")
+    checker = geometry_source(scene)             # a CollisionChecker of the observed points alone
 
-- `ground_truth`: the obstacles themselves; what uses them is privileged;
-- `point_cloud`: the points that four sensors observe of them;
+- `ground_truth`: the obstacles themselves (privileged);
+- `point_cloud`: points that four sensors observe of them;
 - the name or path of an encoder with a decoder: points decoded from its latent code.
 
-Table and floor are known in all cases.
+Table and floor are known to all of them.
 """
 
 import functools
@@ -18,11 +18,11 @@ from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, POINT_RADIUS, 
 
 GROUND_TRUTH = "ground_truth"
 CACHED_CHECKERS = 64  # about 60 kB each
-DECODED_RADIUS = 0.0  # m, of decoded points
+DECODED_RADIUS = 0.0  # m, of the ball around a decoded point
 
 
 def find_geometry_source(name):
-    """A function from a `Scene` to the `CollisionChecker` of what this source has of it.
+    """A function from a `Scene` to a `CollisionChecker` of its obstacles as the source has them.
 
     Args:
         name: `ground_truth`, `point_cloud`, or the name or path of an encoder with a decoder.
@@ -30,18 +30,18 @@ def find_geometry_source(name):
     Raises:
         ValueError: it is none of these.
     """
+    name = str(name)
     if name == GROUND_TRUTH:
         return ground_truth_checker
     if name == POINT_CLOUD:
         return observed_checker
-    from roboarm_nmp.envs.perception import encoders  # here: PyTorch takes seconds to import
+    from roboarm_nmp.envs.perception.encoders import encoder_with_decoder  # PyTorch takes seconds
 
     try:
-        encoder = encoders.make_encoder(name)
-        encoder.decoder  # noqa: B018 (or it raises)
+        encoder = encoder_with_decoder(name)
     except ValueError as error:
         raise ValueError(
-            f"a geometry source is {GROUND_TRUTH!r}, {POINT_CLOUD!r} or an encoder with a decoder: "
+            f"a geometry source is {GROUND_TRUTH}, {POINT_CLOUD} or an encoder with a decoder: "
             f"{error}"
         ) from error
     return functools.partial(decoded_checker, encoder=encoder)
@@ -61,6 +61,6 @@ def observed_checker(scene):
 
 @functools.lru_cache(CACHED_CHECKERS)
 def decoded_checker(scene, encoder):
-    """A `CollisionChecker` of table, floor, and points that an encoder's decoder gives."""
+    """A `CollisionChecker` of table, floor, and points decoded from z_E of a `NetworkEncoder`."""
     points = encoder.decoded_points(scene)
     return CollisionChecker(replace(scene, obstacles=()), points, DECODED_RADIUS)

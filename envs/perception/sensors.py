@@ -1,10 +1,11 @@
-"""What can be seen of a scene: cameras and point clouds (paper, section 4).
+"""Sensors: cameras and point clouds (paper, section 4).
 
-A sensor is plain data: where it is, where it looks, what it puts out. A `SensorWorld` is where
-sensors look: the scene and the arm once more, in a physics engine of its own, so that looking never
-touches an episode, and the goal's marker is not seen. `envs.wrappers` puts the two together.
+A sensor is plain data: its place, its viewing direction, its outputs. It observes a `SensorWorld`,
+a second simulation of the scene and the arm. So observing never changes an episode, and the goal's
+marker is invisible. `envs.wrappers.SensorWrapper` adds sensors to an environment.
 """
 
+import functools
 import json
 import math
 from dataclasses import asdict, dataclass
@@ -22,12 +23,11 @@ ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
 CLASSES = ("robot", "table and floor", "obstacle", "nothing")
 ROBOT_COLOUR = (0.90, 0.45, 0.15, 1)
 OUTPUTS = ("rgb", "depth", "segmentation")
-LEAST_NEAR = 0.001  # m, of `near`; with far less, no number is left for the other distances
+MIN_NEAR = 0.001  # m, of `near`: far below it, depths have no resolution left
 # Cardinal directions as seen by the robot: x is forward, y left.
 CARDINAL = {"front": (1, 0), "left": (0, 1), "back": (-1, 0), "right": (0, -1)}
 DISTANCE, HEIGHT = 1.6, 0.8  # of the default sensors' places, m
-# Of the arm when a scene is looked at, rad: always the same, so that what is seen depends on the
-# scene alone.
+# Of the arm while a scene is encoded, rad: always the same, so that z_E depends on the scene alone.
 POSE = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
 
 
@@ -36,18 +36,18 @@ class Camera:
     """A pinhole camera.
 
     Attributes:
-        eye: where it is (x, y, z), m, in the frame of the robot's base.
-        target: the point in the middle of its picture.
-        up: the direction that points up in its picture.
-        field_of_view: angle from the picture's lower to its upper edge, degrees.
+        eye: its position (x, y, z), m, in the frame of the robot's base.
+        target: the point in the middle of its image.
+        up: the direction that points up in its image.
+        field_of_view: angle from the image's lower to its upper edge, degrees.
         size: (width, height) in pixels (paper: 224 by 224).
-        near, far: nearest and farthest distance seen, m, along the viewing direction.
-        outputs: some of `rgb`, uint8 (height, width, 3); `depth`, float32 (height, width), m along
-            the viewing direction, `far` where there is nothing; `segmentation`, uint8 (height,
-            width), the class of what is there: `ROBOT`, `STATIC`, `OBSTACLE` or `NOTHING`.
+        near, far: nearest and farthest visible distance, m, along the viewing direction.
+        outputs: one or more of `rgb`, uint8 (height, width, 3); `depth`, float32 (height, width), m
+            along the viewing direction, `far` where there is nothing; `segmentation`, uint8
+            (height, width), the class of each pixel: `ROBOT`, `STATIC`, `OBSTACLE` or `NOTHING`.
 
     Raises:
-        ValueError: for an attribute that makes no sense.
+        ValueError: an attribute is out of its range.
     """
 
     eye: tuple[float, float, float]
@@ -66,7 +66,9 @@ class Camera:
             and self.outputs
             and all(isinstance(one, str) and one in OUTPUTS for one in self.outputs)
         ):
-            raise ValueError(f"outputs must be some of {', '.join(OUTPUTS)}, got {self.outputs!r}")
+            raise ValueError(
+                f"outputs must be one or more of {', '.join(OUTPUTS)}, got {self.outputs!r}"
+            )
         if (
             len(self.size) != 2
             or not all(isinstance(edge, (int, np.integer)) for edge in self.size)
@@ -86,8 +88,8 @@ class Camera:
         return gym.spaces.Dict({name: spaces[name] for name in self.outputs})
 
     def observe(self, world):
-        """What it sees of a `SensorWorld`: a dict of the outputs."""
-        rgb, depth, segmentation = world.picture(self, self.size)
+        """Its observation of a `SensorWorld`: a dict of the outputs."""
+        rgb, depth, segmentation = world.render(self, self.size)
         everything = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
         return {name: everything[name] for name in self.outputs}
 
@@ -101,7 +103,7 @@ class PointCloud:
         num_samples: number of rays, a square number (paper: 10,000).
 
     Raises:
-        ValueError: for an attribute that makes no sense.
+        ValueError: an attribute is out of its range.
     """
 
     eye: tuple[float, float, float]
@@ -143,10 +145,10 @@ class PointCloud:
     def points(self, depth, segmentation):
         """An observation, from the camera's `depth` (m) and `segmentation`: a dict of
 
-        - `points`: float32 (num_samples, 3), m, in the frame of the robot's base: those that hit
+        - `points`: float32 (num_samples, 3), m, in the frame of the robot's base: where rays hit
           something, row by row of the grid from its upper left; then zeros;
-        - `labels`: uint8 (num_samples,): what they hit, `ROBOT`, `STATIC` or `OBSTACLE`; then
-          `NOTHING`.
+        - `labels`: uint8 (num_samples,): the class of each hit, `ROBOT`, `STATIC` or `OBSTACLE`;
+          then `NOTHING`.
         """
         hit = segmentation != NOTHING
         points = np.zeros((self.num_samples, 3), np.float32)
@@ -156,7 +158,7 @@ class PointCloud:
         return {"points": points, "labels": labels}
 
     def observe(self, world):
-        """What it sees of a `SensorWorld`: `points` and `labels`, see `points`."""
+        """Its observation of a `SensorWorld`: a dict of `points` and `labels`, see `points`."""
         return self.points(**self.camera.observe(world))
 
 
@@ -172,7 +174,7 @@ def cardinal(kind=Camera, **options):
 
 
 def deproject(sensor, depth):
-    """The points (height, width, 3), m, in the frame of the robot's base, of a picture of depths.
+    """The points (height, width, 3), m, in the frame of the robot's base, of a depth image.
 
     Args:
         sensor: a `Camera` or `PointCloud`.
@@ -189,7 +191,7 @@ def deproject(sensor, depth):
 
 
 def _axes(sensor):
-    """Unit vectors (right, up, forward) of a sensor's picture."""
+    """Unit vectors (right, up, forward) of a sensor's image."""
     forward = np.subtract(sensor.target, sensor.eye).astype(np.float64)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, sensor.up)
@@ -204,25 +206,25 @@ def _check_view(sensor):
             raise ValueError(
                 f"{name} must be three numbers, up to {MAX_LENGTH:.0f} m, got {vector!r}"
             )
-    looks = np.subtract(sensor.target, sensor.eye)
-    if np.linalg.norm(np.cross(looks, sensor.up)) < 1e-9:
+    forward = np.subtract(sensor.target, sensor.eye)
+    if np.linalg.norm(np.cross(forward, sensor.up)) < 1e-9:
         raise ValueError("a sensor cannot look along its own up direction, or from its target")
     for name in ("field_of_view", "near", "far"):
         if not is_number(getattr(sensor, name)):
             raise ValueError(f"{name} must be a number, got {getattr(sensor, name)!r}")
     if not 0 < sensor.field_of_view < 180:
         raise ValueError(f"field_of_view must be between 0 and 180, got {sensor.field_of_view!r}")
-    if not LEAST_NEAR <= sensor.near < sensor.far <= MAX_LENGTH:
+    if not MIN_NEAR <= sensor.near < sensor.far <= MAX_LENGTH:
         raise ValueError(
-            f"near and far must be {LEAST_NEAR} <= near < far <= {MAX_LENGTH:.0f} m, "
+            f"near and far must be {MIN_NEAR} <= near < far <= {MAX_LENGTH:.0f} m, "
             f"got {sensor.near!r}, {sensor.far!r}"
         )
 
 
 class SensorWorld(World):
-    """A scene with the arm in it, to be looked at.
+    """A scene with the arm in it, for sensors.
 
-    The arm looks like its collision meshes. Spheres and cylinders are drawn as polyhedra, up to a
+    The arm is drawn as its collision meshes. Spheres and cylinders are drawn as polyhedra, up to a
     tenth of their radius off the true surface.
     """
 
@@ -234,8 +236,8 @@ class SensorWorld(World):
         self.set_scene(scene)
         panda.set_configuration(self.client, self.robot, configuration)
 
-    def picture(self, sensor, size):
-        """What is seen from a sensor's place, with `size` (width, height) in pixels.
+    def render(self, sensor, size):
+        """Images from a sensor's place, with `size` (width, height) in pixels.
 
         Returns:
             `rgb`, `depth` and `segmentation`, as `Camera` describes them.
@@ -265,6 +267,26 @@ class SensorWorld(World):
         return rgb, depth.astype(np.float32), segmentation
 
 
+@functools.cache
+def _shared_world():
+    return SensorWorld()
+
+
+def observe_scene(scene, sensors):
+    """Observations of a `Scene` with the arm in `POSE`.
+
+    Args:
+        scene: a `Scene`.
+        sensors: dict of name -> sensor.
+
+    Returns:
+        Dict of name -> the sensor's observation, a dict.
+    """
+    world = _shared_world()
+    world.show(scene, POSE)
+    return {name: sensor.observe(world) for name, sensor in sensors.items()}
+
+
 _KINDS = {"camera": Camera, "point_cloud": PointCloud}
 
 
@@ -277,10 +299,13 @@ def sensors_to_json(sensors):
 
 
 def sensors_from_json(text):
-    """The inverse of `sensors_to_json`."""
+    """The inverse of `sensors_to_json`. Raises ValueError: it is no text of that function."""
     sensors = {}
-    for name, fields in json.loads(text).items():
-        kind = _KINDS[fields.pop("kind")]
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
-        sensors[name] = kind(**values)
+    try:
+        for name, fields in json.loads(text).items():
+            kind = _KINDS[fields.pop("kind")]
+            values = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+            sensors[name] = kind(**values)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"not sensors: {error!r}") from error
     return sensors
