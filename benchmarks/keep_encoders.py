@@ -1,14 +1,14 @@
-"""Put trained scene encoders into the repository: network, how it was made, and a picture.
+"""Add trained scene encoders to the pretrained ones: network, JSON, and a figure.
 
     pip install -c constraints.txt -e ".[bench]"
     python benchmarks/keep_encoders.py runs/RUN ...    # of vae.py, vqvae.py, pointnet2.py, field.py
 
-Of each finished run, `encoder.pt` becomes `scene_embedding_train/encoders/<exp_name>.pt`, which is
-what `--encoder <exp_name>` finds, and its decoder, if there is one, `<exp_name>.decoder.pt`; with
-`--halve` in half precision, after which policies that use it have to be evaluated again. The JSON
-beside it has data, updates, figures on validation scenes and flags;
-`docs/figures/encoder_<exp_name>.png` is TensorBoard's picture of a validation scene at the update
-whose encoder was kept.
+Of each finished run, `encoder.pt` becomes `envs/perception/pretrained/<exp_name>.pt`, which
+`--encoder <exp_name>` finds, and its decoder, if there is one, `<exp_name>.decoder.pt`. With
+`--float16` they are in half precision; then policies that use the encoder have to be evaluated
+again. The JSON beside it has data, updates, scores on validation scenes and flags;
+`docs/figures/encoder_<exp_name>.png` is TensorBoard's image of a validation scene at the update of
+the encoder.
 """
 
 import argparse
@@ -32,12 +32,12 @@ from roboarm_nmp.envs.utils.files import write_atomically
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from paper_tables import FIGURES, commit
 
-ENLARGED = 2  # each pixel of TensorBoard's picture, in width and height
+ENLARGED = 2  # each pixel of TensorBoard's image, in width and height
 PATHS = ("runs_dir", "resume", "observations")  # flags that say nothing about the encoder
 
 
-def picture(run, step):
-    """What TensorBoard has of a run at one evaluation, a PIL image."""
+def validation_image(run, step):
+    """TensorBoard's image of a run at one evaluation, a PIL image."""
     events = EventAccumulator(str(run), size_guidance={"images": 0}).Reload()
     (tag,) = events.Tags()["images"]
     shown = next(event for event in events.Images(tag) if event.step == step)
@@ -45,8 +45,8 @@ def picture(run, step):
     return image.resize((image.width * ENLARGED, image.height * ENLARGED), Image.NEAREST)
 
 
-def keep(run, encoders, pictures, halve=False):
-    """Copy one run's encoder, write its JSON and its picture; the JSON's dict is returned."""
+def keep(run, encoders, figures, float16=False):
+    """Copy one run's encoder, write its JSON and its figure; returns the JSON's dict."""
     trained = json.loads((run / "result.json").read_text())
     name = trained["args"]["exp_name"]
     result = {key: value for key, value in trained.items() if key not in ("args", "encoder")}
@@ -57,10 +57,11 @@ def keep(run, encoders, pictures, halve=False):
     encoders.mkdir(parents=True, exist_ok=True)
     for ending in (".pt", DECODER):
         if (run / f"encoder{ending}").exists():
-            copy = to_float16 if halve else shutil.copyfile
+            copy = to_float16 if float16 else shutil.copyfile
             copy(run / f"encoder{ending}", encoders / f"{name}{ending}")
     write_atomically(encoders / f"{name}.json", (json.dumps(result, indent=1) + "\n").encode())
-    picture(run, trained["best_update"]).save(pictures / f"encoder_{name}.png", optimize=True)
+    image = validation_image(run, trained["best_update"])
+    image.save(figures / f"encoder_{name}.png", optimize=True)
     return result
 
 
@@ -68,14 +69,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a finished run's folder")
     parser.add_argument("--encoders", type=Path, default=PRETRAINED, help="where networks go")
-    parser.add_argument("--pictures", type=Path, default=FIGURES, help="where pictures go")
-    parser.add_argument("--halve", action="store_true", help="in half precision")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="where figures go")
+    parser.add_argument("--float16", action="store_true", help="in half precision")
     args = parser.parse_args()
     for run in args.runs:
         if not (run / "result.json").exists():
             parser.error(f"{run} is no finished run (it has no result.json)")
     for run in args.runs:
-        result = keep(run, args.encoders, args.pictures, args.halve)
+        result = keep(run, args.encoders, args.figures, args.float16)
         print(f"{run}:", {key: value for key, value in result.items() if key != "args"})
 
 

@@ -16,9 +16,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Files that take a minute and more. They begin first, so that no process is left alone with one.
 LONG = (
-    *("test_trainers", "test_encoder_policies", "test_encoders", "test_devices", "test_td3_her_mp"),
-    *("test_dagger", "test_bc", "test_collect", "test_own_algorithm", "test_evaluate"),
-    *("test_paper_tables", "test_own_scene", "test_sac_her_mp", "test_learning"),
+    *("test_trainers", "test_encoder_policies", "test_encoder_trainers", "test_devices"),
+    *("test_td3_her_mp", "test_dagger", "test_bc", "test_collect", "test_own_algorithm"),
+    *("test_evaluate", "test_paper_tables", "test_own_scene", "test_sac_her_mp", "test_learning"),
 )
 
 
@@ -41,6 +41,25 @@ def another_device(request):
     is_meta = request.param == "meta"
     with meta_device.in_cudas_place() if is_meta else contextlib.nullcontext():
         yield request.param
+
+
+@pytest.fixture(params=["float64", "meta", GPU])
+def torch_default(request):
+    """A context in which PyTorch has another default dtype, or another default device."""
+
+    @contextlib.contextmanager
+    def context():
+        if request.param == "float64":
+            torch.set_default_dtype(torch.float64)
+        else:
+            torch.set_default_device(request.param)
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(torch.float32)
+            torch.set_default_device(None)
+
+    return context
 
 
 @pytest.fixture

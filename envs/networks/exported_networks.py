@@ -299,6 +299,9 @@ class ExportedNetwork:
 def _float32_by_default():
     """Inside, PyTorch's default dtype is float32, as where networks were exported."""
     before = torch.get_default_dtype()
+    if before == torch.float32:
+        yield
+        return
     torch.set_default_dtype(torch.float32)
     try:
         yield

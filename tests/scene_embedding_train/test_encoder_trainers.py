@@ -1,0 +1,210 @@
+"""Runs of the encoders' trainers on a few scenes: files, resume, devices, errors."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from encoder_trainers import FOLDER, OF_CLOUDS, SCRIPTS, command
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainers import GPU, run_here
+
+from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.perception.encoders import make_encoder
+from roboarm_nmp.envs.perception.sensors import PointCloud
+from roboarm_nmp.scene_embedding_train import clouds, pictures
+
+
+@pytest.fixture(scope="module", params=SCRIPTS)
+def run(request, observations, tmp_path_factory):
+    """(name, folder) of a finished run."""
+    folder = tmp_path_factory.mktemp(request.param)
+    run_here(*command(request.param, observations, folder)[1:])
+    return request.param, next(folder.iterdir())
+
+
+def shared_blocks(name):
+    blocks, block = {}, None
+    for line in (FOLDER / f"{name}.py").read_text().splitlines():
+        if line.strip().startswith("# SHARED: "):
+            assert block is None
+            block = blocks.setdefault(line.strip(), [])
+        elif line.strip() == "# END SHARED":
+            block = None
+        elif block is not None:
+            block.append(line)
+    return blocks
+
+
+def test_shared_blocks_have_not_drifted_apart():
+    blocks = shared_blocks("vae")
+    assert shared_blocks("vqvae") == blocks and len(blocks) == 8
+    of_clouds = shared_blocks("pointnet2")
+    assert len(of_clouds) == 4 and all(blocks[name] == of_clouds[name] for name in of_clouds)
+    of_field = shared_blocks("field")
+    assert of_field.keys() - of_clouds.keys() == {"# SHARED: networks for pictures"}
+    assert len(of_field) == 5 and all(blocks[name] == of_field[name] for name in of_field)
+
+
+def test_run_writes_an_encoder_a_result_and_events(run):
+    name, folder = run
+    result = json.loads((folder / "result.json").read_text())
+    assert result["updates"] == 8 and result["scenes"] == 14
+    assert result["best_update"] in (4, 8)
+    events = EventAccumulator(str(folder), size_guidance={"images": 0}).Reload()
+    scalars = set(events.Tags()["scalars"])
+    (tag,) = events.Tags()["images"]
+    image = events.Images(tag)[0]
+    if name == "pointnet2":
+        scores = {"accuracy", "iou_robot", "iou_static", "iou_obstacle", "absent"}
+        assert (image.width, image.height) == (2 * 160, 160)
+    elif name == "field":
+        scores = {"error_near", "error_5cm", "error_10cm", "error_20cm", "error_40cm"}
+        assert (image.width, image.height) == (3 * 96, 2 * 96)
+    else:
+        scores = {"error", "error_foreground", "mean_image_error", "mean_image_error_foreground"}
+        assert (image.width, image.height) == (4 * 16, 2 * 16)
+    assert {f"eval/{name}" for name in scores} <= scalars
+    assert all(0 <= result[name] <= 1 for name in scores)
+    assert [event.step for event in events.Scalars(f"eval/{min(scores)}")] == [4, 8]
+
+
+def test_keep_encoders_copies_network_scores_and_figure(run, tmp_path):
+    name, folder = run
+    script = FOLDER.parent / "benchmarks" / "keep_encoders.py"
+    where = ["--encoders", str(tmp_path), "--figures", str(tmp_path)]
+    command = [sys.executable, str(script), str(folder), *where]
+    command += ["--float16"] if name == "field" else []
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    if name == "field":
+        for ending in ("", ".decoder"):
+            kept, whole = tmp_path / f"{name}{ending}.pt", folder / f"encoder{ending}.pt"
+            assert kept.stat().st_size < whole.stat().st_size
+            assert load_network(kept).metadata == load_network(whole).metadata
+    else:
+        kept = (tmp_path / f"{name}.pt").read_bytes()
+        assert kept == (folder / "encoder.pt").read_bytes()
+    assert Image.open(tmp_path / f"encoder_{name}.png").height > 0
+    text = (tmp_path / f"{name}.json").read_text()
+    result = json.loads(text)
+    assert result["scenes"] == 14 and result["args"]["seed"] == 1 and str(folder.parent) not in text
+    assert "roboarm_nmp.scene_embedding_train.collect" in result["observations"]
+    unfinished = subprocess.run([*command[:2], str(tmp_path)], capture_output=True, text=True)
+    assert unfinished.returncode != 0 and "no finished run" in unfinished.stderr
+
+
+def test_saved_encoder_runs_without_its_script(run, observations):
+    name, folder = run
+    encoder = load_network(folder / "encoder.pt")
+    assert encoder.metadata["kind"] == "encoder"
+    encode = make_encoder(folder / "encoder.pt")
+    read = Observations(observations)
+    if name in OF_CLOUDS:
+        inputs = {}
+        for sensor in read.sensors:
+            if isinstance(read.sensors[sensor], PointCloud):
+                shards = [clouds.whole_clouds(read, shard, sensor) for shard in range(3)]
+                points, labels = (torch.cat(one) for one in zip(*shards, strict=True))
+                inputs |= {f"{sensor}_points": points, f"{sensor}_labels": labels}
+    else:
+        images, cameras = pictures.load_images(read, 32)
+        inputs = {one: torch.from_numpy(images[:, i].copy()) for i, one in enumerate(cameras)}
+    together = encoder(**inputs)
+    assert together.shape == (20, 64) and together.dtype == torch.float32
+    alone = [encoder(**{key: value[i : i + 1] for key, value in inputs.items()}) for i in range(20)]
+    torch.testing.assert_close(torch.cat(alone), together, rtol=1e-4, atol=1e-5)
+    assert together.std(0).max() > 0
+    scenes = read.scenes(0)
+    assert encode.size == 64 and (encode(scenes[0]) != encode(scenes[1])).any()
+
+
+def test_field_trains_on_images(observations, tmp_path):
+    flags = ["--sees", "images", "--picture-size", "16", "--latent-size", "16"]
+    run_here(*command("field", observations, tmp_path, *flags)[1:])
+    (folder,) = tmp_path.iterdir()
+    encoder = make_encoder(folder / "encoder.pt")
+    assert set(encoder.sensors) == {"front", "left", "back", "right"} and encoder.size == 16
+    scene = Observations(observations).scenes(0)[0]
+    assert encoder.distances(scene, np.random.rand(7, 3)).shape == (7,)
+    with pytest.raises(SystemExit, match="--latent-size must be a multiple of 8, got 12"):
+        run_here(*command("field", observations, tmp_path, "--latent-size", "12")[1:])
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+def test_killed_and_resumed_is_bit_identical_to_uninterrupted(run, observations, tmp_path, device):
+    name, finished = run
+    if device != "cpu":
+        whole = tmp_path / "whole"
+        run_here(*command(name, observations, whole, "--device", device)[1:])
+        (finished,) = whole.iterdir()
+    if name == "field":  # also for a resume on another machine
+        assert isinstance(json.loads((finished / "args.json").read_text())["bf16"], bool)
+    killed = tmp_path / "killed"
+    process = subprocess.Popen(
+        command(name, observations, killed, "--device", device),
+        start_new_session=True,
+        stderr=subprocess.DEVNULL,
+    )
+    until = time.time() + 120
+    while not list(killed.glob("*/checkpoint.pt")):
+        assert time.time() < until
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    folder = next(killed.iterdir())
+    assert not (folder / "result.json").exists()
+    resume = [sys.executable, str(FOLDER / f"{name}.py"), "--resume", str(folder)]
+    done = subprocess.run(resume, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    one, other = (
+        torch.load(path / "checkpoint.pt", weights_only=True)["model"]
+        for path in (folder, finished)
+    )
+    for key in one:
+        assert torch.equal(one[key], other[key]), key
+    refused = subprocess.run([*resume, "--width", "8"], capture_output=True, text=True)
+    assert refused.returncode == 1 and "--width is 8 now, the run had 4" in refused.stderr
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_update_evaluation_and_resume_run_on_another_device(
+    name, observations, tmp_path, another_device
+):
+    """One update, one evaluation and one resume on another device."""
+    _, script, *flags = command(name, observations, tmp_path, "--device", another_device)
+    flags += ["--total-updates", "1", "--eval-every", "1"]
+    flags += ["--restart-every", "1"] if name == "vqvae" else []
+    if name == "field" and another_device == "meta":  # which autocast does not know
+        flags += ["--bf16", "False"]
+    run_here(script, *flags)
+    (folder,) = tmp_path.iterdir()
+    assert load_network(folder / "encoder.pt").metadata["step"] == 1
+    args = json.loads((folder / "args.json").read_text())
+    (folder / "args.json").write_text(json.dumps(args | {"total_updates": 2}))
+    run_here(script, "--resume", str(folder))
+    assert json.loads((folder / "result.json").read_text())["updates"] == 2
+    weights = torch.load(folder / "checkpoint.pt", weights_only=True)["model"].values()
+    assert {tensor.device.type for tensor in weights} == {another_device}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_diverged_run_ends_with_an_error(name, observations, tmp_path):
+    flags = ("--learning-rate", "1e30", "--total-updates", "3", "--eval-every", "3")
+    with pytest.raises(FloatingPointError, match="are no longer finite"):
+        run_here(*command(name, observations, tmp_path, *flags)[1:])
+    assert not list(tmp_path.glob("*/encoder*.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_folder_without_observations_is_rejected(name, tmp_path):
+    done = subprocess.run(command(name, tmp_path, tmp_path), capture_output=True, text=True)
+    assert done.returncode == 1 and "no observations" in done.stderr
+    assert "Traceback" not in done.stderr

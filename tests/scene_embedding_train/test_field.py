@@ -1,0 +1,162 @@
+"""The trainer of the field: distances, symmetries, one update by hand, and a tiny overfit."""
+
+import copy
+
+import numpy as np
+import pybullet as p
+import pytest
+import torch
+from encoder_trainers import OBSTACLES, check_learning, check_step, load, obstacle_rows, one_update
+from one_type import OneType
+
+from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES
+from roboarm_nmp.scene_embedding_train import clouds
+from roboarm_nmp.scene_embedding_train.training_data import load_obstacles
+
+field = load("field")
+
+
+def test_distances_equal_those_of_pybullet():
+    client = p.connect(p.DIRECT)
+    tip = p.createCollisionShape(p.GEOM_SPHERE, radius=1e-4, physicsClientId=client)
+    tip = p.createMultiBody(0, tip, physicsClientId=client)
+    box, cylinder, sphere = OBSTACLES
+    half = [edge / 2 for edge in box.size]
+    size = {"radius": cylinder.radius, "height": cylinder.length}
+    shapes = [
+        p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client),
+        p.createCollisionShape(p.GEOM_CYLINDER, **size, physicsClientId=client),
+        p.createCollisionShape(p.GEOM_SPHERE, radius=sphere.radius, physicsClientId=client),
+    ]
+    turns = [box.orientation, cylinder.orientation, (0.0, 0.0, 0.0, 1.0)]
+    bodies = [
+        p.createMultiBody(0, shape, -1, obstacle.position, turn, physicsClientId=client)
+        for obstacle, shape, turn in zip(OBSTACLES, shapes, turns, strict=True)
+    ]
+    points = np.random.default_rng(0).uniform([-0.6, -0.6, 0.0], [0.6, 0.6, 1.0], (2_000, 3))
+    expected = []
+    for point in points:
+        p.resetBasePositionAndOrientation(tip, point, (0, 0, 0, 1), physicsClientId=client)
+        found = (p.getClosestPoints(tip, body, 0.5, physicsClientId=client) for body in bodies)
+        expected.append(min((one[8] + 1e-4 for pairs in found for one in pairs), default=0.5))
+    p.disconnect(client)
+    points = torch.tensor(points[None], dtype=torch.float32)
+    found = field.distances(obstacle_rows(), points)[0].numpy()
+    assert (found < 0.0).sum() > 20 and (found == field.FARTHEST).sum() > 20
+    # (Bullet's boxes and cylinders have rounded edges, and its depths are those of GJK and EPA.)
+    np.testing.assert_allclose(found, np.clip(expected, -0.05, 0.4), atol=1.5e-3)
+
+
+def test_queries_are_uniform_and_around_all_obstacles_equally():
+    torch.manual_seed(0)
+    rows = torch.zeros(2, MAX_OBSTACLES, 12)
+    rows[0] = obstacle_rows()[0]
+    queries = field.queries(rows, 6_000, 1e-3)  # (the second scene is empty)
+    assert queries.shape == (2, 6_000, 3) and queries.isfinite().all()
+    anywhere = queries[:, 3_000:]
+    low, high = torch.tensor([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.5]])
+    assert ((anywhere >= low) & (anywhere <= high)).all()
+    assert (anywhere.mean((0, 1)) - (low + high) / 2).abs().max() < 0.05
+    alone = [rows[:1, i : i + 1] for i in range(3)]
+    near = torch.stack([field.distances(one, queries[:1, :3_000]) for one in alone])
+    # That much of the box around the cylinder, or around half of the sphere, is inside of them.
+    shares = (near < 0.003).float().mean((1, 2)) * 3
+    np.testing.assert_allclose(shares, [1.0, np.pi / 4, np.pi / 4 * 11 / 12], atol=0.06)
+
+
+def test_augmented_scenes_have_the_same_distances():
+    torch.manual_seed(0)
+    places, others = torch.randn(5, 7, 3), torch.randn(5, 9, 3)
+    turned, turned_others = field.augment(places, others)
+    torch.testing.assert_close(torch.cdist(turned, turned_others), torch.cdist(places, others))
+    torch.testing.assert_close(turned[..., 2], places[..., 2])
+    assert (turned - places).abs().amax((1, 2)).min() > 0.01
+    edges = turned[:, 1:4, :2] - turned[:, :1, :2]
+    before = places[:, 1:4, :2] - places[:, :1, :2]
+    signs = torch.linalg.det(edges[:, :2]) / torch.linalg.det(before[:, :2])
+    assert set(signs.round().tolist()) == {-1.0, 1.0}  # some are mirrored
+
+
+def test_hat_weights_interpolate_between_cells_around_the_axis():
+    """A point belongs to the cells whose centres it is between, all around the circle."""
+    angle = torch.tensor([0.0, 1.0, 3.14, -3.14, -2.0])
+    points = torch.stack([0.4 * angle.cos(), 0.4 * angle.sin(), torch.full((5,), 0.3)], dim=1)
+    angles, radii, heights = field.cylindrical(points)
+    for cells in (angles, radii, heights):
+        torch.testing.assert_close(cells.sum(1), torch.ones(5))
+    centres = (np.arange(field.ANGLES) + 0.5) / field.ANGLES * 2 * np.pi - np.pi
+    found = (angles.numpy() * np.exp(1j * centres)).sum(1)
+    np.testing.assert_allclose(np.angle(found * np.exp(-1j * angle.numpy())), 0.0, atol=1e-3)
+    radius = (radii @ ((torch.arange(field.RADII) + 0.5) / field.RADII * field.REACH)).numpy()
+    np.testing.assert_allclose(radius, 0.4, atol=1e-6)
+
+
+def test_rotation_by_a_sector_rolls_the_latent_code():
+    torch.manual_seed(0)
+    args = field.Args(width=8, latent_size=16)
+    model, eighth = field.Field(4, args).eval(), 2 * np.pi / field.SECTORS
+    points, there = torch.rand(3, 20, 3) - 0.5, torch.rand(3, 20) < 0.8
+    c, s = np.cos(eighth), np.sin(eighth)
+    turn = torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32)
+    z, turned = model.encode(points, there), model.encode(points @ turn, there)
+    expected = z.unflatten(1, (field.SECTORS, -1)).roll(1, 1).flatten(1)
+    torch.testing.assert_close(turned, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        model.decoder(turned, points @ turn), model.decoder(z, points), rtol=1e-4, atol=1e-5
+    )
+    nowhere = model.encode(points + ~there.unsqueeze(2) * 0.3, there)
+    torch.testing.assert_close(nowhere, z)  # absent points change nothing
+
+
+def test_one_update_follows_the_losses_written_out():
+    torch.manual_seed(0)
+    args = field.Args(width=8, learning_rate=0.01, num_queries=30, latent_noise=0.1)
+    model = field.Field(4, args)
+    before, obstacles = copy.deepcopy(model), obstacle_rows().expand(3, -1, -1)
+    points, there = torch.rand(3, 20, 3) - 0.5, torch.rand(3, 20) < 0.8
+    torch.manual_seed(1)
+    losses = one_update(field, model, (points, there), args, obstacles)
+    torch.manual_seed(1)
+    queries = field.queries(obstacles, 30, args.spread)
+    truth = field.distances(obstacles, queries)
+    turned, turned_queries = field.augment(points, queries)
+    z = before.encode(turned, there)
+    errors = (before.decoder(z + 0.1 * torch.randn_like(z), turned_queries) - truth).abs()
+    total = weight = near = count = 0.0
+    for error, distance in zip(errors.flatten(), truth.flatten().tolist(), strict=True):
+        is_near = distance < 0.1
+        total, weight = (
+            total + (5.0 if is_near else 1.0) * error,
+            weight + (5.0 if is_near else 1.0),
+        )
+        near, count = near + is_near * error, count + is_near
+    torch.testing.assert_close(losses["loss"], total / weight)
+    torch.testing.assert_close(losses["near"], near / count)
+    check_step(model, before, total / weight, args.learning_rate)
+
+
+def test_field_overfits_a_few_scenes(observations):
+    torch.manual_seed(0)
+    read, rows = Observations(observations), np.arange(20)
+    args = field.Args(width=64, num_points=32)
+    model = field.Field(4, args)
+    data = [*clouds.load_obstacle_points(read, 32)[1:], load_obstacles(read)]
+    *batch, obstacles = field.batch_of(data, rows, args, "cpu")
+    queries = field.queries(obstacles, 400, 0.05)
+
+    def error():
+        return field.evaluate(model, data, queries, rows, args, "cpu")["error_20cm"]
+
+    check_learning(field, model, batch, (obstacles,), args, error, updates=300)
+
+
+@pytest.mark.parametrize("sees", ["clouds", "images"])
+def test_no_kernel_receives_two_floating_point_types(sees):
+    args = field.Args(width=8, sees=sees, picture_size=16, num_queries=12, bf16=True)
+    model = field.Field(4, args)
+    points = torch.rand(3, 20, 3) - 0.5, torch.rand(3, 20) < 0.8
+    observed = points if sees == "clouds" else (torch.rand(3, 4, 3, 16, 16),)
+    with OneType():
+        losses = one_update(field, model, observed, args, obstacle_rows().expand(3, -1, -1))
+    assert losses["loss"].isfinite()

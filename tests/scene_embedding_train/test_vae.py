@@ -1,0 +1,75 @@
+"""The trainer of the VAE: its mathematics, one update by hand, and a tiny overfit."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from encoder_trainers import check_learning, check_step, load, one_update
+
+from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.scene_embedding_train import pictures
+
+vae = load("vae")
+
+
+def test_kl_divergence_is_that_of_torch_distributions():
+    mean, log_variance = torch.randn(5, 7), torch.randn(5, 7)
+    normal = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
+    expected = torch.distributions.kl_divergence(normal, torch.distributions.Normal(0.0, 1.0))
+    torch.testing.assert_close(vae.kl_divergence(mean, log_variance), expected)
+
+
+def test_one_update_follows_the_losses_written_out():
+    torch.manual_seed(0)
+    args = vae.Args(width=4, kl_weight=0.7, foreground_weight=3.0, learning_rate=0.01)
+    model, mean_image = vae.VAE(2, 16, args), torch.full((2, 3, 16, 16), 0.5)
+    images = 0.35 + 0.3 * torch.rand(5, 2, 3, 16, 16)  # some within 0.1 of the mean image
+    before = copy.deepcopy(model)
+    torch.manual_seed(1)
+    losses = one_update(vae, model, images, args, mean_image)
+    torch.manual_seed(1)
+    mean, log_variance = before.encode(images)
+    normal = torch.distributions.Normal(mean, (log_variance / 2).exp())
+    decoded = before.decode(mean + normal.stddev * torch.randn(5, 32))
+    far = ((images - 0.5).abs() > 0.1).any(2, keepdim=True).expand_as(images)
+    assert 0.1 < far.float().mean() < 0.99
+    errors = (decoded - images) ** 2
+    error = (errors.sum() + 3.0 * errors[far].sum()) / (far.numel() + 3.0 * far.sum())
+    standard = torch.distributions.Normal(0.0, 1.0)
+    kl = torch.distributions.kl_divergence(normal, standard).mean()
+    torch.testing.assert_close(losses["reconstruction"], error)
+    torch.testing.assert_close(losses["kl"], kl)
+    torch.testing.assert_close(losses["loss"], error + 0.7 * kl)
+    check_step(model, before, error + 0.7 * kl, args.learning_rate)
+
+
+def test_vae_overfits_a_few_scenes(observations):
+    rows, args = np.arange(20), vae.Args(width=8)
+    model, (data, _) = vae.VAE(4, 16, args), pictures.load_images(Observations(observations), 16)
+    mean_image = pictures.mean_picture(data, 20, "cpu")
+
+    def error():
+        measured = (model, data, rows, mean_image, 20, "cpu")
+        return pictures.reconstruction_errors(*measured)["error_foreground"]
+
+    check_learning(vae, model, pictures.batch_of(data, rows, "cpu"), (mean_image,), args, error)
+
+
+@pytest.mark.parametrize(("size", "halvings"), [(224, 5), (64, 4), (112, 4), (16, 2), (8, 1)])
+def test_networks_fit_images_of_any_allowed_size(size, halvings):
+    assert vae.num_halvings(size) == halvings
+    args = vae.Args(width=2)
+    model = vae.VAE(4, size, args)
+    images = torch.rand(3, 4, 3, size, size)
+    assert model(images).shape == images.shape
+    assert model.encode(images)[0].shape == (3, 64)
+
+
+def test_each_decoder_depends_on_all_cameras():
+    images = torch.rand(1, 4, 3, 16, 16)
+    changed = images.clone()
+    changed[:, 2] = torch.rand(3, 16, 16)
+    torch.manual_seed(0)
+    model = vae.VAE(4, 16, vae.Args(width=4))
+    assert (model(images) != model(changed)).flatten(2).any(2)[0].tolist() == [True] * 4

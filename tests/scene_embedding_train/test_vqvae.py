@@ -1,0 +1,97 @@
+"""The trainer of the VQ-VAE: its mathematics, one update by hand, and a tiny overfit."""
+
+import copy
+
+import numpy as np
+import torch
+from encoder_trainers import check_learning, check_step, load, one_update
+
+from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.scene_embedding_train import pictures
+
+vqvae = load("vqvae")
+
+
+def test_quantisation_selects_the_nearest_code():
+    codebook = vqvae.Codebook(vqvae.Args(num_codes=20, code_size=3))
+    vectors = torch.randn(4, 5, 3)
+    quantised, numbers = codebook(vectors)
+    for vector, code, number in zip(
+        vectors.flatten(0, 1), quantised.flatten(0, 1), numbers, strict=True
+    ):
+        distances = [float((vector - one).square().sum()) for one in codebook.codes]
+        assert number == np.argmin(distances)
+        torch.testing.assert_close(code, codebook.codes[number])
+
+
+def test_gradient_passes_straight_through_quantisation():
+    latent = torch.randn(6, 3, requires_grad=True)
+    quantised = torch.randn(6, 3, requires_grad=True)
+    out = vqvae.straight_through(latent, quantised)
+    torch.testing.assert_close(out, quantised)
+    weights = torch.randn(6, 3)
+    (out * weights).sum().backward()
+    torch.testing.assert_close(latent.grad, weights)
+    assert quantised.grad is None or not quantised.grad.any()
+
+
+def test_unused_codes_restart_as_encoded_vectors():
+    codebook = vqvae.Codebook(vqvae.Args(num_codes=6, code_size=2))
+    before, vectors = codebook.codes.detach().clone(), torch.randn(50, 2)
+    codebook.uses += torch.tensor([1.0, 0, 2, 0, 0, 5])
+    codebook.restart(vectors)
+    for number in (0, 2, 5):
+        torch.testing.assert_close(codebook.codes[number], before[number])
+    for number in (1, 3, 4):
+        assert (codebook.codes[number] == vectors).all(1).any()
+    assert not codebook.uses.any()
+
+
+def test_one_update_follows_the_losses_written_out():
+    torch.manual_seed(0)
+    options = {"width": 4, "num_codes": 8, "commitment": 0.6, "foreground_weight": 0.0}
+    args = vqvae.Args(**options, learning_rate=0.01)
+    model, images = vqvae.VQVAE(2, 16, args), torch.rand(5, 2, 3, 16, 16)
+    before = copy.deepcopy(model)
+    losses, latents = one_update(vqvae, model, images, args, torch.zeros(2, 3, 16, 16))
+    error = codes = commitment = 0.0
+    for i in range(2):
+        z, book = before.encoders[i](images[:, i]), before.codebooks[i].codes
+        nearest = (z.unsqueeze(2) - book).square().sum(3).argmin(2)
+        torch.testing.assert_close(latents[i], z.detach())
+        assert model.codebooks[i].uses.tolist() == [(nearest == k).sum() for k in range(8)]
+        quantised = book[nearest]
+        # The value of the codes; the gradient goes to z only.
+        through = quantised.detach() + z - z.detach()
+        decoded = before.decoders[i](through.flatten(1))
+        error = error + (decoded - images[:, i]).square().mean() / 2
+        codes = codes + (quantised - z.detach()).square().mean() / 2
+        commitment = commitment + (quantised.detach() - z).square().mean()
+    loss = error + codes + 0.6 * commitment / 2
+    torch.testing.assert_close(losses["reconstruction"], error)
+    torch.testing.assert_close(losses["commitment"], commitment)
+    torch.testing.assert_close(losses["loss"], loss)
+    check_step(model, before, loss, args.learning_rate)
+
+
+def test_vqvae_overfits_a_few_scenes(observations):
+    rows, args = np.arange(20), vqvae.Args(width=8)
+    read = Observations(observations)
+    model, (data, _) = vqvae.VQVAE(4, 16, args), pictures.load_images(read, 16)
+    mean_image = pictures.mean_picture(data, 20, "cpu")
+
+    def error():
+        measured = (model, data, rows, mean_image, 20, "cpu")
+        return pictures.reconstruction_errors(*measured)["error_foreground"]
+
+    check_learning(vqvae, model, pictures.batch_of(data, rows, "cpu"), (mean_image,), args, error)
+
+
+def test_each_decoder_depends_on_its_own_camera_only():
+    images = torch.rand(1, 4, 3, 16, 16)
+    changed = images.clone()
+    changed[:, 2] = torch.rand(3, 16, 16)
+    torch.manual_seed(0)
+    model = vqvae.VQVAE(4, 16, vqvae.Args(width=4))
+    different = (model(images) != model(changed)).flatten(2).any(2)[0].tolist()
+    assert different == [False, False, True, False]
