@@ -41,7 +41,7 @@ def find_geometry_source(name):
         encoder = encoder_with_decoder(name)
     except ValueError as error:
         raise ValueError(
-            f"a geometry source is {GROUND_TRUTH}, {POINT_CLOUD} or an encoder with a decoder: "
+            f"a geometry source is {GROUND_TRUTH!r}, {POINT_CLOUD!r} or an encoder with a decoder: "
             f"{error}"
         ) from error
     return functools.partial(decoded_checker, encoder=encoder)

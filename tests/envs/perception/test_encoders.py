@@ -310,7 +310,7 @@ def test_folder_is_rejected_as_encoder(tmp_path):
 
 @pytest.mark.parametrize("number", [0, 10_000, -1, 2.0, True, "8"])
 def test_number_of_points_out_of_range_is_rejected(number):
-    with pytest.raises(ValueError, match="num_points must be an integer from 1 to 9,999"):
+    with pytest.raises(ValueError, match="num_points must be 1 to 9,999, got"):
         make_encoder("point_cloud", number)
 
 
