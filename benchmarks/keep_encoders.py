@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from paper_tables import FIGURES, commit
 
 ENLARGED = 2  # each pixel of TensorBoard's image, in width and height
-PATHS = ("runs_dir", "resume", "observations")  # flags that say nothing about the encoder
+PATHS = ("runs_dir", "resume", "observations")  # flags that do not describe the encoder
 
 
 def validation_image(run, step):

@@ -1,10 +1,10 @@
-"""Render the pictures of the sensors in docs/figures.
+"""Render the figures of the sensors in docs/figures.
 
     python docs/make_sensor_figures.py
 
-Where the four default sensors are (purple balls), and what each kind puts out for the same scene:
-one column per place; from above: RGB, depth (near is bright), segmentation, point cloud. Classes:
-robot red, table and floor orange, obstacles yellow (as in the paper's figure).
+The places of the four default sensors (purple balls), and the outputs of each kind for the same
+scene: one column per place; from above: RGB, depth (near is bright), segmentation, point cloud.
+Classes: robot red, table and floor orange, obstacles yellow (as in the paper's figure).
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ from roboarm_nmp.envs.perception.sensors import (
     cardinal,
 )
 
-FOLDER = Path(__file__).parent / "pictures"
+FOLDER = Path(__file__).parent / "figures"
 COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [255, 255, 255]], np.uint8)
 
 
@@ -48,17 +48,17 @@ def placement(query):
     return np.reshape(pixels, (480, 640, 4))[..., :3].astype(np.uint8)
 
 
-def cloud_picture(cloud, size=224):
-    """Points from above, x up and y to the left as the robot sees it, coloured by class."""
-    picture = np.full((size, size, 3), 255, np.uint8)
+def cloud_image(cloud, size=224):
+    """Points from above, x up and y to the left, coloured by class."""
+    image = np.full((size, size, 3), 255, np.uint8)
     hit = cloud["labels"] != NOTHING
     points, labels = cloud["points"][hit], cloud["labels"][hit]
     order = np.argsort(points[:, 2])  # the highest is drawn last
     pixels = ((1.2 - points[order, :2]) / 2.4 * size).astype(int)
     inside = ((pixels >= 0) & (pixels < size - 1)).all(1)
     for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        picture[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
-    return picture
+        image[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
+    return image
 
 
 def main():
@@ -68,15 +68,15 @@ def main():
     world.show(query.scene, query.start)
     columns = []
     for name, camera in cardinal(Camera, outputs=OUTPUTS).items():
-        seen = camera.observe(world)
-        depth = 255 * (1 - seen["depth"] / camera.far)
-        column = [seen["rgb"], np.repeat(depth[..., None], 3, 2).astype(np.uint8)]
-        column += [COLOURS[seen["segmentation"]]]
-        column += [cloud_picture(cardinal(PointCloud)[name].observe(world))]
+        observed = camera.observe(world)
+        depth = 255 * (1 - observed["depth"] / camera.far)
+        column = [observed["rgb"], np.repeat(depth[..., None], 3, 2).astype(np.uint8)]
+        column += [COLOURS[observed["segmentation"]]]
+        column += [cloud_image(cardinal(PointCloud)[name].observe(world))]
         columns.append(np.concatenate(column))
     world.close()
-    pictures = Image.fromarray(np.concatenate(columns, axis=1))
-    pictures.quantize(128).save(FOLDER / "sensors_outputs.png", optimize=True)
+    outputs = Image.fromarray(np.concatenate(columns, axis=1))
+    outputs.quantize(128).save(FOLDER / "sensors_outputs.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Saving a network so that anybody can run it without the script that made it, safely.
+"""Network files: networks that anybody can run safely, without the script that made them.
 
 A network file is plain data: the network's graph as a list of named PyTorch operations, its
 tensors, and metadata. `load_network` interprets that list; a file from a stranger runs no code,
@@ -87,7 +87,7 @@ def save_network(path, module, example_inputs, metadata):
         metadata: a dict that JSON can write.
 
     Raises:
-        NetworkError: it cannot be exported, or uses an operation a network may not have.
+        NetworkError: it cannot be exported, or uses an operation that is not allowed.
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -142,8 +142,8 @@ def load_network(path, device="cpu"):
     """The `ExportedNetwork` in a file, its tensors on `device`.
 
     Raises:
-        NetworkError: no such file, not a network, damaged, or with something in it that a network
-            may not have. Nothing of the file has been executed.
+        NetworkError: no such file, not a network, damaged, or with contents that are not allowed.
+            Nothing of the file has been executed.
     """
     return ExportedNetwork(_read(path), path, device)
 

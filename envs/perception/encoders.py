@@ -187,9 +187,7 @@ class PointCloudEncoder(SceneEncoder):
 
     def __init__(self, num_points=NUM_POINTS, encoder=None):
         if type(num_points) is not int or not 1 <= num_points <= MAX_POINTS:
-            raise ValueError(
-                f"num_points must be an integer from 1 to {MAX_POINTS:,}, got {num_points!r}"
-            )
+            raise ValueError(f"num_points must be 1 to {MAX_POINTS:,}, got {num_points!r}")
         super().__init__(POINT_CLOUD, 3 * num_points, 3)
         self.num_points, self._encoder = num_points, encoder
         if encoder is not None:

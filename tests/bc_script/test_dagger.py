@@ -301,7 +301,7 @@ def test_no_kernel_gets_two_types(tmp_path, folder, short_episodes):
     [
         (["--paths", "nowhere"], "--paths: nowhere"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
-        (["--encoder", "lidar"], "--encoder: lidar: cannot be read"),
+        (["--encoder", "lidar"], "--encoder: no such encoder: lidar"),
         (["--batch-size", "0"], "--batch-size must be at least 1"),
         (["--pool-size", "5"], "--pool-size must be at least --examples-per-update"),
     ],

@@ -295,18 +295,22 @@ def test_encoders_do_not_depend_on_torch_defaults(torch_default):
 # --- Rejected
 
 
-@pytest.mark.parametrize(
-    "name", ["points", "points:32", "nowhere/encoder.pt", "field.decoder", "."]
-)
+@pytest.mark.parametrize("name", ["points", "points:32", "nowhere/encoder.pt", "field.decoder"])
 def test_unknown_encoder_is_rejected_with_the_known_names(name):
-    expected = "a network file|" if name == "." else "field, pointnet2, vae, vqvae|"
-    with pytest.raises(NetworkError, match=f"{expected}cannot be read"):
+    with pytest.raises(NetworkError) as error:
         make_encoder(name)
+    for part in (name, "oracle", "point_cloud", "path", "field, pointnet2, vae, vqvae"):
+        assert part in str(error.value)
+
+
+def test_folder_is_rejected_as_encoder(tmp_path):
+    with pytest.raises(NetworkError, match="cannot be read: Is a directory"):
+        make_encoder(tmp_path)
 
 
 @pytest.mark.parametrize("number", [0, 10_000, -1, 2.0, True, "8"])
 def test_number_of_points_out_of_range_is_rejected(number):
-    with pytest.raises(ValueError, match="num_points must be an integer from 1 to 9,999"):
+    with pytest.raises(ValueError, match="num_points must be 1 to 9,999, got"):
         make_encoder("point_cloud", number)
 
 

@@ -1,4 +1,4 @@
-"""What is seen of obstacles: points, collision checks against them, and encodings."""
+"""The observed point cloud: its points, collision checks against it, and encodings."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,14 +6,13 @@ import pytest
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import POINT, CollisionChecker
-from roboarm_nmp.envs.networks.operations import NetworkError
-from roboarm_nmp.envs.perception import point_clouds as seeing
-from roboarm_nmp.envs.perception.encoders import SceneEncoder
+from roboarm_nmp.envs.perception import point_clouds
+from roboarm_nmp.envs.perception.encoders import make_encoder
+from roboarm_nmp.envs.perception.geometry_source import observed_checker
 from roboarm_nmp.envs.perception.point_clouds import (
     CELL,
     POINT_RADIUS,
     farthest_points,
-    observed_checker,
     observed_points,
 )
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
@@ -24,7 +23,7 @@ EMPTY = Scene(())
 
 @pytest.fixture(scope="module")
 def clutter():
-    """Some scenes of `random_boxes_hard`."""
+    """Scenes of `random_boxes_hard`."""
     env, rng, scenes = envs.make("random_boxes_hard"), np.random.default_rng(3), []
     for _ in range(4):
         env.sample_scene(rng)
@@ -33,7 +32,7 @@ def clutter():
     return scenes
 
 
-def test_points_lie_on_what_can_be_seen():
+def test_observed_points_lie_on_visible_surfaces():
     points = observed_points(Scene((BOX,)))
     out = np.abs(points - BOX.position) - np.array(BOX.size) / 2
     assert len(points) > 300 and points.dtype == np.float32
@@ -46,30 +45,31 @@ def test_points_lie_on_what_can_be_seen():
     assert len(np.unique(cells, axis=0)) == len(points)
 
 
-def test_a_scene_is_seen_the_same_way_again():
+def test_observed_points_are_reproducible():
     scene = Scene((BOX, Sphere((-0.4, 0.4, 0.3), 0.1)))
     before = observed_points(scene).tobytes()
     observed_points(Scene((Sphere((0.4, 0.4, 0.4), 0.05),)))
-    seeing._look.cache_clear()
+    point_clouds._observe.cache_clear()
     assert observed_points(scene).tobytes() == before
 
 
-def test_nothing_to_see():
+def test_empty_scene_has_no_observed_points():
     assert observed_points(EMPTY).shape == (0, 3)
     states = np.random.default_rng(0).uniform(-1, 1, (200, 7))
-    seen, true = observed_checker(EMPTY), CollisionChecker(EMPTY)
-    assert (seen.is_free(states) == true.is_free(states)).all()
-    assert (seen.signed_distances(states).distance == true.signed_distances(states).distance).all()
+    one, other = observed_checker(EMPTY), CollisionChecker(EMPTY)
+    assert (one.is_free(states) == other.is_free(states)).all()
+    assert (one.signed_distances(states).distance == other.signed_distances(states).distance).all()
     assert not farthest_points(observed_points(EMPTY), 5).any()
-    assert not SceneEncoder("points")(EMPTY).any()
+    assert not make_encoder("point_cloud")(EMPTY).any()
 
 
-def test_what_is_there_but_hidden_is_not_known():
+def test_hidden_obstacle_changes_no_observation():
     """A small box inside of the table."""
     hidden = Scene((Box((0.0, 0.0, -0.2), (0.05, 0.05, 0.05)),))
     assert observed_points(hidden).shape == (0, 3)
-    env = envs.make("wall", encoder="points:4", link_distances="points")
-    other = envs.make("wall", encoder="points:4", link_distances="points")
+    options = {"encoder": "point_cloud", "num_points": 4}
+    options |= {"link_distances": True, "geometry_source": "point_cloud"}
+    env, other = envs.make("wall", **options), envs.make("wall", **options)
     query = env.sample_query(np.random.default_rng(0))
     observed = [
         one.reset_specific(*query, scene)[0] for one, scene in ((env, hidden), (other, EMPTY))
@@ -80,8 +80,8 @@ def test_what_is_there_but_hidden_is_not_known():
     env.close(), other.close()
 
 
-def test_points_are_balls():
-    """Against the same balls as obstacles of a scene."""
+def test_checks_against_points_equal_those_against_balls():
+    """The same balls as obstacles of a scene."""
     rng = np.random.default_rng(1)
     points = np.concatenate(
         [rng.uniform((-0.6, -0.6, 0.0), (0.6, 0.6, 0.9), (8, 3)), rng.normal(0.45, 0.03, (60, 3))]
@@ -97,18 +97,18 @@ def test_points_are_balls():
     a, b = one.signed_distances(states), other.signed_distances(states)
     np.testing.assert_allclose(b.distance, a.distance, atol=2e-6)
     assert ((a.geometry >= 0) == (b.geometry == POINT)).all() and (b.geometry == POINT).mean() > 0.3
-    away = np.abs(a.distance) > 1e-4  # where they just touch, the direction is a matter of rounding
+    away = np.abs(a.distance) > 1e-4  # at contact, the normal is a matter of rounding
     assert np.quantile(np.abs(a.gradient - b.gradient)[away], 0.999) < 1e-4
 
 
-def test_distances_from_points_are_nearly_those_from_what_was_seen(clutter):
+def test_distances_from_observed_points_are_close_to_those_from_obstacles(clutter):
     """Nine of ten are at most 15 mm too long, none is more than 15 mm too short."""
     errors = []
     for scene in clutter:
         states = np.random.default_rng(0).uniform(-1, 1, (3000, 7))
-        true, seen = CollisionChecker(scene), observed_checker(scene)
+        true, observed = CollisionChecker(scene), observed_checker(scene)
         states = states[true.is_free(states)]
-        a, b = (one.signed_distances(states, self_collisions=False) for one in (true, seen))
+        a, b = (one.signed_distances(states, self_collisions=False) for one in (true, observed))
         near = (a.geometry >= 0) & (a.distance < 0.1)
         errors.append((b.distance - a.distance)[near])
     errors = np.concatenate(errors)
@@ -121,12 +121,12 @@ def test_distances_from_points_are_nearly_those_from_what_was_seen(clutter):
     ("points", "radius"),
     [([[0.0, np.nan, 0.0]], 0.01), ([[0.0, 0.0, 0.0]], -0.01), ([[0.0, 0.0]], 0.01)],
 )
-def test_bad_points_are_refused(points, radius):
+def test_invalid_points_are_rejected(points, radius):
     with pytest.raises(ValueError, match="points"):
         CollisionChecker(EMPTY, points, radius)
 
 
-def test_farthest_points_against_a_loop():
+def test_farthest_points_equal_a_loop():
     points = np.random.default_rng(2).uniform(-1, 1, (50, 3)).astype(np.float32)
     chosen = [max(range(50), key=lambda i: np.linalg.norm(points[i]))]
     while len(chosen) < 8:
@@ -138,8 +138,8 @@ def test_farthest_points_against_a_loop():
     assert sorted(padded[:3].tolist()) == sorted(points[:3].tolist()) and not padded[3:].any()
 
 
-def test_points_as_an_encoding():
-    env = envs.make("random_boxes_hard", encoder="points")
+def test_environment_appends_farthest_observed_points():
+    env = envs.make("random_boxes_hard", encoder="point_cloud")
     observation, _ = env.reset(seed=1)
     scene = observation["observation"][10:].reshape(64, 3)
     expected = farthest_points(observed_points(env.unwrapped.scene), 64)
@@ -148,18 +148,16 @@ def test_points_as_an_encoding():
     after, *_ = env.step(np.full(7, 0.01))
     assert after["observation"][10:].tobytes() == scene.tobytes()
     env.close()
-    env = envs.make("random_boxes_hard", encoder="points:16")
+    env = envs.make("random_boxes_hard", encoder="point_cloud", num_points=16)
     assert env.reset(seed=1)[0]["observation"].shape == (10 + 48,)
     env.close()
-    for name in ("points:0", "points:x"):
-        with pytest.raises(NetworkError, match=name):
-            SceneEncoder(name)
 
 
-def test_vector_environments_see_as_single_ones_do():
+def test_vector_environment_observes_as_single_ones():
     def make():
-        sees = {"encoder": "points:8", "link_distances": "points"}
-        return envs.make("random_boxes_hard", goal_type="combined", **sees)
+        options = {"encoder": "point_cloud", "num_points": 8, "goal_type": "combined"}
+        options |= {"link_distances": True, "geometry_source": "point_cloud"}
+        return envs.make("random_boxes_hard", **options)
 
     several, one = gym.vector.SyncVectorEnv([make, make]), make()
     together, _ = several.reset(seed=[4, 5])
@@ -167,10 +165,8 @@ def test_vector_environments_see_as_single_ones_do():
         alone, _ = one.reset(seed=seed)
         for name, value in alone.items():
             np.testing.assert_array_equal(together[name][row], value)
-    assert together["link_distances"].shape == (2, 10, 8) and together["observation"].shape == (
-        2,
-        34,
-    )
+    assert together["link_distances"].shape == (2, 10, 8)
+    assert together["observation"].shape == (2, 34)
     actions = np.full((2, 7), 0.01, np.float32)
     stepped, *_ = several.step(actions)
     after, *_ = one.step(actions[1])

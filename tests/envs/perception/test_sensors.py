@@ -1,4 +1,4 @@
-"""Cameras and point clouds: geometry worked out by hand, classes, and nothing else disturbed."""
+"""Cameras and point clouds: geometry worked out by hand, classes, and no side effects."""
 
 import math
 import re
@@ -21,6 +21,8 @@ from roboarm_nmp.envs.perception.sensors import (
     PointCloud,
     SensorWorld,
     cardinal,
+    sensors_from_json,
+    sensors_to_json,
 )
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.wrappers import SensorWrapper
@@ -28,6 +30,11 @@ from roboarm_nmp.scene_embedding_train import collect
 
 HOME = np.array([0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8])
 BALL = Sphere((0.4, 0.5, 0.9), 0.1)
+MIX = {
+    "above": Camera((0.1, 0.0, 2.5), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), size=(32, 24)),
+    "depth": Camera((1.6, 0.0, 0.8), size=(20, 20), outputs=("depth",)),
+    "cloud": PointCloud((0.0, 1.6, 0.8), num_samples=400),
+}
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +45,12 @@ def world():
 
 
 @pytest.mark.parametrize(("size", "fov"), [((224, 224), 60.0), ((160, 120), 40.0)])
-def test_a_ball_is_where_a_pinhole_camera_sees_it(world, size, fov):
+def test_ball_appears_where_a_pinhole_camera_projects_it(world, size, fov):
     world.show(Scene((BALL,)), HOME)
-    # Looks along -x, so that the picture's right is +y and its upper edge +z.
+    # Looks along -x, so that the image's right is +y and its upper edge +z.
     camera = Camera((2.0, 0.2, 0.7), (0.0, 0.2, 0.7), (0, 0, 1), fov, size, outputs=OUTPUTS)
-    seen = camera.observe(world)
-    rows, columns = np.nonzero(seen["segmentation"] == OBSTACLE)
+    observed = camera.observe(world)
+    rows, columns = np.nonzero(observed["segmentation"] == OBSTACLE)
     focal = size[1] / 2 / math.tan(math.radians(fov) / 2)  # pixels
     distance = 2.0 - BALL.position[0]
     # A ball's outline is a little larger than its cross-section through the centre.
@@ -53,13 +60,13 @@ def test_a_ball_is_where_a_pinhole_camera_sees_it(world, size, fov):
     assert abs(columns.min() + columns.max() - 2 * column) / 2 < 1.5
     assert abs(rows.min() + rows.max() - 2 * row) / 2 < 1.5
     assert len(rows) == pytest.approx(math.pi * radius**2, rel=0.08)
-    middle = seen["depth"][round(row), round(column)]
-    assert 0 <= middle - (distance - BALL.radius) < 0.01  # drawn as a polyhedron, inside
-    assert seen["rgb"].shape == (*size[::-1], 3) and seen["rgb"].dtype == np.uint8
+    centre = observed["depth"][round(row), round(column)]
+    assert 0 <= centre - (distance - BALL.radius) < 0.01  # drawn as a polyhedron, inside
+    assert observed["rgb"].shape == (*size[::-1], 3) and observed["rgb"].dtype == np.uint8
 
 
 @pytest.mark.parametrize("name", list(cardinal()))
-def test_points_lie_on_what_they_are_said_to_hit(world, name):
+def test_points_lie_on_surfaces_of_their_class(world, name):
     pole = Cylinder((0.0, -0.5, 0.4), 0.05, 0.8)
     world.show(Scene((BALL, pole)), HOME)
     cloud = cardinal(PointCloud)[name].observe(world)
@@ -86,17 +93,17 @@ def test_points_lie_on_what_they_are_said_to_hit(world, name):
     assert (np.linalg.norm(robot - [0.1, 0, 0.5], axis=1) < 0.75).all()
 
 
-def test_a_cloud_is_what_a_camera_in_its_place_sees(world):
+def test_point_cloud_equals_a_camera_in_its_place(world):
     world.show(envs.TASKS["boxes"].scene, HOME)
     cloud = cardinal(PointCloud, num_samples=2500)["left"].observe(world)
     image = cardinal(size=(50, 50), outputs=("depth", "segmentation"))["left"].observe(world)
-    seen = image["segmentation"] != NOTHING
+    visible = image["segmentation"] != NOTHING
     hits = cloud["labels"] != NOTHING
-    np.testing.assert_array_equal(cloud["labels"][hits], image["segmentation"][seen])
+    np.testing.assert_array_equal(cloud["labels"][hits], image["segmentation"][visible])
     ahead = np.array([0.0, -1.6, -0.4]) / math.hypot(1.6, 0.4)  # the viewing direction
     depth = (cloud["points"][hits] - np.array([0.0, 1.6, 0.8])) @ ahead
-    np.testing.assert_allclose(depth, image["depth"][seen], atol=1e-5)
-    assert (image["depth"][~seen] == 5.0).all()
+    np.testing.assert_allclose(depth, image["depth"][visible], atol=1e-5)
+    assert (image["depth"][~visible] == 5.0).all()
 
 
 def test_table_and_floor_may_be_missing(world):
@@ -105,19 +112,19 @@ def test_table_and_floor_may_be_missing(world):
     assert set(labels) == {ROBOT, OBSTACLE, NOTHING}
 
 
-def test_what_is_seen_depends_on_scene_and_arm_only(world):
+def test_observations_depend_on_scene_and_arm_only(world):
     sensors = {**cardinal(outputs=OUTPUTS), "cloud": cardinal(PointCloud)["back"]}
     tasks = [envs.TASKS[name].scene for name in ("boxes", "double_walls", "narrow_shelves")]
 
-    def look(world, scene, configuration):
+    def observe(world, scene, configuration):
         world.show(scene, configuration)
         return {name: sensor.observe(world) for name, sensor in sensors.items()}
 
-    first = look(world, tasks[0], HOME)
-    other = look(world, tasks[1], HOME)
-    look(world, tasks[2], np.zeros(7))
+    first = observe(world, tasks[0], HOME)
+    other = observe(world, tasks[1], HOME)
+    observe(world, tasks[2], np.zeros(7))
     fresh = SensorWorld()
-    for again in (look(world, tasks[0], HOME), look(fresh, tasks[0], HOME)):
+    for again in (observe(world, tasks[0], HOME), observe(fresh, tasks[0], HOME)):
         for name, outputs in first.items():
             for output, array in outputs.items():
                 np.testing.assert_array_equal(again[name][output], array)
@@ -140,18 +147,16 @@ def test_what_is_seen_depends_on_scene_and_arm_only(world):
         (lambda: PointCloud((1, 0, 1), num_samples=10), "square"),
     ],
 )
-def test_a_sensor_that_makes_no_sense_is_refused(make, complaint):
+def test_invalid_sensor_is_rejected(make, complaint):
     with pytest.raises(ValueError, match=complaint):
         make()
 
 
-# --- The wrapper
+def test_sensors_survive_json():
+    assert sensors_from_json(sensors_to_json(MIX)) == MIX
 
-MIX = {
-    "above": Camera((0.1, 0.0, 2.5), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), size=(32, 24)),
-    "depth": Camera((1.6, 0.0, 0.8), size=(20, 20), outputs=("depth",)),
-    "cloud": PointCloud((0.0, 1.6, 0.8), num_samples=400),
-}
+
+# --- The wrapper
 
 
 def same(one, other):
@@ -162,11 +167,11 @@ def same(one, other):
     )
 
 
-def test_the_wrapper_is_a_gymnasium_environment():
+def test_sensor_wrapper_is_a_gymnasium_environment():
     check_env(SensorWrapper(envs.make("random_boxes_easy", horizon=5), MIX), skip_render_check=True)
 
 
-def test_observed_once_per_episode_or_in_every_step():
+def test_sensors_observe_once_per_episode_or_in_every_step():
     for every_step in (False, True):
         env = SensorWrapper(envs.make("random_boxes_hard"), MIX, every_step)
         first, _ = env.reset(seed=4)
@@ -182,7 +187,7 @@ def test_observed_once_per_episode_or_in_every_step():
         env.close()
 
 
-def test_the_code_of_the_docs(tmp_path, monkeypatch):
+def test_code_of_the_docs_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     collect.collect(
         collect.Args(num=80, sensors="images", image_size=16, shard_size=50, workers=1), False
@@ -201,7 +206,7 @@ def test_the_code_of_the_docs(tmp_path, monkeypatch):
     np.testing.assert_allclose(principal.std(0), 1, atol=0.05)
 
 
-def test_looking_changes_nothing_else():
+def test_observing_changes_no_episode():
     plain = envs.make("random_boxes_hard", render_mode="rgb_array")  # with a goal's marker
     wrapped = SensorWrapper(
         envs.make("random_boxes_hard", render_mode="rgb_array"), MIX, every_step=True
@@ -211,17 +216,17 @@ def test_looking_changes_nothing_else():
     assert same(marked, unmarked.reset(seed=3)[0]["sensors"])
     rng = np.random.default_rng(0)
     for episode in range(3):
-        expected, seen = plain.reset(seed=episode)[0], wrapped.reset(seed=episode)[0]
+        expected, observed = plain.reset(seed=episode)[0], wrapped.reset(seed=episode)[0]
         for _ in range(60):
             for name, array in expected.items():
-                np.testing.assert_array_equal(seen[name], array)
+                np.testing.assert_array_equal(observed[name], array)
             action = rng.uniform(-0.05, 0.05, 7)
-            expected, seen = plain.step(action)[0], wrapped.step(action)[0]
+            expected, observed = plain.step(action)[0], wrapped.step(action)[0]
     for env in (plain, wrapped, unmarked):
         env.close()
 
 
-def test_in_a_vector_environment():
+def test_sensors_work_in_a_vector_environment():
     vector = gym.vector.SyncVectorEnv(
         [lambda: SensorWrapper(envs.make("random_boxes_easy"), MIX) for _ in range(2)]
     )
@@ -231,7 +236,7 @@ def test_in_a_vector_environment():
     vector.close()
 
 
-def test_many_scenes_do_not_grow_the_process():
+def test_memory_does_not_grow_with_the_number_of_scenes():
     env = SensorWrapper(envs.make("random_boxes_hard"), cardinal(size=(16, 16)))
     rng, sizes = np.random.default_rng(0), []
     for number in range(2400):

@@ -14,10 +14,11 @@ from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import evaluate
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_transitions
-from roboarm_nmp.envs.perception.encoders import oracle, scene_encoder
+from roboarm_nmp.envs.perception.encoders import make_encoder
 
 HARD = "random_boxes_hard"
-SIZE = len(oracle(envs.TASKS["wall"].scene))
+oracle = make_encoder("oracle")
+SIZE = oracle.size
 
 
 @pytest.fixture
@@ -145,5 +146,5 @@ def test_what_is_no_encoder_is_refused(trainer, tmp_path, capsys):
 
 def test_one_encoder_serves_all_environments_of_a_process(env):
     other = envs.make(HARD, encoder="oracle")
-    assert env.encoder is other.encoder is scene_encoder("oracle")
+    assert env.encoder is other.encoder is oracle
     other.close()

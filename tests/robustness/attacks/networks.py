@@ -34,16 +34,17 @@ class Mixed(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.pictures = nn.Sequential(
+        self.images = nn.Sequential(
             nn.Conv2d(3, 6, 3, 2, 1), nn.GroupNorm(2, 6), nn.ELU(), nn.MaxPool2d(2), nn.AvgPool2d(2)
         )
         self.grow = nn.Sequential(nn.ConvTranspose2d(6, 3, 2, 2), nn.BatchNorm2d(3), nn.Sigmoid())
         self.book = nn.Embedding(9, 5)
         self.layer = nn.Sequential(nn.Linear(12, 5), nn.LayerNorm(5), nn.GELU(), nn.Softplus())
 
-    def forward(self, picture, points, numbers):
-        seen = self.pictures(picture.float() / 255)
-        x = self.layer(torch.cat([seen.mean((2, 3)), self.grow(seen).amax((2, 3)), numbers], 1))
+    def forward(self, image, points, numbers):
+        encoded = self.images(image.float() / 255)
+        parts = [encoded.mean((2, 3)), self.grow(encoded).amax((2, 3)), numbers]
+        x = self.layer(torch.cat(parts, 1))
         nearest = torch.cdist(x, self.book.weight).argmin(1)
         x = x + self.book(nearest) + self.book((nearest + 9) // 2)
         near = torch.cdist(points, points[:, :2]).topk(3, dim=1, largest=False)
@@ -59,14 +60,14 @@ class Mixed(nn.Module):
 def inputs(rows=2):
     generator = torch.Generator().manual_seed(0)
     return {
-        "picture": torch.randint(0, 255, (rows, 3, 16, 16), generator=generator).byte(),
+        "image": torch.randint(0, 255, (rows, 3, 16, 16), generator=generator).byte(),
         "points": torch.rand(rows, 8, 3, generator=generator),
         "numbers": torch.rand(rows, 3, generator=generator),
     }
 
 
 def hostile(content, rng):
-    """A copy with one to three things changed; `rng` is a `random.Random`."""
+    """A copy with one to three changes; `rng` is a `random.Random`."""
     content = copy.deepcopy(content)
     for _ in range(rng.randint(1, 3)):
         nodes = content["nodes"]
@@ -88,7 +89,7 @@ def hostile(content, rng):
 
 
 def _change(arguments, rng, nodes, content):
-    """Change one of the arguments, in place, or of those inside of it."""
+    """Change one of the arguments in place, or one inside of it."""
     keys = list(arguments) if isinstance(arguments, dict) else list(range(len(arguments)))
     if not keys or rng.random() < 0.05:
         if isinstance(arguments, list):
@@ -127,7 +128,7 @@ def _tensor(tensor, rng):
 
 
 def attempts(seed, folder):
-    """The attempt: a function from a number to what came of loading and running such a network."""
+    """A function from a number to the outcome of loading and running such a network."""
     path = folder / "mixed.pt"
     torch.manual_seed(seed)
     save_network(path, Mixed(), inputs(), {"kind": "encoder"})
@@ -136,7 +137,7 @@ def attempts(seed, folder):
     def attempt(number):
         changed = hostile(content, random.Random(f"{seed} {number}"))
         try:
-            # As a reader gets it; what cannot be unpickled is for the attack on files.
+            # As read from a file; contents that cannot be unpickled belong to the attack on files.
             ExportedNetwork(pickle.loads(pickle.dumps(changed)))(**inputs())
         except NetworkError as error:
             return "out of memory" if "allocate" in str(error) else REFUSED

@@ -1,25 +1,25 @@
-"""What z_E knows of a scene: which cells are occupied, and how far links are from obstacles.
+"""Geometry in a latent code: occupied cells and link distances that can be decoded from z_E.
 
-    python benchmarks/scene_knowledge.py                       # the pretrained encoders, oracle, mean
-    python benchmarks/scene_knowledge.py runs/.../encoder.pt --json knowledge.json
+    python benchmarks/decoded_geometry.py                  # pretrained encoders, oracle, mean
+    python benchmarks/decoded_geometry.py runs/RUN/encoder.pt --json geometry.json
 
-The space around the robot is divided into cells of 0.2 m; one is occupied if an obstacle reaches
-into it. The network has two layers of 256; the oracle is a set, so there it looks at one obstacle
-at a time, and a cell is occupied if one of them says so. It learns from the scenes of the
-demonstrations of `random_boxes_hard` and is tested on those of its test queries, 2,000 that
-neither it nor an encoder has seen. Two figures, over all cells that are not always empty:
+The space around the robot is divided into cells of 0.2 m. A cell is occupied if an obstacle
+overlaps it. A probe, a network with two layers of 256, predicts the occupied cells from z_E. The
+oracle is a set: its probe receives one obstacle at a time, and the predictions are combined. Probes
+are trained on scenes of the demonstrations of `random_boxes_hard` and tested on those of its test
+queries, 2,000 that no encoder was trained on. Two scores, over all cells that are not always empty:
 
-- information: the share of the uncertainty that z_E removes, 1 - (cross-entropy of the
-  prediction) / (cross-entropy of each cell's mean); the mean has 0, perfect knowledge 1;
-- IoU: of the cells predicted as occupied (probability over one half) and those that are. For an
-  encoder that has a decoder also of the cells in which that says that something is, without any
-  network (nearer than a distance that is chosen on training scenes).
+- information: the share of the uncertainty that z_E removes, 1 - (cross-entropy of the prediction)
+  / (cross-entropy of each cell's mean); 0 for the mean, 1 for perfect predictions;
+- IoU: of the cells predicted as occupied (probability above one half) and the occupied ones. For an
+  encoder with a decoder also of the cells with decoded obstacles, without a probe: those nearer
+  than a distance that is chosen on training scenes.
 
-What a policy needs is how far its links are from obstacles (m, clipped to 0.4). A second network,
-as large, learns that from z_E and where the links are, at `POSES` random configurations per scene:
+Policies need the distances of links from obstacles (m, clipped to 0.4). A second probe, as large,
+predicts them from z_E and the links' places, at `POSES` random configurations per scene:
 
-- links: mean error in cm for links that are within 10 cm of an obstacle;
-- decoded: the same by the points that a decoder tells of (`envs.perception.encoders.decoded_checker`).
+- links: mean error in cm for links within 10 cm of an obstacle;
+- decoded: the same of the decoded points (`envs.perception.geometry_source.decoded_checker`).
 """
 
 import argparse
@@ -38,31 +38,29 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception.encoders import (
-    DECODED_RADIUS,
     DECODED_REACH,
     MAX_OBSTACLES,
     ORACLE,
-    decoded_points,
-    oracle,
+    make_encoder,
     pretrained_encoders,
-    scene_encoder,
 )
+from roboarm_nmp.envs.perception.geometry_source import DECODED_RADIUS
 from roboarm_nmp.envs.scenes.primitives import ROW, to_array
 
 TASK = "random_boxes_hard"
 CELL = 0.2  # m
 LOW, HIGH = np.array([-0.8, -0.8, 0.0]), np.array([0.8, 0.8, 1.6])
-POSES, ACTIVATION_DISTANCE, FAR = 16, 0.1, 0.4
-# m: from when on what a decoder tells of counts as being in a cell; one of them is chosen.
+POSES, NEAR, FAR = 16, 0.1, 0.4  # NEAR, FAR: m
+# m: a decoded point nearer than this to an obstacle occupies its cell; one of them is chosen.
 REACHES = [-0.005, 0.0, 0.0025, 0.005, 0.0075, 0.01, DECODED_REACH]
 SHAPE = tuple(np.round((HIGH - LOW) / CELL).astype(int))
 
 
 def occupied(obstacles):
-    """Which cells obstacles reach into: bool `SHAPE`.
+    """Cells that obstacles overlap: bool `SHAPE`.
 
-    By separating axes, the boxes' faces and the cells': exact for upright boxes, and a little too
-    many for others; cylinders and spheres count as their boxes.
+    By separating axes, the boxes' faces and the cells': exact for upright boxes, slightly too many
+    cells for others; cylinders and spheres count as their boxes.
     """
     centres = LOW + CELL * (np.stack(np.indices(SHAPE), axis=-1) + 0.5)
     cells = np.zeros(SHAPE, bool)
@@ -78,7 +76,7 @@ def occupied(obstacles):
 
 
 def link_distances(scenes, seed):
-    """At random configurations, where the links are and how far from obstacles.
+    """The links' places and distances from obstacles at random configurations.
 
     Returns:
         float32 (scenes, POSES, 63), place and two axes of each joint's frame; (scenes, POSES, 10),
@@ -86,8 +84,8 @@ def link_distances(scenes, seed):
     """
     states = np.random.default_rng(seed).uniform(-1.0, 1.0, (len(scenes), POSES, 7))
     distances = [
-        CollisionChecker(replace(scene, table=None, floor=None)).link_distances(some, within=FAR)
-        for scene, some in zip(tqdm(scenes, desc="distances"), states, strict=True)
+        CollisionChecker(replace(scene, table=None, floor=None)).link_distances(batch, within=FAR)
+        for scene, batch in zip(tqdm(scenes, desc="distances"), states, strict=True)
     ]
     frames = panda.joint_frames(panda.denormalise(states))
     parts = [part for place, axes in frames for part in (place, axes[..., :, 0], axes[..., :, 2])]
@@ -108,7 +106,7 @@ def _rotation(quaternion):
 
 
 class AnyObstacle(nn.Module):
-    """The oracle's numbers (n, 384) -> logits (n, cells), from those that `network` gives each."""
+    """The oracle's z_E (n, 384) -> logits (n, cells), from those of `network` for each obstacle."""
 
     def __init__(self, network):
         super().__init__()
@@ -122,9 +120,9 @@ class AnyObstacle(nn.Module):
 
 
 def probe(latents, cells, test_latents, is_set=False, seed=0, epochs=60):
-    """Train the network; its probabilities (n, cells) on the test scenes.
+    """Train the first probe; its probabilities (n, cells) on the test scenes.
 
-    A tenth of the training scenes decides when it is best.
+    A tenth of the training scenes selects the epoch.
     """
     torch.manual_seed(seed)
     if not is_set:
@@ -155,7 +153,7 @@ def probe(latents, cells, test_latents, is_set=False, seed=0, epochs=60):
 
 
 class NearestObstacle(nn.Module):
-    """The oracle's numbers and links' places -> distances, the least of those to each obstacle."""
+    """The oracle's z_E and links' places -> distances, the least of those from each obstacle."""
 
     def __init__(self, network):
         super().__init__()
@@ -171,7 +169,7 @@ class NearestObstacle(nn.Module):
 
 
 def distance_probe(latents, data, test_latents, test_data, is_set=False, seed=0, epochs=10):
-    """Train the second network; its mean error (m) on the test scenes' links within `ACTIVATION_DISTANCE`."""
+    """Train the second probe; its mean error (m) for links within `NEAR` in the test scenes."""
     torch.manual_seed(seed)
     if not is_set:
         mean, std = latents.mean(0), latents.std(0) + 1e-3
@@ -193,7 +191,7 @@ def distance_probe(latents, data, test_latents, test_data, is_set=False, seed=0,
             scene, pose = rows // POSES, rows % POSES
             truth = distances[scene, pose]
             predicted = network(torch.cat([latents[scene], places[scene, pose]], dim=1))
-            weights = 1.0 + 4.0 * (truth < ACTIVATION_DISTANCE)
+            weights = 1.0 + 4.0 * (truth < NEAR)
             loss = (weights * (predicted - truth).abs()).sum() / weights.sum()
             optimizer.param_groups[0]["lr"] = 1e-3 * (1.0 - done / updates)
             optimizer.zero_grad()
@@ -203,13 +201,13 @@ def distance_probe(latents, data, test_latents, test_data, is_set=False, seed=0,
     with torch.no_grad():
         spread = test_latents.unsqueeze(1).expand(-1, POSES, -1)
         inputs = torch.cat([spread, test_places], dim=2).flatten(0, 1)
-        predicted = torch.cat([network(some) for some in inputs.split(4096)])
+        predicted = torch.cat([network(batch) for batch in inputs.split(4096)])
     error = (predicted - test_distances.flatten(0, 1)).abs()
-    return error[test_distances.flatten(0, 1) < ACTIVATION_DISTANCE].mean().item()
+    return error[test_distances.flatten(0, 1) < NEAR].mean().item()
 
 
-def told_cells(points):
-    """Cells that points (n, 3), m, are in: bool (all cells,)."""
+def cells_of(points):
+    """Cells that contain points (n, 3), m: bool (all cells,)."""
     grid = np.zeros(SHAPE, bool)
     at = np.floor((points - LOW) / CELL).astype(int)
     grid[tuple(at[((at >= 0) & (at < SHAPE)).all(1)].T)] = True
@@ -217,15 +215,16 @@ def told_cells(points):
 
 
 def decoded(name, training, cells, testing, test_cells, test_data):
-    """What the points know that a decoder tells of: `decoded_iou` and `decoded_cm`.
+    """Errors of the points that a decoder gives: a dict of `decoded_iou` and `decoded_cm`.
 
     Args:
-        training, testing: scenes. With the first 200 of `training` it is chosen how near something
-            must be for its cell to count as occupied.
+        name: of an encoder with a decoder.
+        training, testing: scenes. The first 200 of `training` select the distance below which a
+            decoded point occupies its cell.
         cells, test_cells: bool (n, all cells), the truth.
         test_data: of `testing`, see `link_distances`.
     """
-    encoder = scene_encoder(name)
+    encoder = make_encoder(name)
 
     def nearer(scene, points, reach):
         return points[encoder.distances(scene, points) < reach]
@@ -234,39 +233,42 @@ def decoded(name, training, cells, testing, test_cells, test_data):
         return float((guess & truth).sum() / (guess | truth).sum())
 
     guesses = {reach: [] for reach in REACHES}
-    for scene in tqdm(training[:200], desc="decoded, to choose"):
-        points = decoded_points(scene, name)
+    for scene in tqdm(training[:200], desc="decoded, to select"):
+        points = encoder.decoded_points(scene)
         for reach, found in guesses.items():
-            found.append(told_cells(nearer(scene, points, reach)))
+            found.append(cells_of(nearer(scene, points, reach)))
     best = max(REACHES, key=lambda reach: iou(np.stack(guesses[reach]), cells[:200]))
     found, errors = [], []
     _, distances, states = test_data
-    for scene, truth, some in zip(tqdm(testing, desc="decoded"), distances, states, strict=True):
-        points = decoded_points(scene, name)
-        found.append(told_cells(nearer(scene, points, best)))
+    for scene, truth, batch in zip(tqdm(testing, desc="decoded"), distances, states, strict=True):
+        points = encoder.decoded_points(scene)
+        found.append(cells_of(nearer(scene, points, best)))
         bare = replace(scene, obstacles=(), table=None, floor=None)
         checker = CollisionChecker(bare, points, DECODED_RADIUS)
-        error = np.abs(checker.link_distances(some, within=FAR)[..., 0] - truth)
-        errors.append(error[truth < ACTIVATION_DISTANCE])
+        error = np.abs(checker.link_distances(batch, within=FAR)[..., 0] - truth)
+        errors.append(error[truth < NEAR])
     mean = 100 * float(np.concatenate(errors).mean())
     return {"decoded_iou": iou(np.stack(found), test_cells), "decoded_cm": mean}
 
 
 def latents(names, scenes):
-    """z_E of scenes by each encoder, float32 (n, size), by name. The same sensors look once."""
+    """z_E of scenes by each encoder, float32 (n, size), by name.
+
+    Encoders with the same sensors share their observations.
+    """
     groups = []  # of encoders
-    for encoder in map(scene_encoder, names):
-        group = next((some for some in groups if some[0].sensors == encoder.sensors), None)
+    for encoder in map(make_encoder, names):
+        group = next((one for one in groups if one[0].sensors == encoder.sensors), None)
         if group is None:
             groups.append([encoder])
         else:
             group.append(encoder)
     found = {name: [] for name in names}
-    for scene in tqdm(scenes, desc="looking"):
+    for scene in tqdm(scenes, desc="observing"):
         for group in groups:
-            seen = group[0].look(scene)
+            observed = group[0].observe(scene)
             for encoder in group:
-                found[encoder.name].append(encoder.encode(seen))
+                found[encoder.name].append(encoder.encode(observed))
     return {name: np.stack(z) for name, z in found.items()}
 
 
@@ -276,8 +278,8 @@ def cross_entropy(probabilities, cells):
     return float(-np.where(cells, np.log(p), np.log(1 - p)).mean())
 
 
-def figures(probabilities, means, cells):
-    """The two figures of the module's docstring; `means` (cells,) are the training scenes'."""
+def scores(probabilities, means, cells):
+    """The first two scores of the module's docstring; `means` (cells,) are the training scenes'."""
     guess = probabilities > 0.5
     means = np.broadcast_to(means, cells.shape)
     return {
@@ -291,9 +293,9 @@ def main():
     parser.add_argument(
         "encoders", nargs="*", help="networks (encoder.pt); default: the pretrained"
     )
-    parser.add_argument("--num", type=int, default=10_000, help="scenes to learn from (10,000)")
+    parser.add_argument("--num", type=int, default=10_000, help="scenes to train on (10,000)")
     parser.add_argument("--num-test", type=int, default=2_000, help="scenes to test on (2,000)")
-    parser.add_argument("--json", type=Path, help="write the figures to this file too")
+    parser.add_argument("--json", type=Path, help="write the scores to this file, too")
     args = parser.parse_args()
     torch.set_num_threads(1)
     demos, queries = load_demos(TASK), load_queries(TASK)
@@ -307,26 +309,27 @@ def main():
     cells, test_cells = (grid[:, sometimes] for grid in grids)
     means = cells.mean(0)
     data, test_data = link_distances(training, 0), link_distances(testing, 1)
-    results = {"mean": figures(means[None].repeat(len(test_cells), 0), means, test_cells)}
+    results = {"mean": scores(means[None].repeat(len(test_cells), 0), means, test_cells)}
     nothing = np.zeros((len(training), 1), np.float32), np.zeros((len(testing), 1), np.float32)
     error = distance_probe(nothing[0], data, nothing[1], test_data)
     results["mean"]["links_cm"] = 100 * error
     names = args.encoders or pretrained_encoders()
-    known, test_known = latents(names, training), latents(names, testing)
-    known[ORACLE], test_known[ORACLE] = (
-        np.stack([oracle(scene) for scene in scenes]) for scenes in (training, testing)
+    codes, test_codes = latents(names, training), latents(names, testing)
+    codes[ORACLE], test_codes[ORACLE] = (
+        np.stack([make_encoder(ORACLE)(scene) for scene in scenes])
+        for scenes in (training, testing)
     )
     for name in tqdm([ORACLE, *names], desc="encoders"):
-        (z, test_z), is_set = (known[name], test_known[name]), name == ORACLE
-        result = figures(probe(z, cells, test_z, is_set), means, test_cells)
+        (z, test_z), is_set = (codes[name], test_codes[name]), name == ORACLE
+        result = scores(probe(z, cells, test_z, is_set), means, test_cells)
         error = distance_probe(z, data, test_z, test_data, is_set)
         result["links_cm"] = 100 * error
-        if scene_encoder(name).has_decoder:
+        if make_encoder(name).decoder is not None:
             result |= decoded(name, training, grids[0], testing, grids[1], test_data)
         results[name] = result
         if args.json is not None:
             args.json.write_text(json.dumps(results, indent=1) + "\n")
-    print(f"{len(training)} scenes to learn from, {len(testing)} to test, {cells.shape[1]} cells,")
+    print(f"{len(training)} scenes to train on, {len(testing)} to test on, {cells.shape[1]} cells,")
     print(f"{test_cells.mean():.3f} of them occupied")
     for name, result in results.items():
         line = f"{name:40} information {result['information']:.3f}  IoU {result['iou']:.3f}"
