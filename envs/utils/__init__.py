@@ -1,1 +1,1 @@
-"""Files that are never half written, and worker processes."""
+"""What any command needs: files that are never half written, worker processes, signals."""
