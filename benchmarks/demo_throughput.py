@@ -50,15 +50,17 @@ from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import RESOLUTION
-from roboarm_nmp.envs.datasets import files as datasets
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.envs.utils.random_streams import Stream
 
 # The tasks that the plain way can do: with a fixed scene, and a table and a floor.
 FIXED = [
     name for name, task in envs.TASKS.items() if task.trainable and isinstance(task.scene, Scene)
 ]
 BLOCK = 5  # queries
-TOLERANCE, STEP_LIMIT = 0.01, 30  # of the plain way, at one sub-goal
+# Of the plain way: seconds for one plan; normalised distance and physics steps for one sub-goal.
+TIME_LIMIT, TOLERANCE, STEP_LIMIT = 10.0, 0.01, 30
 
 
 class GivenUp(Exception):
@@ -86,7 +88,7 @@ class Ours:
     def draw(self, index):
         """Query `index` as the collector draws it: (start, goal, the random numbers after it)."""
         options = self.collector.options
-        rng = np.random.default_rng([options["seed"], collect.STREAM, index])
+        rng = np.random.default_rng([options["seed"], Stream.DEMONSTRATIONS, index])
         return *self._draw(rng), rng.bit_generator.state
 
     def _given(self, rng):
@@ -194,7 +196,7 @@ class Plain:
     def plan(self, start, goal, seed):
         """A path (n, 7), rad; None if there was none within the limits."""
         self.plan_checks = 0
-        deadline = time.monotonic() + self.options["time_limit"]
+        deadline = time.monotonic() + TIME_LIMIT
         ou.RNG.setSeed(seed)
         ends = []
         for configuration in (start, goal):
@@ -227,7 +229,7 @@ class Plain:
         """Whether the arm gets from the start of a path to its end without touching anything."""
         client, robot = self.client, self.robot
         self.teleport(path[0])
-        targets = datasets.subgoals(path)[1:]
+        targets = subgoals(path)[1:]
         for target in targets:
             for i, angle in zip(panda.ARM_JOINTS, panda.denormalise(target), strict=True):
                 self.command(i, angle, panda.MAX_TORQUE[i])

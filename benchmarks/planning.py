@@ -1,17 +1,17 @@
 """Planning with compiled collision checks: how fast, and how often is there a plan in time?
 
     pip install -c constraints.txt -e .
-    python benchmarks/planning.py    # random_boxes_hard; some 3 minutes
+    python benchmarks/planning.py    # random_boxes_hard; about 3 minutes
     python benchmarks/planning.py --task benchmaker_bookshelf_thin --split original
 
-Ours is `demo_generation.planning.Planner.plan_within`: RRT-Connect with one round of shortening,
-which keeps less and less distance. Two others check one configuration at a time in PyBullet's
-world, asked from Python, and make three searches of less and less distance, as it was before
-`envs.collision.checker`: one with today's range and shortening, and one with OMPL's own range and three
-rounds of shortening, as `evaluate.py --policy planner` had them then (`pybullet_checked`).
+`ours` is `demo_generation.planning.Planner` with its defaults: RRT-Connect alternates with
+LBKPIECE1, margins shrink, and one round of shortening follows. Two others check one configuration
+at a time in PyBullet's world, asked from Python. They make up to three searches with smaller and
+smaller margins, as `Planner` did before `envs.collision.checker`. `pybullet_same_options` has our
+range and shortening, `pybullet_checked` OMPL's own range and three rounds of shortening.
 
-The others plan the first `--peer` queries, in turns with ours. A mean is over all queries of a
-planner, those without a plan included; a ratio is over the queries that both have had. Times are
+The others plan the first `--peer` queries, in turns with ours. Means are over all queries of a
+planner, unsolved queries included; ratios are over the queries of both planners. Times are
 wall-clock time of one process, so nothing else should run. The last line is JSON.
 """
 
@@ -43,10 +43,10 @@ from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 class PyBulletValidity:
     """Whether a normalised configuration is free, by the contacts that PyBullet reports."""
 
-    def __init__(self, world, margin, ends, time_limit, max_checks):
+    def __init__(self, world, margin, ends, deadline):
         self.world, self.margin, self.checks = world, margin, 0
         self.ends = [(panda.normalise(end), self.distance(end) - 1e-5) for end in ends]
-        self.deadline, self.max_checks = time.monotonic() + time_limit, max_checks
+        self.deadline = deadline
 
     def distance(self, configuration):
         client, robot = self.world.client, self.world.robot
@@ -65,36 +65,38 @@ class PyBulletValidity:
         )
 
     def exhausted(self):
-        return self.checks >= self.max_checks or time.monotonic() > self.deadline
+        return time.monotonic() > self.deadline
 
     def restore_margins(self):
-        """Nothing to do: what it keeps does not change."""
+        """Nothing to do: margins do not change within a search."""
 
 
 class PyBulletPlanner(Planner):
-    """The planner as it was: the clearance is kept by inflating the scene, searches begin anew."""
+    """The earlier planner: inflated scenes give clearance, and every search starts anew."""
 
     def __init__(self, env, **options):
         super().__init__(env, **options)
         self.inflated = envs.RoboArmEnv(env.scene)
 
-    def plan_within(self, seconds, *query, rng):
-        deadline = time.monotonic() + seconds
-        for share, margin_scale in ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25)):
-            self.time_limit = share * (deadline - time.monotonic())
-            with contextlib.suppress(PlanningError):
-                return self.plan(
-                    *query, seed=int(rng.integers(1, 2**32)), margin_scale=margin_scale
-                )
-        raise PlanningError(f"no path in {seconds} s")
+    def plan(self, start, goal, scene=None, *, seed, time_limit=5.0):
+        rng, deadline = np.random.default_rng(seed), time.monotonic() + time_limit
+        self.env.reset_specific(start, goal, scene)
+        for share, self.margin_scale in ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25)):
+            until = time.monotonic() + share * (deadline - time.monotonic())
+            path = self._search(start, goal, int(rng.integers(1, 2**32)), until)
+            if path is not None:
+                return path
+        raise PlanningError(f"no path in {time_limit} s")
 
-    def _validity(self, start, goal, schedule, time_limit, max_checks):
-        ((_, margin_scale),) = schedule
+    def _turns(self):
+        return ((self.planner, math.inf),)
+
+    def _validity(self, start, goal, deadline):
         world = self.env
-        self.inflated.set_scene(inflate(self.env.scene, margin_scale * self.clearance))
+        self.inflated.set_scene(inflate(self.env.scene, self.margin_scale * self.clearance))
         if not any(self.inflated.in_collision(end) for end in (start, goal)):
             world = self.inflated
-        return PyBulletValidity(world, margin_scale * MARGIN, (start, goal), time_limit, max_checks)
+        return PyBulletValidity(world, self.margin_scale * MARGIN, (start, goal), deadline)
 
     def _space(self, is_valid):
         information = ob.SpaceInformation(planning.normalised_space())
@@ -126,7 +128,7 @@ def plan(planner, query, seconds, seed):
     """(milliseconds, the path or None)"""
     began, path = time.perf_counter(), None
     with contextlib.suppress(PlanningError):
-        path = planner.plan_within(seconds, *query, rng=np.random.default_rng(seed))
+        path = planner.plan(*query, seed=seed, time_limit=seconds)
     return 1e3 * (time.perf_counter() - began), path
 
 
@@ -140,7 +142,7 @@ def main():
     parser.add_argument("--task", default="random_boxes_hard", choices=list(envs.TASKS))
     parser.add_argument("--split", default="test", choices=["test", "validation", "original"])
     parser.add_argument("--num", type=int, default=1000, help="queries (1,000)")
-    parser.add_argument("--peer", type=int, default=300, help="of them also with the others (300)")
+    parser.add_argument("--peer", type=int, default=300, help="queries of the others (300)")
     parser.add_argument("--limits", type=float, nargs="+", default=[5.0, 0.05], help="seconds")
     args = parser.parse_args()
     queries = load_queries(args.task, args.split)[: args.num]
@@ -149,10 +151,8 @@ def main():
     env, other_env = envs.make(args.task), envs.make(args.task)
     ways = {
         "ours": Planner(env),
-        "pybullet_checked": PyBulletPlanner(
-            other_env, max_checks=math.inf, planner_range=0, simplify=3
-        ),
-        "pybullet_same_options": PyBulletPlanner(other_env, max_checks=math.inf),
+        "pybullet_checked": PyBulletPlanner(other_env, planner_range=0, simplify=3),
+        "pybullet_same_options": PyBulletPlanner(other_env),
     }
     plan(ways["ours"], queries[0], 60.0, 0)  # compiles
     result = {"task": args.task, "split": args.split, "queries": len(queries)}

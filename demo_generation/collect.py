@@ -1,16 +1,17 @@
-"""Collect demonstrations: sample a query, plan, follow the plan in the simulator, verify, keep.
+"""Collect demonstrations: sample a query, plan, follow the plan in the simulator, verify, store.
 
-    python -m roboarm_nmp.demo_generation.collect --task double_walls --num 10000
+    roboarm collect --task double_walls --num 10000
 
-Paper: appendix "Collection of demonstrations". Demonstration i depends on the seed, i and the
-options only, so the file is the same whatever the number of workers. Every verified demonstration
-goes to a journal beside the output at once; a run that was interrupted or killed in whatever way
-goes on from there when it is started again.
+Paper: appendix "Collection of demonstrations". Demonstration i depends only on the seed, i and the
+options, so the file is the same on every machine and for every number of workers. Every verified
+demonstration is written to a journal beside the output at once. After an interruption of any kind,
+the same command continues from the journal.
 """
 
 import base64
 import collections
 import contextlib
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,16 +31,15 @@ from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
     NonNegativeFloat,
     NonNegativeInt,
-    PositiveFloat,
     PositiveInt,
     Seed,
     Workers,
 )
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.files import check_writable
+from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
 
-# Streams 1 and 2 of random numbers are those of the test and validation queries.
-STREAM = 3
 MAX_QUERIES = 100  # tried for one demonstration
 REASONS = ("no_plan", "missed", "collided", "too_long")
 
@@ -56,12 +56,10 @@ class Args:
     """Number of processes. The file does not depend on it."""
     planner: str = "RRTConnect"
     """One of OMPL's planners, by name."""
-    time_limit: PositiveFloat = 10.0
-    """Seconds for one plan, a safeguard: where it strikes, the result depends on the machine."""
     max_checks: PositiveInt = 30_000
-    """Configurations that one plan may look at (some 3 us each)."""
+    """Collision checks for one plan (about 3 us each)."""
     clearance: NonNegativeFloat = 0.005
-    """Metres that plans keep from the scene, where start and goal do."""
+    """Metres between plans and the scene, where start and goal allow it."""
     planner_range: NonNegativeFloat = 0.4
     """Longest motion (normalised) that the planner tries at once; 0 for OMPL's choice."""
     simplify: NonNegativeInt = 1
@@ -69,7 +67,7 @@ class Args:
     attempts: PositiveInt = 3
     """Plans tried on a query before it is given up for a new one (paper: 3)."""
     allow_collisions: bool = False
-    """Keep demonstrations that touched something but reached the goal (the paper's rule)."""
+    """Accept demonstrations with contact that reach the goal (the paper's rule)."""
     output: Path | None = None
     """File to write. The default is `envs/demos/<task>.h5`."""
     overwrite: bool = False
@@ -83,7 +81,6 @@ OPTIONS = (
     "task",
     "seed",
     "planner",
-    "time_limit",
     "max_checks",
     "clearance",
     "planner_range",
@@ -91,13 +88,13 @@ OPTIONS = (
     "attempts",
     "allow_collisions",
 )
-PLANNER_OPTIONS = ("planner", "time_limit", "max_checks", "clearance", "planner_range", "simplify")
-# Of files that were made before these were options, such as the pretrained ones.
+PLANNER_OPTIONS = ("planner", "max_checks", "clearance", "planner_range", "simplify")
+# Those of files that were made before these were options, such as the pretrained files.
 EARLIER_OPTIONS = {"planner_range": 0.0, "simplify": 3}
 
 
 def make_planner(env, options):
-    """A `Planner` with the `PLANNER_OPTIONS` of a collection, or of the file that it made."""
+    """A `Planner` with the `PLANNER_OPTIONS` of a collection, or of a demonstration file."""
     options = EARLIER_OPTIONS | options
     return Planner(env, **{name: options[name] for name in PLANNER_OPTIONS})
 
@@ -113,7 +110,7 @@ class Collector:
     def __call__(self, index):
         """Demonstration `index`: a JSON-ready dict with its plan, execution and rejections."""
         options, rejected = self.options, collections.Counter()
-        rng = np.random.default_rng([options["seed"], STREAM, index])
+        rng = np.random.default_rng([options["seed"], Stream.DEMONSTRATIONS, index])
         for given_up in range(MAX_QUERIES):
             self.env.sample_scene(rng)
             start, goal = self.env.sample_query(rng)
@@ -149,19 +146,19 @@ def demonstrate(planner, start, goal, rng, attempts, allow_collisions=False, rej
     """Plan and follow the plan until it works: `(path, Execution, planner's seed)`, or None.
 
     Args:
-        planner: a `Planner`; its environment has the query's scene.
+        planner: a `Planner` with `max_checks`; its environment has the query's scene.
         start, goal: float32 (7,), rad.
-        rng: NumPy Generator that the planner's seeds come from.
+        rng: NumPy Generator of the planner's seeds.
         attempts: plans to try at most.
-        allow_collisions: accept an execution that touched something.
-        rejected: a Counter of the reasons, `REASONS`, why attempts failed, to be added to.
+        allow_collisions: accept an execution with contact.
+        rejected: a Counter to which the reasons of failed attempts, `REASONS`, are added.
     """
     rejected = collections.Counter() if rejected is None else rejected
-    for attempt in range(attempts):
+    for _ in range(attempts):
         seed = int(rng.integers(1, 2**32))
         try:
-            # Each attempt dares to go nearer to obstacles: some queries leave no choice.
-            path = planner.plan(start, goal, seed=seed, margin_scale=0.5**attempt)
+            # A limit in seconds would make the result depend on the machine.
+            path = planner.plan(start, goal, seed=seed, time_limit=math.inf)
         except PlanningError:
             rejected["no_plan"] += 1
             continue
@@ -243,7 +240,7 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             [_decode(demo["plan"]) for demo in demos],
             [_decode(demo["states"]) for demo in demos],
             {name: [demo[name] for demo in demos] for name in ("plan_seed", "digest", "collided")},
-            made_by=f"python -m roboarm_nmp.demo_generation.collect --num {num} {flags}",
+            made_by=f"roboarm collect --num {num} {flags}",
             parameters={"options": options, "counts": counts},
             scenes_of=scenes_of,
         )
@@ -255,11 +252,11 @@ def _check(args):
     """The path to write. Raises ValueError for arguments that cannot work."""
     flags.check(args)
     path = args.output or demo_path(args.task)
-    demo_path(args.task)  # refuses an unknown task, also with --output
+    demo_path(args.task)  # rejects an unknown task, also with --output
     if not envs.get_task(args.task).trainable:
-        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
+        raise ValueError(f"{args.task} is for testing only: training on it is not allowed")
     with contextlib.closing(envs.make(args.task)) as env:
-        # Refuses what a planner refuses, before any work is done.
+        # Rejects what a planner rejects, before any work is done.
         make_planner(env, vars(args))
     check_writable(path)
     if query_path(args.task).exists():
@@ -275,11 +272,12 @@ def main(args):
         path = _check(args)
         options = {name: getattr(args, name) for name in OPTIONS}
         counts = collect(path, args.num, options, args.workers, args.ray_address)
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as interrupt:
+        exit_interrupted(interrupt, "the same command continues from here")
     except OSError as error:
-        sys.exit(f"error: {error}\nwhat was collected is safe; the same command goes on from here")
+        sys.exit(
+            f"error: {error}\nwhat was collected is safe; the same command continues from here"
+        )
     except (ValueError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     rejected = ", ".join(f"{counts[reason]} {reason}" for reason in REASONS)
@@ -291,4 +289,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m roboarm_nmp.demo_generation.collect", description=__doc__))
+    raise_on_sigterm()
+    main(tyro.cli(Args, prog="roboarm collect", description=__doc__))

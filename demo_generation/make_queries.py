@@ -1,17 +1,17 @@
 """Make the query files of tasks, `envs/data/<task>.h5`: random feasible starts and goals.
 
-    python -m roboarm_nmp.demo_generation.make_queries --task wall
-    python -m roboarm_nmp.demo_generation.make_queries --task random_boxes_hard --solvable
+    roboarm queries --task wall
+    roboarm queries --task random_boxes_hard --solvable
 
-With `--solvable` a query is kept only if a planner solved it: one of `SOLVE_ATTEMPTS` plans of
-RRT-Connect, at most `SOLVE_CHECKS` collision checks each (together a few seconds), reached the goal
-without touching anything when it was followed in the simulator.
+With `--solvable`, a query is accepted only if the planner solves it. That means: one of
+`SOLVE_ATTEMPTS` plans, of at most `SOLVE_CHECKS` collision checks each, reaches the goal in the
+simulator without contact.
 
-Where scenes vary, `--queries-per-scene` queries in a row have the same one: smaller files.
+Where scenes vary, `--queries-per-scene` queries in a row share a scene, which makes smaller files.
 
-Query i of a split depends on the seed, the split and i only, so the file is the same whatever the
-number of workers. It is written at the end, in one piece; until then queries go to a journal beside
-it, and an interrupted run goes on from there when it is started again.
+Query i of a split depends only on the seed, the split and i, so the file is the same on every
+machine and for every number of workers. The file is written at the end, in one piece. Until then,
+queries are written to a journal beside it. After an interruption, the same command continues.
 """
 
 import contextlib
@@ -36,15 +36,14 @@ from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.files import check_writable
+from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
 from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
 HOLD_STEPS = 24
-# Not 0: NumPy makes the same stream of [seed, 0, 0] as of plain seed, so the first query would be
-# that of an environment's `reset(seed=seed)`.
-STREAMS = {"test": 1, "validation": 2}
-SCENE_STREAM = 1  # a fourth number, for the scenes of a split
-# A bound in seconds would make the file depend on the machine.
+STREAMS = {"test": Stream.TEST_QUERIES, "validation": Stream.VALIDATION_QUERIES}
+SCENES = 1  # a fourth number, for the scenes of a split
 SOLVE_ATTEMPTS, SOLVE_CHECKS = 3, 30_000
 
 
@@ -53,11 +52,11 @@ class Args:
     task: tuple[str, ...]
     """Names of tasks, paths of scene files, or `all`."""
     solvable: bool = False
-    """Keep only queries that a planner solved."""
+    """Accept only queries that the planner solves."""
     queries_per_scene: PositiveInt = 1
     """Queries in each scene, where scenes vary."""
     seed: Seed = 0
-    """Seed of the queries; 0 gives the pretrained files."""
+    """Seed of the queries. (The files of this project have seed 0.)"""
     num_test: PositiveInt = 10_000
     """Number of test queries."""
     num_validation: PositiveInt = 200
@@ -84,12 +83,12 @@ class Sampler:
     def __call__(self, job):
         """Query `number` of a split, as a JSON-ready dict.
 
-        Its `rejected` counts the samples that were not held for long enough (`unheld`), or that the
-        planner did not solve (`unsolved`).
+        Its `rejected` counts the samples that the simulated arm does not hold for long enough
+        (`unheld`) and those that the planner does not solve (`unsolved`).
         """
         seed, split, number = job
         scene = [seed, STREAMS[split], number // self.queries_per_scene]
-        self.env.sample_scene(np.random.default_rng([*scene, SCENE_STREAM]))
+        self.env.sample_scene(np.random.default_rng([*scene, SCENES]))
         rng = np.random.default_rng([seed, STREAMS[split], number])
         rejected = Counter()
         for _ in range(MAX_QUERIES):
@@ -128,7 +127,7 @@ def make_queries(
         task: name of the task, or path of a scene file.
         seed: int >= 0.
         num_test, num_validation: numbers of queries, > 0.
-        solvable: keep only queries that a planner solved.
+        solvable: accept only queries that the planner solves.
         queries_per_scene: queries in a row that have the same scene, where scenes vary.
         original: path of a JSON file of MotionBenchMaker problems for the split `original`.
         num_workers: number of processes.
@@ -143,7 +142,7 @@ def make_queries(
         DatasetError, OSError: as `envs.datasets.write_queries` does.
         Whatever is raised, what is in the journal is safe.
     """
-    query_path(task)  # refuses an unknown task
+    query_path(task)  # rejects an unknown task
     splits = {} if original is None else {ORIGINAL: read_problems(original)}
     path, distribution, base = Path(path), envs.get_task(task).scene, envs.get_task(task).base_scene
     options = {"task": str(task), "seed": seed, "solvable": solvable}
@@ -188,7 +187,7 @@ def make_queries(
         if solvable:
             parameters |= {"unsolved": rejected["unsolved"], "solve_checks": SOLVE_CHECKS}
             parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
-        made_by = f"python -m roboarm_nmp.demo_generation.make_queries --task {task} --seed {seed} "
+        made_by = f"roboarm queries --task {task} --seed {seed} "
         made_by += f"--num-test {num_test} --num-validation {num_validation}"
         made_by += " --solvable" * solvable
         if queries_per_scene > 1:
@@ -212,7 +211,7 @@ def _check(args):
         read_problems(args.original)
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
-        query_path(task)  # refuses an unknown task, also with --output
+        query_path(task)  # rejects an unknown task, also with --output
         check_writable(path)
     return pairs
 
@@ -244,14 +243,10 @@ def main(args):
             print(text)
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as interrupt:
+        exit_interrupted(interrupt, "the same command continues from here")
 
 
 if __name__ == "__main__":
-    main(
-        tyro.cli(
-            Args, prog="python -m roboarm_nmp.demo_generation.make_queries", description=__doc__
-        )
-    )
+    raise_on_sigterm()
+    main(tyro.cli(Args, prog="roboarm queries", description=__doc__))

@@ -8,9 +8,9 @@
     query = load_queries("double_walls")[0]  # start, goal, scene
     path = Planner(env).plan(*query, seed=1)  # float32 (n, 7), rad
 
-Collisions are checked by `envs.collision.checker`, which agrees with the environment's PyBullet world to
-within a fraction of a millimetre and is some twenty times faster; the environment itself has the
-last word on start and goal. Planning happens in the normalised configuration space [-1, 1]^7.
+Collisions are checked by `envs.collision.checker`. It agrees with PyBullet within a fraction of a
+millimetre and is about twenty times faster. The environment itself decides whether start and goal
+are feasible. Planning happens in the normalised configuration space [-1, 1]^7.
 """
 
 import math
@@ -25,7 +25,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.subgoals import subgoals
 
-# OMPL writes to the console; what a user should know is raised here.
+# OMPL writes to the console. What concerns a user is raised here.
 ou.setLogLevel(ou.LogLevel.LOG_NONE)
 
 PLANNERS = tuple(
@@ -41,26 +41,26 @@ PLANNERS = tuple(
 """Names of OMPL's planners that can be used."""
 
 # A configuration this close (m) to a collision counts as one, which absorbs most of the
-# controller's lag: without it, two of three plans on `double_walls` touch something when followed.
+# controller's lag: without the margin, two of three plans on `double_walls` collide when followed.
 MARGIN = 0.003
-# CircularConv a start or goal that is nearer than that, the margin grows by this much (m) per unit of
-# normalised distance from it: all of it is kept again some three steps away.
+# Where start or goal is nearer than that, the margin is the distance there. It grows by this much
+# (m) per unit of normalised distance from them: the full margin holds again about three steps away.
 MARGIN_GROWTH = 0.03
-# `Planner.plan_within` gives up these distances bit by bit as a search goes on, because one that
-# takes long is likely to go on for long: after so many configurations it keeps this share of them.
+# A search that has taken long is likely to take much longer, so margin and clearance shrink: after
+# so many collision checks, they are scaled by this factor.
 # (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmarks.md.)
 MARGIN_SCHEDULE = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
-# Where RRT-Connect has found nothing after so many configurations, another planner may look at half
-# as many before it goes on, and so in turns, each twice as long as the last one: some ways out of a
-# shelf that RRT-Connect does not find, LBKPIECE1 finds at once.
+# After so many checks without a path, RRT-Connect hands over to another planner for half as many.
+# They alternate, each turn twice as long as the last: LBKPIECE1 quickly finds some paths out of
+# shelves that RRT-Connect does not find.
 # (Chosen on the same queries, and on the original MotionBenchMaker problems: docs/benchmarks.md.)
 OTHER_PLANNER, FIRST_TURN = "LBKPIECE1", 8_000
-# Searches that it makes at most for a path that can be followed within an episode.
+# Searches at most, per plan, for a path that can be followed within an episode.
 SEARCHES = 3
-# Steps by which the arm may come later than its last sub-goal.
+# Steps by which the arm may arrive later than its last sub-goal.
 LAG = 10
-# Trials of cutting a corner in one round of simplification, and how many may fail in a row. Bounded
-# by iterations, unlike OMPL's simplifyMax, which is bounded by seconds, they are deterministic.
+# Shortcuts tried in one round of simplification, and how many may fail in a row. A limit of
+# iterations is deterministic, unlike the seconds of OMPL's simplifyMax.
 SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS = 50, 25
 
 
@@ -69,24 +69,25 @@ class PlanningError(RuntimeError):
 
 
 class Validity:
-    """Which normalised configurations and motions are free; counts what it is asked.
+    """Decides which normalised configurations and motions are free, and counts the checks.
 
     Call it with one configuration (7 numbers), or use `free` and `motions_free` for many at once.
-    `checks` is how many configurations were looked at so far, `exhausted()` whether the limits of
-    this plan are reached: a planner asks now and then, and gives up.
+    `checks` is the number of configurations checked so far. `exhausted()` says whether the limits
+    of this plan are reached: a planner asks now and then, and gives up.
 
     Args:
         checker: a `CollisionChecker`.
-        rules: pairs of a number of checks and, to be kept from then on, a dict of `margin`,
-            `clearance` and `endpoint_margins` of the checker's methods; the first from 0 on.
-        time_limit, max_checks: as for `Planner`.
+        rules: pairs of a number of checks and the arguments that hold from then on: a dict of
+            `margin`, `clearance` and `endpoint_margins` for the checker. The first number is 0.
+        deadline: the time (`time.monotonic()`, s) at which the plan is exhausted.
+        max_checks: the number of checks at which the plan is exhausted.
     """
 
-    def __init__(self, checker, rules, time_limit, max_checks):
+    def __init__(self, checker, rules, deadline, max_checks):
         self._checker, self._rules, self._later = checker, rules, list(rules)
-        self._deadline, self._max_checks = time.monotonic() + time_limit, max_checks
+        self._deadline, self._max_checks = deadline, max_checks
         self.checks = 0
-        self._relax()
+        self._next_rule()
 
     def __call__(self, state):
         """Whether a configuration is free."""
@@ -115,20 +116,21 @@ class Validity:
         return checks > 0
 
     def exhausted(self):
+        """Whether the limits of this plan are reached."""
         return self.checks >= self._max_checks or time.monotonic() > self._deadline
 
     def restore_margins(self):
-        """From now on, the first rule is kept: for what improves a path that is there."""
+        """Return to the full margins, for changes to a path that has been found."""
         self._later = [self._rules[0]]
-        self._relax()
+        self._next_rule()
 
     def _count(self, checks):
         self.checks += checks
         if self.checks >= self._next:
-            self._relax()
+            self._next_rule()
 
-    def _relax(self):
-        """Keep the next rule."""
+    def _next_rule(self):
+        """Apply the last rule whose number of checks is reached."""
         while self._later and self._later[0][0] <= self.checks:
             self._rule = self._later.pop(0)[1]
         self._next = self._later[0][0] if self._later else math.inf
@@ -136,7 +138,7 @@ class Validity:
 
 
 class _States(ob.StateValidityChecker):
-    """OMPL's question about one state."""
+    """Answers OMPL's question about one state."""
 
     def __init__(self, space, is_valid):
         super().__init__(space)
@@ -148,7 +150,7 @@ class _States(ob.StateValidityChecker):
 
 
 class _Motions(ob.MotionValidator):
-    """OMPL's question about a motion, the start of which it knows to be valid."""
+    """Answers OMPL's question about a motion with a valid start."""
 
     def __init__(self, space, is_valid):
         super().__init__(space)
@@ -171,117 +173,106 @@ class Planner:
         planner: one of `PLANNERS`, or your own: a function `(is_valid, start, goal, rng)` that
             returns a path (n, 7) from start to goal, or None. `is_valid` is a `Validity`, start
             and goal are normalised configurations (7,), float64, `rng` is a NumPy Generator.
-        time_limit: seconds for one plan.
-        max_checks: configurations looked at for one plan; unlike seconds, the same on every
-            machine. Asymptotically optimal planners use all of it; FMT and BFMT need more.
+            `RRTConnect` alternates with `OTHER_PLANNER` where it takes long.
         clearance: metres that a path keeps from the scene, in addition to `MARGIN`. A query that
-            starts or ends nearer is planned without it.
-        planner_range: longest motion (L2, normalised) that the planner tries at once, if it is of
-            those that have such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with
-            RRTConnect, docs/benchmarks.md.)
+            starts or ends nearer is planned without it. `MARGIN_SCHEDULE` scales both in a long
+            search.
+        planner_range: longest motion (L2, normalised) that the planner tries at once, if it has
+            such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with RRTConnect,
+            docs/benchmarks.md.)
         simplify: rounds of removing vertices and cutting corners; 0 for none.
-        geometry_source: from a `Scene` to the `CollisionChecker` that is asked, by default that of the
-            true obstacles; `envs.perception.point_clouds.observed_checker` knows only what sensors see.
+        geometry_source: a function from a `Scene` to the `CollisionChecker` to plan with. The
+            default is that of the ground-truth obstacles; `envs.perception.geometry_source` has
+            others.
+        max_checks: collision checks for one plan; None for no limit. Unlike a time limit, it ends
+            a search at the same point on every machine. Asymptotically optimal planners use all of
+            their limit; FMT and BFMT need about 100,000 checks.
 
     Raises:
-        ValueError: unknown planner, a limit that is not positive, or another number out of range.
+        ValueError: unknown planner, or a number out of range.
     """
 
     def __init__(
         self,
         env,
         planner="RRTConnect",
-        time_limit=10.0,
-        max_checks=30_000,
         clearance=0.005,
         planner_range=0.4,
         simplify=1,
         geometry_source=CollisionChecker,
+        max_checks=None,
     ):
         if not callable(planner) and planner not in PLANNERS:
             raise ValueError(f"unknown planner {planner!r}: one of {', '.join(PLANNERS)}")
-        for name, value in (("time_limit", time_limit), ("max_checks", max_checks)):
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, got {value!r}")
         if not 0 <= clearance < 0.5:
             raise ValueError(f"clearance must be in [0, 0.5) m, got {clearance!r}")
         if not 0 <= planner_range < math.inf:
             raise ValueError(f"planner_range must be 0 or positive, got {planner_range!r}")
         if not (simplify >= 0 and simplify == int(simplify)):
             raise ValueError(f"simplify must be a number of rounds, got {simplify!r}")
-        self.env, self.planner = env, planner
-        self.time_limit, self.max_checks = time_limit, max_checks
-        self.clearance = clearance
+        if max_checks is not None and not max_checks > 0:
+            raise ValueError(f"max_checks must be positive or None, got {max_checks!r}")
+        self.env, self.planner, self.clearance = env, planner, clearance
         self.planner_range, self.simplify = planner_range, simplify
-        self._geometry_source, self._scene, self._checker = (
-            geometry_source,
-            env.scene,
-            geometry_source(env.scene),
-        )
-        # What is compiled at its first call is compiled now, not in a plan's time.
+        self.max_checks, self._geometry_source = max_checks, geometry_source
+        self._scene, self._checker = env.scene, geometry_source(env.scene)
+        # Compile here what is compiled at its first call: a plan's time is for planning.
         state = (0.0,) * panda.NUM_JOINTS
         self._checker.signed_distances(state)
         self._checker.motion_checker()(state, state)
         self.checks = 0
-        """Configurations that the last plan has looked at."""
+        """Collision checks of the last plan."""
 
-    def plan(self, start, goal, scene=None, *, seed, margin_scale=1.0):
+    def plan(self, start, goal, scene=None, *, seed, time_limit=5.0):
         """A path from start to goal: float32 (n, 7), rad; its ends are exactly start and goal.
+
+        The same seed gives the same path on every machine, whatever was planned before, as long as
+        the time suffices: only a search that `time_limit` ends depends on the machine. If following
+        the path takes longer than an episode, there are up to `SEARCHES` searches, and the shortest
+        path is returned.
 
         Args:
             start, goal: joint angles (7, rad).
             scene: a `Scene` to change the environment to first.
-            seed: int > 0. The same seed gives the same path, whatever was planned before (except
-                where `time_limit` is what ends the search).
-            margin_scale: share of `clearance` and `MARGIN` to keep, in [0, 1].
+            seed: int >= 0 or a sequence of such ints, as for `np.random.default_rng`.
+            time_limit: seconds for all searches; `math.inf` for no limit. The plan may take a
+                little longer.
 
         Raises:
             ValueError: start or goal is not 7 numbers inside the limits, or is in collision; seed
-                or margin_scale is out of range; or your own planner returned something that is not a
+                or time_limit is out of range; your own planner returned something that is not a
                 path from start to goal.
             PlanningError: no path within `time_limit` and `max_checks`.
         """
-        if not 0 <= margin_scale <= 1:
-            raise ValueError(f"margin_scale must be in [0, 1], got {margin_scale!r}")
-        turns, schedule = ((self.planner, math.inf),), ((0, margin_scale),)
-        limits = self.time_limit, self.max_checks
-        return self._plan(start, goal, scene, seed, turns, schedule, *limits)
-
-    def plan_within(self, seconds, start, goal, scene=None, *, rng):
-        """A path found in `seconds`, which are its only limit; it keeps what `MARGIN_SCHEDULE` say.
-
-        RRT-Connect gets help from `OTHER_PLANNER` where it takes long. The same path comes out on
-        every machine that has the time. If it takes longer to follow than an episode lasts, there
-        is another search, up to `SEARCHES`, and the shortest is returned. `rng`, a NumPy Generator,
-        gives the seeds; the rest is as for `plan`, which may be a little late itself.
-        """
-        deadline, best = time.monotonic() + seconds, None
-        turns = ((self.planner, math.inf),)
-        if self.planner == "RRTConnect":
-            turns = tuple(_turns())
+        if seed is None:
+            raise ValueError("seed must be an int or a sequence of ints, got None")
+        if not time_limit > 0:
+            raise ValueError(f"time_limit must be positive, got {time_limit!r}")
+        if np.shape(goal) == (3,):  # a position, with which an episode may begin
+            raise ValueError("goal must have 7 numbers, got shape (3,)")
+        rng, deadline = np.random.default_rng(seed), time.monotonic() + time_limit
+        # Bad queries are rejected here, as an episode would reject them.
+        self.env.reset_specific(start, goal, scene)
+        start, goal = (np.asarray(end, dtype=np.float32) for end in (start, goal))
+        self.checks, best = 0, None
         for _ in range(SEARCHES):
-            seed, left = int(rng.integers(1, 2**32)), deadline - time.monotonic()
-            try:
-                path = self._plan(start, goal, scene, seed, turns, MARGIN_SCHEDULE, left, math.inf)
-            except PlanningError:
+            path = self._search(start, goal, int(rng.integers(1, 2**32)), deadline)
+            if path is None:
                 break
             if best is None or len(subgoals(path)) < len(subgoals(best)):
                 best = path
             if len(subgoals(best)) <= self.env.horizon - LAG:
                 break
         if best is None:
-            raise PlanningError(f"no path in {seconds} s")
+            raise PlanningError(
+                f"no path in {self.checks} collision checks (time_limit {time_limit} s, max_checks "
+                f"{self.max_checks})"
+            )
         return best
 
-    def _plan(self, start, goal, scene, seed, turns, schedule, time_limit, max_checks):
-        if not seed > 0:
-            raise ValueError(f"seed must be positive, got {seed!r}")  # OMPL ignores others
-        if np.shape(goal) == (3,):  # a position, with which an episode may begin
-            raise ValueError("goal must have 7 numbers, got shape (3,)")
-        # Both are refused here as an episode would refuse them.
-        self.env.reset_specific(start, goal, scene)
-        start, goal = (np.asarray(end, dtype=np.float32) for end in (start, goal))
-        is_valid = self._validity(start, goal, schedule, time_limit, max_checks)
+    def _search(self, start, goal, seed, deadline):
+        """The path of one search, float32 (n, 7), rad; None: there was none within the limits."""
+        is_valid = self._validity(start, goal, deadline)
         states = panda.normalise(start), panda.normalise(goal)
         # For the random number generators that OMPL makes from here on. Spaces make some, for the
         # projections of KPIECE1 and its kin; how many must not matter to the planner.
@@ -292,40 +283,37 @@ class Planner:
             path = self.planner(is_valid, *states, np.random.default_rng(seed))
             path = None if path is None else _checked(path, *states)
         else:
-            path = _solve(turns, self.planner_range, space, is_valid, *states)
+            path = _solve(self._turns(), self.planner_range, space, is_valid, *states)
         if path is not None and self.simplify:
             is_valid.restore_margins()
             path = _simplify(space, path, self.simplify)
-        self.checks = is_valid.checks
+        self.checks += is_valid.checks
         if path is None:
-            raise PlanningError(
-                f"no path in {is_valid.checks} collision checks (limits: {max_checks} checks, "
-                f"{time_limit} s)"
-            )
+            return None
         path = panda.denormalise(path).astype(np.float32)
         path[0], path[-1] = start, goal
         return path
 
-    def _validity(self, start, goal, schedule, time_limit, max_checks):
+    def _validity(self, start, goal, deadline):
+        """The `Validity` of one search."""
         if self._scene is not self.env.scene:
             self._scene, self._checker = self.env.scene, self._geometry_source(self.env.scene)
         ends = np.clip(np.stack([panda.normalise(start), panda.normalise(goal)]), -1.0, 1.0)
         near = self._checker.signed_distances(ends).distance.min(-1)
         from_scene = self._checker.signed_distances(ends, self_collisions=False).distance.min(-1)
-        clearance = schedule[0][1] * self.clearance
-        clearance = self.clearance if from_scene.min() >= clearance else 0.0
+        clearance = self.clearance if from_scene.min() >= self.clearance else 0.0
         rules = []
-        for checks, margin_scale in schedule:
+        for checks, margin_scale in MARGIN_SCHEDULE:
             # Less a hair, because the ends are checked again after normalising, which rounds.
             distances = np.minimum(near, from_scene - margin_scale * clearance) - 1e-5
-            endpoint_margins = ends, distances, MARGIN_GROWTH
-            rule = dict(
-                margin=margin_scale * MARGIN,
-                clearance=margin_scale * clearance,
-                endpoint_margins=endpoint_margins,
-            )
+            rule = {
+                "margin": margin_scale * MARGIN,
+                "clearance": margin_scale * clearance,
+                "endpoint_margins": (ends, distances, MARGIN_GROWTH),
+            }
             rules.append((checks, rule))
-        return Validity(self._checker, rules, time_limit, max_checks)
+        left = math.inf if self.max_checks is None else self.max_checks - self.checks
+        return Validity(self._checker, rules, deadline, left)
 
     def _space(self, is_valid):
         """OMPL's `SpaceInformation`, which asks `is_valid`."""
@@ -337,6 +325,21 @@ class Planner:
         information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
         information.setup()
         return information
+
+    def _turns(self):
+        """For `_solve`: RRT-Connect and the other planner alternate, any other planner works alone.
+
+        There are more turns than anybody has time for.
+        """
+        if self.planner != "RRTConnect":
+            yield self.planner, math.inf
+            return
+        checks, length = 0, FIRST_TURN
+        for _ in range(20):
+            for name, share in (("RRTConnect", length), (OTHER_PLANNER, length // 2)):
+                checks += share
+                yield name, checks
+            length *= 2
 
 
 def normalised_space():
@@ -357,21 +360,11 @@ def _state(space, values):
     return state
 
 
-def _turns():
-    """RRT-Connect's turns and the other planner's, for `_solve`: more than there is time for."""
-    checks, length = 0, FIRST_TURN
-    for _ in range(20):
-        for name, share in (("RRTConnect", length), (OTHER_PLANNER, length // 2)):
-            checks += share
-            yield name, checks
-        length *= 2
-
-
 def _solve(turns, planner_range, space, is_valid, start, goal):
-    """Normalised path (n, 7) by OMPL's planners; None if there was none in time.
+    """Normalised path (n, 7) by OMPL's planners; None: there is none within the limits.
 
-    `turns`: pairs of a planner's name, and the number of checks at which the next one takes over;
-    one that had a turn before goes on from there.
+    `turns`: pairs of a planner's name and the number of checks at which the next planner takes
+    over. A planner that had a turn before continues its search.
     """
     problem = ob.ProblemDefinition(space)
     problem.setStartAndGoalStates(_state(space, start), _state(space, goal))
@@ -412,7 +405,7 @@ def _to_array(path):
 
 
 def _checked(path, start, goal):
-    """What a person's own planner returned, as an array. Raises ValueError if it is no path."""
+    """What a user's own planner returned, as an array. Raises ValueError if it is not a path."""
     path = np.asarray(path, dtype=np.float64)
     if path.ndim != 2 or path.shape[1] != panda.NUM_JOINTS or len(path) < 2:
         raise ValueError(f"the planner returned shape {path.shape}: a path has shape (n > 1, 7)")

@@ -9,7 +9,7 @@ import zlib
 from roboarm_nmp.envs.scenes.primitives import scene_to_json
 from roboarm_nmp.envs.tasks import get_task
 
-VERSION = 3
+VERSION = 4
 
 
 def journal_of(path):

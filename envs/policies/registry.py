@@ -245,9 +245,8 @@ def _planner(env, seed, time_limit, geometry_source):
     planner = planning.Planner(env, geometry_source=geometry_source)
 
     def begin(number, query):
-        rng = np.random.default_rng([seed, number])
         try:
-            path = planner.plan_within(time_limit, *query, rng=rng)
+            path = planner.plan(*query, seed=[seed, number], time_limit=time_limit)
         except planning.PlanningError:
             return EpisodePolicy(None, found=False)
         return EpisodePolicy(_follow(path), found=True)

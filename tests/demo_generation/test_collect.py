@@ -1,4 +1,4 @@
-"""Collecting and verifying: the same file whatever the workers and however often it is killed."""
+"""Collecting and verifying: the same file for any number of workers and of interruptions."""
 
 import contextlib
 import dataclasses
@@ -52,7 +52,7 @@ def run(output, *flags, **kwargs):
 
 
 def journal_lines(output):
-    """Whole lines of the journal after the first, which holds the options."""
+    """The number of complete lines of the journal after the first, which holds the options."""
     journal = collect.journal_of(output)
     return max(journal.read_bytes().count(b"\n") - 1, 0) if journal.exists() else 0
 
@@ -117,7 +117,7 @@ def output(tmp_path):
 
 
 def finish(output, whole, *flags):
-    """Run the command on `output` to its end; how many demonstrations it says it began with."""
+    """Run the command on `output` to its end; the number of demonstrations it continues from."""
     result = run(output, *flags)
     assert result.returncode == 0, result.stderr
     assert output.read_bytes() == whole.read_bytes()
@@ -157,10 +157,10 @@ def test_collected_demonstrations_are_good(whole):
     env.close()
 
 
-def test_the_file_says_how_to_make_it_again(whole):
+def test_file_records_the_command_that_makes_it(whole):
     demos = load_demos(whole)
-    assert demos.made_by.startswith("python -m roboarm_nmp.demo_generation.collect ")
-    arguments = demos.made_by.split()[3:]
+    assert demos.made_by.startswith("roboarm collect ")
+    arguments = demos.made_by.split()[2:]
     flags = dict(zip(arguments[::2], arguments[1::2], strict=True))
     assert flags["--task"] == TASK and flags["--num"] == str(NUM) and flags["--seed"] == "0"
     assert set(flags) <= {f"--{name.replace('_', '-')}" for name in ("num", *collect.OPTIONS)}
@@ -169,7 +169,7 @@ def test_the_file_says_how_to_make_it_again(whole):
 
 @pytest.mark.parametrize("task", ["double_walls", "random_boxes_hard"])
 def test_pretrained_demonstrations_have_the_queries_of_their_seed(task):
-    """Their plans are of an earlier planner (docs/demonstrations.md), their queries are not."""
+    """Only their plans are those of an earlier planner (docs/demonstrations.md)."""
     pretrained = load_demos(task)
     collector = collect.Collector(options(task=task))
     for index in (0, 1, 4_321):
@@ -193,7 +193,7 @@ def test_rejected_attempts_are_counted(output):
     assert stored["queries_given_up"] == stored["attempts"] - 4  # one attempt on each query
 
 
-def test_limits_too_tight_for_any_query(tmp_path):
+def test_limits_too_tight_for_every_query_are_an_error(tmp_path):
     result = run(tmp_path / "demos.h5", "--max-checks", 1, task="no_obstacles")
     assert result.returncode == 1
     assert "error: 100 queries in a row could not be solved ({'no_plan': 300})" in result.stderr
@@ -204,7 +204,7 @@ def test_limits_too_tight_for_any_query(tmp_path):
 # --- Interrupted, killed, damaged
 
 
-def test_a_killed_worker_is_replaced(whole, output):
+def test_killed_worker_is_replaced(whole, output):
     with running(output, "--workers", "2") as process:
         victim = worker_processes(process)[0]
         victim.kill()
@@ -215,7 +215,7 @@ def test_a_killed_worker_is_replaced(whole, output):
     assert list(output.parent.iterdir()) == [output]
 
 
-def test_a_killed_run_goes_on_and_leaves_no_workers(whole, output):
+def test_killed_run_continues_and_leaves_no_workers(whole, output):
     with running(output, "--workers", "2", demos=3) as process:
         children = worker_processes(process)
         process.kill()
@@ -227,13 +227,23 @@ def test_a_killed_run_goes_on_and_leaves_no_workers(whole, output):
     assert finish(output, whole) == collected
 
 
-def test_control_c_and_on_again(whole, output):
+@pytest.mark.parametrize(
+    ("number", "whom", "code", "word"),
+    [
+        (signal.SIGINT, os.killpg, 130, "interrupted"),  # from a terminal, to the workers too
+        (signal.SIGTERM, os.kill, 143, "terminated"),
+        (signal.SIGTERM, os.killpg, 143, "terminated"),  # as `timeout` does
+    ],
+)
+def test_interrupted_run_continues(whole, output, number, whom, code, word):
     with running(output, demos=2) as process:
-        os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the workers, too
+        children = worker_processes(process)
+        whom(process.pid, number)
         _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert stderr.splitlines()[-1] == "interrupted; the same command goes on from here"
+    assert process.returncode == code
+    assert stderr.splitlines()[-1] == f"{word}; the same command continues from here"
     assert "Traceback" not in stderr
+    wait_for(lambda: all(has_ended(child) for child in children), 20)
     collected = journal_lines(output)
     assert collected >= 2 and not output.exists()
     assert finish(output, whole) == collected
@@ -241,7 +251,7 @@ def test_control_c_and_on_again(whole, output):
 
 @pytest.fixture(scope="module")
 def journal():
-    """The journal of a collection that was stopped just before it wrote its file."""
+    """The journal of a collection that was killed just before it wrote its file."""
     scene = scene_to_json(envs.TASKS[TASK].scene)
     collector = collect.Collector(options())
     made = [collector(index) for index in reversed(range(NUM))]
@@ -253,7 +263,7 @@ def entry_of(line):
     return json.loads(line[9:])
 
 
-def test_what_is_in_the_journal_is_not_made_again(journal, output):
+def test_journal_entries_are_not_made_again(journal, output):
     lines = journal.splitlines(keepends=True)
     marked = entry_of(lines[5]) | {"digest": 123456789}
     lines[5] = line_of(marked)
@@ -265,14 +275,14 @@ def test_what_is_in_the_journal_is_not_made_again(journal, output):
 
 
 @pytest.mark.parametrize("cut", [1, 9000], ids=["without its end", "with lines before"])
-def test_a_torn_last_line_is_dropped(whole, journal, output, cut):
+def test_torn_last_line_is_dropped(whole, journal, output, cut):
     collect.journal_of(output).write_bytes(journal[:-cut])
     left = journal[:-cut].count(b"\n") - 1
     assert 8 < left < NUM
     assert finish(output, whole) == left
 
 
-def test_a_journal_goes_on_after_a_torn_line(journal, output):
+def test_journal_continues_after_a_torn_line(journal, output):
     path, lines = collect.journal_of(output), journal.splitlines(keepends=True)
     path.write_bytes(b"".join(lines[:4]) + lines[4][:100])
     for expected in (3, 4, 5):  # torn, whole, whole
@@ -282,7 +292,7 @@ def test_a_journal_goes_on_after_a_torn_line(journal, output):
     assert path.read_bytes() == b"".join(lines[:7])
 
 
-def test_a_flipped_bit_costs_its_entry_and_is_said(whole, journal, output):
+def test_flipped_bit_drops_its_entry_and_is_reported(whole, journal, output):
     rng, flipped = np.random.default_rng(0), bytearray(journal)
     flipped[rng.integers(journal.index(b"\n") + 1, len(journal) - 1)] ^= 1 << rng.integers(8)
     collect.journal_of(output).write_bytes(flipped)
@@ -293,24 +303,24 @@ def test_a_flipped_bit_costs_its_entry_and_is_said(whole, journal, output):
     assert NUM - 2 <= begun < NUM  # two of them, if it was the end of a line
 
 
-def test_a_torn_first_line_is_written_again(whole, journal, output):
+def test_torn_first_line_is_written_again(whole, journal, output):
     collect.journal_of(output).write_bytes(journal[:30])
     assert finish(output, whole) == 0
 
 
-def test_a_journal_may_have_any_of_the_demonstrations(whole, journal, output):
+def test_journal_may_have_any_of_the_demonstrations(whole, journal, output):
     few = journal.splitlines(keepends=True)[:5]
     collect.journal_of(output).write_bytes(b"".join(few))  # numbers 12 to 15
     assert finish(output, whole) == 4
 
 
-def test_fewer_can_be_taken_than_are_in_the_journal(whole, journal, output):
+def test_file_may_have_fewer_demonstrations_than_the_journal(whole, journal, output):
     collect.journal_of(output).write_bytes(journal)
     collect.collect(output, 3, options(), progress=False)
     np.testing.assert_array_equal(load_demos(output).digest, load_demos(whole).digest[:3])
 
 
-def test_a_full_disk(whole, output):
+def test_full_disk_keeps_the_journal(whole, output):
     def small_files():
         resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))  # bytes
 
@@ -330,7 +340,7 @@ def test_a_full_disk(whole, output):
     assert finish(output, whole) == collected
 
 
-def test_a_disk_too_full_for_the_file(whole, journal, output, monkeypatch):
+def test_disk_too_full_for_the_file_keeps_the_journal(whole, journal, output, monkeypatch):
     collect.journal_of(output).write_bytes(journal)
 
     def full(*_):
@@ -345,7 +355,7 @@ def test_a_disk_too_full_for_the_file(whole, journal, output, monkeypatch):
     assert finish(output, whole) == NUM
 
 
-def test_two_collections_at_once(whole, output):
+def test_second_collection_of_the_same_file_is_rejected(whole, output):
     with running(output, demos=1) as process:
         process.send_signal(signal.SIGSTOP)  # so that it does not finish in the meantime
         second = run(output)
@@ -357,11 +367,11 @@ def test_two_collections_at_once(whole, output):
     assert output.read_bytes() == whole.read_bytes()
 
 
-# --- Refused
+# --- Rejected
 
 
-def refusal(args):
-    """What the command says when it refuses; it must not have taken long."""
+def rejection(args):
+    """The message of a command that rejects its arguments at once."""
     begin = time.monotonic()
     with pytest.raises(SystemExit) as ended:
         collect.main(args)
@@ -381,7 +391,6 @@ def refusal(args):
         ({"seed": -1}, r"--seed must be in \[0, 2\^32\)"),
         ({"attempts": 0}, "--attempts must be at least 1"),
         ({"max_checks": 0}, "--max-checks must be at least 1"),
-        ({"time_limit": -1.0}, "--time-limit must be above 0"),
         ({"clearance": -0.1}, "--clearance must be at least 0"),
         ({"clearance": 0.6}, "clearance must be in"),
         ({"ray_address": "x"}, "--ray-address must be `auto` or HOST:PORT"),
@@ -391,19 +400,19 @@ def refusal(args):
         ({"output": Path(".")}, "is a directory"),
     ],
 )
-def test_refused_before_any_work(tmp_path, arguments, complaint):
+def test_bad_flag_is_rejected_before_any_work(tmp_path, arguments, complaint):
     output = tmp_path / arguments.pop("output", "demos.h5")
     args = collect.Args(**({"task": TASK, "num": 4, "output": output} | arguments))
-    assert re.search(complaint, refusal(args))
+    assert re.search(complaint, rejection(args))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("task", [name for name in envs.TASKS if not envs.TASKS[name].trainable])
-def test_a_task_for_testing_only_is_refused(task, output):
-    assert f"{task} is for testing only" in refusal(collect.Args(task, output=output))
+def test_task_for_testing_only_is_rejected(task, output):
+    assert f"{task} is for testing only" in rejection(collect.Args(task, output=output))
 
 
-def test_the_command_says_it_in_one_line(tmp_path):
+def test_error_is_one_line(tmp_path):
     result = run(tmp_path / "missing" / "demos.h5", task="wall")
     assert result.returncode == 1 and result.stdout.count("\n") <= 1
     errors = [line for line in result.stderr.splitlines() if "pybullet" not in line]
@@ -411,18 +420,18 @@ def test_the_command_says_it_in_one_line(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_file_is_refused_without_overwrite(whole, output):
+def test_existing_file_is_rejected_without_overwrite(whole, output):
     output.write_bytes(b"precious")
     args = collect.Args(TASK, num=NUM, output=output)
-    assert refusal(args) == f"error: {output} exists; --overwrite replaces it"
+    assert rejection(args) == f"error: {output} exists; --overwrite replaces it"
     assert output.read_bytes() == b"precious" and list(output.parent.iterdir()) == [output]
     assert finish(output, whole, "--overwrite") == 0
 
 
-def test_the_journal_of_another_collection_is_refused(journal, output):
+def test_journal_of_another_collection_is_rejected(journal, output):
     path = collect.journal_of(output)
     path.write_bytes(journal)
-    message = refusal(collect.Args(TASK, num=NUM, seed=5, planner="RRT", output=output))
+    message = rejection(collect.Args(TASK, num=NUM, seed=5, planner="RRT", output=output))
     assert str(path) in message
     assert "(seed 0, not 5, planner 'RRTConnect', not 'RRT')" in message
     assert path.read_bytes() == journal and not output.exists()
@@ -432,23 +441,23 @@ def test_the_journal_of_another_collection_is_refused(journal, output):
     "contents",
     [b"dear diary,\ntoday was fine\n", b"PK\x03", b'["a", "list"]\n', b'{"journal": 99}\n'],
 )
-def test_what_is_no_journal_is_left_alone(output, contents):
+def test_file_that_is_no_journal_is_left_unchanged(output, contents):
     path = collect.journal_of(output)
     path.write_bytes(contents)
-    assert f"{path}: not a journal" in refusal(collect.Args(TASK, num=1, output=output))
+    assert f"{path}: not a journal" in rejection(collect.Args(TASK, num=1, output=output))
     assert path.read_bytes() == contents
 
 
 # --- Workers
 
 
-def test_a_job_that_raises_is_heard_of():
+def test_exception_of_a_job_is_raised():
     results = workers.run(functools.partial, (int,), ["7", "eight"], 1)  # a worker that is `int`
     with pytest.raises(ValueError, match="eight"):
         assert list(results) == [7, 8]
 
 
-def test_workers_that_always_die_are_given_up():
+def test_workers_that_always_die_are_an_error():
     said = []
     with pytest.raises(RuntimeError, match="workers died 5 times without a result"):
         list(workers.run(os._exit, (1,), range(3), 1, warn=said.append))
@@ -469,23 +478,23 @@ class DiesOnceOnEachJob:
         return 10 * job
 
 
-def test_each_job_is_done_once_whatever_dies(tmp_path):
+def test_each_job_is_done_once_although_workers_die(tmp_path):
     said = []
     results = list(workers.run(DiesOnceOnEachJob, (tmp_path,), range(7), 1, warn=said.append))
     assert sorted(results) == [0, 10, 20, 30, 40, 50, 60]
     assert len(said) == 7 > workers.MAX_DEATHS  # with results between
 
 
-def test_nothing_to_do_starts_nothing():
+def test_no_jobs_start_no_workers():
     assert list(workers.run(os._exit, (1,), [], 1)) == []
 
 
-# --- Verifying and mending
+# --- Verifying and repairing
 
 
 @pytest.fixture(scope="module")
 def exact(whole):
-    """Of each demonstration of `whole`: plan, execution (not rounded, as in the file), seed."""
+    """Plan, exact execution (the file's is rounded) and seed of each demonstration of `whole`."""
     demos = load_demos(whole)
     with contextlib.closing(envs.make(TASK)) as env:
         return [
@@ -496,13 +505,13 @@ def exact(whole):
 
 @pytest.fixture(scope="module")
 def straight(exact):
-    """The same, straight from start to goal, whatever is in the way."""
+    """The same, straight from start to goal, with collisions."""
     with contextlib.closing(envs.make(TASK)) as env:
         return [[plan[[0, -1]], follow(env, plan[[0, -1]]), seed] for plan, _, seed in exact]
 
 
 @pytest.fixture(scope="module")
-def touching():
+def colliding():
     """A configuration inside the limits and in collision."""
     rng = np.random.default_rng(0)
     with contextlib.closing(envs.make(TASK)) as env:
@@ -538,8 +547,8 @@ def starting_at(configuration, demo):
 
 
 @pytest.fixture
-def damaged(output, exact, straight, touching):
-    """A file with demonstrations that are not good; and their verdict -> number."""
+def damaged(output, exact, straight, colliding):
+    """A file with bad demonstrations, and a dict from their verdict to their number."""
     collided = next(i for i, (_, e, _) in enumerate(straight) if e.collided and e.reached)
     missed = next(i for i, (_, e, _) in enumerate(straight) if not e.reached)
     changed, refused = [i for i in range(NUM) if i not in (collided, missed)][4:6]
@@ -548,7 +557,7 @@ def damaged(output, exact, straight, touching):
         demos[i] = straight[i]
     plan, execution, seed = exact[changed]
     demos[changed] = [plan, dataclasses.replace(execution, digest=execution.digest ^ 1), seed]
-    demos[refused] = starting_at(touching, exact[refused])
+    demos[refused] = starting_at(colliding, exact[refused])
     bad = {"collided": collided, "missed": missed, "changed": changed, "refused": refused}
     return write(output, demos), bad
 
@@ -568,7 +577,7 @@ def verdicts(path):
     return [verifier(index)[1] for index in range(len(verifier.demos))]
 
 
-def test_verify_finds_what_is_not_good(whole, damaged):
+def test_verify_finds_bad_demonstrations(whole, damaged):
     path, bad = damaged
     before = path.read_bytes()
     expected = ["good"] * NUM
@@ -585,7 +594,7 @@ def test_verify_finds_what_is_not_good(whole, damaged):
     assert path.read_bytes() == before
 
 
-def test_mending(damaged):
+def test_repair_replaces_or_removes_bad_demonstrations(damaged):
     path, bad = damaged
     old = load_demos(path)
     result = verify_command(path, "--repair")
@@ -608,13 +617,13 @@ def test_mending(damaged):
     assert verify(path, progress=False) == expected
 
 
-def test_mending_a_good_file_changes_nothing(whole, output):
+def test_repair_of_a_good_file_changes_nothing(whole, output):
     output.write_bytes(whole.read_bytes())
     assert verify(output, repair=True, progress=False)["good"] == NUM
     assert output.read_bytes() == whole.read_bytes()
 
 
-def test_states_that_are_not_the_execution_are_found(output, exact):
+def test_states_that_differ_from_the_execution_are_found(output, exact):
     demos = list(exact[:3])
     states = demos[1][1].states.copy()
     states[5, 3] += 0.002
@@ -639,22 +648,22 @@ def test_collisions_are_rejected_unless_allowed(output, straight):
     assert set(verdicts(write(output, reached))) == {"good", "collided"}
 
 
-def test_a_file_in_which_nothing_can_be_mended(output, exact, touching):
-    before = write(output, [starting_at(touching, exact[0])]).read_bytes()
+def test_file_without_a_repairable_demonstration_is_an_error(output, exact, colliding):
+    before = write(output, [starting_at(colliding, exact[0])]).read_bytes()
     with pytest.raises(DatasetError) as caught:
         verify(output, num_workers=1, repair=True, progress=False)
     assert str(output) in str(caught.value)
     assert output.read_bytes() == before
 
 
-def test_a_file_that_was_not_collected_cannot_be_verified(output, exact):
+def test_file_without_options_cannot_be_verified(output, exact):
     write(output, exact[:2], parameters={})  # it does not say with what options
     with pytest.raises(DatasetError) as caught:
         verify(output, num_workers=1, progress=False)
     assert str(output) in str(caught.value)
 
 
-def test_verify_goes_on_after_a_bad_file(whole, tmp_path):
+def test_verify_continues_after_a_bad_file(whole, tmp_path):
     (tmp_path / "bad.h5").write_bytes(whole.read_bytes()[:3000])
     result = verify_command(tmp_path / "bad.h5", tmp_path / "none.h5", whole)
     assert result.returncode == 1 and "Traceback" not in result.stderr
@@ -667,7 +676,7 @@ def test_verify_goes_on_after_a_bad_file(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_a_node_collects_the_same_bytes(output, tmp_path, cluster):
+def test_cluster_that_loses_a_node_collects_the_same_bytes(output, tmp_path, cluster):
     num = 150
     local = tmp_path / "local.h5"
     assert run(local, "--workers", "2", num=num).returncode == 0
@@ -680,7 +689,7 @@ def test_a_cluster_that_loses_a_node_collects_the_same_bytes(output, tmp_path, c
 
 
 @pytest.mark.slow
-def test_no_cluster_to_work_on(output):
+def test_missing_cluster_is_an_error(output):
     pytest.importorskip("ray")
     result = run(output, "--ray-address", "auto")
     assert result.returncode == 1 and "Traceback" not in result.stderr

@@ -343,7 +343,7 @@ def test_sampled_queries_are_solved_and_have_scenes_of_their_own():
     planner = Planner(RoboArmEnv())
     for query, scene in zip(made, scenes, strict=True):
         ends = (np.array(query[end], np.float32) for end in ("start", "goal"))
-        assert len(planner.plan(*ends, scene, seed=1, margin_scale=0.25)) >= 2
+        assert len(planner.plan(*ends, scene, seed=1)) >= 2
 
 
 def test_queries_in_a_row_share_a_scene_if_asked():

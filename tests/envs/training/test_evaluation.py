@@ -259,7 +259,7 @@ def test_the_planner_solves_double_walls_and_follows_its_plan():
     env, rows = envs.make("double_walls"), []
     planner = Planner(env)
     for index, query in enumerate(queries):
-        path = planner.plan_within(60.0, *query, rng=np.random.default_rng([2, index]))
+        path = planner.plan(*query, seed=[2, index], time_limit=60.0)
         states = panda.denormalise(follow(env, path).states)
         to_goal = panda.forward_kinematics(states) - panda.forward_kinematics(query.goal)
         steps = int(np.argmax(np.linalg.norm(to_goal, axis=1) <= env.ee_tolerance))
