@@ -1,18 +1,18 @@
 """Export demonstrations as a Minari dataset, the format of many offline-learning libraries.
 
     pip install -e ".[minari]"
-    python -m roboarm_nmp.demo_generation.export_minari --task double_walls --goal-type ee
+    roboarm minari --task double_walls --goal-type ee
 
 Then `minari.load_dataset("roboarm-nmp/double_walls/ee-v0")` has the demonstrations as episodes of
-the task's environment, each up to the first time that it reaches its goal. The dataset is in
-Minari's local storage: `~/.minari/datasets`, or the folder in MINARI_DATASETS_PATH.
+the task's environment, each up to the first step that reaches its goal. The dataset is in Minari's
+local storage: `~/.minari/datasets`, or the folder in MINARI_DATASETS_PATH.
 
-Demonstration files round configurations to 0.0002 of the normalised space. That is exact enough to
-learn from, but replaying the actions of an episode adds it up, and one in a hundred ends just short
-of its goal. With --exact, replaying the actions repeats the episode.
+Demonstration files round configurations to 0.0002 of the normalised space. That is exact enough for
+training, but the errors accumulate when the actions of an episode are replayed: one episode in a
+hundred ends just short of its goal. With --exact, replaying the actions repeats the episode.
 
-Minari makes the environment again from its Gymnasium id alone, so this works for the tasks of
-`envs.TASKS` whose scene is fixed: not for scenes that vary, and not for scene files.
+Minari makes the environment again from its Gymnasium id alone. So this works for the tasks of
+`envs.TASKS` with a fixed scene, not for scenes that vary, and not for scene files.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_episode
 from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
 
-PREFIX = ".exporting-"  # of folders that are not whole yet; Minari does not look into hidden ones
+PREFIX = ".exporting-"  # of incomplete folders; Minari ignores hidden ones
 
 
 @dataclass
@@ -47,7 +47,7 @@ class Args:
     file: Path | None = None
     """Demonstration file to export instead."""
     goal_type: Literal["ee", "config", "combined"] = "ee"
-    """What the goals are."""
+    """Kind of the goals."""
     dataset_id: str | None = None
     """Minari's name for the dataset. The default is `roboarm-nmp/<task>/<goal type>-v0`."""
     exact: bool = False
@@ -59,13 +59,12 @@ class Args:
 def unrounded(demo, env):
     """The demonstration with its exact states and actions, by following its plan in `env`.
 
-    Raises ValueError: it is another execution on this machine.
+    Raises ValueError: the execution differs on this machine.
     """
     execution = follow(env, demo.plan)
     if execution.digest != demo.digest:
         raise ValueError(
-            "the demonstrations do not repeat exactly here: `python -m roboarm_nmp.demo_generation.verify "
-            "FILE --repair` first"
+            "the executions differ on this machine: repair them with `roboarm verify FILE --repair`"
         )
     states, points = execution.states, subgoals(demo.plan)
     actions = points[np.minimum(np.arange(1, len(states)), len(points) - 1)] - states[:-1]
@@ -88,7 +87,7 @@ def episode(demo, env):
     """
     observation, achieved, desired, action, success = demo_episode(demo, env)
     truncations = np.zeros(len(action), bool)
-    truncations[-1] = not success[-1]  # the recording ends, not the task
+    truncations[-1] = not success[-1]  # the recording ends, but not the episode
     return {
         "observations": {
             "observation": observation,
@@ -107,19 +106,19 @@ def _check_recoverable(demos):
     """Raise ValueError unless Minari could make the environment of every episode again."""
     if demos.task not in envs.TASKS:
         raise ValueError(
-            f"these demonstrations are for {demos.task!r}, which is none of envs.TASKS: without a "
-            f"registered environment, nobody could recover theirs from a Minari dataset"
+            f"the demonstrations' task {demos.task!r} is not in envs.TASKS: Minari can recover "
+            f"registered environments only"
         )
     if demos.scenes.index is not None:
         raise ValueError(
-            f"the scenes of {demos.task} vary, and a Minari episode would not say which scene it "
-            f"belongs to: only demonstrations in a fixed scene can be exported"
+            f"the scenes of {demos.task} vary, and a Minari episode does not store its scene: only "
+            f"demonstrations in a fixed scene can be exported"
         )
 
 
 @contextlib.contextmanager
 def _locked(folder):
-    """A context in which this process holds a folder. Raises BlockingIOError: another one does."""
+    """A context with a lock on a folder. Raises BlockingIOError: another process has it."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -129,7 +128,7 @@ def _locked(folder):
 
 
 def _clear_leftovers(root):
-    """Delete what exports that were killed have left, unless a dataset was about to be replaced."""
+    """Delete what killed exports left, unless a dataset was about to be replaced."""
     for folder in root.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError), _locked(folder):
             if not (folder / "old").exists():
@@ -144,14 +143,14 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
         goal_type: `ee`, `config` or `combined`.
         dataset_id: a name with a version, `namespace/name-v0`; None for the default.
         exact: follow the plans again, see above.
-        overwrite: replace a dataset of this name. Until the new one is whole, the old one stays.
+        overwrite: replace a dataset of this name. The old one stays until the new one is complete.
         progress: show a progress bar.
 
     Raises:
         ImportError: Minari is not installed.
         ValueError: the demonstrations are for a scene file, or their scenes vary; Minari does not
-            allow the name, or there is a dataset of this name; or, with `exact`, the demonstrations
-            do not repeat on this machine.
+            allow the name, or there is a dataset of this name; or, with `exact`, the executions
+            differ on this machine.
         OSError: the dataset cannot be written.
     """
     _check_recoverable(demos)
@@ -228,8 +227,4 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(
-        tyro.cli(
-            Args, prog="python -m roboarm_nmp.demo_generation.export_minari", description=__doc__
-        )
-    )
+    main(tyro.cli(Args, prog="roboarm minari", description=__doc__))

@@ -1,4 +1,4 @@
-"""Following a plan in the simulator, which is what turns it into a demonstration."""
+"""Following a plan in the simulator, which turns it into a demonstration."""
 
 import zlib
 from dataclasses import dataclass
@@ -7,23 +7,23 @@ import numpy as np
 
 from roboarm_nmp.envs.subgoals import subgoals
 
-# The goal is reached well inside the tolerances of every goal type, so that rounding the stored
-# configurations cannot take it out again.
+# Share of the tolerances of every goal type within which the goal counts as reached: rounding the
+# stored configurations must not undo that.
 INSIDE = 0.9
-# After the last sub-goal the goal is commanded for at most so many steps until it is reached. No
-# longer: at full speed the arm may swing beyond it, and touch something.
+# After the last sub-goal, the goal is commanded for at most so many steps until it is reached. More
+# steps risk a collision: at full speed the arm may swing beyond the goal.
 SETTLE_STEPS = 10
 
 
 @dataclass(frozen=True)
 class Execution:
-    """What happened when a plan was followed.
+    """The execution of a plan.
 
     Attributes:
         states: float32 (n + 1, 7), the normalised configuration before each step and at the end.
-        collided: whether anything was touched on the way.
+        collided: whether there was any contact.
         reached: whether the end is well inside the tolerances of every goal type.
-        digest: CRC-32 of the bytes of `states`; equal for exactly equal executions.
+        digest: CRC-32 of the bytes of `states`; the same for exactly the same executions.
     """
 
     states: np.ndarray

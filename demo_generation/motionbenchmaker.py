@@ -1,6 +1,6 @@
 """Problems of MotionBenchMaker (Chamzas et al., RA-L 7(2), 2022) as queries with scenes.
 
-They are read from the JSON form of the problem set that VAMP distributes: `problems`, each with
+The files are the JSON form of the problem set that VAMP distributes: `problems`, each with
 `start` (7, rad), `goals` (one or more, 7, rad) and `obstacles`: `box` (`position`, `quat_xyzw`,
 `size`), `cylinder` (`position`, `quat_xyzw`, `radius`, `length`), in m, in the base's frame.
 """
@@ -16,11 +16,11 @@ from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 def read_problems(path):
     """The problems in a JSON file: start and goal, float32 (n, 7), rad, and a list of n `Scene`s.
 
-    The scenes have neither table nor floor, as published. Of several goals the first is taken.
+    The scenes have neither table nor floor, as published. The first of several goals is used.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is not such a file.
+        ValueError: the file is not of this form.
     """
     try:
         problems = json.loads(Path(path).read_text())["problems"]

@@ -1,29 +1,28 @@
-"""Roadmaps: many short paths in one scene, and how to go on from any configuration in it.
+"""Roadmaps: many short paths in one scene, and a direction to the goal from any configuration.
 
-    python -m roboarm_nmp.demo_generation.roadmaps --task random_boxes_hard --scenes 6000 --output roadmaps
+    roboarm roadmaps --task random_boxes_hard --scenes 6000 --output roadmaps
 
-collects paths of many scenes (read by `envs.datasets.roadmap_paths.load_roadmap_paths`). In Python:
+collects paths of many scenes, for `envs.datasets.roadmap_paths.load_roadmap_paths`. In Python:
 
     from roboarm_nmp.demo_generation.roadmaps import Roadmap
 
     roadmap = Roadmap(scene, rng)
-    roadmap.random_paths(300, rng)           # so many paths, each (k, 7), normalised
-    roadmap.paths(starts, goals, rng)        # the same for given queries; None where there is none
-    roadmap.labels(states, goals, rng)       # the direction to go on in, and how long the rest is
+    roadmap.random_paths(300, rng)           # 300 paths, each (k, 7), normalised
+    roadmap.paths(starts, goals, rng)        # paths of given queries; None where there is none
+    roadmap.labels(states, goals, rng)       # direction and length of the path from each state
 
-A probabilistic roadmap (Kavraki et al., 1996): random free configurations, each joined to its
-nearest neighbours where the straight motion is free, and shortest paths in that graph, which are
-then pruned and cut short. Of a motion only some states are looked at beforehand, and the others
-when a shortest path would take it (Bohlin and Kavraki, 2000), which finds the same paths.
+A roadmap is a probabilistic roadmap (Kavraki et al., 1996). Its nodes are random free
+configurations; its edges are free straight motions to the nearest neighbours. Shortest paths in
+that graph are then pruned and shortened. Edges are checked coarsely at first, and finely when a
+shortest path would take them (Bohlin and Kavraki, 2000), which finds the same paths.
 
-Paths keep `margin` from everything where there is room. A node, a start or a goal that is nearer
-to something than that is not lost: around it, a path may come as near as it is itself, and has to
-get away by `MARGIN_GROWTH`.
+Paths keep `margin` from obstacles and from the arm itself where there is room. Near a node, a start
+or a goal that is closer, the margin is that configuration's own distance, and grows by
+`MARGIN_GROWTH` away from it.
 
-Scene i of a collection and its paths depend on the seed, the options and i only, so the files are
-the same whatever the number of workers. They are written a shard at a time, each in one piece; a
-run that was interrupted or killed goes on when it is started again, and one that is finished can be
-continued with more scenes.
+Scene i of a collection and its paths depend only on the seed, the options and i, so the files are
+the same for every number of workers. They are written in shards, each atomically. After an
+interruption the same command continues; a finished collection is extended by a larger `--scenes`.
 """
 
 import copy
@@ -42,48 +41,51 @@ from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Seed, Workers
+from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
 
-# L2, normalised, between states of a motion that are looked at before a path wants to take it.
+# L2, normalised, between checked states of a motion before a path wants to take it.
 COARSE = 8 * RESOLUTION
-# CircularConv a configuration that is nearer to something than the margin, the margin grows by this much
-# (m) per unit of normalised distance from it.
+# Near a configuration that is closer to an obstacle than the margin, the margin is its distance. It
+# grows by this much (m) per unit of normalised distance from it.
 MARGIN_GROWTH = 0.05
-# Nodes keep at least this (m), as plans do (`demo_generation.planning.MARGIN`).
+# Least margin (m) of nodes, that of plans (`demo_generation.planning.MARGIN`).
 NODE_MARGIN = 0.003
 # A motion costs up to 1 + NARROW times its length, where one of its ends has no room at all.
 NARROW = 2.0
-# A configuration that is deeper (m) in something is moved out of it before anything else, until it
-# is NODE_MARGIN away, in steps of OUT_STEP (normalised).
+# A configuration in deeper (m) contact is first moved out of it, in steps of OUT_STEP (normalised),
+# until its distance is NODE_MARGIN.
 INSIDE, OUT_STEP, MAX_OUT_STEPS = 0.001, 0.01, 100
-# A way begins and ends at one of so many nearest nodes.
+# A path begins and ends at one of so many nearest nodes.
 JOINED = 30
-# Where there is none: nodes that are added near the ends, and how near (normalised) they are drawn,
-# the largest standard deviation of each joint.
+# Where there is no path: the number of nodes that are added near the ends, and the largest standard
+# deviation of each joint (normalised) around them.
 GROWN, GROWN_SCALE = 400, 0.6
-# Normalised, along ways through narrow places: where it is asked how narrow they are.
+# Spacing (normalised) of the points at which paths through narrow places measure their room.
 DENSE = 0.15
-# `random_paths`: goals for each path (each costs a search of the whole roadmap), queries for each
-# path that is wanted, and how often it draws more of them before it gives up.
+# `random_paths`: goals per path (each costs a search of the whole roadmap), queries per path, and
+# how often it samples more queries before it gives up.
 GOALS_PER_PATH, SPARE, MAX_ROUNDS = 0.13, 1.1, 10
 # Random chords tried on each path, and the share of its length that each has to save.
 CHORDS, LEAST_GAIN = 40, 0.005
-# A label's direction is that of so much (normalised) of its way, a third of a step of the arm.
+# A label is the direction to the point at this distance (normalised) along the path: a third of a
+# step of the arm.
 AHEAD = 0.01
-_HAIR = 1e-5  # m: what rounding may take from a distance
+_ROUNDING = 1e-5  # m: largest rounding error of a distance
 _DIFFERENCES = 1e-4 * np.stack([-np.eye(7), np.eye(7)])  # normalised: (2, 7, 7)
 
 
 class Roadmap:
     """The roadmap of a scene. Configurations are normalised.
 
-    The same scene, arguments and generators give the same answers.
+    The same scene, arguments and generators give the same results.
 
     Args:
         scene: a `Scene`.
         rng: a NumPy Generator.
         num_nodes: random free configurations.
-        num_neighbours: of the nearest nodes, how many each node, start and goal is joined to.
-        margin: m, at least `NODE_MARGIN`: what paths keep from everything, the arm itself included.
+        num_neighbours: nearest nodes to which each node is joined.
+        margin: m, at least `NODE_MARGIN`: distance of paths from obstacles and from the arm itself.
 
     Raises:
         ValueError: the margin is smaller.
@@ -96,15 +98,15 @@ class Roadmap:
         self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
         self._checker = CollisionChecker(scene)
         self.nodes, self._room = np.empty((0, 7)), np.empty(0)
-        # Motions between neighbours: which of these margins each keeps, 2 if none; and whether all
-        # of it has been looked at, or it is only believed.
+        # Motions between neighbours: the index of the margin that each keeps, 2 for none; and
+        # whether it was checked finely, or only coarsely.
         self._margins = margin, NODE_MARGIN
         self._edges, self._edge_costs = np.empty((2, 0), np.int64), np.empty((2, 0))
-        self._kept, self._is_known = np.empty(0, np.int64), np.empty(0, bool)
+        self._kept, self._is_checked = np.empty(0, np.int64), np.empty(0, bool)
         self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
 
     def _add_nodes(self, nodes):
-        """Let motions lead from free configurations (n, 7) to the nearest nodes."""
+        """Add free configurations (n, 7) as nodes, with edges to their nearest nodes."""
         first = len(self.nodes)
         self.nodes = np.concatenate([self.nodes, nodes])
         self._room = np.concatenate([self._room, self._rooms(nodes)])
@@ -118,14 +120,14 @@ class Roadmap:
         self._edge_costs = np.concatenate([self._edge_costs, costs], axis=1)
         kept = np.zeros(edges.shape[1], np.int64)
         for i, margin in enumerate(self._margins):
-            asked = np.flatnonzero(kept == i)
-            motions = *self.nodes[edges[:, asked]], *self._room[edges[:, asked]]
-            kept[asked] += ~self._joined(*motions, margin, COARSE)
+            checked = np.flatnonzero(kept == i)
+            motions = *self.nodes[edges[:, checked]], *self._room[edges[:, checked]]
+            kept[checked] += ~self._joined(*motions, margin, COARSE)
         self._kept = np.concatenate([self._kept, kept])
-        self._is_known = np.concatenate([self._is_known, np.zeros(len(kept), bool)])
+        self._is_checked = np.concatenate([self._is_checked, np.zeros(len(kept), bool)])
 
     def _grown(self, around, rng):
-        """This roadmap with more nodes, near configurations that could not be joined to it."""
+        """This roadmap with more nodes near configurations (n, 7) that have no path in it."""
         centres = around[np.arange(GROWN) % len(around)]
         scale = rng.uniform(0.0, GROWN_SCALE, (GROWN, 1))
         new = np.clip(centres + scale * rng.standard_normal((GROWN, 7)), -1.0, 1.0)
@@ -134,7 +136,7 @@ class Roadmap:
         return roadmap
 
     def sample(self, number, rng, margin=0.0):
-        """Random free configurations, float64 (number, 7). Raises RuntimeError: there are none."""
+        """Random free configurations, float64 (number, 7). Raises RuntimeError: none is found."""
         found, missing = [np.empty((0, 7))], number
         for _ in range(1000):
             if missing == 0:
@@ -149,7 +151,7 @@ class Roadmap:
     def random_paths(self, number, rng):
         """`number` smoothed paths between random free configurations: a list of float32 (k, 7).
 
-        Fewer, where hardly any configurations can be joined.
+        Fewer, where hardly any two configurations have a path between them.
         """
         goals = self.sample(int(np.ceil(GOALS_PER_PATH * number)), rng)
         paths = []
@@ -163,10 +165,10 @@ class Roadmap:
         return paths[:number]
 
     def paths(self, starts, goals, rng):
-        """Smoothed paths from starts (n, 7) to goals (n, 7): a list of float32 (k, 7), k > 1, or
-        None where there is no way.
+        """Smoothed paths from starts (n, 7) to goals (n, 7): a list of float32 (k, 7), k > 1.
 
-        Starts may be in contact, as for `labels`. Fast for many queries with few different goals.
+        None where there is no path. Starts may be in contact, as for `labels`. Many queries with
+        few different goals are fast.
         """
         # The simulated arm may be a little beyond its limits.
         starts, goals = (
@@ -176,12 +178,12 @@ class Roadmap:
         begins = self._moved_out(starts, -INSIDE)
         points, room, found = self._search(begins, goals)
         paths = [None] * len(starts)
-        ways = self._smooth(points[found], points[found], room[found], rng)
-        for i, path in zip(np.flatnonzero(found), ways, strict=True):
+        smooth = self._smooth(points[found], points[found], room[found], rng)
+        for i, path in zip(np.flatnonzero(found), smooth, strict=True):
             paths[i] = path
         lost = np.flatnonzero(~found)
         if len(lost):
-            # Through narrow places, where the margin is not kept. Away from them it is.
+            # Through narrow places, where less than the margin is kept.
             begins[lost] = self._moved_out(begins[lost], NODE_MARGIN)
             ends = np.unique(np.concatenate([begins[lost], goals[lost]]), axis=0)
             points, _, found = self._grown(ends, rng)._search(
@@ -189,27 +191,27 @@ class Roadmap:
             )
             states = _dense(points[found])
             room = self._rooms(states.reshape(-1, 7)).reshape(states.shape[:2])
-            ways = self._smooth(points[found], states, room, rng)
-            for i, path in zip(lost[found], ways, strict=True):
+            smooth = self._smooth(points[found], states, room, rng)
+            for i, path in zip(lost[found], smooth, strict=True):
                 paths[i] = path
         for i, path in enumerate(paths):
             if path is not None:
                 path = np.concatenate([starts[i : i + 1], path]).astype(np.float32)
                 moves = (path[1:] != path[:-1]).any(1)
-                # A path whose start is its goal has two points, too.
+                # A path whose start is its goal has two points all the same.
                 paths[i] = path[np.r_[True, moves]] if moves.any() else path[:2]
         return paths
 
     def labels(self, states, goals, rng):
-        """How to go on from each of the states (n, 7) to its goal (n, 7).
+        """Direction and length of a path from each of the states (n, 7) to its goal (n, 7).
 
-        States may be in contact. Where one is nearer to something than the margin, the way begins
-        as near as it is. From really inside something, it first goes the shortest way out.
+        States may be in contact. Where a state is closer than the margin, its path begins at its
+        own distance. From a contact deeper than `INSIDE`, the path first leaves the obstacle.
 
         Returns:
-            directions: float32 (n, 7), unit vectors: to where the way is after `AHEAD`. Zeros where
-                the state is its goal, NaN where there is no way.
-            lengths: float32 (n,), of the way, L2, normalised. NaN where there is none.
+            directions: float32 (n, 7), unit vectors towards the path's point after `AHEAD`. Zeros
+                where the state is its goal, NaN where there is no path.
+            lengths: float32 (n,), of the path, L2, normalised. NaN where there is none.
         """
         directions = np.full((len(states), 7), np.nan, np.float32)
         lengths = np.full(len(states), np.nan, np.float32)
@@ -223,84 +225,82 @@ class Roadmap:
         return directions, lengths
 
     def _distances(self, states):
-        """m, of the arm from the nearest thing; negative inside of it."""
+        """Distances (m) of the arm from obstacles and from itself; negative in contact."""
         return self._checker.signed_distances(states).distance.min(-1)
 
     def _rooms(self, states):
-        """The distances, at most the margin."""
+        """The same, at most the margin."""
         room = np.full(len(states), self.margin)
         near = ~self._checker.is_free(states, self.margin)
         room[near] = np.minimum(self._distances(states[near]), self.margin)
         return room
 
     def _free(self, starts, ends, states, room, margin, **options):
-        """Whether motions (n, 7) are free, each as near as its own states (n, k, 7) allow."""
-        endpoint_margins = (states, room - _HAIR, MARGIN_GROWTH)
+        """Whether motions (n, 7) are free, with the room at each one's states (n, k, 7)."""
+        endpoint_margins = (states, room - _ROUNDING, MARGIN_GROWTH)
         return self._checker.is_motion_free(
             starts, ends, margin, endpoint_margins=endpoint_margins, **options
         )
 
     def _costs(self, starts, ends, start_room, end_room):
-        """Of straight motions (..., 7), if they are free."""
+        """Costs of straight motions (..., 7)."""
         tightness = 1.0 - np.clip(np.minimum(start_room, end_room) / self.margin, 0.0, 1.0)
         return np.linalg.norm(ends - starts, axis=-1) * (1.0 + NARROW * tightness)
 
     def _joined(self, starts, ends, start_room, end_room, margin, resolution=RESOLUTION):
-        """Whether straight motions (n, 7) are free, as near as both of their ends allow."""
+        """Whether straight motions (n, 7) are free, with the room at both of their ends."""
         states, room = np.stack([starts, ends], axis=1), np.stack([start_room, end_room], axis=1)
         options = {"resolution": resolution, "ends_known": True}
         return self._free(starts, ends, states, room, margin, **options)
 
     def _nearest_nodes(self, states, number):
-        """(n, number), in any order."""
+        """Indices of the nearest nodes, (n, number), in any order."""
         squared = (self.nodes**2).sum(1) - 2.0 * states @ self.nodes.T
         return np.argpartition(squared, number, axis=1)[:, :number]
 
     def _smooth(self, points, states, room, rng):
-        """Paths (n, k, 7), padded, made shorter, as near as the states (n, m, 7) allow that they
-        come by.
-        """
+        """Shortened paths (n, k, 7), padded, with the room at their states (n, m, 7)."""
         return self._cut_short(self._prune(points, states, room), states, room, rng)
 
     def _search(self, starts, goals, narrow=False):
         """Shortest paths: points (n, k, 7), padded with the goal, their room (n, k), found (n,).
 
-        Where they are `narrow`, their motions need not keep more than `NODE_MARGIN`.
+        `narrow` paths keep `NODE_MARGIN` only.
         """
         margin, count = self._margins[narrow], len(self.nodes)
         goals, which = np.unique(goals, axis=0, return_inverse=True)
         start_room, goal_room = self._rooms(starts), self._rooms(goals)
         states, room = np.concatenate([self.nodes, goals]), np.concatenate([self._room, goal_room])
-        # Edges lead from goals to nodes and not back: no path goes through another query's goal.
+        # Edges lead from goals to nodes and not back: no path leads through another query's goal.
         goal = np.repeat(np.arange(len(goals)), JOINED)
         node = self._nearest_nodes(goals, JOINED).ravel()
-        ways = goals[goal], self.nodes[node], goal_room[goal], self._room[node]
-        goal_costs = self._costs(*ways)
-        goal_costs[~self._joined(*ways, margin)] = np.inf
+        motions = goals[goal], self.nodes[node], goal_room[goal], self._room[node]
+        goal_costs = self._costs(*motions)
+        goal_costs[~self._joined(*motions, margin)] = np.inf
         # The first step is to the goal itself or to a node.
         first = np.c_[count + which, self._nearest_nodes(starts, JOINED)]
         first_costs = self._costs(starts[:, None], states[first], start_room[:, None], room[first])
         first_costs[start_room < -INSIDE] = np.inf
-        is_known = np.zeros(first.shape, bool)
+        is_checked = np.zeros(first.shape, bool)
         found, routes = np.zeros(len(starts), bool), {}
         waiting = np.arange(len(starts))
         while len(waiting):
             asked, row = np.unique(which[waiting], return_inverse=True)
             rest, before = self._shortest(asked, goal, node, goal_costs, narrow)
-            # From or to the inside of something there is no way.
+            # There is no path from or to a configuration in contact.
             rest[goal_room[asked] < -INSIDE] = np.inf
             while True:  # the best first step of those that are free
                 costs = first_costs[waiting] + rest[row[:, None], first[waiting]]
                 best = costs.argmin(1)
                 possible = np.isfinite(costs.min(1))
-                unknown = possible & ~is_known[waiting, best]
-                if not unknown.any():
+                unchecked = possible & ~is_checked[waiting, best]
+                if not unchecked.any():
                     break
-                query, step = waiting[unknown], best[unknown]
+                query, step = waiting[unchecked], best[unchecked]
                 tried = first[query, step]
                 ends = starts[query], states[tried]
                 free = self._joined(*ends, start_room[query], room[tried], margin)
-                is_known[query, step] = True
+                is_checked[query, step] = True
                 first_costs[query[~free], step[~free]] = np.inf
             waiting, best, row = waiting[possible], best[possible], row[possible]
             at = first[waiting, best]
@@ -309,7 +309,7 @@ class Roadmap:
                 at = np.where(at < count, before[row, at], at)
                 route.append(at)
             route = np.stack(route, axis=1)
-            free = self._look(route, narrow)
+            free = self._check(route, narrow)
             found[waiting[free]] = True
             routes |= dict(zip(waiting[free], route[free], strict=True))
             waiting = waiting[~free]
@@ -321,7 +321,7 @@ class Roadmap:
         return points, np.concatenate([start_room[:, None], room[route]], axis=1), found
 
     def _shortest(self, asked, goal, node, goal_costs, narrow):
-        """Dijkstra's algorithm from the goals that are asked, by what is not known to be blocked.
+        """Dijkstra's algorithm from the goals `asked`, by motions that are not known to collide.
 
         `goal[i]` is joined to `node[i]`, where that costs less than infinity.
 
@@ -338,10 +338,10 @@ class Roadmap:
         graph = csr_array((costs, (tails, heads)), shape=(size, size))
         return dijkstra(graph, indices=count + asked, return_predecessors=True)
 
-    def _look(self, route, narrow):
-        """Whether all motions between nodes of each route (n, k) are what they were believed to be.
+    def _check(self, route, narrow):
+        """Whether fine checks confirm all motions between nodes of each route (n, k): bool (n,).
 
-        Those that were only believed are looked at.
+        Motions without one get theirs here.
         """
         count = len(self.nodes)
         path, step = np.nonzero((route[:, 1:] < count) & (route[:, :-1] != route[:, 1:]))
@@ -349,32 +349,32 @@ class Roadmap:
         names, wanted = self._edges[0] * count + self._edges[1], ends[0] * count + ends[1]
         order = np.argsort(names)
         used = order[np.searchsorted(names, wanted, sorter=order)]
-        unknown = np.unique(used[~self._is_known[used]])
+        unchecked = np.unique(used[~self._is_checked[used]])
         for kept in (1, 0):
-            edges = unknown[self._kept[unknown] == kept]
+            edges = unchecked[self._kept[unchecked] == kept]
             ends = self._edges[:, edges]
             free = self._joined(*self.nodes[ends], *self._room[ends], self._margins[kept])
-            self._is_known[edges[free]] = True
+            self._is_checked[edges[free]] = True
             self._kept[edges[~free]] += 1
         free = np.ones(len(route), bool)
-        free[path[~self._is_known[used] | (self._kept[used] > narrow)]] = False
+        free[path[~self._is_checked[used] | (self._kept[used] > narrow)]] = False
         return free
 
     def _prune(self, points, states, room):
-        """Paths (n, k, 7), padded, without the vertices that straight motions can leave out."""
+        """Paths (n, k, 7), padded, without the vertices that free straight motions bypass."""
         n, size = points.shape[:2]
         lengths = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
         moves = np.full((n, size, size), np.inf)
         steps = np.arange(size - 1)
         moves[:, steps, steps + 1] = lengths[:, steps, steps + 1]
         first, last = np.triu_indices(size, 2)
-        path, pair = np.nonzero(moves[:, last - 1, last] > 0.0)  # not to where the goal is repeated
+        path, pair = np.nonzero(moves[:, last - 1, last] > 0.0)  # not to the padding
         first, last = first[pair], last[pair]
         ends = points[path, first], points[path, last]
         free = self._free(*ends, states[path], room[path], self.margin, ends_known=True)
         path, first, last = path[free], first[free], last[free]
         moves[path, first, last] = lengths[path, first, last]
-        # The shortest way through what is left, by dynamic programming.
+        # The shortest path through these motions, by dynamic programming.
         costs, before = np.zeros((n, size)), np.zeros((n, size), np.int64)
         for i in range(1, size):
             through = costs[:, :i] + moves[:, :i, i]
@@ -389,7 +389,7 @@ class Roadmap:
         return pruned[:, : max(kept.sum(1).max(initial=0), 2)]
 
     def _cut_short(self, points, states, room, rng):
-        """Paths (n, k, 7), padded, after trying random chords; as near as their states allow."""
+        """Paths (n, k, 7), padded, shortened by random chords, with the room at their states."""
         rows = np.arange(len(points))
         for _ in range(CHORDS):
             steps = np.linalg.norm(np.diff(points, axis=1), axis=-1)
@@ -422,7 +422,7 @@ class Roadmap:
         return points
 
     def _moved_out(self, states, room):
-        """The states, those with less room (m) moved to `NODE_MARGIN` by the shortest way."""
+        """The states; those with less room (m) are moved along the gradient to `NODE_MARGIN`."""
         states = states.copy()
         inside = np.flatnonzero(self._rooms(states) < room)
         for _ in range(MAX_OUT_STEPS):
@@ -447,18 +447,13 @@ def _dense(points):
     return np.concatenate([dense, points[:, -1:]], axis=1)
 
 
-# Streams 1 to 4 of random numbers are those of queries, demonstrations and observations. Seeds are
-# below 2^32, so each is one word of what NumPy seeds with: no scene is one of another stream's.
-STREAM = 5
-
-
 @dataclass
 class Args:
     output: Path
     """Folder to write to."""
     task: str = "random_boxes_hard"
-    """Name of a task, `mixed_scenes`, or path of a scene file. Where scenes do not vary, each has a
-    new roadmap."""
+    """Name of a task, `mixed_scenes`, or path of a scene file. Each scene has a roadmap of its own,
+    also where scenes do not vary."""
     scenes: PositiveInt = 6000
     """Number of scenes."""
     paths_per_scene: PositiveInt = 300
@@ -466,9 +461,9 @@ class Args:
     num_nodes: PositiveInt = 1000
     """Nodes of a roadmap."""
     num_neighbours: PositiveInt = 14
-    """SignedDistances nodes that each is joined to, where the motion is free."""
+    """Nearest nodes to which each node is joined."""
     margin: PositiveFloat = 0.015
-    """Metres that paths keep from everything, where there is room."""
+    """Distance (m) of paths from obstacles and from the arm itself, where there is room."""
     shard_size: PositiveInt = 50
     """Scenes in each file."""
     seed: Seed = 0
@@ -476,7 +471,7 @@ class Args:
     workers: Workers = 2
     """Number of processes. The files do not depend on it."""
     ray_address: str | None = None
-    """Work on the Ray cluster at this address (`auto`, `HOST:PORT`) and not in local processes."""
+    """Address of a Ray cluster (`auto`, `HOST:PORT`) to use instead of local processes."""
 
 
 # What a shard depends on, besides its number.
@@ -493,7 +488,7 @@ OPTIONS = (
 
 def random_paths_of_scene(index, options):
     """`(Scene, paths)` of scene `index` of a collection. `options`: a dict with keys `OPTIONS`."""
-    rng = np.random.default_rng([options["seed"], STREAM, index])
+    rng = np.random.default_rng([options["seed"], Stream.ROADMAPS, index])
     scene = envs.get_task(options["task"]).scene
     scene = scene if isinstance(scene, Scene) else scene.sample(rng)
     arguments = {name: options[name] for name in ("num_nodes", "num_neighbours", "margin")}
@@ -517,13 +512,13 @@ class Collector:
 
 
 def collect(args, progress=True):
-    """Make the shards that are missing; returns all `RoadmapPaths`.
+    """Make the missing shards. Returns all `RoadmapPaths`.
 
     Raises:
-        ValueError: arguments that cannot work; the folder holds other paths, or damaged ones.
+        ValueError: the flags cannot work, or the folder holds other paths, or damaged ones.
         RuntimeError: a scene leaves no room for the arm, or workers keep dying.
         ConnectionError: there is no Ray cluster.
-        OSError: the folder cannot be written. What was written is safe.
+        OSError: the folder cannot be written. Finished shards are kept.
     """
     if args.num_nodes <= max(args.num_neighbours, JOINED):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
@@ -532,12 +527,12 @@ def collect(args, progress=True):
     package = Path(envs.__file__).parent.resolve()
     if package in (args.output.resolve(), *args.output.resolve().parents):
         raise ValueError(
-            f"{args.output} is in {package}: the repository's own files stay as they are"
+            f"{args.output} is in {package}, which has the repository's own files only"
         )
     shards.check_collection(args)
     options = {name: getattr(args, name) for name in OPTIONS}
     given = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
-    made_by = " ".join(["python -m roboarm_nmp.demo_generation.roadmaps", *given])
+    made_by = " ".join(["roboarm roadmaps", *given])
     shards.collect(
         args,
         args.scenes,
@@ -556,9 +551,8 @@ def collect(args, progress=True):
 def main(args):
     try:
         made = collect(args)
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as interrupt:
+        exit_interrupted(interrupt, "the same command continues from here")
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
@@ -567,4 +561,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m roboarm_nmp.demo_generation.roadmaps", description=__doc__))
+    raise_on_sigterm()
+    main(tyro.cli(Args, prog="roboarm roadmaps", description=__doc__))

@@ -1,10 +1,10 @@
 """Verify demonstration files: follow every plan again in the simulator; repair what fails.
 
-    python -m roboarm_nmp.demo_generation.verify envs/demos/double_walls.h5 --repair
+    roboarm verify envs/demos/double_walls.h5 --repair
 
 Paper: appendix "Software package description" ("verification, and correction"). A demonstration
-is good if its plan, followed, gives exactly the execution that is stored, reaches its goal, and
-touches nothing (unless the file was collected with --allow-collisions). Exits with 1 if any is not.
+is good if following its plan repeats the stored execution exactly, reaches the goal and has no
+contact (unless the file was collected with --allow-collisions). The exit code is 1 if any is not.
 """
 
 import sys
@@ -25,9 +25,10 @@ from roboarm_nmp.envs.tasks import is_task
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import Workers
 from roboarm_nmp.envs.utils import workers
+from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
 
 VERDICTS = ("good", "changed", "missed", "collided", "refused")
-MEND_ATTEMPTS = 10
+REPAIR_ATTEMPTS = 10
 
 
 @dataclass
@@ -37,11 +38,11 @@ class Args:
     workers: Workers = 2
     """Number of processes."""
     repair: bool = False
-    """Plan anew what does not verify, on the same query, and replace the file."""
+    """Plan failed demonstrations anew, on the same queries, and replace the file."""
 
 
 class Verifier:
-    """Follows the demonstrations of a file; with `repair`, plans anew where that fails."""
+    """Follows the demonstrations of a file; with `repair`, plans failed ones anew."""
 
     def __init__(self, path, repair):
         self.demos = load_demos(path)
@@ -52,15 +53,15 @@ class Verifier:
         self.planner = make_planner(self.env, options)
 
     def __call__(self, index):
-        """`(index, verdict, demo)`: one of `VERDICTS`, and, with `repair`, what to store.
+        """`(index, verdict, demo)`: one of `VERDICTS`, and, with `repair`, the repaired demo.
 
-        That is a dict with plan, states, plan_seed, digest, collided; or None: not repaired.
+        That is a dict of plan, states, plan_seed, digest and collided; None: it was not repaired.
         """
         demo, seed = self.demos[index], int(self.demos.plan_seed[index])
         try:
             execution = follow(self.env, demo.plan, demo.scene)
         except ValueError:
-            return index, "refused", None  # start or goal: no plan can help
+            return index, "refused", None  # start or goal is infeasible: no plan can help
         verdict = self._verdict(demo, execution)
         if not self.repair:
             return index, verdict, None
@@ -68,7 +69,7 @@ class Verifier:
             return index, verdict, _demo(demo.plan, execution, seed)
         rng = np.random.default_rng([seed, index])
         found = demonstrate(
-            *(self.planner, demo.start, demo.goal, rng, MEND_ATTEMPTS),
+            *(self.planner, demo.start, demo.goal, rng, REPAIR_ATTEMPTS),
             allow_collisions=self.allow_collisions,
         )
         return index, verdict, found and _demo(*found)
@@ -98,8 +99,8 @@ def _demo(plan, execution, seed):
 def verify(task_or_path, num_workers=1, repair=False, progress=True):
     """Follow every demonstration of a task or file; with `repair`, replace the file by a good one.
 
-    Mended: an execution that is another one now is stored as it is; what misses or collides is
-    planned anew; what cannot be helped is removed.
+    A repair stores an execution that has changed as it is now, plans anew where the execution
+    misses the goal or collides, and removes demonstrations for which that fails.
 
     Returns:
         A dict: how many demonstrations have each of `VERDICTS`, `total`, and `removed`.
@@ -115,7 +116,7 @@ def verify(task_or_path, num_workers=1, repair=False, progress=True):
     if repair and not is_task(task):
         raise DatasetError(f"{path}: to repair it, name the scene file {task}.yaml instead")
     if "options" not in demos.parameters:
-        raise DatasetError(f"{path}: it does not say with what options it was collected")
+        raise DatasetError(f"{path}: has no record of the options it was collected with")
     counts, kept = Counter(), {}
     results = workers.run(Verifier, (path, repair), range(len(demos)), num_workers)
     bar = tqdm(
@@ -136,7 +137,7 @@ def verify(task_or_path, num_workers=1, repair=False, progress=True):
         good = list(kept.values())
         removed = len(demos) - len(good)
         if not good:
-            raise DatasetError(f"{path}: nothing in it can be repaired")
+            raise DatasetError(f"{path}: none of its demonstrations can be repaired")
         write_demos(
             path,
             task,
@@ -168,9 +169,8 @@ def main(args):
             print(f"error: {error}", file=sys.stderr)
             failed = True
             continue
-        except KeyboardInterrupt:
-            print("interrupted; no file was changed by halves", file=sys.stderr)
-            sys.exit(130)
+        except KeyboardInterrupt as interrupt:
+            exit_interrupted(interrupt, f"{name} is unchanged: the same command verifies it again")
         bad = counts["total"] - counts["good"]
         text = ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS)
         text += f" of {counts['total']} demonstrations"
@@ -182,4 +182,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="python -m roboarm_nmp.demo_generation.verify", description=__doc__))
+    raise_on_sigterm()
+    main(tyro.cli(Args, prog="roboarm verify", description=__doc__))
