@@ -1,4 +1,4 @@
-"""Writing files whole, and whether they still are."""
+"""Writing files atomically, and checking that they can be written or are undamaged."""
 
 import contextlib
 import fcntl
@@ -13,12 +13,12 @@ from pathlib import Path
 def write_atomically(path, contents):
     """Write bytes: at every moment, whatever happens, `path` is the old file or the whole new one.
 
-    What is no file but a device or a pipe, such as `/dev/stdout`, is written to. Raises OSError if
-    it cannot be written; an old file is left as it was, and no other.
+    A device or a pipe, such as `/dev/stdout`, is written to directly. Raises OSError if the file
+    cannot be written: an old file stays as it is, and no other file is left.
     """
     path = Path(path)
     if _is_device(path):
-        with open(path, "ab") as file:  # which may be a file all the same: nothing in it is lost
+        with open(path, "ab") as file:  # /dev/stdout may be a file: nothing in it is lost
             file.write(contents)
         return
     with new_contents(path) as temporary:
@@ -27,11 +27,10 @@ def write_atomically(path, contents):
 
 @contextlib.contextmanager
 def new_contents(path):
-    """A context whose value is the path of an empty file; at its end that replaces `path`.
+    """A context whose value is the path of an empty file, which replaces `path` at its end.
 
-    What was written is brought to the disk first: after a power cut too, `path` is the old file or
-    the whole new one. After an exception it is the old one. What processes that were killed have
-    left is cleared away.
+    The contents are first flushed to the disk: after a power cut too, `path` is the old file or the
+    whole new one. After an exception it is the old one. Leftovers of killed processes are deleted.
     """
     path = Path(path)
     clear_leftovers(path.parent, path.name)
@@ -39,7 +38,7 @@ def new_contents(path):
         temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
         lock = open(temporary, "wb")  # noqa: SIM115 (closed below)
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if temporary.exists():  # or it looked like a leftover, before it was locked
+        if temporary.exists():  # otherwise another process took it for a leftover before the lock
             break
         lock.close()
     try:
@@ -53,9 +52,9 @@ def new_contents(path):
 
 
 def clear_leftovers(folder, name="*"):
-    """Delete what killed processes left of new contents of the file `name`, or of all, in a folder.
+    """Delete temporary files that killed processes left in a folder, of the file `name` or of all.
 
-    Who is still writing holds a lock.
+    A process that is still writing holds a lock.
     """
     for temporary in Path(folder).glob(f".{name if name == '*' else glob.escape(name)}.*.tmp"):
         with contextlib.suppress(OSError), open(temporary, "rb") as file:
@@ -68,7 +67,7 @@ def _is_device(path):
 
 
 def check_writable(path):
-    """Raise ValueError if no file can be written at `path`. To be called before long work."""
+    """Raise ValueError if no file can be written at `path`. Call it before long work."""
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"{path} is a directory, not a file")
@@ -82,29 +81,32 @@ def check_writable(path):
 
 
 def check_folder(path):
-    """Raise ValueError unless files can be written in a folder, which may not be there yet."""
+    """Raise ValueError unless files can be written in a folder, which need not exist yet."""
     path = Path(path)
     try:
-        there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+        folder = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
     except OSError as error:
         raise ValueError(f"cannot write {path}: {error.strerror}") from error
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        raise ValueError(f"{path}: {there} is no folder that can be written")
+    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{path}: {folder} is not a folder that can be written")
 
 
 def check_archive(path):
-    """Raise an exception if a file that `torch.save` wrote is damaged, which `torch.load` ignores.
+    """Detect damage in a file of `torch.save` that `torch.load` ignores.
 
-    ValueError: one of its checksums does not match, or what is said of an entry is not what
-    `torch.save` says. OSError, zipfile.BadZipFile: as `zipfile`.
+    Raises:
+        ValueError: a checksum does not match, or an entry is not of the kind that `torch.save`
+            writes.
+        OSError, zipfile.BadZipFile: as `zipfile`.
     """
     with zipfile.ZipFile(path) as archive:
-        # As torch writes it. What comes out is no larger than the file.
+        # Torch does not compress: the contents are no larger than the file.
         stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.filelist)
         if not stored or sum(entry.file_size for entry in archive.filelist) > path.stat().st_size:
             raise ValueError("it is compressed")
         if archive.testzip() is not None:
             raise ValueError("a checksum does not match")
-        # Of an entry marked as a folder `torch.load` reads nothing: the tensor is what memory had.
+        # `torch.load` reads nothing of an entry that is marked as a folder: the tensor would be
+        # uninitialised memory.
         if any(entry.external_attr for entry in archive.filelist):
-            raise ValueError("an entry is no plain file")
+            raise ValueError("an entry is not a plain file")

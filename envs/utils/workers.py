@@ -19,13 +19,14 @@ MAX_DEATHS = 5  # without a single result between them
 
 
 def run(make_worker, arguments, jobs, workers, warn=print):
-    """Yield the results of all jobs, as they get ready, from `workers` processes.
+    """Yield the results of all jobs in the order of completion, from `workers` processes.
 
-    A process that dies is replaced, its job is done again, and `warn` is called with a sentence.
+    A process that dies is replaced, its job is repeated, and `warn` is called with a sentence. If
+    the caller is interrupted or closes this generator, running jobs are aborted.
 
     Raises:
         RuntimeError: processes died `MAX_DEATHS` times without a result between.
-        Exception: what a job raised.
+        Exception: the exception of a job.
     """
     waiting, deaths = collections.deque(jobs), 0
     while waiting:
@@ -51,20 +52,25 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             deaths += 1
             if deaths == MAX_DEATHS:
                 raise RuntimeError(f"workers died {deaths} times without a result") from error
-            warn("a worker died; going on with new ones")
+            warn("a worker died; a new one takes its place")
+        except BaseException:
+            # Without this, `shutdown` would wait for running jobs, which may take minutes.
+            for process in executor._processes.values():
+                process.terminate()
+            raise
         finally:
             executor.shutdown(cancel_futures=True)
 
 
 def _start(make_worker, arguments):
     global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_follow_parent, daemon=True).start()
     _worker = make_worker(*arguments)
 
 
 def _follow_parent():
-    """End this worker when the parent was killed; it would wait for work for ever."""
+    """End this worker when its parent was killed. Otherwise it would wait for work for ever."""
     multiprocessing.parent_process().join()
     os._exit(1)
 
@@ -74,7 +80,7 @@ def _work(job):
 
 
 def check_ray(address):
-    """Raise ValueError unless there can be a Ray cluster at an address; None is none."""
+    """Raise ValueError unless an address may be that of a Ray cluster, or is None: no cluster."""
     if address is None:
         return
     match = re.fullmatch(r"([^/\s:]+):(\d{1,5})", address)
@@ -84,14 +90,14 @@ def check_ray(address):
         raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
     if address == "auto":
         return
-    try:  # where nobody answers, Ray would wait
+    try:  # without an answer, Ray would wait
         socket.create_connection((match[1], int(match[2])), timeout=5).close()
     except OSError as error:
         raise ValueError(f"no Ray cluster at {address}: {error}") from error
 
 
 def run_on_ray(address, make_worker, arguments, jobs):
-    """Like `run`, on the Ray cluster at `address`; Ray does a lost worker's or node's jobs again.
+    """Like `run`, on the Ray cluster at `address`. Ray repeats the jobs of lost workers and nodes.
 
     The cluster's machines need this project installed. Raises ConnectionError if there is no
     cluster at the address.
@@ -100,7 +106,7 @@ def run_on_ray(address, make_worker, arguments, jobs):
 
     ray.init(address=address, log_to_driver=False, logging_level="warning")
     try:
-        # Spread, so that all nodes work; retried without end, because a node may be lost.
+        # Spread over all nodes. Retried without end, because nodes may be lost.
         work = ray.remote(num_cpus=1, max_retries=-1, scheduling_strategy="SPREAD")(_work_on_ray)
         waiting, running = collections.deque(jobs), []
         while waiting or running:

@@ -485,6 +485,15 @@ def test_each_job_is_done_once_although_workers_die(tmp_path):
     assert len(said) == 7 > workers.MAX_DEATHS  # with results between
 
 
+def test_running_jobs_are_aborted_when_the_results_are_closed():
+    results = workers.run(functools.partial, (time.sleep,), [0.0, 600.0], 1)
+    next(results)
+    children, begin = worker_processes(psutil.Process()), time.monotonic()
+    results.close()
+    assert time.monotonic() - begin < 60
+    assert children and all(has_ended(child) for child in children)
+
+
 def test_no_jobs_start_no_workers():
     assert list(workers.run(os._exit, (1,), [], 1)) == []
 
