@@ -22,10 +22,10 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
+from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
-
-# Streams 1 to 3 of random numbers are those of the queries and demonstrations.
-STREAM = 4
+from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
 
 
 @dataclass
@@ -75,7 +75,7 @@ class Collector:
         number, first, end = job
         seen, configurations, observations = [], [], []
         for index in range(first, end):
-            rng = np.random.default_rng([self.seed, STREAM, index])
+            rng = np.random.default_rng([self.seed, Stream.OBSERVATIONS, index])
             self.env.sample_scene(rng)
             configurations.append(self.env.sample_feasible(rng))
             seen.append(self.env.scene)
@@ -93,6 +93,7 @@ def collect(args, progress=True):
         ConnectionError: there is no Ray cluster.
         OSError: the folder cannot be written. What was written is safe.
     """
+    flags.check(args)
     shards.check_collection(args)
     names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
     given = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
@@ -115,9 +116,8 @@ def collect(args, progress=True):
 def main(args):
     try:
         made = collect(args)
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as interrupt:
+        exit_interrupted(interrupt, "the same command continues from here")
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
@@ -125,6 +125,7 @@ def main(args):
 
 
 if __name__ == "__main__":
+    raise_on_sigterm()
     main(
         tyro.cli(
             Args, prog="python -m roboarm_nmp.scene_embedding_train.collect", description=__doc__
