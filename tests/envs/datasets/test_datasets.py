@@ -526,6 +526,28 @@ def test_make_queries_command_repeats_itself(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_terminated_make_queries_command_continues(made, tmp_path):
+    path = tmp_path / "wall.h5"
+    arguments = ["roboarm_nmp", "queries", "--task", "wall", "--num-test", 30]
+    arguments += ["--num-validation", 10, "--workers", 1, "--output", path]
+    process = subprocess.Popen(
+        [sys.executable, "-m", *map(str, arguments)], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    deadline, journal = time.monotonic() + 100, make_queries.journal_of(path)
+    while not journal.exists() or journal.read_bytes().count(b"\n") < 3:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    process.terminate()
+    _, stderr = process.communicate()
+    assert process.returncode == 143 and "Traceback" not in stderr
+    assert stderr.splitlines()[-1] == "terminated; the same command continues from here"
+    assert not path.exists() and journal.exists()
+    assert command(*arguments).returncode == 0
+    again, expected = load_queries(path), load_queries(made)
+    np.testing.assert_array_equal(again.start, expected.start)
+    assert list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
