@@ -40,6 +40,7 @@ from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
 from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
@@ -520,6 +521,7 @@ def collect(args, progress=True):
         ConnectionError: there is no Ray cluster.
         OSError: the folder cannot be written. Finished shards are kept.
     """
+    flags.check(args)
     if args.num_nodes <= max(args.num_neighbours, JOINED):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
     if not args.margin >= NODE_MARGIN:

@@ -22,6 +22,7 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
+from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
 from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
@@ -92,6 +93,7 @@ def collect(args, progress=True):
         ConnectionError: there is no Ray cluster.
         OSError: the folder cannot be written. Finished shards are kept.
     """
+    flags.check(args)
     shards.check_collection(args)
     names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
     given = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]

@@ -1,45 +1,32 @@
-"""Queries and demonstrations of the tasks: all that reads and writes their files, and the command.
+"""The command `roboarm data`: validates files of queries, describes files of demonstrations.
 
-    python -m roboarm_nmp.envs.datasets validate envs/data/wall.h5 --simulate
-    python -m roboarm_nmp.envs.datasets describe wall boxes
-
-Import from here. What is where: `envs.datasets.queries`, `envs.datasets.demonstrations`, `envs.subgoals`, and the
-files' format in `envs.datasets.format`.
+roboarm data validate envs/data/wall.h5 --simulate
+roboarm data describe wall boxes
 """
 
 import argparse
 import sys
 
-from roboarm_nmp.envs.datasets.demonstrations import (
-    describe,
-    load_demos,
-)
-from roboarm_nmp.envs.datasets.format import (
-    locate,
-)
-from roboarm_nmp.envs.datasets.queries import (
-    query_path,
-    validate,
-)
+from roboarm_nmp.envs.datasets.demonstrations import describe, load_demos
+from roboarm_nmp.envs.datasets.format import locate
+from roboarm_nmp.envs.datasets.queries import query_path, validate
 from roboarm_nmp.envs.tasks import TASKS
 
 
-def _main(arguments=None):
+def main(arguments=None):
+    """Run the command. Returns the exit code: 0, or 1 if a file is bad."""
     parser = argparse.ArgumentParser(
-        prog="python -m roboarm_nmp.envs.datasets",
-        description="The files of the tasks: queries and demonstrations.",
+        prog="roboarm data", description="Files of the tasks: queries and demonstrations."
     )
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser(
         "validate",
         help="check query files",
-        description="Check query files. One line on stdout for each good one, one on stderr for "
-        "each bad one, saying what is wrong; exits with 1 if any is bad. (For demonstrations: "
-        "python -m roboarm_nmp.demo_generation.verify.)",
+        description="Check query files. Each good file gives a line on stdout, each bad one a line "
+        "on stderr that names the error. The exit code is 1 if any is bad. (For demonstrations: "
+        "roboarm verify.)",
     )
-    command.add_argument(
-        "files", nargs="+", metavar="FILE", help="path of a file, or a task's name (its own file)"
-    )
+    command.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
     command.add_argument("--task", choices=list(TASKS), help="the task the files must be for")
     command.add_argument(
         "--simulate",
@@ -52,15 +39,12 @@ def _main(arguments=None):
         help="statistics of demonstration files",
         description="Print statistics of demonstration files, one column per file.",
     )
-    command.add_argument(
-        "files", nargs="+", metavar="FILE", help="path of a file, or a task's name (its own file)"
-    )
+    command.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
     options = parser.parse_args(arguments)
-    run = {"validate": _main_validate, "describe": _main_describe}[options.command]
-    return run(options)
+    return {"validate": _validate, "describe": _describe}[options.command](options)
 
 
-def _main_validate(options):
+def _validate(options):
     bad = False
     for file in options.files:
         try:
@@ -76,7 +60,7 @@ def _main_validate(options):
     return int(bad)
 
 
-def _main_describe(options):
+def _describe(options):
     try:
         columns = [describe(load_demos(file)) for file in options.files]
     except ValueError as error:
@@ -90,4 +74,4 @@ def _main_describe(options):
 
 
 if __name__ == "__main__":
-    sys.exit(_main())
+    sys.exit(main())

@@ -33,8 +33,8 @@ from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import MAX_STEP, schedule
 from roboarm_nmp.envs.tasks import get_task
 
-# Resolution of the stored configurations, normalised: they are off by half of it at most, which
-# moves the end-effector by less than 0.5 mm. Where scenes vary, these need the space: twice that.
+# Resolution of the stored configurations, normalised. Their error is at most half of it, and moves
+# the end effector by less than 0.5 mm. Where scenes vary, twice that keeps the files small.
 QUANTUM, QUANTUM_IN_SCENES = 2e-4, 4e-4
 
 
@@ -71,16 +71,16 @@ class Demos:
         start, goal: float32 (n, 7), rad.
         scenes: `QueryScenes`; `scenes[i]` is that of demonstration i.
         states: float32 (m, 7): the executed configurations of all demonstrations, normalised.
-        actions: float32 (m, 7): the displacement commanded in each; zero in the last of a
-            demonstration, from which nothing was commanded.
+        actions: float32 (m, 7): the displacement commanded in each; zero in the last one of each
+            demonstration, which has no action.
         offsets: int64 (n + 1,): demonstration i is `states[offsets[i] : offsets[i + 1]]`.
         plan: float32 (p, 7), rad: the waypoints of all plans.
         plan_offsets: int64 (n + 1,), the same for `plan`.
         plan_seed: uint32 (n,), the planner's seeds.
         digest: uint32 (n,), see `Demo`.
-        collided: bool (n,), whether something was touched.
+        collided: bool (n,), whether the execution has a contact.
         made_by: the command that made the file.
-        parameters: dict of what else determined them, and of how many attempts were rejected.
+        parameters: dict of everything else that determined them, and of counts of rejections.
     """
 
     task: str
@@ -101,7 +101,7 @@ class Demos:
 
     @property
     def quantum(self):
-        """What `states` were rounded to multiples of, measured from where a plan puts them."""
+        """Resolution of `states`: their deviations from the plan are multiples of it."""
         return self.parameters.get("quantum", QUANTUM)
 
     def __len__(self):
@@ -123,9 +123,9 @@ class Demos:
 
 
 def demo_path(task):
-    """Where the demonstrations of a task are, or belong: of a scene file, `<name>_demos.h5` beside.
+    """Path of a task's demonstration file; for a scene file, `<name>_demos.h5` beside it.
 
-    Raises ValueError for a task that is neither.
+    Raises ValueError: `task` is neither.
     """
     return task_file(task, "demos", "_demos.h5")
 
@@ -200,17 +200,17 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
         executions: list of float32 (m, 7) arrays, normalised configurations, starting at the start.
         columns: `{"plan_seed", "digest", "collided"}`: sequences of ints, one per demonstration.
         made_by: the command line that makes this file.
-        parameters: dict of whatever else determined them; must fit into JSON.
+        parameters: JSON-ready dict of everything else that determined them.
         scenes_of: sequence of n `Scene`s; None where all of them are the task's.
 
     Raises:
-        DatasetError: arrays that a file must not have, or a query twice, or one of the task's test
-            or validation queries; nothing is written then.
+        DatasetError: invalid arrays, a query twice, or one of the task's test or validation
+            queries. Nothing is written.
         ValueError: unknown task.
-        OSError: the file cannot be written; an old file is left as it was.
+        OSError: the file cannot be written; an old file stays as it is.
     """
     path = Path(path)
-    demo_path(task)  # refuses an unknown task
+    demo_path(task)  # rejects an unknown task
     lengths, plan_lengths = [len(one) for one in executions], [len(one) for one in plans]
     if not plans or len(executions) != len(plans):
         raise DatasetError(f"{path}: {len(plans)} plans and {len(executions)} executions")
@@ -230,7 +230,7 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
             shared = len(keys & query_keys(queries.start, queries.goal))
             if shared:
                 raise DatasetError(f"{path}: {shared} queries are {split} queries of {task}")
-    # The arm lags behind the sub-goals, each joint by a nearly constant share of their last move.
+    # The arm lags behind the sub-goals, each joint by a nearly constant share of the last move.
     before, here, _ = schedule(plan, plan_offsets, offsets)
     moved = here - before
     lag = ((here - states) * moved).sum(0) / np.maximum(np.square(moved).sum(0), 1e-9)
@@ -279,7 +279,7 @@ def describe(demos):
         "path_length": float(length_of(moves * (panda.UPPER - panda.LOWER) / 2).mean()),
         "detour": float((length_of(moves) / straight).mean()),
         "waypoints": float(np.diff(demos.plan_offsets).mean()),
-        "touching": int(demos.collided.sum()),
+        "collided": int(demos.collided.sum()),
         "solved": len(demos) / (len(demos) + counts.get("queries_given_up", 0)),
         **counts,
     }

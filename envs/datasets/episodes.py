@@ -1,8 +1,8 @@
-"""Demonstrations as episodes of a goal type: what an environment would have recorded on the way.
+"""Demonstrations as episodes of a goal type: as an environment would have recorded them.
 
-A demonstration (`envs.datasets.Demo`) is a motion between two configurations. What is observed and
-achieved on it, and when its goal counts as reached, depends on what the goal is: `ee`, `config` or
-`combined`. Learning from demonstrations and exporting them begin here.
+A demonstration (`envs.datasets.demonstrations.Demo`) is a motion between two configurations. Its
+observations, its achieved goals and the step that reaches the goal depend on the goal type: `ee`,
+`config` or `combined`. Trainers and the Minari export use these episodes.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ class Episode(NamedTuple):
     """One episode of T steps, float32.
 
     `observation` (T + 1, o), `achieved_goal` (T + 1, g), `desired_goal` (g,), `action` (T, 7), and
-    `reached` (T + 1,), bool: whether the goal counts as reached there.
+    `reached` (T + 1,), bool: whether that observation reaches the goal.
     """
 
     observation: np.ndarray
@@ -31,9 +31,9 @@ class Episode(NamedTuple):
 
 
 def goal_of(goal_type, state, position):
-    """What a goal of this type says of an arm: (..., 3) `ee`, (..., 7) `config`, (..., 10) both.
+    """The goal that an arm achieves: (..., 3) for `ee`, (..., 7) `config`, (..., 10) `combined`.
 
-    `state` (..., 7) is its normalised configuration, `position` (..., 3) its end-effector's, m.
+    `state` (..., 7) is its normalised configuration, `position` (..., 3) its end effector's, m.
     """
     if goal_type == "ee":
         return position
@@ -43,7 +43,7 @@ def goal_of(goal_type, state, position):
 
 
 def observed(states, goal, goal_type):
-    """What is observed on the way through `states`, without velocities, to `goal`.
+    """Observations at `states`, without velocities, in an episode with `goal`.
 
     Args:
         states: normalised configurations (n, 7).
@@ -63,9 +63,9 @@ def demo_episode(demo, env):
     """A `Demo` as `env` would have recorded it, up to reaching its goal: an `Episode`.
 
     Args:
-        demo: an `envs.datasets.Demo`.
-        env: an environment of `envs.make` without velocities; its goal type, action mode, goal
-            tolerances, encoder and appended link_distances are those of the episode.
+        demo: a `Demo`.
+        env: an environment of `envs.make` without velocities. Its goal type, action mode, goal
+            tolerances, encoder and appended link distances are those of the episode.
     """
     observation, achieved_goal, desired_goal = observed(demo.states, demo.goal, env.goal_type)
     action = demo.actions
@@ -87,7 +87,7 @@ def demo_episode(demo, env):
 
 
 def transition(before, action, after, collision):
-    """As a replay buffer keeps it: `action` led from observation `before` (a dict) to `after`."""
+    """A replay buffer's entry: `action` led from the observation `before` (a dict) to `after`."""
     return {
         "observation": before["observation"],
         "action": action,
@@ -99,22 +99,22 @@ def transition(before, action, after, collision):
 
 
 def demo_transitions(demo, env):
-    """The same as a list of such transitions."""
+    """The episode of `demo_episode` as a list of such transitions."""
     episode = demo_episode(demo, env)
-    seen = [
+    observations = [
         {"observation": one, "achieved_goal": achieved, "desired_goal": episode.desired_goal}
         for one, achieved in zip(episode.observation, episode.achieved_goal, strict=True)
     ]
-    steps = zip(seen[:-1], episode.action, seen[1:], strict=True)
+    steps = zip(observations[:-1], episode.action, observations[1:], strict=True)
     return [transition(before, action, after, False) for before, action, after in steps]
 
 
 class DemoQueriesWrapper(gym.Wrapper):
-    """Episodes on the queries of demonstrations: `reset` draws one of them, `demo` is it.
+    """Episodes on the queries of demonstrations: `reset` draws one of them, `demo` is that `Demo`.
 
     Args:
         env: an environment of `envs.make`.
-        demos: `envs.datasets.Demos`.
+        demos: the `Demos`.
     """
 
     def __init__(self, env, demos):
@@ -130,7 +130,7 @@ class DemoQueriesWrapper(gym.Wrapper):
 
 
 def load_demos_for(env, file, task):
-    """The demonstrations in a file, or of a task, if they can be episodes of `env`.
+    """The `Demos` of a file or task, if they can be episodes of `env`.
 
     Args:
         env: an environment of `envs.make`.
@@ -138,11 +138,13 @@ def load_demos_for(env, file, task):
         task: the task that they must be for.
 
     Raises:
-        DatasetError: they cannot; or as `load_demos`.
+        DatasetError: they cannot be episodes of `env`; or as `load_demos`.
     """
     if env.velocities or env.max_step < MAX_STEP:
-        raise DatasetError(f"demonstrations have no velocities, and steps up to {MAX_STEP}")
+        raise DatasetError(
+            f"demonstrations have no velocities, and steps up to {MAX_STEP}: unlike the environment"
+        )
     demos = load_demos(file, task)
     if env.stop_on_collision and demos.collided.any():
-        raise DatasetError("--stop-on-collision, but some of these demonstrations touch something")
+        raise DatasetError("--stop-on-collision, but some of these demonstrations have contacts")
     return demos

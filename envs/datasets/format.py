@@ -3,7 +3,7 @@
 A query file, `envs/data/<task>.h5`, has the groups `test` and `validation`, and `original` where a
 task has queries from elsewhere, each with
 
-- `start`, `goal`: float32 (n, 7), joint angles in rad, exactly those the simulator was asked about;
+- `start`, `goal`: float32 (n, 7), joint angles in rad, exactly those checked in the simulator;
 - `goal_position`: float32 (n, 3), the end-effector position at the goal in metres,
 - where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
   uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
@@ -13,16 +13,16 @@ A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
 - `plan`: float32 (p, 7), joint angles in rad: the waypoints of all plans, one plan after another,
   the first one of each the start, the last one the goal; `plan_length`: uint32 (n,);
-- `residual`: int16 (m, 7), the executed configurations (see `envs.datasets.demonstrations.write_demos`), one
-  execution after another; `length`: uint32 (n,), configurations in each;
+- `residual`: int16 (m, 7), the executed configurations, one execution after another (see
+  `envs.datasets.demonstrations.write_demos`); `length`: uint32 (n,), configurations in each;
 - `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
-- `collided`: uint8 (n,), whether the execution touched something;
+- `collided`: uint8 (n,), whether the execution has a contact;
 - where scenes vary, `scene`, `obstacle_count` and `obstacles`, as above.
 
 Both have the attributes `schema`, `schema_version`, `task`, `seed`, `scene` (JSON: the scene,
 without the obstacles that vary), `made_by` (the command that makes the file again), `parameters`
-(JSON) and `checksum` (SHA-256 of all the others and the arrays). Files are written to a temporary
-name and then renamed: there is never half a file.
+(JSON) and `checksum` (SHA-256 of all the others and the arrays). Files are written under a
+temporary name and then renamed: there is never half a file.
 """
 
 import hashlib
@@ -51,7 +51,7 @@ ORIGINAL = "original"  # split of queries that were not sampled; few tasks have 
 QUERY_SCHEMA, DEMO_SCHEMA = "roboarm-nmp queries", "roboarm-nmp demonstrations"
 SCHEMA_VERSION = 1
 MAX_ARRAY_BYTES = 2**30
-"""Of an array in memory: 100,000 demonstrations have a fifth of that."""
+"""Largest array in memory: 100,000 demonstrations have a fifth of that."""
 # Of each array: dtype, numbers per row (None: one dimension), and the array of the same length.
 SCENE_ARRAYS = {
     "scene": ("<u4", None, None),
@@ -107,11 +107,11 @@ _SCENE_TOLERANCE = 1e-9
 
 
 class DatasetError(ValueError):
-    """A file that cannot be used. The message names the file and says what is wrong with it."""
+    """A file that cannot be used. The message names the file and the error."""
 
 
 class QueryScenes:
-    """The scenes of n queries: `scenes[i]` is the `Scene` of query i, made when asked for.
+    """The scenes of n queries: `scenes[i]` is the `Scene` of query i, made on access.
 
     Attributes:
         base: the `Scene` without the obstacles that vary; the scene itself, if none do.
@@ -142,9 +142,11 @@ def task_file(task, folder, suffix):
         ValueError: there is no such task.
         DatasetError: no files are made for this one.
     """
-    get_task(task)  # refuses an unknown task
+    get_task(task)  # rejects an unknown task
     if task in TRAINING_SCENES:
-        raise DatasetError(f"{task} are to learn from: no queries or demonstrations are in them")
+        raise DatasetError(
+            f"{task} are scenes for training: there are no queries or demonstrations in them"
+        )
     if has_name(task):
         return Path(__file__).parents[1] / folder / f"{task}.h5"
     return Path(task).with_name(task_name(task) + suffix)
@@ -174,8 +176,8 @@ def write_file(path, schema, task, seed, arrays, made_by, parameters):
         "parameters": json.dumps(parameters, sort_keys=True),
     }
     # HDF5 crashes the process on damaged metadata in its oldest format and in strings of variable
-    # length (h5py's default); newer formats have checksums over metadata, fixed lengths included.
-    # It is made in memory because HDF5 also crashes when the disk is full.
+    # length (h5py's default). Newer formats have checksums of metadata, which include fixed-length
+    # strings. The file is made in memory because HDF5 also crashes when the disk is full.
     contents = io.BytesIO()
     with h5py.File(contents, "w", libver=("v110", "v110")) as file:
         for name, value in {**attributes, "checksum": _checksum(attributes, arrays)}.items():
@@ -212,7 +214,7 @@ def scene_arrays(path, scenes_of, base, prefix=""):
 
 
 def read_scenes(path, attributes, arrays, prefix=""):
-    """The inverse of `scene_arrays`: `QueryScenes`. Raises DatasetError for nonsense."""
+    """The inverse of `scene_arrays`: `QueryScenes`. Raises DatasetError for invalid arrays."""
     base = scene_from_json(attributes["scene"])
     if f"{prefix}scene" not in arrays:
         return QueryScenes(base)
@@ -227,7 +229,9 @@ def read_scenes(path, attributes, arrays, prefix=""):
     if not np.isfinite(rows).all():
         raise DatasetError(f"{path}: {prefix}obstacles has numbers that are not finite")
     if len(rows) and not (rows[:, 8:].min() > 0 and np.abs(rows).max() <= MAX_LENGTH):
-        raise DatasetError(f"{path}: {prefix}obstacles has sizes that make no sense")
+        raise DatasetError(
+            f"{path}: {prefix}obstacles has sizes that are not positive, or too large"
+        )
     return QueryScenes(base, index.astype(np.int64), offsets, rows)
 
 
@@ -293,9 +297,9 @@ def read_file(path, schema, task):
 
 
 def check_plain(path, group):
-    """Raise DatasetError for links, arrays that lie elsewhere or nowhere, and too large ones.
+    """Raise DatasetError for links, for arrays outside the file, and for too large arrays.
 
-    A file of some kB can name other files, or promise arrays that no memory has room for.
+    A file of a few kB can refer to other files, or declare arrays larger than the memory.
     """
     for name in group:
         where = f"{path}: {group.name.rstrip('/')}/{name}"
@@ -306,7 +310,7 @@ def check_plain(path, group):
             check_plain(path, found)
             continue
         if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
-            raise DatasetError(f"{where} is no array of this file")
+            raise DatasetError(f"{where} is not an array in this file")
         if found.size * found.dtype.itemsize > MAX_ARRAY_BYTES:
             raise DatasetError(f"{where} has {found.shape} numbers: too many")
         if found.size and not found.id.get_storage_size():
@@ -345,7 +349,7 @@ def _read_open(path, file, schema, task):
     if attribute(file, "checksum") != _checksum(attributes, arrays):
         raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
 
-    scene_from_json(attributes["scene"])  # or it is damaged
+    scene_from_json(attributes["scene"])  # raises if it is damaged
     if not isinstance(json.loads(attributes["parameters"]), dict):
         raise DatasetError(f"{path}: attribute parameters is not a dict")
     made_for = attributes["task"]
@@ -355,7 +359,7 @@ def _read_open(path, file, schema, task):
         )
     if task is None and made_for in TASKS:
         task = made_for
-    # Of a scene file that is not at hand, the file itself says what the scene is.
+    # Where the scene file is not at hand, the scene is that of this file.
     wanted = scene_to_json(get_task(task).base_scene) if task else attributes["scene"]
     if not _same_scene(attributes["scene"], wanted):
         replacing = " --overwrite" * (schema == DEMO_SCHEMA)

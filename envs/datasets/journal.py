@@ -1,4 +1,4 @@
-"""What long jobs have made so far, kept beside the file that they will write."""
+"""Journals: the results of a long job so far, beside the file that it will write."""
 
 import fcntl
 import json
@@ -13,43 +13,43 @@ VERSION = 4
 
 
 def journal_of(path):
-    """Where what was made for a file is kept until the file is written."""
+    """Path of the journal of a file."""
     return path.with_name(path.name + ".journal")
 
 
 def line_of(entry):
-    """A line of a journal, bytes: a JSON-ready dict, after its checksum."""
+    """A line of a journal, bytes: a checksum and a JSON-ready dict."""
     content = json.dumps(entry).encode()
     return b"%08x %s\n" % (zlib.crc32(content), content)
 
 
 def _entry_of(line):
-    """The inverse, of a line without its end; None: it is damaged."""
+    """The dict of a line (without its newline); None: the line is damaged."""
     checksum, _, content = line.partition(b" ")
     return json.loads(content) if checksum == b"%08x" % zlib.crc32(content) else None
 
 
 class Journal:
-    """What was made so far: lines of JSON with a checksum, the first one saying of what.
+    """Results so far: lines of JSON with a checksum. The first line is a header with the options.
 
-    Lines are appended and flushed one at a time, so a kill can damage the last one only; it is
-    dropped when the journal is opened again. So is any other that does not fit its checksum, which
-    is said on stderr. One process at a time holds the journal.
+    Lines are appended and flushed one at a time, so a kill can damage the last line only. Opening a
+    journal drops an incomplete last line, and other lines whose checksum does not match with a
+    message on stderr. One process at a time holds the journal.
 
     Args:
-        path: file to go on with, or to begin.
+        path: file to continue, or to begin.
         options: JSON-ready dict of what the results depend on, `task` among them. The task's scene
-            is added to it.
+            is added.
 
     Raises:
-        ValueError: the file is the journal of something else, no journal, or in use.
-        OSError: it cannot be written.
+        ValueError: the file is the journal of another job, not a journal, or in use.
+        OSError: the file cannot be written.
     """
 
     def __init__(self, path, options):
         self.path = path
         self.entries = {}
-        """Index -> entry."""
+        """Dict of index -> entry."""
         scene = scene_to_json(get_task(options["task"]).base_scene)
         header = {"journal": VERSION, **options, "scene": scene}
         self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
@@ -58,15 +58,15 @@ class Journal:
         except OSError as error:
             raise ValueError(f"{path}: another process is writing to it") from error
         if not path.exists() or not os.path.samestat(os.fstat(self._file.fileno()), path.stat()):
-            raise ValueError(f"{path}: another process has just finished with it")
+            raise ValueError(f"{path}: another process has just finished it")
         self._file.seek(0)
         contents = self._file.read()
         lines = contents.split(b"\n")
-        entries = [_entry_of(line) for line in lines[:-1]]  # the rest is torn
+        entries = [_entry_of(line) for line in lines[:-1]]  # the last one is incomplete or empty
         if entries and entries[0] != header:
             raise ValueError(_difference(path, entries[0], header))
         if not entries and not line_of(header).startswith(contents):
-            raise ValueError(_difference(path, None, header))  # and not a torn first line either
+            raise ValueError(_difference(path, None, header))  # nor an incomplete header
         self.entries = {entry["index"]: entry for entry in entries[1:] if entry is not None}
         if damaged := entries.count(None):
             print(f"{path}: damaged, {damaged} of its lines are made again", file=sys.stderr)
@@ -76,7 +76,7 @@ class Journal:
             self._write(header)
 
     def append(self, entry):
-        """Keep a JSON-ready dict under its `index`, safely when this returns."""
+        """Write a JSON-ready dict with an `index`. When this returns, a kill cannot lose it."""
         self._write(entry)
         self.entries[entry["index"]] = entry
 
@@ -91,7 +91,7 @@ class Journal:
             raise
 
     def close(self):
-        """Let others have it. If nothing was made, there is no journal."""
+        """Release the journal. One without entries is deleted."""
         if not self.entries:
             self.path.unlink(missing_ok=True)
         self._file.close()
@@ -99,13 +99,13 @@ class Journal:
 
 def _difference(path, found, wanted):
     if not isinstance(found, dict) or found.get("journal") != VERSION:
-        return f"{path}: not a journal that this version can continue; move it away"
+        return f"{path}: not a journal that this version can continue; move or delete it"
     names = [name for name in wanted if found.get(name) != wanted[name]]
     differences = ", ".join(
         "another scene" if name == "scene" else f"{name} {found.get(name)!r}, not {wanted[name]!r}"
         for name in names
     )
     return (
-        f"{path}: the journal of something else ({differences}): use its flags to continue it, or "
+        f"{path}: the journal of something else ({differences}): continue it with its flags, or "
         f"delete it"
     )

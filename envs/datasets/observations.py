@@ -1,17 +1,18 @@
-"""Files of what sensors saw: a folder of shards, each an HDF5 file of some hundred scenes.
+"""Files of observations of sensors: a folder of shards, HDF5 files of a few hundred scenes each.
 
 A shard, `shard_00012.h5`, has the arrays (n scenes)
 
 - `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
-  rows of `envs.scenes.primitives.to_array`; `configuration` float32 (n, 7), the arm's joint angles in rad;
+  rows of `envs.scenes.primitives.to_array`;
+- `configuration` float32 (n, 7), the arm's joint angles in rad;
 - of each `Camera`, by its name, the outputs: `front/rgb` uint8 (n, height, width, 3),
   `front/segmentation` uint8 (n, height, width), `front/depth` uint16 (n, height, width) in units of
   `far` / 65,535;
-- of each `PointCloud`, `depth` and `segmentation` of its grid: the points follow from them.
+- of each `PointCloud`, `depth` and `segmentation` of its grid, from which the points follow;
 
 and the attributes `schema`, `schema_version`, `task`, `seed`, `first` (number of the first scene),
 `scene` (JSON: the scene without the obstacles that vary), `sensors` (JSON), `made_by`. Images are
-compressed one by one, with a checksum each, so that any of them can be read alone.
+compressed one by one, with a checksum each, so each can be read alone.
 """
 
 import io
@@ -36,10 +37,10 @@ SCHEMA, SCHEMA_VERSION = "roboarm-nmp observations", 1
 
 
 def observe(world, sensors):
-    """What each sensor sees of a `SensorWorld`, in the form in which it is stored.
+    """The observation of a `SensorWorld` by each sensor, in the form in which it is stored.
 
     Returns:
-        A dict of `<sensor>/<output>` -> array, as a shard has them but for the first dimension.
+        A dict of `<sensor>/<output>` -> array, as in a shard but without the first dimension.
     """
     arrays = {}
     for name, sensor in sensors.items():
@@ -52,7 +53,7 @@ def observe(world, sensors):
     return arrays
 
 
-def shard_bytes(task, seed, first, sensors, scenes_seen, configurations, observations, made_by):
+def shard_bytes(task, seed, first, sensors, scenes, configurations, observations, made_by):
     """The contents of a shard's file.
 
     Args:
@@ -60,14 +61,14 @@ def shard_bytes(task, seed, first, sensors, scenes_seen, configurations, observa
         seed: of the collection, an int.
         first: number of the first scene.
         sensors: dict of name -> sensor.
-        scenes_seen: list of n `Scene`s.
+        scenes: list of n `Scene`s.
         configurations: float32 (n, 7), rad.
         observations: list of n dicts, those of `observe`.
         made_by: the command line that makes the shards.
     """
-    rows = to_array([o for scene in scenes_seen for o in scene.obstacles])
+    rows = to_array([o for scene in scenes for o in scene.obstacles])
     arrays = {
-        "obstacle_count": np.array([len(scene.obstacles) for scene in scenes_seen], np.uint32),
+        "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
         "obstacles": rows,
         "configuration": np.asarray(configurations, np.float32),
     }
@@ -102,12 +103,12 @@ def shard_bytes(task, seed, first, sensors, scenes_seen, configurations, observa
 
 
 def open_shard(path):
-    """An `h5py.File` of a shard. Raises DatasetError: damaged, or something else."""
+    """A context with the `h5py.File` of a shard. Raises DatasetError: as `shards.open_shard`."""
     return shards.open_shard(path, "observations", SCHEMA, SCHEMA_VERSION)
 
 
 class Observations:
-    """A folder of shards, checked; scenes are numbered through all of them.
+    """A folder of shards, checked. Scenes are numbered through all shards.
 
     Args:
         folder: path.
@@ -121,7 +122,7 @@ class Observations:
         self.folder = Path(folder)
         paths = shard_paths(folder, "observations")
         self.offsets = np.zeros(len(paths) + 1, np.int64)
-        """Number of the first scene of each shard, and of all scenes."""
+        """Number of the first scene of each shard, and the number of all scenes."""
         first = None
         for number, path in enumerate(paths):
             with open_shard(path) as file:
@@ -131,7 +132,7 @@ class Observations:
             first = first or found
             for name, value in found.items():
                 if value != first[name]:
-                    raise DatasetError(f"{path}: another {name} than that of the first shard")
+                    raise DatasetError(f"{path}: its {name} differs from that of the first shard")
         self.task, self.seed = first["task"], first["seed"]
         self.sensors = sensors_from_json(first["sensors"])
         """Dict of name -> sensor."""
@@ -141,7 +142,7 @@ class Observations:
         return int(self.offsets[-1])
 
     def read(self, number, name):
-        """One array of a shard, e.g. `read(3, "front/rgb")`. Raises DatasetError if it is bad."""
+        """One array of a shard, e.g. `read(3, "front/rgb")`. Raises DatasetError: it is damaged."""
         path = shard_path(self.folder, number)
         with open_shard(path) as file:
             return read_array(file, path, name)

@@ -84,9 +84,9 @@ class Queries:
 
 
 def query_path(task):
-    """Where the queries of a task are, or belong: of a scene file, `<name>_queries.h5` beside.
+    """Path of a task's query file; for a scene file, `<name>_queries.h5` beside it.
 
-    Raises ValueError for a task that is neither.
+    Raises ValueError: `task` is neither.
     """
     return task_file(task, "data", "_queries.h5")
 
@@ -126,7 +126,7 @@ def write_queries(path, task, seed, splits, made_by, parameters):
             `original` where there are some; start and goal float32 (n, 7), rad; scenes a sequence
             of n `Scene`s, left out where all of them are the task's.
         made_by: the command line that makes this file.
-        parameters: dict of whatever else determined the queries; must fit into JSON.
+        parameters: JSON-ready dict of everything else that determined the queries.
 
     Raises:
         DatasetError: arrays that a query file must not have; nothing is written then.
@@ -156,12 +156,12 @@ def validate(path, task=None, simulate=False, progress=False):
     Args:
         path: the file.
         task: the task it should be for; None allows any.
-        simulate: also put the arm at every start and goal (minutes for 10,000 queries): feasible,
-            held as long as when the file was made, and `goal_position` where the goal is.
+        simulate: also check in the simulator (minutes for 10,000 queries) that every start and goal
+            is feasible, for as long as when the file was made, and that `goal_position` is right.
         progress: show a progress bar while simulating.
 
     Raises:
-        DatasetError: the first thing found wrong.
+        DatasetError: the first error found.
     """
     queries, parameters = _read_queries(path, task)
     if simulate:
@@ -210,7 +210,9 @@ def _simulate(path, queries, hold_steps, progress):
         off = np.linalg.norm(position - queries[split].goal_position, axis=1) > _POSITION_TOLERANCE
         if off.any():
             row = int(np.argmax(off))
-            raise DatasetError(f"{path}: {split}/goal_position[{row}] is not where the goal is")
+            raise DatasetError(
+                f"{path}: {split}/goal_position[{row}] is not the position of the goal"
+            )
     world = World(queries["test"].scenes.base)
     total = sum(len(queries[split]) for split in queries)
     with (

@@ -1,6 +1,6 @@
-"""Files of roadmap paths (`demo_generation.roadmaps`): a folder of shards of some scenes each.
+"""Files of roadmap paths (`demo_generation.roadmaps`): a folder of shards of a few scenes each.
 
-    paths = load_roadmap_paths("roadmaps/hard")   # of thousands of scenes, in a second or so
+    paths = load_roadmap_paths("roadmaps/hard")   # thousands of scenes in about a second
     paths.scenes[i]                               # the Scene of number i
     paths.of_scene(i)                             # its paths: list of float32 (k, 7), normalised
     paths.points, paths.offsets                   # the same, flat, for a whole folder
@@ -38,10 +38,10 @@ class RoadmapPaths:
     """The paths of s scenes, n in all.
 
     Attributes:
-        task: name of the task that the scenes are of.
+        task: name of the scenes' task.
         seed: of the collection, int.
-        scenes: `scenes[i]` is the `Scene` of number i, made when asked for.
-        path_offsets: int64 (s + 1,): scene i has the paths from `path_offsets[i]` on.
+        scenes: `scenes[i]` is the `Scene` of number i, made on access.
+        path_offsets: int64 (s + 1,): the paths of scene i begin at number `path_offsets[i]`.
         points: float32 (p, 7), normalised configurations.
         offsets: int64 (n + 1,): path j is `points[offsets[j] : offsets[j + 1]]`.
     """
@@ -101,7 +101,7 @@ def shard_bytes(task, seed, first, scenes, paths, made_by):
 
 
 def open_shard(path):
-    """An `h5py.File` of a shard. Raises DatasetError: damaged, or something else."""
+    """A context with the `h5py.File` of a shard. Raises DatasetError: as `shards.open_shard`."""
     return shards.open_shard(path, "roadmap paths", SCHEMA, SCHEMA_VERSION)
 
 
@@ -121,7 +121,7 @@ def load_roadmap_paths(folder):
         first = first or found
         for name, value in found.items():
             if value != first[name]:
-                raise DatasetError(f"{path}: another {name} than that of the first shard")
+                raise DatasetError(f"{path}: its {name} differs from that of the first shard")
     arrays = {name: np.concatenate(part) for name, part in parts.items()}
     obstacles, paths, offsets = (
         np.concatenate([[0], np.cumsum(arrays[name], dtype=np.int64)])

@@ -1,7 +1,7 @@
-"""Folders of shards: `shard_00012.h5` and so on, HDF5 files of some hundred scenes each.
+"""Folders of shards: `shard_00012.h5` and so on, HDF5 files of a few hundred scenes each.
 
-Every array has checksums, and so has what HDF5 says about them: damage is noticed when it is read.
-`collect` makes a folder's shards, whatever is in them.
+Arrays and HDF5's metadata have checksums: damage is detected when it is read. `collect` makes the
+shards of a folder, whatever their contents.
 """
 
 import contextlib
@@ -15,7 +15,6 @@ from tqdm import tqdm
 
 from roboarm_nmp.envs.datasets.format import DatasetError, attribute, check_plain
 from roboarm_nmp.envs.tasks import get_task
-from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
 
@@ -28,8 +27,9 @@ def shard_path(folder, number):
 
 
 def shard_paths(folder, what):
-    """Paths of all shards of a folder, in order. Raises DatasetError: there are none of `what`, or
-    one is missing.
+    """Paths of all shards of a folder, in order.
+
+    Raises DatasetError: there are no shards, or one is missing. `what` names their contents.
     """
     numbers = sorted(
         int(match[1]) for path in Path(folder).glob("*") if (match := _SHARD.fullmatch(path.name))
@@ -43,7 +43,7 @@ def shard_paths(folder, what):
 
 
 def write_attributes(file, attributes):
-    """Texts and numbers, by name. (Strings of a fixed length: see `dataset_format.write_file`.)"""
+    """Write strings and numbers by name. (Strings have a fixed length: see `format.write_file`.)"""
     for name, value in attributes.items():
         file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
 
@@ -52,7 +52,8 @@ def write_attributes(file, attributes):
 def open_shard(path, what, schema, version):
     """A context with the `h5py.File` of a shard.
 
-    Raises DatasetError: it is something else than `what`, or damaged, which may come out later.
+    Raises DatasetError: it is not a shard of `what`, or damaged. Damage may also be found later, in
+    the context.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -74,11 +75,10 @@ def read_array(file, path, name):
 
 
 def check_collection(args):
-    """Raises ValueError: flags of a collection, as `collect` takes them, that cannot work."""
-    flags.check(args)
+    """Raise ValueError for flags of a collection, as `collect` takes them, that cannot work."""
     check_folder(args.output)
     if not get_task(args.task).trainable:
-        raise ValueError(f"{args.task} is for testing only: nothing may be learned from it")
+        raise ValueError(f"{args.task} is for testing only: training on it is not allowed")
     workers.check_ray(args.ray_address)
 
 
@@ -95,30 +95,31 @@ def collect(
     per_scene=1,
     progress=True,
 ):
-    """Make the shards of a folder that are missing, each in one piece, in workers.
+    """Make the missing shards of a folder in workers. Each shard is written atomically.
 
     Args:
         args: the flags `task`, `output` (the folder), `shard_size`, `workers`, `ray_address`.
-        num_scenes: in all shards.
-        collector: a class. Of a job, `(number, first scene, scene after the last)`, its instances
-            make `(number, contents of the file)`.
-        arguments: of the class.
-        made_by: the command line, as it stands in the shards: others are not of this collection.
+        num_scenes: number of scenes in all shards.
+        collector: a class. Its instances are functions from a job, `(number, first scene, scene
+            after the last)`, to `(number, contents of the file)`.
+        arguments: those of the class.
+        made_by: the command line that the shards store. Shards with another one do not belong to
+            this collection.
         open_shard: a function from a path to an `h5py.File`.
-        counted: name of an array in it that has a row per scene.
-        unit, per_scene: what the progress bar counts, and how many of it each scene has.
+        counted: name of an array with a row per scene.
+        unit, per_scene: unit of the progress bar, and the number of them per scene.
         progress: whether there is a bar.
 
     Raises:
         ValueError: the folder holds shards of another collection, or damaged ones.
         RuntimeError: workers keep dying.
         ConnectionError: there is no Ray cluster.
-        OSError: the folder cannot be written. What was written is safe.
+        OSError: the folder cannot be written. Finished shards are kept.
     """
     firsts = range(0, num_scenes, args.shard_size)
     jobs = [(i, k, min(k + args.shard_size, num_scenes)) for i, k in enumerate(firsts)]
 
-    def is_there(job):
+    def exists(job):
         number, first, end = job
         path = shard_path(args.output, number)
         if not path.exists():
@@ -127,14 +128,14 @@ def collect(
             found = attribute(file, "made_by")
             if found != made_by:
                 raise ValueError(f"{path} was made by another command: {found}")
-            return len(file[counted]) >= end - first  # the last one may have had fewer
+            return len(file[counted]) >= end - first  # the last shard may have had fewer
 
-    missing = [job for job in jobs if not is_there(job)]
-    there = num_scenes - sum(end - first for _, first, end in missing)
+    missing = [job for job in jobs if not exists(job)]
+    done = num_scenes - sum(end - first for _, first, end in missing)
     bar = tqdm(
         desc=str(args.task),
         total=num_scenes * per_scene,
-        initial=there * per_scene,
+        initial=done * per_scene,
         unit=f" {unit}",
         mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
         disable=not progress,

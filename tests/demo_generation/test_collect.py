@@ -681,6 +681,20 @@ def test_verify_continues_after_a_bad_file(whole, tmp_path):
     assert f"{whole}: {NUM} good" in result.stdout
 
 
+def test_terminated_verify_leaves_the_file_unchanged(damaged):
+    path, _ = damaged
+    before = path.read_bytes()
+    arguments = [sys.executable, "-m", "roboarm_nmp", "verify", "--repair", str(path)]
+    process = subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: worker_processes(process) or process.poll() is not None)
+    process.terminate()
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 143 and "Traceback" not in stderr
+    last = stderr.splitlines()[-1]
+    assert last == f"terminated; {path} is unchanged: the same command verifies it again"
+    assert path.read_bytes() == before
+
+
 # --- On a cluster
 
 

@@ -1,4 +1,4 @@
-"""The Minari export: the episodes are those of the environment, and replay in it."""
+"""The Minari export: its episodes are those of the environment, and replay in it."""
 
 import dataclasses
 import subprocess
@@ -16,7 +16,7 @@ from roboarm_nmp import envs  # noqa: E402
 from roboarm_nmp.demo_generation import collect, export_minari  # noqa: E402
 from roboarm_nmp.envs import panda  # noqa: E402
 from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos  # noqa: E402
-from roboarm_nmp.envs.datasets.format import QueryScenes
+from roboarm_nmp.envs.datasets.format import QueryScenes  # noqa: E402
 from roboarm_nmp.envs.scenes.files import save_scene  # noqa: E402
 from roboarm_nmp.envs.scenes.primitives import to_array  # noqa: E402
 
@@ -24,7 +24,6 @@ OPTIONS = {
     "task": "wall",
     "seed": 5,
     "planner": "RRTConnect",
-    "time_limit": 10.0,
     "max_checks": 100_000,
     "clearance": 0.005,
     "planner_range": 0.3,
@@ -71,7 +70,7 @@ def error_of(*flags):
 
 
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
-def test_the_episodes_are_the_demonstrations_up_to_the_goal(demos, goal_type):
+def test_episodes_are_the_demonstrations_up_to_the_goal(demos, goal_type):
     dataset_id, steps = export_minari.export(demos, goal_type, progress=False)
     assert dataset_id == f"roboarm-nmp/wall/{goal_type}-v0"
     dataset = minari.load_dataset(dataset_id)
@@ -114,7 +113,7 @@ def test_the_episodes_are_the_demonstrations_up_to_the_goal(demos, goal_type):
         assert episode.infos["is_success"].tolist() == [False] * length + [True]
 
 
-def test_the_spaces_and_the_environment_are_recovered(demos):
+def test_spaces_and_environment_are_recovered(demos):
     dataset_id, _ = export_minari.export(demos, "config", "mine/reach-v7", progress=False)
     dataset = minari.load_dataset(dataset_id)
     env = dataset.recover_environment()
@@ -131,7 +130,7 @@ def test_the_spaces_and_the_environment_are_recovered(demos):
     assert list(minari.list_local_datasets()) == ["mine/reach-v7"]
 
 
-def test_replaying_the_actions(demos):
+def test_replayed_actions_repeat_the_episode(demos):
     """Exact ones repeat the episode; rounded ones end near the goal."""
     for exact, tolerance in ((True, 1e-3), (False, 0.02)):
         dataset_id, _ = export_minari.export(
@@ -153,7 +152,7 @@ def test_replaying_the_actions(demos):
             assert not exact or info["is_success"]
 
 
-def test_without_reaching_the_goal_an_episode_is_truncated(demos):
+def test_episode_that_misses_its_goal_is_truncated(demos):
     env = envs.make("wall")
     short = demos[0]
     short = dataclasses.replace(short, states=short.states[:5], actions=short.actions[:4])
@@ -162,14 +161,14 @@ def test_without_reaching_the_goal_an_episode_is_truncated(demos):
     assert not episode["terminations"].any() and (episode["rewards"] == -1.0).all()
 
 
-def test_exact_export_refuses_other_executions(demos, storage):
+def test_exact_export_rejects_other_executions(demos, storage):
     demos.digest[2] += 1
     with pytest.raises(ValueError, match="verify FILE --repair"):
         export_minari.export(demos, exact=True, progress=False)
     assert list(storage.iterdir()) == []
 
 
-def test_scenes_that_vary_are_refused(demos, storage):
+def test_scenes_that_vary_are_rejected(demos, storage):
     scene = envs.TASKS["wall"].scene
     index, offsets = np.zeros(len(demos), int), np.array([0, len(scene.obstacles)])
     varied = QueryScenes(scene, index, offsets, to_array(scene.obstacles))
@@ -178,7 +177,7 @@ def test_scenes_that_vary_are_refused(demos, storage):
     assert list(storage.iterdir()) == []
 
 
-def test_a_scene_file_has_no_environment_to_recover(demos, storage, tmp_path_factory):
+def test_scene_file_is_rejected(demos, storage, tmp_path_factory):
     folder = tmp_path_factory.mktemp("own")
     save_scene(envs.TASKS["wall"].scene, folder / "mine.yaml")
     columns = {name: getattr(demos, name) for name in ("plan_seed", "digest", "collided")}
@@ -186,12 +185,12 @@ def test_a_scene_file_has_no_environment_to_recover(demos, storage, tmp_path_fac
     file = folder / "mine_demos.h5"
     write_demos(file, str(folder / "mine.yaml"), 5, plans, states, columns, "a test", {})
     for source in ({"file": file}, {"task": str(folder / "mine.yaml")}):
-        with pytest.raises(SystemExit, match="^error: these .* for 'mine', which is none of"):
+        with pytest.raises(SystemExit, match="^error: .* task 'mine' is not in envs.TASKS"):
             export_minari.main(export_minari.Args(**source))
     assert list(storage.iterdir()) == []
 
 
-def test_an_existing_dataset_is_replaced_only_on_demand_and_as_a_whole(demos, storage, monkeypatch):
+def test_existing_dataset_is_replaced_only_on_demand_and_as_a_whole(demos, storage, monkeypatch):
     dataset_id, steps = export_minari.export(demos, progress=False)
     with pytest.raises(ValueError, match=r"roboarm-nmp/wall/ee-v0 exists .*--overwrite"):
         export_minari.export(demos, progress=False)
@@ -210,7 +209,7 @@ def test_an_existing_dataset_is_replaced_only_on_demand_and_as_a_whole(demos, st
     assert [entry.name for entry in storage.iterdir()] == ["roboarm-nmp"]
 
 
-def test_command(path, storage):
+def test_command_exports_and_prints_the_dataset(path, storage):
     result = run("--file", path, "--goal-type", "combined", "--dataset-id", "cli-v1")
     assert result.returncode == 0, result.stderr
     dataset = minari.load_dataset("cli-v1")
@@ -226,8 +225,8 @@ def test_bad_flags_and_files_give_one_line(path, tmp_path):
     assert f"{damaged}: truncated or corrupt" in error_of("--file", damaged)
 
 
-def test_main_names_what_is_wrong(path, monkeypatch):
-    """What does not need a process of its own."""
+def test_main_names_the_error(path, monkeypatch):
+    """Errors that need no process of their own."""
 
     def error(**flags):
         with pytest.raises(SystemExit) as caught:

@@ -1,4 +1,4 @@
-"""Roadmaps: paths that keep their distance, labels from anywhere, and files that repeat exactly."""
+"""Roadmaps: paths with a margin, labels of any configuration, and files that repeat exactly."""
 
 import os
 import signal
@@ -51,14 +51,14 @@ def roadmap():
     return Roadmap(hard_scene(3), np.random.default_rng(0))
 
 
-def test_paths_keep_their_distance(roadmap):
+def test_paths_keep_the_margin(roadmap):
     paths = roadmap.random_paths(60, np.random.default_rng(1))
     assert len(paths) == 60
     assert all(path.dtype == np.float32 and path.shape == (len(path), 7) for path in paths)
     near = [distances(roadmap.scene, along(path)) for path in paths]
     assert min(x.min() for x in near) > -1e-4
     assert (np.concatenate(near) < roadmap.margin - 0.001).mean() < 0.1
-    # Where both ends and everything on the way have room, all of the margin is kept.
+    # Where both ends and the whole path have room, the full margin is kept.
     roomy = [x for x in near if min(x[0], x[-1]) > 0.016 and x.min() > 0.006]
     assert len(roomy) > 20
     assert np.mean([x.min() > roadmap.margin - 0.001 for x in roomy]) > 0.9
@@ -71,7 +71,7 @@ def test_paths_are_short(roadmap):
     paths = roadmap.paths(starts, goals, np.random.default_rng(2))
     assert found.sum() > 20
     raw = np.array([length(p) for p in points[found]])
-    smooth = np.array([length(path) for path, there in zip(paths, found, strict=True) if there])
+    smooth = np.array([length(path) for path, one in zip(paths, found, strict=True) if one])
     assert (smooth <= raw + 1e-5).all()
     assert smooth.mean() < 0.85 * raw.mean()
     for start, goal, path in zip(starts, goals, paths, strict=True):
@@ -81,31 +81,30 @@ def test_paths_are_short(roadmap):
 
 
 @pytest.mark.parametrize("narrow", [False, True])
-def test_paths_are_those_of_a_roadmap_of_which_all_is_known(narrow):
-    """Where every motion has been looked at before anything is asked."""
-    roadmap, known = (Roadmap(hard_scene(4), np.random.default_rng(0), 300) for _ in range(2))
-    for _ in range(2):  # with the margin, and then with what nodes keep
-        known._look(known._edges.T, narrow=True)
-    usable = known._kept <= 1
-    assert known._is_known[usable].all() and 0.2 < usable.mean() < 0.9
-    ends, room = known.nodes[known._edges], known._room[known._edges]
-    free = known._joined(*ends, *room, roadmap.margin)
-    # The first look is not at the same states of a motion.
-    assert (free == (known._kept == 0)).mean() > 0.99
+def test_paths_equal_those_of_a_roadmap_with_all_motions_checked(narrow):
+    roadmap, checked = (Roadmap(hard_scene(4), np.random.default_rng(0), 300) for _ in range(2))
+    for _ in range(2):  # with the margin, and then with that of nodes
+        checked._check(checked._edges.T, narrow=True)
+    usable = checked._kept <= 1
+    assert checked._is_checked[usable].all() and 0.2 < usable.mean() < 0.9
+    ends, room = checked.nodes[checked._edges], checked._room[checked._edges]
+    free = checked._joined(*ends, *room, roadmap.margin)
+    # The coarse check is not at the same states of a motion.
+    assert (free == (checked._kept == 0)).mean() > 0.99
     rng = np.random.default_rng(5)
     starts, goals = roadmap.sample(40, rng), np.repeat(roadmap.sample(8, rng), 5, axis=0)
-    both = [one._search(starts, goals, narrow) for one in (roadmap, known)]
+    both = [one._search(starts, goals, narrow) for one in (roadmap, checked)]
     assert both[0][2].sum() > 15
     for ours, theirs in zip(*both, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-    assert roadmap._is_known.sum() < 0.5 * known._is_known.sum()
+    assert roadmap._is_checked.sum() < 0.5 * checked._is_checked.sum()
 
 
-def test_no_paths_are_asked_for(roadmap):
+def test_no_queries_give_no_paths(roadmap):
     assert roadmap.paths(np.empty((0, 7)), np.empty((0, 7)), np.random.default_rng(0)) == []
 
 
-def test_a_free_straight_motion_is_the_path():
+def test_free_straight_motion_is_the_path():
     roadmap = Roadmap(Scene(), np.random.default_rng(0), num_nodes=100)
     start, goal = np.array([[0.1] * 7, [-0.1] * 7])
     (path,) = roadmap.paths([start], [goal], np.random.default_rng(0))
@@ -115,7 +114,7 @@ def test_a_free_straight_motion_is_the_path():
     np.testing.assert_allclose(lengths, [0.2 * 7**0.5, 0.0], atol=1e-6)
 
 
-def test_queries_that_a_planner_solved_are_found():
+def test_queries_that_a_planner_solves_have_paths():
     queries = load_queries("random_boxes_hard", "validation")
     near, found = [], 0
     for i in range(8):
@@ -131,8 +130,8 @@ def test_queries_that_a_planner_solved_are_found():
     assert found >= 7
 
 
-def touching(roadmap, depth):
-    """Configurations with something this deep (m) in the arm, found by walking into it."""
+def colliding(roadmap, depth):
+    """Configurations in contact with this depth (m), found on straight lines into obstacles."""
     rng, found = np.random.default_rng(4), []
     starts = roadmap.sample(30, rng, 0.003)
     ends = starts + 0.3 * rng.standard_normal(starts.shape)
@@ -146,7 +145,7 @@ def touching(roadmap, depth):
 
 @pytest.mark.parametrize("depth", [0.0003, 0.008])
 def test_labels_of_states_in_contact(roadmap, depth):
-    states = touching(roadmap, depth)
+    states = colliding(roadmap, depth)
     assert len(states) >= 5
     goals = np.repeat(roadmap.sample(1, np.random.default_rng(5), 0.015), len(states), axis=0)
     paths = roadmap.paths(states, goals, np.random.default_rng(6))
@@ -161,7 +160,7 @@ def test_labels_of_states_in_contact(roadmap, depth):
             continue
         assert rest == pytest.approx(length(path), rel=1e-5)
         before = distances(roadmap.scene, state)
-        if depth > 0.001:  # first out, by the shortest way: no random direction is much better
+        if depth > 0.001:  # first along the gradient: no random direction is much better
             assert distances(roadmap.scene, path[1:]).min() > -1e-4
             rng = np.random.default_rng(7)
             others = rng.standard_normal((50, 7))
@@ -174,8 +173,8 @@ def test_labels_of_states_in_contact(roadmap, depth):
             assert distances(roadmap.scene, along(path)).min() > before - 1e-4
 
 
-def test_no_way_to_a_goal_inside_of_something(roadmap):
-    goal = touching(roadmap, 0.008)[0]
+def test_goal_in_collision_has_no_path(roadmap):
+    goal = colliding(roadmap, 0.008)[0]
     start = roadmap.sample(1, np.random.default_rng(0))[0]
     assert roadmap.paths([start], [goal], np.random.default_rng(0)) == [None]
     directions, lengths = roadmap.labels([start], [goal], np.random.default_rng(0))
@@ -183,7 +182,7 @@ def test_no_way_to_a_goal_inside_of_something(roadmap):
     assert roadmap.paths(np.empty((0, 7)), np.empty((0, 7)), np.random.default_rng(0)) == []
 
 
-def test_the_same_seed_gives_the_same_labels(roadmap):
+def test_seed_gives_the_same_labels(roadmap):
     rng = np.random.default_rng(8)
     states, goals = roadmap.sample(10, rng), np.repeat(roadmap.sample(2, rng), 5, axis=0)
     again = Roadmap(roadmap.scene, np.random.default_rng(0))
@@ -195,12 +194,12 @@ def test_the_same_seed_gives_the_same_labels(roadmap):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_trainer_that_asks_for_labels_needs_no_ompl():
-    check = "import sys, demo_generation.roadmaps; sys.exit('ompl' in sys.modules)"
+def test_roadmaps_do_not_import_ompl():
+    check = "import sys, roboarm_nmp.demo_generation.roadmaps; sys.exit('ompl' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", check], cwd=ROOT).returncode == 0
 
 
-def test_a_margin_below_that_of_the_nodes_is_refused():
+def test_margin_below_that_of_the_nodes_is_rejected():
     with pytest.raises(ValueError, match="margin"):
         Roadmap(Scene(), np.random.default_rng(0), margin=0.001)
 
@@ -219,7 +218,7 @@ def collected(tmp_path_factory):
     return folder
 
 
-def test_what_was_collected(collected):
+def test_collection_has_its_scenes_and_free_paths(collected):
     paths = load_roadmap_paths(collected)
     assert len(paths) == 5 and paths.task == "random_boxes_hard" and paths.seed == 0
     np.testing.assert_array_equal(paths.path_offsets, np.arange(6) * 6)
@@ -231,7 +230,7 @@ def test_what_was_collected(collected):
     assert paths.offsets[-1] == len(paths.points)
 
 
-def test_no_scene_is_one_of_the_queries(collected):
+def test_no_scene_is_that_of_a_query(collected):
     paths = load_roadmap_paths(collected)
     mine = {to_array(paths.scenes[i].obstacles).tobytes() for i in range(len(paths))}
     for split in ("test", "validation"):
@@ -241,47 +240,51 @@ def test_no_scene_is_one_of_the_queries(collected):
         assert len(rows) > 10 and not mine & rows
 
 
-def test_the_files_do_not_depend_on_the_workers(collected, tmp_path):
+def test_files_do_not_depend_on_the_workers(collected, tmp_path):
     collect(replace(Args(tmp_path, **SMALL), workers=2), progress=False)
     assert files(tmp_path) == files(collected)
 
 
 @pytest.mark.slow
-def test_a_cluster_makes_the_same_files(collected, tmp_path, cluster):
+def test_cluster_makes_the_same_files(collected, tmp_path, cluster):
     collect(Args(tmp_path, **SMALL, ray_address=cluster.address), progress=False)
     assert files(tmp_path) == files(collected)
 
 
-def test_killed_and_resumed_is_the_same(collected, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "code", "line"),
+    [
+        (signal.SIGKILL, -9, None),
+        (signal.SIGTERM, 143, "terminated; the same command continues from here"),
+    ],
+)
+def test_interrupted_command_continues_to_the_same_files(collected, tmp_path, number, code, line):
     flags = [f"--{k.replace('_', '-')}={v}" for k, v in SMALL.items()]
-    command = [
-        sys.executable,
-        "-m",
-        "roboarm_nmp.demo_generation.roadmaps",
-        "--output",
-        str(tmp_path),
-        *flags,
-    ]
-    process = subprocess.Popen(command, cwd=ROOT, start_new_session=True, stderr=subprocess.DEVNULL)
+    command = [sys.executable, "-m", "roboarm_nmp", "roadmaps", "--output", str(tmp_path), *flags]
+    process = subprocess.Popen(
+        command, cwd=ROOT, start_new_session=True, stderr=subprocess.PIPE, text=True
+    )
     deadline = time.monotonic() + 100
     while not shard_path(tmp_path, 0).exists():
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    os.killpg(process.pid, number)
+    _, stderr = process.communicate()
+    assert process.returncode == code and "Traceback" not in stderr
+    assert line is None or stderr.splitlines()[-1] == line
     written = shard_path(tmp_path, 0).stat().st_mtime_ns
     collect(Args(tmp_path, **SMALL), progress=False)
     assert shard_path(tmp_path, 0).stat().st_mtime_ns == written
     assert files(tmp_path) == files(collected)
 
 
-def test_more_scenes_go_on_from_what_is_there(collected, tmp_path):
+def test_more_scenes_extend_a_collection(collected, tmp_path):
     collect(Args(tmp_path, **SMALL | {"scenes": 3}), progress=False)
     collect(Args(tmp_path, **SMALL), progress=False)
     assert files(tmp_path) == files(collected)
 
 
-def test_a_corrupt_shard_is_named(collected, tmp_path):
+def test_corrupt_shard_is_rejected_by_name(collected, tmp_path):
     for name, contents in files(collected).items():
         (tmp_path / name).write_bytes(contents)
     (tmp_path / "shard_00000.h5.bak").write_bytes(b"")  # no shard
@@ -314,7 +317,7 @@ def test_a_corrupt_shard_is_named(collected, tmp_path):
         ({"margin": 0.0}, "--margin"),
     ],
 )
-def test_what_cannot_be_collected_is_refused(collected, changes, message):
+def test_bad_flag_is_rejected(collected, changes, message):
     before = files(collected)
     with pytest.raises(ValueError, match=message):
         collect(replace(Args(collected, **SMALL), **changes), progress=False)
@@ -322,7 +325,7 @@ def test_what_cannot_be_collected_is_refused(collected, changes, message):
     assert not (Path(envs.__file__).parent / "demos" / "new").exists()
 
 
-def test_a_task_with_one_scene_has_new_paths_each_time(tmp_path):
+def test_task_with_one_scene_has_other_paths_each_time(tmp_path):
     paths = collect(Args(tmp_path, task="wall", **SMALL | {"scenes": 2}), progress=False)
     assert paths.scenes[0] == paths.scenes[1] == envs.get_task("wall").scene
     assert not np.array_equal(paths.of_scene(0)[0], paths.of_scene(1)[0])

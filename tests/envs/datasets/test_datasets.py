@@ -1,4 +1,4 @@
-"""The query files: exact, reproducible, never half written, and a bad one is refused by name."""
+"""Query files: exact, reproducible, written atomically; errors of bad files name them."""
 
 import dataclasses
 import json
@@ -18,10 +18,15 @@ from paths import ROOT
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import make_queries
 from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.datasets import files as datasets
 from roboarm_nmp.envs.datasets import format as dataset_format
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.queries import load_queries, query_path, validate, write_queries
+from roboarm_nmp.envs.datasets.format import SPLITS, DatasetError
+from roboarm_nmp.envs.datasets.queries import (
+    Queries,
+    load_queries,
+    query_path,
+    validate,
+    write_queries,
+)
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
 
@@ -80,7 +85,7 @@ def test_round_trip_is_exact(tmp_path):
 def test_queries_are_indexed_like_a_list(path):
     queries = load_queries(path)
     few = queries[5:8]
-    assert isinstance(few, datasets.Queries) and len(few) == 3
+    assert isinstance(few, Queries) and len(few) == 3
     np.testing.assert_array_equal(few.goal_position, queries.goal_position[5:8])
     start, goal, scene = queries[6]
     np.testing.assert_array_equal(start, few.start[1])
@@ -97,13 +102,13 @@ def test_same_contents_same_bytes(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_made_again_the_file_has_the_same_bytes(made, tmp_path, workers):
+def test_file_made_again_has_the_same_bytes(made, tmp_path, workers):
     again = tmp_path / "again.h5"
     make_queries.make_queries(again, "wall", 0, 30, 10, num_workers=workers, progress=False)
     assert again.read_bytes() == made.read_bytes()
 
 
-def test_interrupted_it_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch):
+def test_interrupted_command_continues_to_the_same_bytes(made, tmp_path, monkeypatch):
     again, done = tmp_path / "again.h5", []
 
     def die(journal, entry):
@@ -131,7 +136,7 @@ def test_interrupted_it_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [again]
 
 
-def test_a_query_does_not_depend_on_the_others(made):
+def test_query_does_not_depend_on_the_others(made):
     queries = load_queries(made)
     sampler = make_queries.Sampler("wall", solvable=False)
     for index in (29, 3):
@@ -177,7 +182,7 @@ def test_splits_must_be_disjoint(path):
         write(path, splits)
 
 
-def test_wrong_arguments_are_refused(path):
+def test_bad_arguments_are_rejected(path):
     with pytest.raises(ValueError, match="unknown task 'wal'"):
         write(path, task="wal")
     with pytest.raises(ValueError, match="unknown task 'wal'"):
@@ -294,7 +299,7 @@ def promised(path):
 BAD = [
     (soft_link, "/test/goal is a link, which is never followed"),
     (external_link, "/test is a link, which is never followed"),
-    (elsewhere, "/test/goal is no array of this file"),
+    (elsewhere, "/test/goal is not an array in this file"),
     (never_written, "was never written"),
     (promised, "too many"),
     (missing, "no such file"),
@@ -314,7 +319,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("damage", "complaint"), BAD, ids=[damage.__name__ for damage, _ in BAD])
-def test_bad_files_are_refused_by_name(path, damage, complaint):
+def test_bad_file_is_rejected_by_name(path, damage, complaint):
     damage(path)
     for read in (load_queries, validate):
         with pytest.raises(DatasetError) as caught:
@@ -323,11 +328,11 @@ def test_bad_files_are_refused_by_name(path, damage, complaint):
         assert "\n" not in str(caught.value)
 
 
-def test_flipped_bytes_anywhere_change_nothing_or_are_refused(path):
+def test_flipped_byte_changes_nothing_or_is_rejected(path):
     contents = path.read_bytes()
     expected = load_queries(path)
     rng = np.random.default_rng(0)
-    refused = 0
+    rejected = 0
     for position in rng.integers(len(contents), size=300):
         damaged = bytearray(contents)
         damaged[position] ^= int(rng.integers(1, 256))
@@ -336,14 +341,14 @@ def test_flipped_bytes_anywhere_change_nothing_or_are_refused(path):
             queries = load_queries(path)
         except DatasetError as error:
             assert str(path) in str(error)
-            refused += 1
+            rejected += 1
         else:  # a byte that HDF5 does not use
             np.testing.assert_array_equal(queries.start, expected.start)
             np.testing.assert_array_equal(queries.goal, expected.goal)
-    assert refused > 0
+    assert rejected > 0
 
 
-def test_a_file_for_another_task_is_refused(path, monkeypatch):
+def test_file_for_another_task_is_rejected(path, monkeypatch):
     with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'"):
         validate(path, "no_obstacles")
     monkeypatch.setattr("roboarm_nmp.envs.datasets.queries.query_path", lambda task: path)
@@ -361,7 +366,7 @@ def test_a_file_for_another_task_is_refused(path, monkeypatch):
         dataclasses.replace(envs.TASKS["wall"].scene, floor=-0.61),
     ],
 )
-def test_a_file_for_an_old_scene_is_refused(path, monkeypatch, scene):
+def test_file_for_an_old_scene_is_rejected(path, monkeypatch, scene):
     task = dataclasses.replace(envs.TASKS["wall"], scene=scene)
     monkeypatch.setitem(envs.TASKS, "wall", task)
     with pytest.raises(DatasetError, match="out of date.*made by a test") as caught:
@@ -369,7 +374,7 @@ def test_a_file_for_an_old_scene_is_refused(path, monkeypatch, scene):
     assert str(path) in str(caught.value)
 
 
-def test_simulating_finds_infeasible_queries(made, tmp_path):
+def test_simulation_finds_infeasible_queries(made, tmp_path):
     folded = np.zeros(7, np.float32)  # inside the limits; elbow and wrist straight and folded
     folded[3], folded[5] = -3.1, 3.8
     env = envs.make("wall")
@@ -384,10 +389,12 @@ def test_simulating_finds_infeasible_queries(made, tmp_path):
         validate(path, simulate=True)
 
 
-def test_simulating_finds_wrong_positions(path):
+def test_simulation_finds_wrong_positions(path):
     with h5py.File(path, "r+") as file:
         file["test/goal_position"][4, 0] += np.float32(0.001)
-        attributes = {name: datasets.attribute(file, name) for name in dataset_format._ATTRIBUTES}
+        attributes = {
+            name: dataset_format.attribute(file, name) for name in dataset_format._ATTRIBUTES
+        }
         names = dataset_format.array_formats(dataset_format.QUERY_SCHEMA, file)
         arrays = {name: file[name][()] for name in names}
         file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
@@ -402,7 +409,7 @@ def test_simulating_finds_wrong_positions(path):
 KILLED_IN_THE_MIDDLE = """
     import os, sys, time
     import numpy as np
-    from envs import datasets
+    from roboarm_nmp.envs.datasets.queries import write_queries
 
     def wait(descriptor):
         print("in the middle", flush=True)
@@ -411,13 +418,14 @@ KILLED_IN_THE_MIDDLE = """
     os.fsync = wait  # after the bytes, before they are on the disk under the file's name
     queries = np.full((5, 7), -0.05, np.float32), np.full((5, 7), -0.06, np.float32)
     splits = {"test": queries, "validation": queries[::-1]}
-    datasets.write_queries(sys.argv[1], "wall", 0, splits, "", {})
+    write_queries(sys.argv[1], "wall", 0, splits, "", {})
 """
 
 WRITES_AGAIN_AND_AGAIN = """
     import sys
     import numpy as np
-    from envs import datasets, panda
+    from roboarm_nmp.envs import panda
+    from roboarm_nmp.envs.datasets.queries import write_queries
 
     rng = np.random.default_rng(1)
     test, validation = (
@@ -426,13 +434,13 @@ WRITES_AGAIN_AND_AGAIN = """
     )
     for seed in range(10, 10_000):
         splits = {"test": test, "validation": validation}
-        datasets.write_queries(sys.argv[1], "wall", seed, splits, "", {})
+        write_queries(sys.argv[1], "wall", seed, splits, "", {})
         print("in the middle", flush=True)
 """
 
 
 def start_writer(script, path):
-    """The process of `script`, once it has printed its first line."""
+    """The process of `script`, after it has printed its first line."""
     process = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(script), path],
         cwd=ROOT,
@@ -444,18 +452,18 @@ def start_writer(script, path):
     return process
 
 
-def test_a_writer_killed_in_the_middle_leaves_the_old_file(path):
+def test_writer_killed_in_the_middle_leaves_the_old_file(path):
     before = path.read_bytes()
     process = start_writer(KILLED_IN_THE_MIDDLE, path)
     process.kill()
     assert process.wait() == -signal.SIGKILL
     process.stdout.close()
     assert path.read_bytes() == before
-    write(path)  # and what the killed writer left behind is in nobody's way
+    write(path)  # in spite of leftovers of the killed writer
     assert path.read_bytes() == before
 
 
-def test_a_writer_killed_anywhere_leaves_a_whole_file(path):
+def test_writer_killed_anywhere_leaves_a_whole_file(path):
     for delay in (0.0, 0.01, 0.023, 0.041):
         process = start_writer(WRITES_AGAIN_AND_AGAIN, path)
         time.sleep(delay)
@@ -465,7 +473,7 @@ def test_a_writer_killed_anywhere_leaves_a_whole_file(path):
         process.stdout.close()
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
+def test_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
     before = path.read_bytes()
 
     def full(*_):
@@ -478,7 +486,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
     assert list(path.parent.iterdir()) == [path]
 
 
-# --- The commands
+# --- Commands
 
 
 def command(*arguments):
@@ -503,7 +511,7 @@ def test_validate_command(made, path):
 def test_make_queries_command_repeats_itself(tmp_path):
     path = tmp_path / "wall.h5"
     arguments = "--task wall --seed 5 --num-test 12 --num-validation 3"
-    made_by = f"python -m roboarm_nmp.demo_generation.make_queries {arguments}"
+    made_by = f"roboarm queries {arguments}"
     result = command(
         "roboarm_nmp.demo_generation.make_queries", *arguments.split(), "--output", path
     )
@@ -512,8 +520,31 @@ def test_make_queries_command_repeats_itself(tmp_path):
         assert file.attrs["made_by"].decode() == made_by
         assert json.loads(file.attrs["parameters"].decode())["hold_steps"] == 24
     first = path.read_bytes()
-    command(*made_by.split()[2:], "--output", path, "--workers", 1)
+    again = ["roboarm_nmp", *made_by.split()[1:], "--output", path, "--workers", 1]
+    assert command(*again).returncode == 0
     assert path.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_terminated_make_queries_command_continues(made, tmp_path):
+    path = tmp_path / "wall.h5"
+    arguments = ["roboarm_nmp", "queries", "--task", "wall", "--num-test", 30]
+    arguments += ["--num-validation", 10, "--workers", 1, "--output", path]
+    process = subprocess.Popen(
+        [sys.executable, "-m", *map(str, arguments)], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    deadline, journal = time.monotonic() + 100, make_queries.journal_of(path)
+    while not journal.exists() or journal.read_bytes().count(b"\n") < 3:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    process.terminate()
+    _, stderr = process.communicate()
+    assert process.returncode == 143 and "Traceback" not in stderr
+    assert stderr.splitlines()[-1] == "terminated; the same command continues from here"
+    assert not path.exists() and journal.exists()
+    assert command(*arguments).returncode == 0
+    again, expected = load_queries(path), load_queries(made)
+    np.testing.assert_array_equal(again.start, expected.start)
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -521,7 +552,7 @@ def test_make_queries_command_repeats_itself(tmp_path):
     ("arguments", "complaint"),
     [
         (["--task", "wall", "wal"], "unknown task 'wal'"),
-        (["--task", "mixed_scenes"], "mixed_scenes are to learn from"),
+        (["--task", "mixed_scenes"], "mixed_scenes are scenes for training"),
         (["--task", "wall", "--output", "no/such/folder/wall.h5"], "cannot write no/such/folder"),
         (["--task", "wall", "--output", "envs"], "envs is a directory"),
         (["--task", "all", "--output", "some.h5"], "one task"),
@@ -529,18 +560,18 @@ def test_make_queries_command_repeats_itself(tmp_path):
         (["--task", "wall", "--seed", "-1"], "--seed must be in [0, 2^32)"),
     ],
 )
-def test_make_queries_refuses_before_it_works(arguments, complaint):
+def test_make_queries_rejects_bad_flags_before_any_work(arguments, complaint):
     result = command("roboarm_nmp.demo_generation.make_queries", *arguments)
     assert result.returncode == 1
     assert complaint in result.stderr
     assert "queries/s" not in result.stderr and "Traceback" not in result.stderr
 
 
-# --- The pretrained files
+# --- Files of the project
 
 
 @pytest.mark.parametrize("task", envs.TASKS)
-def test_pretrained_queries(task):
+def test_queries_of_the_project_are_feasible_and_have_their_positions(task):
     env = envs.make(task)
     client = p.connect(p.DIRECT)
     robot = p.loadURDF(
@@ -548,7 +579,7 @@ def test_pretrained_queries(task):
         useFixedBase=True,
         physicsClientId=client,
     )
-    for split in datasets.SPLITS:
+    for split in SPLITS:
         queries = load_queries(task, split)
         assert len(queries) == {"test": 10_000, "validation": 200}[split]
         chosen = np.random.default_rng(0).choice(len(queries), 20, replace=False)
@@ -572,13 +603,13 @@ def test_pretrained_queries(task):
         ("random_boxes_hard", 4, 8),
     ],
 )
-def test_pretrained_random_scenes(task, fewest, most):
+def test_random_scenes_of_the_project_have_every_number_of_obstacles(task, fewest, most):
     queries = load_queries(task)
-    with h5py.File(datasets.query_path(task)) as file:
+    with h5py.File(query_path(task)) as file:
         parameters = json.loads(file.attrs["parameters"].decode())
         counts = file["test/obstacle_count"][()]
         scene = file["test/scene"][()]
-    assert parameters["solve_attempts"] > 0  # a planner solved them all
+    assert parameters["solve_attempts"] > 0  # the planner has solved all of them
     # Five queries in each of 2,000 scenes, all counts equally often.
     np.testing.assert_array_equal(scene, np.arange(10_000) // 5)
     assert len({queries[i].scene for i in range(0, 10_000, 5)}) == 2000

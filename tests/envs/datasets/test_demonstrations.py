@@ -1,4 +1,4 @@
-"""The demonstration files: in and out again, replayed, and a bad one is refused by name."""
+"""Demonstration files: round trip, replay; errors of bad files name them."""
 
 import dataclasses
 import time
@@ -13,7 +13,6 @@ from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets import demonstrations
-from roboarm_nmp.envs.datasets import files as datasets
 from roboarm_nmp.envs.datasets import format as dataset_format
 from roboarm_nmp.envs.datasets.demonstrations import (
     QUANTUM,
@@ -70,7 +69,7 @@ def write(path, made, task="wall", parameters=None):
 
 
 def hand_made():
-    """Arguments of `write_demos`: made-up plans on `no_obstacles`, executions far from them."""
+    """Arguments of `write_demos`: random plans on `no_obstacles`, executions far from them."""
     rng = np.random.default_rng(0)
 
     def configurations(rows):
@@ -90,7 +89,7 @@ def hand_made():
 # --- Reading and writing
 
 
-def test_round_trip(path, made):
+def test_round_trip_is_exact_up_to_rounding(path, made):
     plans, executions, seeds = made
     demos = load_demos(path)
     assert (demos.task, demos.seed, demos.made_by) == ("wall", 4, "made by a test")
@@ -103,7 +102,7 @@ def test_round_trip(path, made):
         assert demo.goal.tobytes() == demos.goal[i].tobytes() == plan[-1].tobytes()
         np.testing.assert_allclose(
             demo.states, execution.states, rtol=0, atol=QUANTUM / 2 + 1e-6
-        )  # of other shapes, this fails too
+        )  # fails for other shapes, too
         assert demo.digest == demos.digest[i] == execution.digest
         assert demos.plan_seed[i] == seeds[i]
         assert bool(demos.collided[i]) == execution.collided
@@ -115,7 +114,7 @@ def test_round_trip(path, made):
     assert demos.offsets[0] == 0 and demos.offsets[-1] == len(demos.states) == len(demos.actions)
 
 
-def test_executions_far_from_their_plans_survive(tmp_path):
+def test_executions_far_from_their_plans_are_stored(tmp_path):
     arguments = hand_made()
     write_demos(tmp_path / "demos.h5", **arguments)
     demos = load_demos(tmp_path / "demos.h5")
@@ -128,7 +127,7 @@ def test_executions_far_from_their_plans_survive(tmp_path):
     assert demos.collided.tolist() == [False, True, False]
 
 
-def test_there_are_no_demonstrations_beyond_the_last(path):
+def test_index_beyond_the_last_demonstration_is_an_error(path):
     demos = load_demos(path)
     for i in (5, -1):
         with pytest.raises(IndexError, match=f"demonstration {i} of 5"):
@@ -186,7 +185,7 @@ def test_same_contents_same_bytes(path, made, tmp_path):
     assert write(tmp_path / "again.h5", made).read_bytes() == path.read_bytes()
 
 
-def test_statistics_by_hand(tmp_path):
+def test_statistics_equal_those_by_hand(tmp_path):
     arguments = hand_made()
     arguments["parameters"] = {"counts": {"queries_given_up": 1, "attempts": 5}}
     write_demos(tmp_path / "demos.h5", **arguments)
@@ -205,7 +204,7 @@ def test_statistics_by_hand(tmp_path):
         "path_length": np.mean(lengths),
         "detour": np.mean(detours),
         "waypoints": (2 + 3 + 4) / 3,
-        "touching": 1,
+        "collided": 1,
         "solved": 3 / 4,
         "queries_given_up": 1,
         "attempts": 5,
@@ -217,7 +216,7 @@ def test_statistics_by_hand(tmp_path):
 
 
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
-def test_the_actions_lead_to_the_goal(path, goal_type):
+def test_actions_lead_to_the_goal(path, goal_type):
     env, reached = envs.make("wall", goal_type=goal_type), 0
     for demo in load_demos(path):
         env.reset_specific(demo.start, demo.goal)
@@ -230,7 +229,7 @@ def test_the_actions_lead_to_the_goal(path, goal_type):
                 break
         reached += info["is_success"]
         assert not info["collision_so_far"]
-        # The rounding of the states adds up over the actions: some may end just outside.
+        # Rounding errors of states accumulate over the actions: some may end just outside.
         assert closest <= 1.5 * (0.05 if goal_type == "config" else 0.02)
     assert reached >= 4  # of 5
     env.close()
@@ -248,18 +247,18 @@ def test_following_the_plan_gives_the_digest(path):
     env.close()
 
 
-def test_a_plan_through_an_obstacle_collides(made):
+def test_plan_through_an_obstacle_collides(made):
     env = envs.make("wall")
     outcomes = []
     for start, goal, _ in load_queries("wall")[4:8]:  # straight through the wall
         execution = follow(env, np.stack([start, goal]))
         assert execution.collided
         outcomes.append(execution.reached)
-    assert not all(outcomes)  # and most get stuck
+    assert not all(outcomes)  # most get stuck
     env.close()
 
 
-# --- Refused when writing
+# --- Rejected when writing
 
 
 def with_row(array, row, value):
@@ -344,7 +343,7 @@ def test_bad_demonstrations_are_not_written(path, change, complaint):
     assert path.read_bytes() == before
 
 
-def test_wrong_tasks_are_refused(path):
+def test_unknown_task_is_rejected(path):
     with pytest.raises(ValueError, match="unknown task 'wal'"):
         write_demos(path, **hand_made() | {"task": "wal"})
     with pytest.raises(ValueError, match="unknown task 'wal'"):
@@ -353,7 +352,7 @@ def test_wrong_tasks_are_refused(path):
         load_demos("wal")
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
+def test_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
     before = path.read_bytes()
 
     def full(*_):
@@ -441,7 +440,9 @@ def wrong_shape(path):
 def sign_again(path):
     """Give a changed file the checksum it should have."""
     with h5py.File(path, "r+") as file:
-        attributes = {name: datasets.attribute(file, name) for name in dataset_format._ATTRIBUTES}
+        attributes = {
+            name: dataset_format.attribute(file, name) for name in dataset_format._ATTRIBUTES
+        }
         arrays = {name: file[name][()] for name in dataset_format.DEMO_ARRAYS}
         file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
 
@@ -487,7 +488,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("damage", "complaint"), BAD, ids=[damage.__name__ for damage, _ in BAD])
-def test_bad_files_are_refused_by_name(path, damage, complaint):
+def test_bad_file_is_rejected_by_name(path, damage, complaint):
     damage(path)
     with pytest.raises(DatasetError) as caught:
         load_demos(path)
@@ -495,11 +496,11 @@ def test_bad_files_are_refused_by_name(path, damage, complaint):
     assert "\n" not in str(caught.value)
 
 
-def test_flipped_bytes_anywhere_change_nothing_or_are_refused(path):
+def test_flipped_byte_changes_nothing_or_is_rejected(path):
     contents = path.read_bytes()
     expected = load_demos(path)
     rng = np.random.default_rng(0)
-    refused = 0
+    rejected = 0
     for position in rng.integers(len(contents), size=150):
         damaged = bytearray(contents)
         damaged[position] ^= int(rng.integers(1, 256))
@@ -508,20 +509,20 @@ def test_flipped_bytes_anywhere_change_nothing_or_are_refused(path):
             demos = load_demos(path)
         except DatasetError as error:
             assert str(path) in str(error)
-            refused += 1
+            rejected += 1
         else:  # a byte that HDF5 does not use
             np.testing.assert_array_equal(demos.states, expected.states)
             np.testing.assert_array_equal(demos.plan, expected.plan)
-    assert refused > 0
+    assert rejected > 0
 
 
-def test_a_demonstration_file_is_no_query_file(path):
+def test_demonstration_file_is_not_a_query_file(path):
     with pytest.raises(DatasetError, match="not a query file") as caught:
         load_queries(path)
     assert str(path) in str(caught.value)
 
 
-def test_a_file_for_another_task_is_refused(path, monkeypatch):
+def test_file_for_another_task_is_rejected(path, monkeypatch):
     monkeypatch.setattr(demonstrations, "demo_path", lambda task: path)
     assert load_demos("wall").task == "wall"
     with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'") as caught:
@@ -537,7 +538,7 @@ def test_a_file_for_another_task_is_refused(path, monkeypatch):
         dataclasses.replace(envs.TASKS["wall"].scene, floor=-0.61),
     ],
 )
-def test_a_file_for_an_old_scene_is_refused(path, monkeypatch, scene):
+def test_file_for_an_old_scene_is_rejected(path, monkeypatch, scene):
     task = dataclasses.replace(envs.TASKS["wall"], scene=scene)
     monkeypatch.setitem(envs.TASKS, "wall", task)
     with pytest.raises(DatasetError, match="out of date.*made by a test") as caught:
@@ -545,14 +546,14 @@ def test_a_file_for_an_old_scene_is_refused(path, monkeypatch, scene):
     assert str(path) in str(caught.value)
 
 
-# --- The pretrained files
+# --- Files of the project
 
 
 FILES = sorted((Path(envs.__file__).parent / "demos").glob("*.h5"))
 
 
 @pytest.mark.parametrize("file", FILES, ids=[file.stem for file in FILES])
-def test_pretrained_demonstrations(file):
+def test_demonstrations_of_the_project_repeat(file):
     demos = load_demos(file.stem)
     assert len(demos) == 10_000 and not demos.collided.any()
     env = envs.make(file.stem)

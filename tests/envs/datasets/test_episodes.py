@@ -1,6 +1,6 @@
-"""envs/datasets/episodes.py: episodes on demonstrations' queries, and which of them fit an environment.
+"""envs/datasets/episodes.py: episodes on demonstrations' queries, and which fit an environment.
 
-(What the episodes hold, by hand: test_sac_her_mp.py and test_export_minari.py.)
+(The contents of episodes, by hand: test_sac_her_mp.py and test_export_minari.py.)
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from roboarm_nmp.envs.datasets.episodes import DemoQueriesWrapper, demo_episode,
 from roboarm_nmp.envs.datasets.format import DatasetError
 
 
-def test_resets_draw_the_demonstrations_queries_and_a_seed_repeats_them():
+def test_resets_draw_queries_of_demonstrations_and_a_seed_repeats_them():
     demos = load_demos("random_boxes_hard")
     env = DemoQueriesWrapper(envs.make("random_boxes_hard", goal_type="config"), demos)
     drawn = []
@@ -28,7 +28,7 @@ def test_resets_draw_the_demonstrations_queries_and_a_seed_repeats_them():
     env.close()
 
 
-def test_an_episode_is_what_the_environment_observes_on_the_way():
+def test_episode_has_the_observations_of_the_environment():
     demo = load_demos("wall")[0]
     env = envs.make("wall", goal_type="combined")
     episode = demo_episode(demo, env)
@@ -50,6 +50,6 @@ def test_an_episode_is_what_the_environment_observes_on_the_way():
         ({"max_step": 0.02}, "steps up to 0.03"),
     ],
 )
-def test_demonstrations_that_do_not_fit_are_refused(arguments, message):
+def test_demonstrations_that_do_not_fit_are_rejected(arguments, message):
     with pytest.raises(DatasetError, match=message):
         load_demos_for(envs.make("wall", **arguments), "wall", "wall")

@@ -1,4 +1,4 @@
-"""Collecting what sensors see: the same files whatever happens, read back as it was seen."""
+"""Collecting observations: the same files after any interruption, and exact when read back."""
 
 import os
 import signal
@@ -41,7 +41,7 @@ def whole(tmp_path_factory):
     return folder
 
 
-def test_what_is_read_is_what_was_seen(whole):
+def test_stored_observations_are_those_of_the_sensors(whole):
     observations = Observations(whole)
     assert len(observations) == 10 and observations.offsets.tolist() == [0, 4, 8, 10]
     assert observations.task == "random_boxes_hard"
@@ -53,7 +53,7 @@ def test_what_is_read_is_what_was_seen(whole):
             assert 4 <= len(scene.obstacles) <= 8 and env.is_feasible(configurations[row])
             world.show(scene, configurations[row])
             for name, sensor in observations.sensors.items():
-                seen = sensor.observe(world)
+                observed = sensor.observe(world)
                 if isinstance(sensor, Camera):
                     read = {"rgb": observations.read(shard, f"{name}/rgb")[row]}
                 else:
@@ -61,7 +61,7 @@ def test_what_is_read_is_what_was_seen(whole):
                     read = sensor.points(
                         depth, observations.read(shard, f"{name}/segmentation")[row]
                     )
-                for output, array in seen.items():
+                for output, array in observed.items():
                     np.testing.assert_allclose(read[output], array, atol=1e-4)
     world.close()
     env.close()
@@ -74,12 +74,12 @@ def test_scenes_and_configurations_are_all_different(whole):
     assert len(scenes) == len(np.unique(poses, axis=0)) == 10
 
 
-def test_sensors_survive_being_stored():
+def test_sensors_are_stored_exactly():
     sensors = {**cardinal(size=(64, 48), outputs=("depth",)), "cloud": PointCloud((1, 2, 3))}
     assert sensors_from_json(sensors_to_json(sensors)) == sensors
 
 
-def test_the_files_do_not_depend_on_workers_or_on_what_was_made_first(whole, tmp_path):
+def test_files_do_not_depend_on_workers_or_on_earlier_shards(whole, tmp_path):
     collect.collect(args(tmp_path / "two", workers=2), progress=False)
     assert shards(tmp_path / "two") == shards(whole)
     collect.collect(args(tmp_path / "grown", num=6), progress=False)  # its last shard is short
@@ -87,7 +87,7 @@ def test_the_files_do_not_depend_on_workers_or_on_what_was_made_first(whole, tmp
     assert shards(tmp_path / "grown") == shards(whole)
 
 
-def test_what_is_there_is_not_made_again(whole, tmp_path, monkeypatch):
+def test_existing_shards_are_not_made_again(whole, tmp_path, monkeypatch):
     for name, contents in shards(whole).items():
         (tmp_path / name).write_bytes(contents)
     (tmp_path / "shard_00001.h5").unlink()
@@ -103,24 +103,29 @@ def test_what_is_there_is_not_made_again(whole, tmp_path, monkeypatch):
     assert made == [(1, 4, 8)] and shards(tmp_path) == shards(whole)
 
 
-def test_killed_it_goes_on(whole, tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "roboarm_nmp.scene_embedding_train.collect",
-        "--output",
-        str(tmp_path),
-    ]
+@pytest.mark.parametrize(
+    ("number", "code", "line"),
+    [
+        (signal.SIGKILL, -9, None),
+        (signal.SIGTERM, 143, "terminated; the same command continues from here"),
+    ],
+)
+def test_interrupted_command_continues_to_the_same_files(whole, tmp_path, number, code, line):
+    command = [sys.executable, "-m", "roboarm_nmp", "observations", "--output", str(tmp_path)]
     command += ["--num", "10", "--shard-size", "4", "--workers", "1"]
     command += ["--image-size", "32", "--num-samples", "400"]
-    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
-    until = time.time() + 60
+    process = subprocess.Popen(
+        command, start_new_session=True, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    until = time.time() + 100
     while not shard_path(tmp_path, 0).exists():
         assert time.time() < until
         time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    result = subprocess.run(command, check=True, capture_output=True, text=True)
+    os.killpg(process.pid, number)
+    _, stderr = process.communicate()
+    assert process.returncode == code and "Traceback" not in stderr
+    assert line is None or stderr.splitlines()[-1] == line
+    result = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path)
     assert "10 scenes" in result.stdout
     assert {k: v for k, v in shards(tmp_path).items() if k.endswith(".h5")} == shards(whole)
 
@@ -134,7 +139,7 @@ def test_killed_it_goes_on(whole, tmp_path):
         ({"task": "nowhere"}, "unknown task"),
     ],
 )
-def test_what_cannot_be_collected_is_refused(tmp_path, change, complaint):
+def test_bad_flag_is_rejected(tmp_path, change, complaint):
     given = args(tmp_path)
     for name, value in change.items():
         setattr(given, name, value)
@@ -143,7 +148,7 @@ def test_what_cannot_be_collected_is_refused(tmp_path, change, complaint):
     assert not shards(tmp_path)
 
 
-def test_another_collection_is_not_mixed_in(whole, tmp_path):
+def test_shards_of_another_collection_are_rejected(whole, tmp_path):
     for name, contents in shards(whole).items():
         (tmp_path / name).write_bytes(contents)
     with pytest.raises(ValueError, match="another command: .*--seed 0"):
@@ -151,7 +156,7 @@ def test_another_collection_is_not_mixed_in(whole, tmp_path):
     assert shards(tmp_path) == shards(whole)
 
 
-def test_damaged_folders_are_refused_by_name(whole, tmp_path):
+def test_damaged_shard_is_rejected_by_name(whole, tmp_path):
     with pytest.raises(DatasetError, match="no observations"):
         Observations(tmp_path)
     for name, contents in shards(whole).items():
@@ -172,6 +177,6 @@ def test_damaged_folders_are_refused_by_name(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_cluster_makes_the_same_files(whole, tmp_path, cluster):
+def test_cluster_makes_the_same_files(whole, tmp_path, cluster):
     collect.collect(args(tmp_path, ray_address=cluster.address), progress=False)
     assert shards(tmp_path) == shards(whole)

@@ -140,7 +140,9 @@ def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
 
 
 def test_there_are_no_queries_in_mixed_scenes():
-    with pytest.raises(DatasetError, match="mixed_scenes are to learn from: no queries or dem"):
+    with pytest.raises(
+        DatasetError, match="mixed_scenes are scenes for training: there are no queries"
+    ):
         load_queries("mixed_scenes")
     env = envs.make("mixed_scenes")
     env.reset(seed=0)

@@ -1,6 +1,6 @@
-"""Many attempts, one after another, in child processes: what crashes or hangs takes no other along.
+"""Many attempts, one after another, in child processes: a crash or a hang ends only one of them.
 
-An attempt is a function from a number to a word for what came of it.
+An attempt is a function from a number to a word for its outcome.
 """
 
 import os
@@ -11,13 +11,13 @@ import traceback
 
 REFUSED, RAN = "refused", "ran"
 SECONDS, MEGABYTES = 20, 1500
-repeating = False  # one attempt, in this process: what is said is wanted
+repeating = False  # True for one attempt in this process, whose messages are shown
 
 
 def outcomes(attempt, numbers, per_child, seconds=SECONDS, megabytes=MEGABYTES):
     """Yield `(number, word)` for each number, in order; `per_child` attempts share a process.
 
-    A process may have so many megabytes more than this one.
+    A process may use so many `megabytes` more than this one.
 
     Words besides those of `attempt`: `crash: SIGNAL`, `hang` (more than `seconds`), `traceback:
     ERROR` for an exception that `attempt` raised.
@@ -50,7 +50,7 @@ def outcomes(attempt, numbers, per_child, seconds=SECONDS, megabytes=MEGABYTES):
 
 
 def _lines(reader, seconds):
-    """Lines of a pipe until its end; None if one takes too long."""
+    """Lines of a pipe until its end; None for a line that takes too long."""
     left = b""
     while True:
         ready, _, _ = select.select([reader], [], [], seconds)

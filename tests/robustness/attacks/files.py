@@ -26,11 +26,11 @@ from roboarm_nmp.envs.training import runs
 from roboarm_nmp.scene_embedding_train import collect as observe
 
 UNCHANGED, CHANGED = "read, as it was", "silent change"
-TEXTS = ("scene", "args")  # of which a person may change anything
+TEXTS = ("scene", "args")  # any change of these may be a user's
 
 
 def digest(*contents):
-    """Of arrays, bytes and what JSON can have."""
+    """SHA-256 of arrays, and of values that JSON can have."""
     sha = hashlib.sha256()
     for content in contents:
         if isinstance(content, np.ndarray):
@@ -41,7 +41,7 @@ def digest(*contents):
 
 
 def make_files(folder):
-    """One file of each kind, in a folder: dict from the kind to its path."""
+    """Make one file of each kind in a folder: dict from the kind to its path."""
     task = folder / "mine.yaml"
     save_scene(get_task("boxes").scene, task)
     paths = {"scene": task, "network": folder / "network.pt"}
@@ -79,7 +79,7 @@ def parts_of_a_run():
 
 
 def content_of(kind, path):
-    """What the project's reader gets out of a file, as a digest; for a journal a dict of them."""
+    """A digest of the contents that the project's reader returns; for a journal a dict of them."""
     if kind == "scene":
         return digest(repr(load_scene(path)))
     if kind == "network":
@@ -103,11 +103,11 @@ def content_of(kind, path):
         rows = [repr(scene) for scene in paths.scenes]
         return digest(paths.task, paths.seed, rows, paths.points, paths.offsets, paths.path_offsets)
     if kind == "observations":
-        seen = Observations(path.parent)
-        names = [f"{name}/rgb" for name in seen.sensors if not name.endswith("cloud")]
-        names += [f"{name}/depth" for name in seen.sensors if name.endswith("cloud")]
-        arrays = [seen.read(0, name) for name in ("configuration", *names)]
-        return digest(seen.task, seen.seed, repr(seen.sensors), repr(seen.scenes(0)), *arrays)
+        made = Observations(path.parent)
+        names = [f"{name}/rgb" for name in made.sensors if not name.endswith("cloud")]
+        names += [f"{name}/depth" for name in made.sensors if name.endswith("cloud")]
+        arrays = [made.read(0, name) for name in ("configuration", *names)]
+        return digest(made.task, made.seed, repr(made.sensors), repr(made.scenes(0)), *arrays)
     if kind == "checkpoint":
         parts = parts_of_a_run()
         runs.load_checkpoint(runs.RunFlags(resume=path.parent), parts)
@@ -118,7 +118,7 @@ def content_of(kind, path):
 
 
 def attempts(seed, folder):
-    """The attempt: a function from a number to what came of reading a damaged file."""
+    """The attempt: a function from a number to the outcome of reading a damaged file."""
     paths = make_files(folder)
     originals = {kind: path.read_bytes() for kind, path in paths.items()}
     contents = {kind: content_of(kind, path) for kind, path in paths.items()}
@@ -134,9 +134,9 @@ def attempts(seed, folder):
         else:
             damaged[place] ^= 1 << rng.randrange(8)
         paths[kind].write_bytes(damaged)
-        said = io.StringIO()
+        messages = io.StringIO()
         try:
-            with contextlib.redirect_stderr(said):
+            with contextlib.redirect_stderr(messages):
                 found = content_of(kind, paths[kind])
         except (DatasetError, NetworkError):
             return REFUSED
@@ -151,10 +151,10 @@ def attempts(seed, folder):
         if found == contents[kind]:
             return UNCHANGED
         if kind == "journal":
-            # Damaged lines are left out, and that is said. The end may be missing: as after a kill.
+            # Damaged lines are left out with a message. The end may be missing, as after a kill.
             fits = found.items() <= contents[kind].items()
             ended = len(damaged) < len(originals[kind]) or not damaged.endswith(b"\n")
-            return REFUSED if fits and (said.getvalue() or ended) else CHANGED
+            return REFUSED if fits and (messages.getvalue() or ended) else CHANGED
         return RAN if kind in TEXTS else CHANGED
 
     return attempt

@@ -1,7 +1,7 @@
-"""`kill -9` at random moments: afterwards the same command goes on, to the same end.
+"""`kill -9` at random moments: afterwards the same command continues, to the same results.
 
-An attempt kills a command (training, collecting, drawing, sweeping), again and again, until it has
-ended; its results are then those of a run that nobody disturbed, and nothing else is there.
+An attempt kills a command (training, collecting, rendering, sweeping) a few times, and then lets it
+finish. Its results must be those of an undisturbed run, without any other file.
 """
 
 import hashlib
@@ -37,26 +37,18 @@ def commands(folder):
             "runs/*/policy.pt",
         ),
         "collecting": (
-            [python, "-m", "roboarm_nmp.demo_generation.collect", "--task", "wall", "--num", "150"]
+            [python, "-m", "roboarm_nmp", "collect", "--task", "wall", "--num", "150"]
             + ["--workers", "1", "--output", folder / "demos.h5"],
             "demos.h5",
         ),
         "observing": (
-            [
-                python,
-                "-m",
-                "roboarm_nmp.scene_embedding_train.collect",
-                "--num",
-                "60",
-                "--shard-size",
-                "10",
-            ]
+            [python, "-m", "roboarm_nmp", "observations", "--num", "60", "--shard-size", "10"]
             + ["--image-size", "64", "--num-samples", "900", "--workers", "1"]
-            + ["--output", folder / "seen"],
-            "seen/*.h5",
+            + ["--output", folder / "observations"],
+            "observations/*.h5",
         ),
-        "drawing": (
-            [python, "-m", "roboarm_nmp.envs.show", "wall", "--output", folder / "a.gif"],
+        "rendering": (
+            [python, "-m", "roboarm_nmp", "show", "wall", "--output", folder / "a.gif"],
             "a.gif",
         ),
         "sweeping": (
@@ -68,7 +60,7 @@ def commands(folder):
 
 
 def attempts(seed, folder):
-    """The attempt: a function from a number to what came of killing a command."""
+    """The attempt: a function from a number to the outcome of killing a command."""
     expected, seconds = {}, {}
     for name in commands(folder):
         here = _folder(folder / f"{name}-undisturbed")
@@ -91,16 +83,16 @@ def attempts(seed, folder):
                 )
                 try:
                     last = kill == KILLS
-                    said, _ = process.communicate(
+                    output, _ = process.communicate(
                         timeout=None if last else rng.uniform(0.1, 1.0) * seconds[name]
                     )
                 except subprocess.TimeoutExpired:
                     process.kill()
-                    said, _ = process.communicate()
+                    process.communicate()
                     continue
-                # What was killed may have been done already, and on its way out.
-                if process.returncode != 0 and "exists; --overwrite" not in said:
-                    return f"{name}: exit code {process.returncode}: {said[-300:]}"
+                # A killed process may have finished its file already.
+                if process.returncode != 0 and "exists; --overwrite" not in output:
+                    return f"{name}: exit code {process.returncode}: {output[-300:]}"
                 break
             if _made(here, pattern) != expected[name]:
                 return f"{name}: another result"
@@ -123,8 +115,8 @@ def _is_leftover(path):
 
 
 def _made(folder, pattern):
-    """Names in which there is no date, and contents, of what a command has made."""
+    """Digests of the files that a command has made; for a sweep, their number."""
     paths = sorted(folder.glob(pattern))
-    if pattern.startswith("sweep"):  # disturbed, a search samples other values
+    if pattern.startswith("sweep"):  # a disturbed search samples other values
         return len(paths)
     return [hashlib.sha256(path.read_bytes()).hexdigest() for path in paths]
