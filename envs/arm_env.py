@@ -192,6 +192,11 @@ class RoboArmEnv(gym.Env):
         self.goal_configuration = None
         """Goal of this episode, float32 (7,), rad; None if it was given as a position."""
 
+    def __getstate__(self):
+        # Generators are made at their first use: here at the latest, so that copies share them.
+        self.np_random, self.action_space.np_random  # noqa: B018
+        return vars(self).copy()
+
     # --- The world
 
     @property

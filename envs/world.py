@@ -9,8 +9,6 @@ import math
 import os
 import subprocess
 import sys
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import pybullet as p
@@ -72,7 +70,9 @@ class World:
     """A scene with the arm in it, in a physics engine of its own.
 
     Copies (`copy.deepcopy`, pickle) are independent worlds in the same state, with the same future,
-    bit for bit; but without a window, of which PyBullet allows one per process.
+    bit for bit: they repeat what happened since the arm was placed, contacts included. For that
+    a world remembers 0.3 kB per environment step. A copy has no window, of which PyBullet allows
+    one per process.
 
     Args:
         scene: a `Scene`; by default an empty one.
@@ -99,7 +99,7 @@ class World:
         _check_scene(scene)
         self.client = p.connect(p.GUI if window else p.DIRECT)
         self.has_window = window
-        self._target = None  # of the position controllers, rad
+        self._target = ()  # of the position controllers, 7 angles (rad); empty before a command
         self._make(scene)
 
     def check_open(self):
@@ -108,7 +108,7 @@ class World:
             raise RuntimeError("this environment, or its world, is closed")
 
     def _make(self, scene):
-        """The physics engine's settings, the robot, and a scene."""
+        """Make the physics engine's settings, the robot, and a scene."""
         p.resetSimulation(physicsClientId=self.client)
         # Without deterministicOverlappingPairs the same episode differs from run to run.
         p.setPhysicsEngineParameter(
@@ -117,7 +117,7 @@ class World:
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
         self.robot = self._load_robot()
         self._parts, self._bodies, self._bodies_made = [], [], 0
-        self._goal_marker = self._marker_radius = None
+        self._goal_marker, self._goal = None, None
         self._speck = p.createVisualShape(
             p.GEOM_BOX, halfExtents=[0.001] * 3, physicsClientId=self.client
         )
@@ -128,10 +128,8 @@ class World:
         """Give the bodies their looks, now and from now on."""
         self.check_open()
         if not self._drawn:
-            engine_state, marker_radius = self._engine_state(), self._marker_radius
             self._drawn = True
-            self._make(self.scene)
-            self._restore(engine_state, marker_radius)
+            self._make_again(self._snapshot())
 
     def _load_robot(self):
         return panda.load(self.client, self._drawn)
@@ -139,36 +137,55 @@ class World:
     # --- Copies
 
     def __getstate__(self):
-        state = vars(self).copy()
-        state["engine_state"] = None if self.client is None else self._engine_state()
-        return state
+        return vars(self) | {"snapshot": None if self.client is None else self._snapshot()}
 
     def __setstate__(self, state):
-        state = state.copy()
-        engine_state = state.pop("engine_state")
         vars(self).update(state, client=None, has_window=False)
-        if engine_state is not None:
-            self.client, marker_radius = p.connect(p.DIRECT), self._marker_radius
-            self._make(self.scene)
-            self._restore(engine_state, marker_radius)
+        snapshot = vars(self).pop("snapshot")
+        if snapshot is not None:
+            self.client = p.connect(p.DIRECT)
+            self._make_again(snapshot)
 
-    def _engine_state(self):
-        """Positions, velocities and contacts of all bodies, as PyBullet stores them."""
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder, "state.bullet")
-            p.saveBullet(str(file), physicsClientId=self.client)
-            return file.read_bytes()
+    def _make_again(self, snapshot):
+        goal = self._goal
+        self._make(self.scene)
+        if goal is not None:
+            self.mark_goal(*goal)
+        self._restore(snapshot)
 
-    def _restore(self, engine_state, marker_radius):
-        """Restore `_engine_state` in a world with the same bodies, made in the same order."""
-        if marker_radius is not None:
-            self.mark_goal(FAR_AWAY, marker_radius)
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder, "state.bullet")
-            file.write_bytes(engine_state)
-            p.restoreState(fileName=str(file), physicsClientId=self.client)
-        if self._target is not None:  # PyBullet does not store it
-            self.command(self._target)
+    def _snapshot(self):
+        """Where the arm was placed, what happened since then, and its state."""
+        joints = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
+        joint_states = [joint[:2] for joint in joints]  # angles and velocities
+        return self._start, self._events, self._target, joint_states
+
+    def _restore(self, snapshot):
+        """Repeat what happened, which restores contacts, too, bit for bit."""
+        start, events, target, joint_states = snapshot
+        if start is not None:
+            self.place(start)
+            for event in events:
+                if event is None:
+                    self._detect_collisions()
+                else:
+                    if event:
+                        self.command(event)
+                    self.simulate()
+        if target:
+            self.command(target)
+        if self._snapshot()[-1] != joint_states:  # it was moved by other means
+            p.resetJointStatesMultiDof(
+                self.robot,
+                panda.RESET_JOINTS,
+                [[angle] for angle, _ in joint_states],
+                [[velocity] for _, velocity in joint_states],
+                physicsClientId=self.client,
+            )
+
+    def _record(self, event):
+        """Remember a simulated step by its target, or, by None, a collision detection."""
+        if self._start is not None:
+            self._events.append(event)
 
     def set_scene(self, scene):
         """Put the arm into another `Scene`. Returns False, and does nothing, for an equal one."""
@@ -179,7 +196,7 @@ class World:
         if self._bodies_made > MAX_BODIES_MADE:
             self._make(scene)
             return True
-        self._remove_goal_marker()  # it is always the last body, which copies rely on
+        self._start, self._events = None, []
         before, self.scene = self._parts, scene
         self._parts = []
         if scene.floor is not None:
@@ -237,11 +254,15 @@ class World:
         Moves the arm: call it between episodes, or continue with a reset.
         """
         self.place(configuration)
-        p.performCollisionDetection(physicsClientId=self.client)
+        self._detect_collisions()
         return any(
             contact[8] < 0.0
             for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
         )
+
+    def _detect_collisions(self):
+        p.performCollisionDetection(physicsClientId=self.client)
+        self._record(None)
 
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
         """Whether joint angles (7, rad) are inside the limits, collision free and held.
@@ -278,17 +299,11 @@ class World:
         `check_free(start=start)`, joint angles (7, rad).
         """
         self.check_open()
-        before = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
+        before = self._snapshot()
         for name, configuration in configurations.items():
             if self.in_collision(configuration):
                 contacts = self._contact_names()
-                p.resetJointStatesMultiDof(
-                    self.robot,
-                    panda.RESET_JOINTS,
-                    [[joint[0]] for joint in before],
-                    [[joint[1]] for joint in before],
-                    physicsClientId=self.client,
-                )
+                self._restore(before)
                 raise ValueError(f"{name} is in collision: {contacts}")
 
     def _contact_names(self):
@@ -323,16 +338,18 @@ class World:
         p.performCollisionDetection(physicsClientId=client)
         p.resetBasePositionAndOrientation(robot, IN_PLACE, NO_TURN, physicsClientId=client)
         panda.set_configuration(client, robot, configuration)
+        self._start, self._events = tuple(configuration), []
 
     def command(self, configuration):
         """Set the targets of the arm's position controllers: joint angles (list of 7, rad)."""
         self.check_open()
-        self._target = configuration
+        self._target = tuple(configuration)
         panda.command(self.client, self.robot, configuration, POSITION_GAINS)
 
     def simulate(self):
         """Run the physics of one environment step. Returns whether the arm was in contact."""
         self.check_open()
+        self._record(self._target)
         contact = False
         for _ in range(SUBSTEPS):
             p.stepSimulation(physicsClientId=self.client)
@@ -373,16 +390,10 @@ class World:
             self._goal_marker = p.createMultiBody(
                 baseVisualShapeIndex=ball, physicsClientId=self.client
             )
-            self._marker_radius = radius
-            self._bodies_made += 1
         p.resetBasePositionAndOrientation(
             self._goal_marker, position, NO_TURN, physicsClientId=self.client
         )
-
-    def _remove_goal_marker(self):
-        if self._goal_marker is not None:
-            p.removeBody(self._goal_marker, physicsClientId=self.client)
-            self._goal_marker = self._marker_radius = None
+        self._goal = position, radius
 
     def close(self):
         """Disconnect from PyBullet. Closing twice is allowed."""
