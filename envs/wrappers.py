@@ -35,7 +35,9 @@ class SensorWrapper(gym.Wrapper):
     def _observe(self, observation):
         configuration = panda.denormalise(observation["observation"][: panda.NUM_JOINTS])
         self._world.show(self.unwrapped.scene, configuration)
-        self._observed = {name: sensor.observe(self._world) for name, sensor in self.sensors.items()}
+        self._observed = {
+            name: sensor.observe(self._world) for name, sensor in self.sensors.items()
+        }
 
     def _with_sensors(self, observation):
         observed = {  # copies, because the user may change an observation

@@ -139,9 +139,7 @@ def test_goal_types_rewards_and_termination_on_batches(goal_type, size):
     assert observation["achieved_goal"].shape == (size,)
     np.testing.assert_allclose(
         info["ee_distance"],
-        np.linalg.norm(
-            panda.forward_kinematics(HOME) - panda.forward_kinematics(NEAR_HOME)
-        ),
+        np.linalg.norm(panda.forward_kinematics(HOME) - panda.forward_kinematics(NEAR_HOME)),
         atol=1e-6,
     )
 

@@ -128,7 +128,9 @@ def test_quaternion_that_is_one_percent_off_is_normalised_and_others_are_rejecte
     half = math.sqrt(0.5)
     orientation = load(text % (0.7071, 0.7071)).table.orientation
     np.testing.assert_allclose(orientation, (0.0, 0.0, half, half), rtol=1e-15)
-    with pytest.raises(SceneFileError, match=r"of table: .*norm 1 \(within 1 %\), got norm 1.0101$"):
+    with pytest.raises(
+        SceneFileError, match=r"of table: .*norm 1 \(within 1 %\), got norm 1.0101$"
+    ):
         load(text % (0.0, 1.0101))
 
 
