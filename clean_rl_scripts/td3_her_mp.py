@@ -249,7 +249,7 @@ class HerReplayBuffer:
         self.rows = np.zeros((capacity, ends[-1]), np.float32)
         self.remaining = np.zeros(capacity, np.int32)
         self.latent_row = np.zeros(capacity, np.int32)  # of each transition
-        self.env, self.rng = env.unwrapped, rng
+        self.env, self.rng = env, rng
         self.capacity, self.her_probability = capacity, her_probability
         self.position, self.size = 0, 0
 

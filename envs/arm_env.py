@@ -477,10 +477,12 @@ def _one_of(name, value, allowed):
 
 def _query_of(options):
     """The arguments of `reset_specific` in `reset`'s options; None if there are none."""
-    if not options:
+    if options is None:
         return None
     if not isinstance(options, dict):
         raise ValueError(f"options must be a dict, got {options!r}")
+    if not options:
+        return None
     if unknown := [name for name in options if name not in ("start", "goal", "scene")]:
         raise ValueError(f"unknown options {unknown}: known are 'start', 'goal' and 'scene'")
     if "start" not in options or "goal" not in options:
