@@ -22,23 +22,26 @@ from roboarm_nmp.envs.world import (
     why_no_window,
 )
 
-GOAL_TYPES = ("ee", "config", "combined")
+GOAL_SIZES = {"ee": 3, "config": 7, "combined": 10}
+"""Numbers of a goal, by goal type: position, configuration, or configuration and position."""
+GOAL_TYPES = tuple(GOAL_SIZES)
 ACTION_MODES = ("relative", "subgoal")
-# With larger ones hardly any query is farther from its goal than that: m, and L2, normalised.
+# m, and L2 in the normalised space. Hardly any start is farther from its goal than these, so a
+# larger tolerance would leave no query.
 MAX_EE_TOLERANCE, MAX_CONFIG_TOLERANCE = 1.0, 2.0
 HORIZON = 400
 STANDARD_RULES = {"max_step": MAX_STEP, "horizon": HORIZON, "stop_on_collision": False}
-"""Results under other ones are not comparable."""
+"""Results under other rules are not comparable."""
 
 
 def deviations(arguments):
-    """Those of `RoboArmEnv`'s `arguments`, a dict, that are other than `STANDARD_RULES`."""
+    """Those of `RoboArmEnv`'s `arguments`, a dict, that differ from `STANDARD_RULES`."""
     given = {name: arguments.get(name, rule) for name, rule in STANDARD_RULES.items()}
     return {name: value for name, value in given.items() if value != STANDARD_RULES[name]}
 
 
 class RoboArmEnv(gym.Env):
-    """A Franka Panda that has to reach a goal among obstacles, touching nothing.
+    """A Franka Panda that has to reach a goal among obstacles, without contact.
 
     Observations are a dict (the GoalEnv interface of Gymnasium-Robotics), all float32:
 
@@ -51,33 +54,39 @@ class RoboArmEnv(gym.Env):
     `subgoal`, the next normalised configuration itself. Either way the displacement is clipped to
     the L2 norm `max_step`, so an action is a direction unless it is shorter than that.
 
-    `info` carries `is_success`, `collision` (something was touched in this step),
+    `info` carries `is_success`, `collision` (the arm was in contact in this step),
     `collision_so_far` (in this episode), `ee_distance` (m) and `config_distance` (normalised; NaN
     if the goal was given as a position only), and `elapsed_steps`.
+
+    Copies (`copy.deepcopy`, pickle) are independent environments in the same state: the episode
+    goes on the same, bit for bit, and so do later ones. A copy has no window.
 
     Args:
         scene: a `Scene`, or a distribution of scenes: an object with `base`, the `Scene` without
             the obstacles that vary, and `sample(rng)`, which draws a `Scene` with a NumPy
             Generator (`envs.scenes.random_boxes.RandomBoxes` is one). `reset` then draws a new one.
-        episodes_per_scene: resets in which a drawn scene stays; a reset with a seed always draws.
+        episodes_per_scene: number of resets until another scene is drawn; a reset with a seed
+            always draws one.
         goal_type: `ee`, `config` or `combined` (reached like `ee`).
         ee_tolerance: goal radius in metres (paper: 0.02).
         config_tolerance: goal radius in the normalised configuration space (paper: 0.05).
         action_mode: `relative` or `subgoal`.
         max_step: longest displacement per step, L2 in the normalised space (paper: 0.03).
         horizon: steps after which an episode is truncated (paper: 400).
-        stop_on_collision: end the episode at the first touch (paper: False).
+        stop_on_collision: end the episode at the first contact (paper: False).
         reward: `sparse`, -1 per step and 0 on reaching the goal, or `dense`, minus the distance
             to the goal in the goal's own metric (metres for `ee` and `combined`).
         sink_state: instead of terminating, stay where the episode ended, at reward 0 whatever the
             action, until the horizon.
         velocities: add joint velocities to `observation`.
         render_mode: None, `rgb_array`, or `human` (opens PyBullet's window). With None, bodies have
-            no looks: call `env.world.draw()` before a picture of `env.client` of your own.
-        render_size: (width, height) of `rgb_array` pictures in pixels.
+            no visual shapes, which saves 50 MB: call `env.world.draw()` before you render
+            `env.client` yourself.
+        render_size: (width, height) of `rgb_array` images in pixels.
 
     Raises:
-        ValueError: for an argument out of its range; the message says what was expected.
+        ValueError: an argument is out of its range; the message says what was expected.
+        RuntimeError: of all methods that need the simulator: the environment is closed.
     """
 
     metadata = {
@@ -160,7 +169,7 @@ class RoboArmEnv(gym.Env):
         self.render_mode = render_mode
         self.render_size = render_size
 
-        goal_size = {"ee": 3, "config": 7, "combined": 10}[goal_type]
+        goal_size = GOAL_SIZES[goal_type]
         self._observation_size = 17 if velocities else 10
         unbounded = [
             ("observation", self._observation_size),
@@ -172,16 +181,21 @@ class RoboArmEnv(gym.Env):
         )
         self.action_space = gym.spaces.Box(-1.0, 1.0, (panda.NUM_JOINTS,), np.float32)
 
-        self._window = render_mode == "human"
-        if self._window and (problem := why_no_window()):
+        window = render_mode == "human"
+        if window and (problem := why_no_window()):
             gym.logger.warn(f"render_mode='human' needs a display ({problem}): no window")
-            self._window = False
-        self.world = World(scene, self._window, drawn=render_mode is not None)
+            window = False
+        self.world = World(scene, window, drawn=render_mode is not None)
         """The simulated `World`. Change its scene by `set_scene` of the environment."""
         self.start_configuration = None
         """Start of this episode, float32 (7,), rad; None before the first reset."""
         self.goal_configuration = None
         """Goal of this episode, float32 (7,), rad; None if it was given as a position."""
+
+    def __getstate__(self):
+        # Generators are made at their first use: here at the latest, so that copies share them.
+        self.np_random, self.action_space.np_random  # noqa: B018
+        return vars(self).copy()
 
     # --- The world
 
@@ -197,7 +211,7 @@ class RoboArmEnv(gym.Env):
 
     @property
     def scene(self):
-        """The `Scene` that the arm is in."""
+        """The `Scene` around the arm."""
         return self.world.scene
 
     def set_scene(self, scene):
@@ -206,19 +220,19 @@ class RoboArmEnv(gym.Env):
             self.start_configuration = None
 
     def in_collision(self, configuration):
-        """As `World.in_collision`. Go on with a reset."""
+        """As `World.in_collision`. Continue with a reset."""
         return self.world.in_collision(configuration)
 
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
-        """As `World.is_feasible`. Go on with a reset."""
+        """As `World.is_feasible`. Continue with a reset."""
         return self.world.is_feasible(configuration, hold_steps)
 
     def sample_feasible(self, rng):
-        """As `World.sample_feasible`. Go on with a reset."""
+        """As `World.sample_feasible`. Continue with a reset."""
         return self.world.sample_feasible(rng)
 
     def sample_query(self, rng):
-        """A start and a goal the start does not already reach: two float32 (7,), rad."""
+        """A start and a goal that is not reached from the outset: two float32 (7,), rad."""
         start = self.sample_feasible(rng)
         while True:
             goal = self.sample_feasible(rng)
@@ -233,16 +247,29 @@ class RoboArmEnv(gym.Env):
     # --- Episodes
 
     def sample_scene(self, rng):
-        """Change to a scene drawn from the task's distribution; nothing, if the scene is fixed."""
+        """Change to a scene drawn from the task's distribution. A fixed scene stays."""
         if self.scene_distribution is not None:
             self.set_scene(self.scene_distribution.sample(rng))
 
     def reset(self, *, seed=None, options=None):
         """Start an episode from a random feasible start to a random feasible goal.
 
-        In a new scene, if scenes are drawn and this one has had its `episodes_per_scene`.
+        If scenes are drawn, in a new one after `episodes_per_scene` episodes.
+
+        Args:
+            seed: an int seeds the generator of scenes and queries.
+            options: a dict of `start`, `goal` and possibly `scene` starts an episode as
+                `reset_specific` does, through all wrappers and in vector environments.
+
+        Raises:
+            ValueError: an unknown option, one of `start` and `goal` without the other, or as for
+                `reset_specific`.
         """
+        self.world.check_open()
+        query = _query_of(options)
         super().reset(seed=seed)
+        if query is not None:
+            return self.reset_specific(**query)
         if seed is not None or self._episodes_in_scene >= self.episodes_per_scene:
             self.sample_scene(self.np_random)
             self._episodes_in_scene = 0
@@ -252,6 +279,9 @@ class RoboArmEnv(gym.Env):
     def reset_specific(self, start, goal, scene=None):
         """Start an episode on a given query.
 
+        Wrappers around this environment, such as Gymnasium's `TimeLimit`, do not notice the call:
+        with them, use `reset(options={"start": start, "goal": goal, "scene": scene})`.
+
         Args:
             start: joint angles (7, rad).
             goal: joint angles (7, rad); or, with goal type `ee`, an end-effector position (3, m).
@@ -259,8 +289,9 @@ class RoboArmEnv(gym.Env):
 
         Raises:
             ValueError: wrong size, not finite, outside the joint limits or in collision. A running
-                episode is left as it was (unless the scene was changed).
+                episode then goes on (unless the scene was changed).
         """
+        self.world.check_open()
         start = _vector("start", start, (7,))
         goal = _vector("goal", goal, (7, 3) if self.goal_type == "ee" else (7,))
         for name, configuration in (("start", start), ("goal", goal)):
@@ -309,25 +340,17 @@ class RoboArmEnv(gym.Env):
 
         Raises:
             ValueError: the action is not 7 finite numbers; nothing has moved then.
-            RuntimeError: there was no reset yet.
+            RuntimeError: there was no reset yet, or the environment is closed.
         """
+        self.world.check_open()
         if self.start_configuration is None:
             raise RuntimeError("no episode: call reset() or reset_specific() before step()")
-        given = action
-        try:
-            action = np.asarray(given)
-            real = action.dtype.kind in "fiub" and not np.ma.isMaskedArray(given)
-            action = action.astype(np.float64) if real else None
-        except (TypeError, ValueError, RuntimeError):  # of lists in lists, other libraries' tensors
-            action = None
-        if action is None or action.shape != (7,) or not math.isfinite(action @ action):
-            raise ValueError(f"an action is 7 finite numbers in [-1, 1], got {given}")
+        action = _action(action)
         self._steps += 1
         if self._in_sink:
             info = self._info(False, self._is_success)
             return self._observation(), 0.0, False, self._steps >= self.horizon, info
 
-        action = np.clip(action, -1.0, 1.0)
         delta = action if self.action_mode == "relative" else action - self._state
         length = math.sqrt(delta @ delta)
         if length > self.max_step:
@@ -335,7 +358,7 @@ class RoboArmEnv(gym.Env):
         target = panda.denormalise(np.clip(self._state + delta, -1.0, 1.0))
         self.world.command(target.tolist())
         collision = self.world.simulate()
-        if self._window:
+        if self.world.has_window:
             time.sleep(TIME_STEP * SUBSTEPS)  # as long as the simulated time
         self._collision_so_far = self._collision_so_far or collision
         self._state, self._velocity, self._position = self.world.read_arm(self.velocities)
@@ -391,21 +414,22 @@ class RoboArmEnv(gym.Env):
     def _reward(self, distance):
         if self.reward == "dense":
             return -distance
-        return np.where(distance <= self._tolerance, 0.0, -1.0).astype(np.float32)
+        reward = np.where(distance <= self._tolerance, 0.0, -1.0).astype(np.float32)
+        return reward[()]  # () makes a scalar of an array without dimensions
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         """Reward of arriving at `achieved_goal` (..., d) when the goal is `desired_goal` (..., d).
 
-        Returns an array of the batch shape (a scalar for single goals). `info` is not used.
+        Returns an array of the batch shape, a NumPy scalar for single goals. `info` is not used.
         """
         return self._reward(self._distance(achieved_goal, desired_goal))
 
     def compute_terminated(self, achieved_goal, desired_goal, info):
-        """Whether an episode ends there: a bool array of the batch shape.
+        """Whether an episode ends there: bool, of the batch shape; a NumPy scalar for single goals.
 
         `info` is one info dict (entries may be arrays), or a sequence of them as long as the
-        batch; with `stop_on_collision` its `collision` ends the episode too. What is missing in
-        an info counts as False.
+        batch. With `stop_on_collision` its `collision`, False where it is missing, ends the
+        episode, too.
         """
         ended = self._distance(achieved_goal, desired_goal) <= self._tolerance
         if self.stop_on_collision:
@@ -413,17 +437,18 @@ class RoboArmEnv(gym.Env):
         return ended & (not self.sink_state)
 
     def compute_truncated(self, achieved_goal, desired_goal, info):
-        """Whether the horizon cuts the episode there: a bool array of the batch shape.
+        """Whether the horizon truncates the episode there: as `compute_terminated`.
 
-        `info`: as for `compute_terminated`; `elapsed_steps` is read, 0 where it is missing.
+        Of `info`, `elapsed_steps` is read, too, 0 where it is missing.
         """
         late = _entry(info, "elapsed_steps", int) >= self.horizon
         return late & ~self.compute_terminated(achieved_goal, desired_goal, info)
 
-    # --- Pictures
+    # --- Images
 
     def render(self):
-        """With `rgb_array`: a uint8 picture (height, width, 3) of the arm, scene and goal."""
+        """With `rgb_array`: a uint8 image (height, width, 3) of the arm, scene and goal."""
+        self.world.check_open()
         if self.render_mode != "rgb_array":
             return None
         width, height = self.render_size
@@ -450,11 +475,44 @@ def _one_of(name, value, allowed):
         raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
 
 
+def _query_of(options):
+    """The arguments of `reset_specific` in `reset`'s options; None if there are none."""
+    if options is None:
+        return None
+    if not isinstance(options, dict):
+        raise ValueError(f"options must be a dict, got {options!r}")
+    if not options:
+        return None
+    if unknown := [name for name in options if name not in ("start", "goal", "scene")]:
+        raise ValueError(f"unknown options {unknown}: known are 'start', 'goal' and 'scene'")
+    if "start" not in options or "goal" not in options:
+        raise ValueError(f"options must have both 'start' and 'goal', got {list(options)}")
+    return options
+
+
+def _action(given):
+    """An action as float64 (7,), clipped. Raises ValueError, with the reason, if it is none."""
+    expected = "an action is 7 finite numbers in [-1, 1]"
+    try:
+        action = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError) as error:  # a list in a list, a tensor
+        raise ValueError(f"{expected}, got {given!r}, no NumPy array: {error}") from error
+    if action.dtype.kind not in "fiub" or np.ma.isMaskedArray(given):
+        kind = "a masked array" if np.ma.isMaskedArray(given) else f"dtype {action.dtype}"
+        raise ValueError(f"{expected}, got {kind}: {given!r}")
+    if action.shape != (panda.NUM_JOINTS,):
+        raise ValueError(f"{expected}, got shape {action.shape}: {given!r}")
+    if not np.isfinite(action).all():
+        raise ValueError(f"{expected}, got {given!r}")
+    return np.clip(action, -1.0, 1.0).astype(np.float64)
+
+
 def _vector(name, value, sizes):
     try:
-        vector = np.asarray(value, dtype=np.float32)
+        with np.errstate(over="ignore"):  # 1e200 becomes infinite, which is rejected below
+            vector = np.asarray(value, dtype=np.float32)
     except (OverflowError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers, got {value!r}") from error
+        raise ValueError(f"{name} must be numbers, got {value!r}: {error}") from error
     if vector.ndim != 1 or vector.size not in sizes:
         expected = " or ".join(str(size) for size in sizes)
         raise ValueError(f"{name} must have {expected} numbers, got shape {vector.shape}")

@@ -23,8 +23,10 @@ ARM_JOINTS = (0, 1, 2, 3, 4, 5, 6)
 FINGER_JOINTS = (9, 10)
 EE_LINK = 11  # panda_grasptarget, the point between the fingertips
 COLLISION_LINKS = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10)
-"""PyBullet's indices of the links that may collide with something: the seven that the joints move,
-the hand, the two fingers. In this order wherever there is a row per link."""
+"""PyBullet's indices of the links that may collide: the seven that the joints move, the hand, the
+two fingers. Arrays with a row per link have this order."""
+LINK_DISTANCES_SHAPE = (len(COLLISION_LINKS), 1 + NUM_JOINTS)
+"""Of link distances: for each link, its signed distance (m) and the gradient of that."""
 FINGER_OPENING = 0.04  # m, each finger; constant
 
 # The pairs of links that may collide, by PyBullet link index (-1 is the base, 8 the hand, 9 and 10
@@ -106,13 +108,16 @@ def joint_frames(configuration):
 _FOLDER = Path(pybullet_data.getDataPath(), "franka_panda")
 
 
-def load(client):
-    """Load the arm with its base fixed at the origin; returns its body id. Fingers stay open."""
+def load(client, drawn=True):
+    """Load the arm with its base fixed at the origin; returns its body id. Fingers stay open.
+
+    Without `drawn` it has no visual shapes, which take 50 MB.
+    """
+    flags = p.URDF_USE_SELF_COLLISION
+    if not drawn:
+        flags |= p.URDF_IGNORE_VISUAL_SHAPES
     robot = p.loadURDF(
-        str(_FOLDER / "panda.urdf"),
-        useFixedBase=True,
-        flags=p.URDF_USE_SELF_COLLISION,
-        physicsClientId=client,
+        str(_FOLDER / "panda.urdf"), useFixedBase=True, flags=flags, physicsClientId=client
     )
     links = range(-1, p.getNumJoints(robot, physicsClientId=client))
     for a in links:

@@ -1,7 +1,7 @@
 """The simulated world: the physics engine, the arm, the scene's bodies, contacts, feasibility.
 
-Everything that moves an arm or looks at one stands on this; `envs.arm_env.RoboArmEnv` makes a
-goal-conditioned MDP of it, `envs.perception.sensors.SensorWorld` something to be looked at.
+`envs.arm_env.RoboArmEnv` is a goal-conditioned MDP on such a world; sensors observe another,
+`envs.perception.sensors.SensorWorld`.
 """
 
 import contextlib
@@ -21,22 +21,23 @@ from roboarm_nmp.envs.scenes.primitives import FRICTION, Box, Cylinder, Scene, f
 TIME_STEP = 1.0 / 120.0
 SUBSTEPS = 4
 POSITION_GAINS = [0.6] * panda.NUM_JOINTS
-# A configuration is "held" if the controller keeps it, untouched, this many environment steps
-# without drifting further than this (normalised).
+# A configuration is "held" if the controller keeps the arm there without contact for this many
+# environment steps, and the arm drifts no further than this (normalised).
 HOLD_STEPS = 5
 HOLD_DRIFT = 1e-3
 # Colour and friction.
 FLOOR_LOOK, TABLE_LOOK = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
 OBSTACLE_COLOUR = (0.36, 0.50, 0.65, 1)
 MAX_SAMPLING_TRIES = 10_000
-MAX_EDGE = 4096  # pixels of a picture: 20,000 by 20,000 would need all of a machine's memory
-# PyBullet keeps some 4 kB of each body that is removed, so after this many the world is made anew,
-# which takes as long as 100 changes of scene.
+MAX_EDGE = 4096  # pixels of an image: 20,000 by 20,000 would need all of a machine's memory
+# PyBullet keeps about 4 kB of each body that is removed, so the world is made anew after this many
+# bodies. That takes as long as 100 changes of scene.
 MAX_BODIES_MADE = 5_000
-# Where and how the arm touches nothing (m, rad). PyBullet places a body by its centre of mass.
+# A place and a configuration without contacts (m, rad). PyBullet places a body by its centre of
+# mass.
 FAR_AWAY, IN_PLACE, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0)
 CONTACT_FREE = ((panda.LOWER + panda.UPPER) / 2).tolist()
-# What asks an X server, and how long (s) it may take.
+# A program that connects to the X server, and how long (s) it may take.
 OPEN_DISPLAY = """
 import ctypes, sys
 open_display = ctypes.CDLL("libX11.so.6").XOpenDisplay
@@ -47,10 +48,10 @@ DISPLAY_SECONDS = 10
 
 
 def why_no_window():
-    """Why PyBullet's window cannot be opened here, in words; None if it can.
+    """The reason, in words, why PyBullet's window cannot be opened here; None if it can.
 
-    To be asked before: without a display PyBullet ends the process, and it waits for ever for one
-    that does not answer.
+    Call this before opening a window: without a display PyBullet ends the process, and it waits
+    forever for a display that does not answer.
     """
     if not sys.platform.startswith("linux"):
         return None
@@ -68,19 +69,27 @@ def why_no_window():
 class World:
     """A scene with the arm in it, in a physics engine of its own.
 
+    Copies (`copy.deepcopy`, pickle) are independent worlds in the same state, with the same future,
+    bit for bit: they repeat what happened since the arm was placed, contacts included. For that
+    a world remembers 0.3 kB per environment step. A copy has no window, of which PyBullet allows
+    one per process.
+
     Args:
         scene: a `Scene`; by default an empty one.
         window: open PyBullet's window.
-        drawn: give bodies the looks that pictures show. PyBullet takes up to six times as long to
-            add a cylinder or a sphere that has them; else pictures show specks, until `draw`.
+        drawn: give bodies the looks that images show. They cost 50 MB of memory, and PyBullet takes
+            up to six times as long to add a cylinder or a sphere. Otherwise images show nothing
+            but specks, until `draw`.
 
     Attributes:
         client: PyBullet's number of the engine; None once it is closed.
         robot: PyBullet's number of the arm's body.
         scene: the `Scene`; `set_scene` changes it.
+        has_window: whether PyBullet's window is open.
 
     Raises:
         TypeError: `scene` is not a `Scene`.
+        RuntimeError: of all methods but `close`: the world is closed.
     """
 
     def __init__(self, scene=None, window=False, drawn=True):
@@ -89,12 +98,17 @@ class World:
         scene = Scene() if scene is None else scene
         _check_scene(scene)
         self.client = p.connect(p.GUI if window else p.DIRECT)
-        self.scene = None
-        self._make()
-        self.set_scene(scene)
+        self.has_window = window
+        self._target = ()  # of the position controllers, 7 angles (rad); empty before a command
+        self._make(scene)
 
-    def _make(self):
-        """The physics engine's settings and the robot, without a scene."""
+    def check_open(self):
+        """Raise RuntimeError if the world is closed."""
+        if self.client is None:
+            raise RuntimeError("this environment, or its world, is closed")
+
+    def _make(self, scene):
+        """Make the physics engine's settings, the robot, and a scene."""
         p.resetSimulation(physicsClientId=self.client)
         # Without deterministicOverlappingPairs the same episode differs from run to run.
         p.setPhysicsEngineParameter(
@@ -103,30 +117,86 @@ class World:
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
         self.robot = self._load_robot()
         self._parts, self._bodies, self._bodies_made = [], [], 0
-        self._goal_marker = None
+        self._goal_marker, self._goal = None, None
         self._speck = p.createVisualShape(
             p.GEOM_BOX, halfExtents=[0.001] * 3, physicsClientId=self.client
         )
+        self.scene = None
+        self.set_scene(scene)
 
     def draw(self):
-        """Give the bodies of the scene their looks, now and from now on; not during an episode."""
+        """Give the bodies their looks, now and from now on."""
+        self.check_open()
         if not self._drawn:
-            for body in self._bodies:
-                p.removeBody(body, physicsClientId=self.client)
-            self._drawn, self._parts, self._bodies = True, [], []
-            scene, self.scene = self.scene, None
-            self.set_scene(scene)
+            self._drawn = True
+            self._make_again(self._snapshot())
 
     def _load_robot(self):
-        return panda.load(self.client)
+        return panda.load(self.client, self._drawn)
+
+    # --- Copies
+
+    def __getstate__(self):
+        return vars(self) | {"snapshot": None if self.client is None else self._snapshot()}
+
+    def __setstate__(self, state):
+        vars(self).update(state, client=None, has_window=False)
+        snapshot = vars(self).pop("snapshot")
+        if snapshot is not None:
+            self.client = p.connect(p.DIRECT)
+            self._make_again(snapshot)
+
+    def _make_again(self, snapshot):
+        goal = self._goal
+        self._make(self.scene)
+        if goal is not None:
+            self.mark_goal(*goal)
+        self._restore(snapshot)
+
+    def _snapshot(self):
+        """Where the arm was placed, what happened since then, and its state."""
+        joints = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
+        joint_states = [joint[:2] for joint in joints]  # angles and velocities
+        return self._start, self._events, self._target, joint_states
+
+    def _restore(self, snapshot):
+        """Repeat what happened, which restores contacts, too, bit for bit."""
+        start, events, target, joint_states = snapshot
+        if start is not None:
+            self.place(start)
+            for event in events:
+                if event is None:
+                    self._detect_collisions()
+                else:
+                    if event:
+                        self.command(event)
+                    self.simulate()
+        if target:
+            self.command(target)
+        if self._snapshot()[-1] != joint_states:  # it was moved by other means
+            p.resetJointStatesMultiDof(
+                self.robot,
+                panda.RESET_JOINTS,
+                [[angle] for angle, _ in joint_states],
+                [[velocity] for _, velocity in joint_states],
+                physicsClientId=self.client,
+            )
+
+    def _record(self, event):
+        """Remember a simulated step by its target, or, by None, a collision detection."""
+        if self._start is not None:
+            self._events.append(event)
 
     def set_scene(self, scene):
-        """Put the arm into another `Scene`; whether it is another: an equal one changes nothing."""
+        """Put the arm into another `Scene`. Returns False, and does nothing, for an equal one."""
+        self.check_open()
         _check_scene(scene)
         if scene is self.scene or scene == self.scene:
             return False
         if self._bodies_made > MAX_BODIES_MADE:
-            self._make()
+            self._make(scene)
+            return True
+        self._start, self._events = None, []
         before, self.scene = self._parts, scene
         self._parts = []
         if scene.floor is not None:
@@ -135,7 +205,7 @@ class World:
             self._parts.append((scene.table, *TABLE_LOOK))
         look = (OBSTACLE_COLOUR, scene.friction)
         self._parts += [(obstacle, *look) for obstacle in scene.obstacles]
-        # What comes first and is the same, floor and table mostly, stays.
+        # The first bodies stay as far as they are the same: floor and table, mostly.
         same = 0
         while same < min(len(before), len(self._parts)) and before[same] == self._parts[same]:
             same += 1
@@ -181,20 +251,24 @@ class World:
     def in_collision(self, configuration):
         """Whether the arm at joint angles (7, rad, inside the limits) overlaps the scene or itself.
 
-        Moves the arm: call it between episodes, or go on with a reset.
+        Moves the arm: call it between episodes, or continue with a reset.
         """
         self.place(configuration)
-        p.performCollisionDetection(physicsClientId=self.client)
+        self._detect_collisions()
         return any(
             contact[8] < 0.0
             for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
         )
 
+    def _detect_collisions(self):
+        p.performCollisionDetection(physicsClientId=self.client)
+        self._record(None)
+
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
         """Whether joint angles (7, rad) are inside the limits, collision free and held.
 
         Held: the position controller keeps the arm there for `hold_steps` environment steps. Moves
-        the arm: call it between episodes, or go on with a reset.
+        the arm: call it between episodes, or continue with a reset.
         """
         if np.any(configuration < panda.LOWER) or np.any(configuration > panda.UPPER):
             return False
@@ -219,25 +293,21 @@ class World:
         raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
 
     def check_free(self, **configurations):
-        """Raise ValueError, saying what is touched, if one of some joint angles is in collision.
+        """Raise ValueError, naming the contacts, if one of some configurations is in collision.
 
-        The arm is then left as it was; otherwise it has moved. E.g. `check_free(start=start)`.
+        The joints are then left as they were; otherwise the arm has moved. E.g.
+        `check_free(start=start)`, joint angles (7, rad).
         """
-        before = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
+        self.check_open()
+        before = self._snapshot()
         for name, configuration in configurations.items():
             if self.in_collision(configuration):
-                touched = self._touched_names()
-                p.resetJointStatesMultiDof(
-                    self.robot,
-                    panda.RESET_JOINTS,
-                    [[joint[0]] for joint in before],
-                    [[joint[1]] for joint in before],
-                    physicsClientId=self.client,
-                )
-                raise ValueError(f"{name} is in collision: {touched}")
+                contacts = self._contact_names()
+                self._restore(before)
+                raise ValueError(f"{name} is in collision: {contacts}")
 
-    def _touched_names(self):
-        """What the arm overlaps, in words; after `in_collision`."""
+    def _contact_names(self):
+        """The pairs in contact, in words; after `in_collision`."""
         names = set()
         for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client):
             if contact[8] < 0.0:
@@ -259,37 +329,44 @@ class World:
 
         Bullet keeps the contact points of two bodies while these move little against each other.
         So a configuration could inherit points from an earlier one that brought the same two links
-        nearly as close. Out in the open, in a pose without contacts, all of them are dropped.
+        nearly as close. Far away, in a configuration without contacts, all of them are dropped.
         """
+        self.check_open()
         client, robot = self.client, self.robot
         p.resetBasePositionAndOrientation(robot, FAR_AWAY, NO_TURN, physicsClientId=client)
         panda.set_configuration(client, robot, CONTACT_FREE)
         p.performCollisionDetection(physicsClientId=client)
         p.resetBasePositionAndOrientation(robot, IN_PLACE, NO_TURN, physicsClientId=client)
         panda.set_configuration(client, robot, configuration)
+        self._start, self._events = tuple(configuration), []
 
     def command(self, configuration):
-        """Point the arm's position controllers at joint angles (list of 7, rad)."""
+        """Set the targets of the arm's position controllers: joint angles (list of 7, rad)."""
+        self.check_open()
+        self._target = tuple(configuration)
         panda.command(self.client, self.robot, configuration, POSITION_GAINS)
 
     def simulate(self):
-        """Run the physics of one environment step; whether the arm touched anything in it."""
-        touched = False
+        """Run the physics of one environment step. Returns whether the arm was in contact."""
+        self.check_open()
+        self._record(self._target)
+        contact = False
         for _ in range(SUBSTEPS):
             p.stepSimulation(physicsClientId=self.client)
-            if not touched:
+            if not contact:
                 # A contact also counts at distance zero, when the surfaces push on each other.
-                contacts = p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
-                touched = any(contact[8] < 0.0 or contact[9] > 0.0 for contact in contacts)
-        return touched
+                points = p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
+                contact = any(point[8] < 0.0 or point[9] > 0.0 for point in points)
+        return contact
 
     def read_arm(self, velocities=False):
-        """Where the arm is.
+        """The arm's state.
 
         Returns:
-            Its normalised configuration (7,), its joint velocities (7,) in normalised units per
-            second (None without `velocities`), and its end-effector position (3,), m; all float64.
+            Normalised configuration (7,), joint velocities (7,) in normalised units per second
+            (None without `velocities`), and end-effector position (3,), m; all float64.
         """
+        self.check_open()
         joints = p.getJointStates(self.robot, panda.ARM_JOINTS, physicsClientId=self.client)
         state, velocity = panda.normalise([joint[0] for joint in joints]), None
         if velocities:
@@ -301,7 +378,8 @@ class World:
         return state, velocity, np.array(link[4])
 
     def mark_goal(self, position, radius):
-        """Show a green ball, visual only, at a position (3,), m. Only one, and always as large."""
+        """Show a green ball, visual only, at a position (3,), m. There is only one."""
+        self.check_open()
         if self._goal_marker is None:
             ball = p.createVisualShape(
                 p.GEOM_SPHERE,
@@ -313,8 +391,9 @@ class World:
                 baseVisualShapeIndex=ball, physicsClientId=self.client
             )
         p.resetBasePositionAndOrientation(
-            self._goal_marker, position, (0, 0, 0, 1), physicsClientId=self.client
+            self._goal_marker, position, NO_TURN, physicsClientId=self.client
         )
+        self._goal = position, radius
 
     def close(self):
         """Disconnect from PyBullet. Closing twice is allowed."""
@@ -323,9 +402,9 @@ class World:
             self.client = None
 
     def __del__(self):
-        # A world that nobody closed must not keep one of PyBullet's connections.
+        # A world that was never closed must not keep one of PyBullet's connections.
         if getattr(self, "client", None) is not None:
-            with contextlib.suppress(TypeError):  # PyBullet is gone already, as the process ends
+            with contextlib.suppress(TypeError):  # at the end of the process PyBullet is gone
                 if p.isConnected(self.client):
                     p.disconnect(physicsClientId=self.client)
 
@@ -333,5 +412,5 @@ class World:
 def _check_scene(scene):
     if not isinstance(scene, Scene):
         raise TypeError(
-            f"a scene must be an roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
+            f"a scene must be a roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
         )

@@ -1,4 +1,7 @@
-"""Wrappers that add to the observation what sensors see, or what an encoder makes of it."""
+"""Wrappers that add to observations: what sensors observe, an encoded scene, link distances."""
+
+import math
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -8,13 +11,13 @@ from roboarm_nmp.envs.perception.sensors import SensorWorld, cardinal
 
 
 class SensorWrapper(gym.Wrapper):
-    """Adds `sensors` to the observation: a dict of sensor's name -> its observation (a dict).
+    """Adds `sensors` to the observation: a dict of a sensor's name -> its observation (a dict).
 
     Args:
         env: a `RoboArmEnv`, possibly wrapped.
-        sensors: dict of name -> `envs.perception.sensors.Camera`, `PointCloud` or anything with their `space`
-            and `observe`; by default four cameras (`cardinal()`).
-        every_step: look in every step; otherwise once per episode, at its start, with the arm in
+        sensors: dict of name -> sensor: an `envs.perception.sensors.Camera` or `PointCloud`, or
+            any object with their `space` and `observe`; by default four cameras (`cardinal()`).
+        every_step: observe in every step; otherwise once per episode, at its start, with the arm in
             the start configuration (paper, appendix "Prediction times investigation").
     """
 
@@ -27,22 +30,24 @@ class SensorWrapper(gym.Wrapper):
             {**env.observation_space.spaces, "sensors": gym.spaces.Dict(spaces)}
         )
         self._world = SensorWorld()
-        self._seen = None
+        self._observed = None
 
-    def _look(self, observation):
+    def _observe(self, observation):
         configuration = panda.denormalise(observation["observation"][: panda.NUM_JOINTS])
         self._world.show(self.unwrapped.scene, configuration)
-        self._seen = {name: sensor.observe(self._world) for name, sensor in self.sensors.items()}
+        self._observed = {
+            name: sensor.observe(self._world) for name, sensor in self.sensors.items()
+        }
 
     def _with_sensors(self, observation):
-        seen = {  # copies: an observation is its owner's to change
+        observed = {  # copies, because the user may change an observation
             name: {output: array.copy() for output, array in outputs.items()}
-            for name, outputs in self._seen.items()
+            for name, outputs in self._observed.items()
         }
-        return {**observation, "sensors": seen}
+        return {**observation, "sensors": observed}
 
     def _begin(self, observation, info):
-        self._look(observation)
+        self._observe(observation)
         return self._with_sensors(observation), info
 
     def reset(self, *, seed=None, options=None):
@@ -51,13 +56,13 @@ class SensorWrapper(gym.Wrapper):
 
     def reset_specific(self, start, goal, scene=None):
         """As `RoboArmEnv.reset_specific`."""
-        return self._begin(*self.env.get_wrapper_attr("reset_specific")(start, goal, scene))
+        return self.reset(options={"start": start, "goal": goal, "scene": scene})
 
     def step(self, action):
         """As `RoboArmEnv.step`."""
         observation, *rest = self.env.step(action)
         if self.every_step:
-            self._look(observation)
+            self._observe(observation)
         return self._with_sensors(observation), *rest
 
     def close(self):
@@ -66,36 +71,36 @@ class SensorWrapper(gym.Wrapper):
 
 
 class _ObservingWrapper(gym.Wrapper):
-    """An env with more in its observations; otherwise with all of its attributes.
+    """An environment with additional observations, and all other attributes of the wrapped one.
 
-    `_with_more` is given an observation of the env, and gives one of its own.
+    `_extend` maps an observation of the wrapped environment to one of this.
     """
 
     def __getattr__(self, name):
-        if name == "env":  # before there is one
+        # `env` is missing while a copy is made. Python asks for special methods of copies, too.
+        if name == "env" or name.startswith("__"):
             raise AttributeError(name)
-        return getattr(self.env, name)
+        return self.env.get_wrapper_attr(name)
 
     def reset(self, *, seed=None, options=None):
         """As `RoboArmEnv.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._with_more(observation), info
+        return self._extend(observation), info
 
     def reset_specific(self, start, goal, scene=None):
         """As `RoboArmEnv.reset_specific`."""
-        observation, info = self.env.reset_specific(start, goal, scene)
-        return self._with_more(observation), info
+        return self.reset(options={"start": start, "goal": goal, "scene": scene})
 
     def step(self, action):
         """As `RoboArmEnv.step`."""
         observation, *rest = self.env.step(action)
-        return self._with_more(observation), *rest
+        return self._extend(observation), *rest
 
 
 class SceneEncodingWrapper(_ObservingWrapper):
     """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
 
-    It is encoded once per scene. Otherwise this is its `RoboArmEnv`, with all of its attributes.
+    A scene is encoded once. All attributes of the wrapped environment are available.
 
     Args:
         env: a `RoboArmEnv`.
@@ -110,58 +115,75 @@ class SceneEncodingWrapper(_ObservingWrapper):
         spaces["observation"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.observation_space = gym.spaces.Dict(spaces)
 
-    def _with_more(self, observation):
+    def _extend(self, observation):
         z = self.encoder(self.unwrapped.scene)
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
 
 class LinkDistancesWrapper(_ObservingWrapper):
-    """Adds `link_distances` to the observation: how far each link is from the nearest thing.
+    """Adds `link_distances` to the observation: the signed distance of each link, and its gradient.
 
-    float32 (10, 8), a row per `envs.collision.checker.LINKS`: the distance from obstacles, table and floor
-    in m, clipped to `envs.collision.checker.LINK_DISTANCE_RANGE`, and its gradient, m per unit of normalised
-    configuration (zeros beyond the range). If the goal is a configuration, `goal_link_distances` is the
-    same there. Otherwise this is its `RoboArmEnv`, with all of its attributes.
+    float32 `panda.LINK_DISTANCES_SHAPE`, a row per `panda.COLLISION_LINKS`: the distance from the
+    nearest obstacle, table or floor in m, clipped to `envs.collision.checker.LINK_DISTANCE_RANGE`,
+    and its gradient, m per unit of normalised configuration (zeros beyond the range). With goals
+    that are configurations, `goal_link_distances` are the same at the goal. All attributes of the
+    wrapped environment are available.
+
+    Hindsight relabelling replaces goals, and must replace `goal_link_distances`, too: see
+    docs/environment.md, "Hindsight relabelling".
 
     Args:
         env: a `RoboArmEnv`, possibly in a `SceneEncodingWrapper`.
-        geometry_source: from a `Scene` to the `CollisionChecker` that tells: `envs.perception.point_clouds.ground_truth_checker`
-            or `observed_checker`.
-        append: whether `observation` has `link_distances`, too: 80 numbers, before an encoded scene.
+        geometry_source: a function from a `Scene` to a `CollisionChecker`
+            (`envs.perception.geometry_source`).
+        append: whether `observation` contains `link_distances`, too, flat, before an encoded scene.
+        goal_link_distances: whether observations contain `goal_link_distances`, if the goal type
+            is not `ee`.
     """
 
-    def __init__(self, env, geometry_source, append=False):
+    def __init__(self, env, geometry_source, append=False, goal_link_distances=True):
         super().__init__(env)
         self._geometry_source, self.appends_link_distances = geometry_source, append
-        names = ["link_distances"] + ["goal_link_distances"] * (env.goal_type != "ee")
-        # (Inside of something, a distance is at least minus the way out.)
-        space = gym.spaces.Box(-np.inf, np.inf, (10, 8), np.float32)
+        self._of_goals = goal_link_distances and self.goal_type != "ee"
+        names = ["link_distances"] + ["goal_link_distances"] * self._of_goals
+        space = gym.spaces.Box(-np.inf, np.inf, panda.LINK_DISTANCES_SHAPE, np.float32)
         spaces = env.observation_space.spaces | {name: space for name in names}
         if append:
-            size = spaces["observation"].shape[0] + 80
+            size = spaces["observation"].shape[0] + math.prod(panda.LINK_DISTANCES_SHAPE)
             spaces["observation"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.observation_space = gym.spaces.Dict(spaces)
-        self._goal, self._of_goal = None, None
+        self._goal, self._at_goal = None, None
 
     def link_distances_at(self, states, scene=None):
-        """What `link_distances` would be in other configurations: (..., 7) -> float32 (..., 10, 8).
+        """`link_distances` at normalised configurations (..., 7): float32 (..., 10, 8).
 
         `scene`: a `Scene`, by default that of the environment.
         """
         checker = self._geometry_source(self.unwrapped.scene if scene is None else scene)
         return checker.link_distances(states)
 
-    def _with_more(self, observation):
-        seen = observation["observation"]
-        more = {"link_distances": self.link_distances_at(seen[:7])}
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        """As `RoboArmEnv.compute_reward`; warns if goals are relabelled."""
+        if self._of_goals and np.ndim(desired_goal) > 1:
+            warnings.warn(
+                "rewards of a batch of goals: after hindsight relabelling, goal_link_distances "
+                'belong to another goal (docs/environment.md, "Hindsight relabelling")',
+                stacklevel=2,
+            )
+        compute_reward = self.env.get_wrapper_attr("compute_reward")
+        return compute_reward(achieved_goal, desired_goal, info)
+
+    def _extend(self, observation):
+        inner = observation["observation"]
+        more = {"link_distances": self.link_distances_at(inner[: panda.NUM_JOINTS])}
         if self.appends_link_distances:
             size = self.unwrapped.observation_space["observation"].shape[0]
-            parts = seen[:size], more["link_distances"].ravel(), seen[size:]
+            parts = inner[:size], more["link_distances"].ravel(), inner[size:]
             more["observation"] = np.concatenate(parts)
-        if self.goal_type != "ee":
-            goal = observation["desired_goal"][:7]
+        if self._of_goals:
+            goal = observation["desired_goal"][: panda.NUM_JOINTS]
             key = self.unwrapped.scene, goal.tobytes()
             if self._goal != key:
-                self._goal, self._of_goal = key, self.link_distances_at(goal)
-            more["goal_link_distances"] = self._of_goal.copy()
+                self._goal, self._at_goal = key, self.link_distances_at(goal)
+            more["goal_link_distances"] = self._at_goal.copy()
         return {**observation, **more}

@@ -242,6 +242,7 @@ class SensorWorld(World):
         Returns:
             `rgb`, `depth` and `segmentation`, as `Camera` describes them.
         """
+        self.check_open()
         width, height = size
         _, _, rgb, depth, bodies = p.getCameraImage(
             width,

@@ -35,10 +35,10 @@ from roboarm_nmp.envs.scenes.primitives import (
     Cylinder,
     Scene,
     Sphere,
+    unit_quaternion,
 )
 from roboarm_nmp.envs.utils.files import write_atomically
 
-_NORM_TOLERANCE = 1e-6
 _MAX_DEPTH = 10  # a scene needs 6
 _HEADER = """\
 # A scene for RoboArm-NMP. Lengths in metres, in the frame of the robot's base: x forward, y left,
@@ -271,12 +271,10 @@ def _orientation(fields, what):
     if "orientation" not in fields:
         return IDENTITY
     node = fields["orientation"]
-    orientation = _vector(node, f"orientation of {what}", 4)
-    norm = math.hypot(*orientation)
-    if abs(norm - 1) > _NORM_TOLERANCE:
-        expected = "a quaternion x, y, z, w of norm 1"
-        raise _mistake(node, f"orientation of {what} must be {expected}, its norm is {norm:.9g}")
-    return orientation
+    try:
+        return unit_quaternion(_vector(node, f"orientation of {what}", 4))
+    except ValueError as error:
+        raise _mistake(node, f"orientation of {what}: {error}") from error
 
 
 def _mapping(node, what, required=(), optional=()):

@@ -11,38 +11,74 @@ import numpy as np
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 MAX_LENGTH, MAX_SCENE_OBSTACLES = 1000.0, 10_000
-"""m, of sizes and coordinates, and obstacles of a scene: more is a mistake."""
+"""Limits of sizes and coordinates (m), and of a scene's obstacles: more is a mistake."""
+# Quaternions: of up to the first deviation of the norm from 1, they stay as they are, bit for bit;
+# up to the second, such as (0, 0, 0.7071, 0.7071), they are normalised.
+_EXACT_NORM, _ROUNDED_NORM = 1e-6, 0.01
 
 
-def _as_tuples(body):
+def is_number(value):
+    """Whether a value is a finite real number of Python or NumPy: no text, date or tensor."""
+    try:
+        kinds = (int, float, np.integer, np.floating)
+        return isinstance(value, kinds) and math.isfinite(value)
+    except (OverflowError, TypeError):  # 10**400; a time span, an integer according to NumPy
+        return False
+
+
+def unit_quaternion(orientation):
+    """A quaternion (x, y, z, w) as a tuple of norm 1.
+
+    Raises ValueError: it is not four finite numbers, or its norm differs from 1 by more than 1 %.
+    """
+    orientation = tuple(orientation)
+    if len(orientation) != 4 or not all(map(is_number, orientation)):
+        raise ValueError(f"a quaternion x, y, z, w is four finite numbers, got {orientation}")
+    norm = math.hypot(*orientation)
+    if not abs(norm - 1) <= _ROUNDED_NORM:
+        raise ValueError(
+            f"a quaternion x, y, z, w must have norm 1 (within 1 %), got norm {norm:.9g}"
+        )
+    if abs(norm - 1) <= _EXACT_NORM:
+        return orientation
+    return tuple(float(number) / norm for number in orientation)
+
+
+def _normalise(body):
     """Vectors may be given as lists or arrays; bodies can be compared and hashed all the same."""
-    for name in ("position", "size", "orientation"):
+    for name in ("position", "size"):
         value = getattr(body, name, ())
         if type(value) is not tuple:
             object.__setattr__(body, name, tuple(value))
+    if hasattr(body, "orientation"):
+        object.__setattr__(body, "orientation", unit_quaternion(body.orientation))
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box: centre, full edges, and orientation as a quaternion (x, y, z, w)."""
+    """A box: centre, full edges, and orientation as a quaternion (x, y, z, w).
+
+    Raises ValueError: the norm of the quaternion differs from 1 by more than 1 %. It is normalised
+    otherwise.
+    """
 
     position: tuple[float, float, float]
     size: tuple[float, float, float]
     orientation: tuple[float, float, float, float] = IDENTITY
 
-    __post_init__ = _as_tuples
+    __post_init__ = _normalise
 
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A cylinder around its local z axis. `position` is its centre."""
+    """A cylinder around its local z axis. `position` is its centre, `orientation` as of a `Box`."""
 
     position: tuple[float, float, float]
     radius: float
     length: float
     orientation: tuple[float, float, float, float] = IDENTITY
 
-    __post_init__ = _as_tuples
+    __post_init__ = _normalise
 
 
 @dataclass(frozen=True)
@@ -52,7 +88,7 @@ class Sphere:
     position: tuple[float, float, float]
     radius: float
 
-    __post_init__ = _as_tuples
+    __post_init__ = _normalise
 
 
 Obstacle = Box | Cylinder | Sphere
@@ -70,14 +106,14 @@ def floor_box(height):
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything the arm can hit apart from itself. `table=None` or `floor=None` leave them out.
+    """All geometry around the arm. `table=None` or `floor=None` leave them out.
 
     `floor` is the height of the floor's surface. `friction` is the obstacles' coefficient; PyBullet
-    multiplies it by the arm's, 0.5. Values, not code: two equal scenes are equal.
+    multiplies it by the arm's, 0.5. Scenes are values: they can be compared and hashed.
 
     Raises:
-        TypeError: something is of another type.
-        ValueError: a number that is none, a size that is not positive, or too much of anything.
+        TypeError: an obstacle or the table is of another type.
+        ValueError: a number is not finite or exceeds its limit, or a size is not positive.
     """
 
     obstacles: tuple[Obstacle, ...] = ()
@@ -103,15 +139,6 @@ class Scene:
             raise ValueError(f"friction must be a number from 0 on, got {self.friction!r}")
 
 
-def is_number(value):
-    """Whether a value is a finite real number, Python's or NumPy's: no text, date or tensor."""
-    try:
-        kinds = (int, float, np.integer, np.floating)
-        return isinstance(value, kinds) and math.isfinite(value)
-    except (OverflowError, TypeError):  # 10**400; a time span, which NumPy counts as an integer
-        return False
-
-
 def _is_length(value):
     return is_number(value) and abs(value) <= MAX_LENGTH
 
@@ -120,13 +147,11 @@ def _check(body):
     sizes = (body.radius,) if not isinstance(body, Box) else body.size
     if isinstance(body, Cylinder):
         sizes = body.radius, body.length
-    turned = getattr(body, "orientation", IDENTITY)
     if not (
-        (len(body.position), len(turned)) == (3, 4)
+        len(body.position) == 3
         and (len(sizes) == 3 or not isinstance(body, Box))
-        and all(map(_is_length, (*body.position, *sizes, *turned)))
+        and all(map(_is_length, (*body.position, *sizes)))
         and min(sizes) > 0
-        and any(turned)
     ):
         raise ValueError(
             f"an obstacle needs finite numbers and positive sizes, up to {MAX_LENGTH:.0f} m: {body}"
@@ -166,7 +191,10 @@ def padded_rows(obstacles, number):
 
 
 def from_array(rows):
-    """The inverse of `to_array`. Raises ValueError for another shape or an unknown kind."""
+    """The inverse of `to_array`.
+
+    Raises ValueError: another shape, an unknown kind, or no unit quaternion.
+    """
     rows = np.asarray(rows, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != ROW:
         raise ValueError(f"an obstacle array has shape (n, {ROW}), got {rows.shape}")

@@ -1,8 +1,10 @@
 """The MDP: numbers against independent formulas, exact replay, Gymnasium, bad input."""
 
 import hashlib
+import os
 import subprocess
 import sys
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +22,7 @@ from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, from_array, to_array
 
 HOME = np.array([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], dtype=np.float32)
-ACTIVATION_DISTANCE_HOME = HOME + np.float32(0.1)
+NEAR_HOME = HOME + np.float32(0.1)
 # Elbow fully bent: the hand is inside the arm.
 FOLDED = np.array([0.0, 0.0, 0.0, -3.1, 0.0, 0.0, 0.0], dtype=np.float32)
 
@@ -67,7 +69,7 @@ def test_forward_kinematics_equals_pybullets(env):
 @pytest.mark.parametrize("mode", ["relative", "subgoal"])
 def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
     env = envs.make("no_obstacles", action_mode=mode)
-    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+    env.reset_specific(HOME, NEAR_HOME)
     s = 2 * (HOME.astype(float) - panda.LOWER) / (panda.UPPER - panda.LOWER) - 1
     commanded = []
     command = panda.command
@@ -78,7 +80,7 @@ def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
     direction = rng.normal(size=7)
     direction /= np.linalg.norm(direction)
     for length, expected in [(0.5, 0.03), (0.031, 0.03), (0.01, 0.01)]:
-        env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+        env.reset_specific(HOME, NEAR_HOME)
         displacement = direction * length
         env.step((displacement if mode == "relative" else s + displacement).astype(np.float32))
         target = 2 * (np.array(commanded[-1]) - panda.LOWER) / (panda.UPPER - panda.LOWER) - 1
@@ -86,7 +88,7 @@ def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
 
 
 def test_the_arm_follows_commands_and_holds_still(env):
-    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+    env.reset_specific(HOME, NEAR_HOME)
     before = panda.normalise(HOME)
     action = np.zeros(7, np.float32)
     action[0] = 1.0
@@ -94,7 +96,7 @@ def test_the_arm_follows_commands_and_holds_still(env):
     moved = observation["observation"][:7] - before
     assert 0.025 < moved[0] < 0.035
     assert np.abs(moved[1:]).max() < 0.006
-    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+    env.reset_specific(HOME, NEAR_HOME)
     for _ in range(200):
         observation, *_ = env.step(np.zeros(7, np.float32))
     np.testing.assert_allclose(observation["observation"][:7], before, atol=2e-3)
@@ -124,22 +126,20 @@ def test_contacts_do_not_depend_on_where_the_arm_was_before():
 @pytest.mark.parametrize("goal_type, size", [("ee", 3), ("config", 7), ("combined", 10)])
 def test_goal_types_rewards_and_termination_on_batches(goal_type, size):
     env = envs.make("no_obstacles", goal_type=goal_type)
-    observation, info = env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+    observation, info = env.reset_specific(HOME, NEAR_HOME)
     expected = {
-        "ee": panda.forward_kinematics(ACTIVATION_DISTANCE_HOME),
-        "config": panda.normalise(ACTIVATION_DISTANCE_HOME),
+        "ee": panda.forward_kinematics(NEAR_HOME),
+        "config": panda.normalise(NEAR_HOME),
         "combined": np.r_[
-            panda.normalise(ACTIVATION_DISTANCE_HOME),
-            panda.forward_kinematics(ACTIVATION_DISTANCE_HOME),
+            panda.normalise(NEAR_HOME),
+            panda.forward_kinematics(NEAR_HOME),
         ],
     }[goal_type]
     np.testing.assert_allclose(observation["desired_goal"], expected, atol=1e-6)
     assert observation["achieved_goal"].shape == (size,)
     np.testing.assert_allclose(
         info["ee_distance"],
-        np.linalg.norm(
-            panda.forward_kinematics(HOME) - panda.forward_kinematics(ACTIVATION_DISTANCE_HOME)
-        ),
+        np.linalg.norm(panda.forward_kinematics(HOME) - panda.forward_kinematics(NEAR_HOME)),
         atol=1e-6,
     )
 
@@ -159,8 +159,8 @@ def test_goal_types_rewards_and_termination_on_batches(goal_type, size):
 
 
 def test_step_agrees_with_the_batch_functions_and_stops_at_the_goal(env):
-    observation, _ = env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
-    goal = panda.normalise(ACTIVATION_DISTANCE_HOME)
+    observation, _ = env.reset_specific(HOME, NEAR_HOME)
+    goal = panda.normalise(NEAR_HOME)
     steps, terminated = 0, False
     while not terminated:
         action = (goal - observation["observation"][:7]).astype(np.float32)
@@ -176,7 +176,7 @@ def test_step_agrees_with_the_batch_functions_and_stops_at_the_goal(env):
 
 def test_dense_reward_is_minus_the_distance():
     env = envs.make("no_obstacles", reward="dense")
-    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+    env.reset_specific(HOME, NEAR_HOME)
     observation, reward, *_ = env.step(np.zeros(7, np.float32))
     distance = np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"])
     assert reward == pytest.approx(-distance)
@@ -191,7 +191,7 @@ def test_horizon_truncates():
 
 def test_velocities_in_the_observation():
     env = envs.make("no_obstacles", velocities=True)
-    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+    env.reset_specific(HOME, NEAR_HOME)
     action = np.zeros(7, np.float32)
     action[2] = 1.0
     observation, *_ = env.step(action)
@@ -219,7 +219,7 @@ def test_collision_is_reported_while_it_lasts_and_so_far():
     for _ in range(5):
         info = env.step(-TURN_LEFT)[4]
     assert not info["collision"] and info["collision_so_far"]
-    assert not env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)[1]["collision_so_far"]
+    assert not env.reset_specific(HOME, NEAR_HOME)[1]["collision_so_far"]
 
 
 def test_stop_on_collision_terminates_and_relabels():
@@ -289,10 +289,10 @@ def test_scene_arrays_round_trip_and_scenes_change():
         from_array(np.full((1, 11), 7.0))
     env = envs.make("no_obstacles")
     shelf = Scene((Box((0.0, 0, 0.9), (1, 1, 0.1)),))
-    env.reset_specific(HOME * 0.5, ACTIVATION_DISTANCE_HOME, scene=env.scene)
+    env.reset_specific(HOME * 0.5, NEAR_HOME, scene=env.scene)
     with pytest.raises(ValueError, match="obstacle 0"):
-        env.reset_specific(HOME * 0, ACTIVATION_DISTANCE_HOME, scene=shelf)
-    env.reset_specific(HOME * 0.5, ACTIVATION_DISTANCE_HOME, scene=Scene())
+        env.reset_specific(HOME * 0, NEAR_HOME, scene=shelf)
+    env.reset_specific(HOME * 0.5, NEAR_HOME, scene=Scene())
 
 
 # --- Exact replay
@@ -318,12 +318,14 @@ def test_replay_is_bit_identical_in_any_order_and_any_process():
     again = {seed: run_episode(env, seed) for seed in order}
     assert again == first
     code = (
-        "from roboarm_nmp import envs; from test_arm_env import run_episode; env = envs.make('double_walls');"
+        "from roboarm_nmp import envs; from test_arm_env import run_episode;"
+        "env = envs.make('double_walls');"
         "print(*[run_episode(env, seed) for seed in (29, 3, 11)])"
     )
     output = subprocess.run(
         [sys.executable, "-c", code],
         cwd=ROOT / "tests" / "envs",
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
         check=True,
@@ -332,7 +334,7 @@ def test_replay_is_bit_identical_in_any_order_and_any_process():
 
 
 @pytest.mark.parametrize("task", ["random_boxes_hard", "benchmaker_bookshelf_thin"])
-def test_an_episode_is_the_same_with_and_without_pictures(task):
+def test_an_episode_is_the_same_with_and_without_rendering(task):
     query = load_queries(task)[5]
     hashes = set()
     for arguments in ({}, {"render_mode": "rgb_array", "render_size": (32, 24)}, {"draw": True}):
@@ -392,8 +394,8 @@ def test_record_video(tmp_path):
     env = gym.make("RoboArmNMP/Boxes-v0", render_mode="rgb_array", horizon=3)
     env = gym.wrappers.RecordVideo(env, str(tmp_path), disable_logger=True)
     env.reset(seed=0)
-    picture = env.render()
-    assert picture.shape == (360, 480, 3) and picture.dtype == np.uint8 and picture.std() > 20
+    image = env.render()
+    assert image.shape == (360, 480, 3) and image.dtype == np.uint8 and image.std() > 20
     for _ in range(3):
         env.step(env.action_space.sample())
     env.close()
@@ -437,34 +439,230 @@ def test_closing_frees_the_connection():
         del env
 
 
+def visible_bodies(env):
+    """PyBullet's numbers of the bodies in an image of the environment's world."""
+    view = p.computeViewMatrix((1.6, 0.0, 0.8), (0.0, 0.0, 0.4), (0.0, 0.0, 1.0))
+    projection = p.computeProjectionMatrixFOV(60, 1.0, 0.1, 5.0)
+    *_, bodies = p.getCameraImage(
+        64, 64, view, projection, renderer=p.ER_TINY_RENDERER, physicsClientId=env.client
+    )
+    return np.reshape(bodies, (64, 64))
+
+
+def test_only_rendering_takes_the_memory_of_visual_shapes():
+    """An environment takes 42 MB; its visual shapes would take 50 more."""
+    envs.make("wall").close()
+    resident = psutil.Process().memory_info().rss
+    made = [envs.make("wall") for _ in range(4)]
+    assert (psutil.Process().memory_info().rss - resident) / 4 < 60e6
+    for env in made:
+        env.close()
+
+
+def test_draw_shows_the_arm_and_the_episode_goes_on():
+    env, drawn = envs.make("wall"), envs.make("wall", render_mode="rgb_array")
+    for one in (env, drawn):
+        one.reset(seed=0)
+        for _ in range(10):
+            one.step(np.ones(7))
+    hidden = visible_bodies(env) == env.robot
+    env.world.draw()
+    shown = visible_bodies(env) == env.robot
+    np.testing.assert_array_equal(shown, visible_bodies(drawn) == drawn.robot)
+    assert shown.any() and not np.array_equal(shown, hidden)  # a part is behind the wall
+    for _ in range(20):
+        pair = [one.step(np.ones(7))[0]["observation"] for one in (env, drawn)]
+        np.testing.assert_array_equal(*pair)
+    env.close()
+    drawn.close()
+
+
+# --- Queries as options of `reset`
+
+QUERY = {"start": HOME, "goal": NEAR_HOME}
+SHELF = Scene((Box((0.6, 0.0, 0.9), (0.3, 0.3, 0.03)),))
+
+
+def test_reset_with_options_starts_the_episode_of_reset_specific():
+    a, b = envs.make("no_obstacles"), envs.make("no_obstacles")
+    for scene in (None, SHELF):
+        first, info = a.reset_specific(HOME, NEAR_HOME, scene)
+        again, same_info = b.reset(options=QUERY | ({} if scene is None else {"scene": scene}))
+        for name in first:
+            np.testing.assert_array_equal(first[name], again[name])
+        assert info == same_info and a.scene == b.scene
+    a.reset(seed=5)
+    b.reset(seed=5, options=QUERY)
+    # The seed is used, and the query draws nothing.
+    assert a.np_random.bit_generator.state != b.np_random.bit_generator.state
+    assert b.np_random.bit_generator.state == np.random.default_rng(5).bit_generator.state
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (QUERY | {"sceen": SHELF}, r"unknown options \['sceen'\]: known are 'start', 'goal' and"),
+        ({"start": HOME}, "must have both 'start' and 'goal'"),
+        ({"scene": SHELF}, "must have both 'start' and 'goal'"),
+        ({"start": HOME, "goal": HOME[:4]}, "goal must have 7 or 3 numbers"),
+        ({"start": FOLDED, "goal": HOME}, "start is in collision"),
+        ("start", "options must be a dict"),
+    ],
+)
+def test_wrong_options_are_rejected_and_the_episode_goes_on(env, options, message):
+    env.reset_specific(HOME, NEAR_HOME)
+    env.step(np.zeros(7))
+    with pytest.raises(ValueError, match=message):
+        env.reset(options=options)
+    assert env.step(np.zeros(7))[4]["elapsed_steps"] == 2
+
+
+def test_gymnasium_make_reaches_reset_specific():
+    env = gym.make("RoboArmNMP/Wall-v0")
+    observation, _ = env.reset_specific(HOME, NEAR_HOME, SHELF)
+    np.testing.assert_allclose(observation["observation"][:7], panda.normalise(HOME), atol=1e-6)
+    assert env.step(np.zeros(7, np.float32))[4]["elapsed_steps"] == 1 and env.scene == SHELF
+    with pytest.raises(RuntimeError, match="no episode: call reset"):
+        gym.make("RoboArmNMP/Wall-v0").step(np.zeros(7, np.float32))
+
+
+@pytest.mark.filterwarnings("ignore:.*is not within the observation space")
+def test_options_pass_through_gymnasiums_wrappers_and_time_limit_counts_from_them():
+    env = gym.make("RoboArmNMP/Wall-v0", max_episode_steps=10)
+    env = gym.wrappers.OrderEnforcing(gym.wrappers.PassiveEnvChecker(env))
+    env = gym.wrappers.RecordEpisodeStatistics(env)
+    env.reset(seed=0)
+    for _ in range(6):
+        env.step(np.zeros(7, np.float32))
+    observation, _ = env.reset(options=QUERY | {"scene": SHELF})
+    np.testing.assert_allclose(observation["observation"][:7], panda.normalise(HOME), atol=1e-6)
+    assert env.unwrapped.scene == SHELF
+    truncated, steps = False, 0
+    while not truncated:
+        *_, truncated, info = env.step(np.zeros(7, np.float32))
+        steps += 1
+    assert steps == 10 and info["episode"]["l"] == 10
+
+
+@pytest.mark.parametrize("vector_env", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
+def test_options_reach_every_env_of_a_vector_env(vector_env):
+    vector = vector_env([lambda: gym.make("RoboArmNMP/NoObstacles-v0")] * 2)
+    observation, _ = vector.reset(options=QUERY)
+    for state in observation["observation"][:, :7]:
+        np.testing.assert_allclose(state, panda.normalise(HOME), atol=1e-6)
+    with pytest.raises(ValueError, match="unknown options"):
+        vector.reset(options={"begin": HOME})
+    vector.close(terminate=True) if vector_env is gym.vector.AsyncVectorEnv else vector.close()
+
+
+# --- Closed environments
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda env: env.reset(),
+        lambda env: env.reset(options=QUERY),
+        lambda env: env.reset_specific(HOME, NEAR_HOME),
+        lambda env: env.step(np.zeros(7)),
+        lambda env: env.render(),
+        lambda env: env.in_collision(HOME),
+        lambda env: env.is_feasible(HOME),
+        lambda env: env.sample_feasible(np.random.default_rng(0)),
+        lambda env: env.sample_query(np.random.default_rng(0)),
+        lambda env: env.set_scene(SHELF),
+        lambda env: env.world.draw(),
+        lambda env: env.world.place(HOME),
+        lambda env: env.world.command(HOME.tolist()),
+        lambda env: env.world.simulate(),
+        lambda env: env.world.read_arm(),
+        lambda env: env.world.check_free(start=HOME),
+        lambda env: env.world.mark_goal((0.5, 0.0, 0.5), 0.02),
+    ],
+)
+@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
+def test_closed_environment_says_so(call, render_mode):
+    env = envs.make("no_obstacles", render_mode=render_mode, sink_state=True)
+    env.reset_specific(HOME, HOME)
+    env.step(np.zeros(7))  # into the sink
+    env.close()
+    with pytest.raises(RuntimeError, match="is closed"):
+        call(env)
+
+
 # --- Bad input: a clear error, and the env goes on
 
 
 @pytest.mark.parametrize(
-    "action",
+    "action, reason",
     [
-        np.full(7, np.nan),
-        np.full(7, np.inf),
-        np.zeros(6),
-        np.zeros((1, 7)),
-        np.zeros(7, complex),
-        np.zeros(7, "datetime64[s]"),
-        np.ma.masked_array(np.zeros(7), mask=[1, 0, 0, 0, 0, 0, 0]),
-        torch.zeros(7, dtype=torch.bfloat16),
-        torch.zeros(7, requires_grad=True),
-        [10**400] * 7,
-        [[0.0], 0.0],
-        "left",
-        None,
+        (np.full(7, np.nan), "nan"),
+        (np.full(7, np.inf), "inf"),
+        (np.zeros(6), r"got shape \(6,\)"),
+        (np.zeros((1, 7)), r"got shape \(1, 7\)"),
+        (np.zeros(7, complex), "got dtype complex128"),
+        (np.zeros(7, "datetime64[s]"), "got dtype datetime64"),
+        (np.ma.masked_array(np.zeros(7), mask=[1, 0, 0, 0, 0, 0, 0]), "got a masked array"),
+        (torch.zeros(7, dtype=torch.bfloat16), "unsupported ScalarType BFloat16"),
+        (torch.zeros(7, requires_grad=True), r"requires grad. Use tensor.detach\(\)"),
+        ([10**400] * 7, "got dtype object"),
+        ([[0.0], 0.0], "inhomogeneous shape"),
+        ("left", "got dtype <U4"),
+        (None, "got dtype object"),
     ],
 )
-def test_bad_actions(env, action):
-    observation, _ = env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
-    with pytest.raises(ValueError, match="7 finite numbers"):
+def test_bad_action_is_rejected_with_the_reason_and_nothing_moves(env, action, reason):
+    observation, _ = env.reset_specific(HOME, NEAR_HOME)
+    with pytest.raises(ValueError, match=f"7 finite numbers.*{reason}"):
         env.step(action)
     after, *_, info = env.step(np.zeros(7, np.float32))
     assert info["elapsed_steps"] == 1
     np.testing.assert_allclose(after["observation"], observation["observation"], atol=1e-3)
+
+
+@pytest.mark.parametrize("mode", ["relative", "subgoal"])
+def test_huge_action_is_clipped_without_a_warning(mode):
+    env, states = envs.make("no_obstacles", action_mode=mode), []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for huge in (1.0, 1e200, 1.7e308, np.longdouble("1e4000"), np.float32(3e38)):
+            env.reset_specific(HOME, NEAR_HOME)
+            states.append(env.step(np.array([huge, -huge, 0, 0, 0, 0, 0]))[0]["observation"])
+        with pytest.raises(ValueError, match="start must be finite"):
+            env.reset_specific([1e200] * 7, NEAR_HOME)
+    for state in states:
+        np.testing.assert_array_equal(state, states[0])
+
+
+def test_tensor_action_moves_like_an_array(env):
+    states = []
+    for action in (np.full(7, 0.01, np.float32), torch.full((7,), 0.01), [np.float32(0.01)] * 7):
+        env.reset_specific(HOME, NEAR_HOME)
+        states.append(env.step(action)[0]["observation"])
+    np.testing.assert_array_equal(states[0], states[1])
+    np.testing.assert_array_equal(states[0], states[2])
+
+
+@pytest.mark.parametrize("reward", ["sparse", "dense"])
+@pytest.mark.parametrize("goal_type, size", [("ee", 3), ("config", 7), ("combined", 10)])
+@pytest.mark.parametrize("stop_on_collision", [False, True])
+def test_single_goals_have_scalar_rewards_and_ends(reward, goal_type, size, stop_on_collision):
+    arguments = {"goal_type": goal_type, "stop_on_collision": stop_on_collision}
+    env = envs.make("no_obstacles", reward=reward, **arguments)
+    for dtype in (np.float32, np.float64):
+        pair = np.zeros(size, dtype), np.full(size, 0.5, dtype)
+        for info in ({}, {"collision": False, "elapsed_steps": 400}):
+            results = [
+                env.compute_reward(*pair, info),
+                env.compute_terminated(*pair, info),
+                env.compute_truncated(*pair, info),
+            ]
+            assert isinstance(results[0], np.floating)
+            assert all(isinstance(result, np.bool_) for result in results[1:])
+            assert results[0] < 0 and not results[1] and results[2] == bool(info)
+    batch = env.compute_reward(np.zeros((1, size)), np.zeros((1, size)), [{}])
+    assert batch.shape == (1,) and batch[0] == 0
+    env.close()
 
 
 @pytest.mark.parametrize(
@@ -481,12 +679,29 @@ def test_bad_actions(env, action):
     ],
 )
 def test_bad_queries_leave_the_running_episode_alone(env, start, goal, message):
-    env.reset_specific(HOME, ACTIVATION_DISTANCE_HOME)
+    env.reset_specific(HOME, NEAR_HOME)
     with pytest.raises(ValueError, match=message):
         env.reset_specific(start, goal)
     observation, *_, info = env.step(np.zeros(7, np.float32))
     assert info["elapsed_steps"] == 1
     np.testing.assert_allclose(observation["observation"][:7], panda.normalise(HOME), atol=1e-3)
+
+
+def test_episode_in_contact_goes_on_bit_for_bit_after_refused_queries():
+    runs = []
+    for refused in (False, True):
+        env, rng, states = envs.make("random_boxes_hard"), np.random.default_rng(0), []
+        for seed in range(4):
+            env.reset(seed=seed)
+            for direction in rng.normal(size=(6, 7)).repeat(10, axis=0):
+                observation, *_, info = env.step(direction)
+                states.append(observation["observation"])
+                if refused and info["collision"]:
+                    with pytest.raises(ValueError, match="start is in collision"):
+                        env.reset_specific(FOLDED, [0.4, 0.1, 0.5])
+        env.close()
+        runs.append(np.stack(states))
+    np.testing.assert_array_equal(*runs)
 
 
 def test_position_goals_are_for_goal_type_ee():
@@ -531,5 +746,5 @@ def test_unknown_task_and_missing_reset():
         envs.make("walls")
     with pytest.raises(RuntimeError, match="call reset"):
         envs.make("no_obstacles").step(np.zeros(7))
-    with pytest.raises(TypeError, match="must be an roboarm_nmp.envs.scenes.primitives.Scene"):
+    with pytest.raises(TypeError, match="must be a roboarm_nmp.envs.scenes.primitives.Scene"):
         envs.RoboArmEnv("wall")

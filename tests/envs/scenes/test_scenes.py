@@ -17,7 +17,16 @@ from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES
-from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere, from_array, to_array
+from roboarm_nmp.envs.scenes.primitives import (
+    Box,
+    Cylinder,
+    Scene,
+    Sphere,
+    from_array,
+    scene_from_json,
+    scene_to_json,
+    to_array,
+)
 from roboarm_nmp.envs.scenes.random_boxes import GRID, KEEP_CLEAR, SHOULDER
 from roboarm_nmp.envs.tasks import TASKS
 
@@ -64,7 +73,6 @@ def distance_to_robot(box):
         {"obstacles": (Box((0, 0, 0), (1, 1)),)},
         {"obstacles": (Box((0, 0, 0), (1, 1, -1)),)},
         {"obstacles": (Box((0, 0, 0), (1, 1, 1e300)),)},
-        {"obstacles": (Box((0, 0, 0), (1, 1, 1), (0, 0, 0, 0)),)},
         {"obstacles": (Cylinder((0, 0, 0), 1, math.nan),)},
         {"table": Box((0, 0, 0), (1, 1, 0))},
         {"floor": math.nan},
@@ -77,6 +85,48 @@ def distance_to_robot(box):
 def test_what_is_no_scene_is_refused_with_the_reason(fields):
     with pytest.raises(ValueError, match=r"obstacle needs finite|at most|floor must|friction must"):
         Scene(**fields)
+
+
+@pytest.mark.parametrize(
+    "orientation",
+    [
+        (0, 15, 0, 2),
+        (0, 0, 0, 0),
+        (1e-200, 0, 0, 0),
+        (0, 0, 0, 1.011),
+        (0, 0, 0.98, 0),
+        (0, 0, 1),
+        (0, 0, math.nan, 1),
+        (0, 0, math.inf, 1),
+        (1e300, 0, 0, 0),
+    ],
+)
+def test_quaternion_more_than_one_percent_off_is_rejected(orientation):
+    for kind, sizes in ((Box, [(1, 1, 1)]), (Cylinder, [0.1, 1.0])):
+        with pytest.raises(ValueError, match="a quaternion x, y, z, w"):
+            kind((0, 0, 0), *sizes, orientation)
+    row = to_array([Box((0, 0, 0), (1, 1, 1))])
+    row[0, 4 : 4 + len(orientation)] = orientation
+    if len(orientation) == 4:
+        with pytest.raises(ValueError, match="a quaternion x, y, z, w"):
+            from_array(row)
+
+
+def test_rounded_quaternion_is_normalised_and_an_exact_one_stays_bit_for_bit():
+    half = math.sqrt(0.5)
+    box = Box((0, 0, 0), (1, 1, 1), [0, 0, 0.7071, 0.7071])
+    np.testing.assert_allclose(box.orientation, (0, 0, half, half), rtol=1e-15)
+    assert box == Box((0, 0, 0), (1, 1, 1), (0, 0, 0.7071, 0.7071)) and len({box, box}) == 1
+    cylinder = Cylinder((0, 0, 0), 0.1, 1.0, np.array([0.6, 0, 0, 0.795]))
+    assert math.hypot(*cylinder.orientation) == pytest.approx(1.0, abs=1e-15)
+    text = scene_to_json(Scene((box, cylinder)))
+    assert scene_from_json(text) == Scene((box, cylinder))
+    rng = np.random.default_rng(0)
+    for angle in rng.uniform(-math.pi, math.pi, 1000):  # all of these differ from 1 by rounding
+        orientation = (0.0, 0.0, math.sin(angle), math.cos(angle))
+        assert Box((0, 0, 0), (1, 1, 1), orientation).orientation == orientation
+        short = tuple(np.float32(orientation).tolist())
+        assert Box((0, 0, 0), (1, 1, 1), short).orientation == short
 
 
 def test_vectors_may_be_lists_and_arrays():

@@ -1,6 +1,8 @@
-"""Senseless arguments of environments, scenes, sensors and policies' layers; senseless actions."""
+"""Odd arguments of environments, scenes, sensors and safety filters; odd actions and queries."""
 
+import copy
 import dataclasses
+import pickle
 import random
 import warnings
 
@@ -29,7 +31,8 @@ ODD = (
 ARGUMENTS = (
     *("episodes_per_scene", "goal_type", "ee_tolerance", "config_tolerance", "action_mode"),
     *("max_step", "horizon", "stop_on_collision", "reward", "sink_state", "velocities"),
-    *("render_mode", "render_size", "encoder", "link_distances", "scene", "no_such_argument"),
+    *("render_mode", "render_size", "encoder", "num_points", "geometry_source", "link_distances"),
+    *("append_link_distances", "goal_link_distances", "scene", "no_such_argument"),
 )
 GOOD_VALUES = {
     "episodes_per_scene": (1, 3),
@@ -38,8 +41,12 @@ GOOD_VALUES = {
     "horizon": (1, 50),
     "velocities": (False, True),
     "render_mode": (None, "rgb_array"),
-    "encoder": (None, "oracle", "points"),
-    "link_distances": (None, "obstacles", "points"),
+    "encoder": (None, "oracle", "point_cloud"),
+    "num_points": (1, 64),
+    "geometry_source": (None, "ground_truth", "point_cloud"),
+    "link_distances": (False, True),
+    "append_link_distances": (False, True),
+    "goal_link_distances": (False, True),
 }
 OF_SCENES = ("position", "size", "orientation", "radius", "length", "obstacles", "table", "floor")
 
@@ -48,14 +55,14 @@ def make_and_step(rng):
     """An environment with one to three odd arguments."""
     chosen = rng.sample(ARGUMENTS, rng.randint(1, 3))
     arguments = {
-        name: rng.choice(GOOD_VALUES.get(name, ODD) if rng.random() < 0.3 else ODD)
+        name: rng.choice(GOOD_VALUES.get(name, ODD) if rng.random() < 0.5 else ODD)
         for name in chosen
     }
     task = rng.choice(["wall", "random_boxes_hard"]) if rng.random() < 0.95 else rng.choice(ODD)
     try:
         env = envs.make(task, **arguments)
     except TypeError as error:
-        # A name that does not exist, and what is no text, scene or path, may be told by Python.
+        # Python itself may refuse an unknown name, or a value that is no text, scene or path.
         if {"no_such_argument", "scene"} & set(chosen) or not isinstance(task, str):
             return REFUSED
         raise error
@@ -73,7 +80,7 @@ def make_and_step(rng):
 
 
 def act_oddly(rng):
-    """An odd action: it is refused and nothing moves, or it is a step like any other."""
+    """An odd action: it is rejected and nothing moves, or it is a step like any other."""
     env = _environment()
     numbers = [rng.choice(NUMBERS) for _ in range(7)]
     action = rng.choice(
@@ -108,7 +115,13 @@ def begin_oddly(rng):
             query[place] = good.astype(object)
             query[place][rng.randrange(7)] = rng.choice(NUMBERS)
     try:
-        observation, _ = env.reset_specific(*query)
+        if rng.random() < 0.5:
+            observation, _ = env.reset_specific(*query)
+        else:
+            options = dict(zip(("start", "goal", "scene"), query, strict=True))
+            if rng.random() < 0.3:
+                options[rng.choice([*ODD[:8], "Start", "seed", "start "])] = good
+            observation, _ = env.reset(options=rng.choice([options] * 9 + [rng.choice(ODD)]))
     except ValueError:
         return REFUSED
     except TypeError:
@@ -170,13 +183,36 @@ def look(rng):
     return RAN
 
 
-def add_layer(rng):
-    """An odd last layer."""
+def copy_anytime(rng):
+    """A copy, at any time of an episode, that goes on as the original does."""
+    env = _environment()
+    if rng.random() < 0.2:
+        env = envs.make(rng.choice(["boxes", "random_boxes_easy"]))
+    elif rng.random() < 0.9:
+        env.reset(seed=rng.randrange(100))
+        for _ in range(rng.randrange(60)):
+            env.step(np.full(7, rng.uniform(-1, 1)))
+    twin = copy.deepcopy(env) if rng.random() < 0.5 else pickle.loads(pickle.dumps(env))
+    if env.start_configuration is None:
+        env.reset()
+        twin.reset()
+    for _ in range(20):
+        action = np.array([rng.uniform(-1, 1) for _ in range(7)])
+        pair = [one.step(action)[0]["observation"].tobytes() for one in (env, twin)]
+        assert pair[0] == pair[1], "the copy moved otherwise"
+    twin.close()
+    return RAN
+
+
+def add_filter(rng):
+    """An odd safety filter."""
     try:
-        layer = SafetyFilter(rng.choice(ODD), rng.choice((True, False, *ODD)))
+        margin = rng.choice(ODD) if rng.random() < 0.5 else rng.choice((0.0, 0.005, 0.02))
+        escape = rng.choice(ODD) if rng.random() < 0.5 else rng.random() < 0.5
+        safety_filter = SafetyFilter(margin, escape)
     except (TypeError, ValueError):
         return REFUSED
-    move = layer(np.full(7, 0.01), np.zeros((9, 8)), max_step=0.03)
+    move = safety_filter(np.full(7, 0.01), np.zeros(panda.LINK_DISTANCES_SHAPE), max_step=0.03)
     assert np.isfinite(move).all()
     return RAN
 
@@ -198,11 +234,14 @@ def _joints(env):
     ]
 
 
-KINDS = (make_and_step, make_and_step, act_oddly, act_oddly, begin_oddly, build, look, add_layer)
+KINDS = (
+    *(make_and_step, make_and_step, act_oddly, act_oddly, begin_oddly, begin_oddly),
+    *(build, look, copy_anytime, add_filter),
+)
 
 
 def attempts(seed, folder):
-    """The attempt: a function from a number to what came of odd arguments."""
+    """The attempt: a function from a number to the outcome of odd arguments."""
 
     def attempt(number):
         warnings.simplefilter("ignore")  # NumPy's
