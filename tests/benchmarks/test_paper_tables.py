@@ -157,7 +157,8 @@ def test_an_algorithm_of_ones_own(results, tmp_path):
 def test_imitation_stands_beside_the_papers_encoders(results):
     found = {"success_rate": 0.9, "num_queries": 1000}
     more = {"success_rate": 0.8, "num_queries": 1000}
-    seeds = {"dagger, point_cloud": found, "dagger, point_cloud, seed 2": more, "dagger, point_cloud, no filter": more}
+    observed = "dagger, point_cloud"
+    seeds = {observed: found, f"{observed}, seed 2": more, f"{observed}, no filter": more}
     unseen = {"narrow_shelves": {"dagger, point_cloud": found}, "wall": {"dagger, oracle": found}}
     unseen["pole_shelves"] = seeds
     page = paper_tables.page(list(CELLS.values()), results, BASELINES, unseen)

@@ -64,8 +64,9 @@ def test_tables_between_the_marks_show_the_results(tmp_path, monkeypatch):
     hard[f"{unseen.OBSERVED}, seed 3"] = result(0.91, 0.85)
     results.write_text(json.dumps(found))
     unseen.main()
-    sentence = "`dagger.py` with point clouds, 2 seeds, `random_boxes_hard`: success 0.930, 0.910, so "
-    sentence += "0.920 ± 0.014; collision-free 0.910, 0.850, so 0.880 ± 0.042; of 3,000, 200 test queries."
+    sentence = "`dagger.py` with point clouds, 2 seeds, `random_boxes_hard`: success 0.930, 0.910, "
+    sentence += "so 0.920 ± 0.014; collision-free 0.910, 0.850, so 0.880 ± 0.042; of 3,000, 200 "
+    sentence += "test queries."
     assert sentence in page.read_text().splitlines()
 
 
