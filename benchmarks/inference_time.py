@@ -6,11 +6,11 @@
 Seconds on one core, means over the first test queries of `random_boxes_hard`: rendering the
 sensors' images, and encoding them, once per episode; finding a path, within 5 s, for planners; one
 action; all of an episode but rendering (the paper's total). Queries share scenes, but nothing
-observed for one query serves another. With `--geometry-source`, policies with point clouds are timed
-with points decoded from that encoder's latent code, too. Encoding includes thinning points, decoding, and what
-distances need; an action includes link distances, and a safety filter. RRT-Connect uses ground
-truth, observed points, and decoded points. Nothing else should run beside it. The last line is
-JSON.
+observed for one query serves another. With `--geometry-source`, policies with point clouds are
+timed with points decoded from that encoder's latent code, too. Encoding includes thinning points,
+decoding, and what distances need; an action includes link distances, and a safety filter. RRT-
+Connect uses ground truth, observed points, and decoded points. Nothing else should run beside it.
+The last line is JSON.
 """
 
 import argparse
