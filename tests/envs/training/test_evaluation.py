@@ -1,6 +1,5 @@
-"""evaluate.py: its metrics, its policies, the same numbers however it is run, and its errors."""
+"""Evaluation: metrics, baselines, safety filters, ground truth, the command and its errors."""
 
-import importlib
 import json
 import os
 import subprocess
@@ -14,7 +13,9 @@ import torch
 from paths import ROOT
 from torch import nn
 
-from roboarm_nmp import demo_generation, envs
+import roboarm_nmp
+from roboarm_nmp import envs
+from roboarm_nmp.clean_rl_scripts import evaluate as command
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.envs import panda
@@ -25,11 +26,12 @@ from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.tasks import Task
+from roboarm_nmp.envs.training import evaluation
+from roboarm_nmp.envs.training.evaluation import EvaluationError, evaluate
 
 SCRIPT = ROOT / "clean_rl_scripts" / "evaluate.py"
-sys.path.append(str(SCRIPT.parent))
-evaluation = importlib.import_module("evaluate")
-evaluate = evaluation.evaluate
+HARD = "random_boxes_hard"
+POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +74,7 @@ def _save(path, module=None, goal_size=7, observation_size=10, **metadata):
 
 
 def _numbers(result):
-    """What must not depend on how an evaluation is run."""
+    """The numbers that must not depend on how an evaluation is run."""
     times = ("ms_per_action", "planning_seconds", "planning_seconds_solved")
     return {name: value for name, value in result.items() if name not in times}
 
@@ -80,7 +82,7 @@ def _numbers(result):
 # --- Metrics
 
 
-def test_wilson_interval():
+def test_wilson_interval_equals_values_by_hand():
     # p = 0.8, n = 10, z^2 = 3.84146: centre (0.8 + 0.192073) / 1.384146, half width
     # 1.959964 * sqrt(0.016 + 0.0096036) / 1.384146
     low, high = evaluation.wilson_interval(8, 10)
@@ -90,7 +92,7 @@ def test_wilson_interval():
     assert evaluation.wilson_interval(10, 10) == pytest.approx((0.722467, 1.0), abs=1e-5)
 
 
-def test_path_length_and_smoothness():
+def test_path_length_and_smoothness_equal_values_by_hand():
     configurations = np.zeros((4, 7))
     configurations[:, 0] = [0.0, 3.0, 3.0, 3.0]
     configurations[:, 1] = [0.0, 4.0, 4.0, 6.0]
@@ -103,7 +105,7 @@ def test_path_length_and_smoothness():
     assert evaluation.path_length(straight[:1]) == evaluation.smoothness(straight[:2]) == 0.0
 
 
-def test_metrics_of_an_evaluation_are_those_of_its_episodes(queries):
+def test_metrics_of_an_evaluation_equal_those_of_its_episodes(queries):
     result = evaluate("go-to-goal", "no_obstacles", queries=queries)
     env, rows = envs.make("no_obstacles"), []
     for start, goal in zip(queries.start, queries.goal, strict=True):
@@ -117,11 +119,11 @@ def test_metrics_of_an_evaluation_are_those_of_its_episodes(queries):
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
         rows.append((info["is_success"], info["collision_so_far"], len(path) - 1, length))
     env.close()
-    success, touched, steps, lengths = (np.array(column) for column in zip(*rows, strict=True))
+    success, collides, steps, lengths = (np.array(column) for column in zip(*rows, strict=True))
     assert result["num_queries"] == 40
     assert result["success_rate"] == success.mean() > 0.9
-    assert result["collision_free_success_rate"] == (success & ~touched).mean()
-    assert result["collision_rate"] == touched.mean()
+    assert result["collision_free_success_rate"] == (success & ~collides).mean()
+    assert result["collision_rate"] == collides.mean()
     assert 0 < result["collision_free_success_rate"] < result["success_rate"]
     assert result["mean_steps"] == pytest.approx(steps[success].mean())
     assert result["path_length"] == pytest.approx(lengths[success].mean(), abs=1e-5)
@@ -131,7 +133,7 @@ def test_metrics_of_an_evaluation_are_those_of_its_episodes(queries):
     assert json.loads(json.dumps(result)) == result
 
 
-def test_a_start_at_the_goal_is_a_success_of_no_steps():
+def test_start_at_the_goal_is_a_success_of_no_steps():
     start = np.array([[0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0]], np.float32)
     result = evaluate(
         "go-to-goal", "no_obstacles", queries=SimpleNamespace(start=start, goal=start)
@@ -141,7 +143,7 @@ def test_a_start_at_the_goal_is_a_success_of_no_steps():
     assert result["ms_per_action"] is None
 
 
-def test_stopping_on_collision_leaves_clean_successes_only(queries):
+def test_stop_on_collision_leaves_collision_free_successes_only(queries):
     free = evaluate("go-to-goal", "no_obstacles", queries=queries)
     stopped = evaluate("go-to-goal", "no_obstacles", queries=queries, stop_on_collision=True)
     assert (
@@ -152,10 +154,10 @@ def test_stopping_on_collision_leaves_clean_successes_only(queries):
     assert stopped["collision_rate"] == free["collision_rate"]
 
 
-# --- The same numbers however it is run
+# --- Reproducibility
 
 
-def test_workers_do_not_change_the_result(queries):
+def test_result_does_not_depend_on_the_number_of_workers(queries):
     alone = evaluate("random", "no_obstacles", queries=queries, num_queries=12, seed=3)
     assert alone["success_rate"] == 0 and alone["mean_steps"] is None
     options = {"split": "validation", "num_queries": 30, "seed": 5}
@@ -175,14 +177,14 @@ def test_random_actions_depend_on_seed_and_query_only():
     assert np.abs(actions(1, 4)).max() <= 1
 
 
-def test_a_network_a_function_and_the_baseline_agree(queries, tmp_path):
+def test_network_function_and_baseline_with_the_same_actions_agree(queries, tmp_path):
     def straight(observation):
         return observation["desired_goal"] - observation["observation"][:7]
 
     few = {"queries": queries, "num_queries": 15}
     threads = torch.get_num_threads()
-    baseline = evaluate("go-to-goal", "no_obstacles", "config", **few)
-    function = evaluate(straight, "no_obstacles", "config", **few)
+    baseline = evaluate("go-to-goal", "no_obstacles", goal_type="config", **few)
+    function = evaluate(straight, "no_obstacles", goal_type="config", **few)
     network = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
     folder = evaluate(str(tmp_path), "no_obstacles", **few, workers=2)
     assert torch.get_num_threads() == threads
@@ -194,7 +196,7 @@ def test_a_network_a_function_and_the_baseline_agree(queries, tmp_path):
         assert result["path_length"] == pytest.approx(baseline["path_length"], rel=1e-3)
 
 
-def test_a_network_brings_its_environment_but_not_the_rules(queries, tmp_path):
+def test_network_brings_its_environment_but_not_the_rules(queries, tmp_path):
     class Still(Straight):
         def forward(self, observation, achieved_goal, desired_goal):
             return observation[:, :7] + 0 * observation[:, 14:].sum(1, keepdim=True)
@@ -207,7 +209,7 @@ def test_a_network_brings_its_environment_but_not_the_rules(queries, tmp_path):
     assert result["success_rate"] == 0.0
 
 
-# --- Policies that look before they move
+# --- Baselines that look for a motion
 
 # `wall` is the box from x 0.25 to 0.95, z up to 0.775, at y = 0, 0.04 thick. Stretched out to the
 # front, left and right of it: halfway between the two the hand is at (0.57, 0, 0.25), inside it.
@@ -221,7 +223,7 @@ def _queries(*pairs, **more):
     return SimpleNamespace(start=start, goal=goal, **more)
 
 
-def test_via_points_go_round_the_wall():
+def test_via_points_go_around_the_wall():
     x, y, z = panda.forward_kinematics((LEFT + RIGHT) / 2)
     assert 0.25 < x < 0.95 and abs(y) < 0.02 and 0 < z < 0.775
     behind = _queries((LEFT, RIGHT))
@@ -234,7 +236,7 @@ def test_via_points_go_round_the_wall():
     assert (result["tries"], result["time_limit"]) == (200, None)
 
 
-def test_via_points_go_straight_where_that_is_free_or_nothing_is_found():
+def test_via_points_go_straight_if_that_is_free_or_no_motion_is_found():
     both = _queries((LEFT, HIGHER), (LEFT, RIGHT))
     straight = evaluate("go-to-goal", "wall", queries=both)
     # The one random configuration of this seed is no way to the second goal.
@@ -245,7 +247,7 @@ def test_via_points_go_straight_where_that_is_free_or_nothing_is_found():
     assert 0 < result["planning_seconds_solved"] != result["planning_seconds"]
 
 
-def test_the_planner_solves_double_walls_and_follows_its_plan():
+def test_planner_solves_double_walls_and_follows_its_plan():
     queries = load_queries("double_walls", "validation")[:4]
     straight = evaluate("go-to-goal", "double_walls", queries=queries)
     assert straight["collision_free_success_rate"] < 0.6
@@ -270,73 +272,112 @@ def test_the_planner_solves_double_walls_and_follows_its_plan():
     assert result["path_length"] == pytest.approx(lengths)
 
 
-def test_a_safety_filter_around_a_policy(tmp_path):
-    """`--safety-margin`: fewer touches, and with the way out of dead ends more is reached."""
-    found = {}
+def test_safety_filter_lowers_collisions_and_escapes_raise_success(tmp_path):
+    results = {}
     for name, flags in {
         "bare": [],
         "none": ["--safety-margin", "0"],
-        "layer": ["--safety-margin", "0.01", "--no-escape"],
-        "way out": ["--safety-margin", "0.01"],
-        "points": ["--safety-margin", "0.015", "--encoder", "points"],
+        "filter": ["--safety-margin", "0.01", "--no-escape"],
+        "escape": ["--safety-margin", "0.01"],
+        "points": ["--safety-margin", "0.015", "--geometry-source", "point_cloud"],
     }.items():
-        command = ["--policy", "go-to-goal", "--task", "random_boxes_hard", "--num-queries", "25"]
-        command += ["--split", "validation", "--goal-type", "combined"]
-        assert evaluation.main([*command, *flags, "--json", str(tmp_path / "result.json")]) == 0
-        found[name] = json.loads((tmp_path / "result.json").read_text())
-    assert _numbers(found["none"]) == _numbers(found["bare"])
-    layers = {name: result["safety_filter"] for name, result in found.items()}
-    assert layers["bare"] is layers["none"] is None
-    assert layers["layer"] == {"keep": 0.01, "escape": False, "version": VERSION}
-    assert layers["way out"] == {"keep": 0.01, "escape": True, "version": VERSION}
-    assert layers["points"] == {"keep": 0.015, "escape": True, "version": VERSION}
-    knows = {name: result["env"].get("link_distances") for name, result in found.items()}
-    assert knows == {name: "obstacles" for name in knows} | {
-        "bare": None,
-        "none": None,
-        "points": "points",
-    }
-    assert found["points"]["encoder"] == "points" and found["way out"]["encoder"] is None
-    for name in ("layer", "way out", "points"):
-        assert found[name]["collision_rate"] < 0.6 * found["bare"]["collision_rate"]
-    rates = {name: result["success_rate"] for name, result in found.items()}
-    assert rates["bare"] < rates["layer"] < rates["way out"]
-    own = ["--policy", "dagger-combined-point_cloud-random_boxes_hard-s1", "--task", "wall"]
-    own += ["--num-queries", "1", "--no-escape", "--json", str(tmp_path / "result.json")]
-    assert evaluation.main(own) == 0
-    layer = json.loads((tmp_path / "result.json").read_text())["safety_filter"]
-    assert not layer["escape"] and layer["keep"] > 0
-    assert found["points"]["seed"] == 0 and found["bare"]["seed"] is None
+        arguments = ["--policy", "go-to-goal", "--task", HARD, "--num-queries", "25"]
+        arguments += ["--split", "validation", "--goal-type", "combined"]
+        assert command.main([*arguments, *flags, "--json", str(tmp_path / "result.json")]) == 0
+        results[name] = json.loads((tmp_path / "result.json").read_text())
+    assert _numbers(results["none"]) == _numbers(results["bare"])
+    filters = {name: result["safety_filter"] for name, result in results.items()}
+    assert filters["bare"] is filters["none"] is None
+    assert filters["filter"] == {"margin": 0.01, "escape": False, "version": VERSION}
+    assert filters["escape"] == {"margin": 0.01, "escape": True, "version": VERSION}
+    assert filters["points"] == {"margin": 0.015, "escape": True, "version": VERSION}
+    for name in ("filter", "escape", "points"):
+        assert results[name]["collision_rate"] < 0.6 * results["bare"]["collision_rate"]
+    rates = {name: result["success_rate"] for name, result in results.items()}
+    assert rates["bare"] < rates["filter"] < rates["escape"]
+    assert results["points"]["seed"] == 0 and results["bare"]["seed"] is None
+
+
+def test_no_escape_changes_the_filter_that_a_policy_includes(tmp_path):
+    arguments = ["--policy", POLICY, "--task", "wall", "--num-queries", "1", "--no-escape"]
+    assert command.main([*arguments, "--json", str(tmp_path / "result.json")]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["safety_filter"] == {"margin": 0.01, "escape": False, "version": VERSION}
+
+
+@pytest.mark.parametrize("source", [None, "point_cloud"])
+def test_safety_filter_around_a_network_without_link_distances(tmp_path, source):
+    path = _save(tmp_path / "policy.pt")
+    few = {"split": "validation", "num_queries": 5}
+    bare = evaluate(path, "boxes", **few)
+    assert "link_distances" not in bare["env"] and bare["collision_rate"] > 0
+    result = evaluate(
+        path, "boxes", **few, safety_filter=SafetyFilter(margin=0.01), geometry_source=source
+    )
+    used = {"link_distances": True, "geometry_source": source or "ground_truth"}
+    assert result["env"] == bare["env"] | used
+    assert result["collision_rate"] < bare["collision_rate"]
+
+
+def test_planner_plans_from_the_observed_point_cloud():
+    truth, points = (
+        evaluate("planner", HARD, num_queries=8, split="validation", geometry_source=source)
+        for source in (None, "point_cloud")
+    )
+    assert truth["success_rate"] >= 0.75 and points["success_rate"] >= 0.75
+    assert truth["path_length"] != points["path_length"]
+
+
+# --- Ground truth
+
+FILTER = SafetyFilter(margin=0.01)
 
 
 @pytest.mark.parametrize(
-    "noted", [{}, {"link_distances": None}]
-)  # before and since SAC and TD3 had it
-def test_a_safety_filter_around_a_network_that_has_no_distances(tmp_path, noted):
-    path = _save(tmp_path / "policy.pt", env={"goal_type": "config"} | noted)
-    bare = evaluate(path, "boxes", split="validation", num_queries=5)
-    assert bare["env"].get("link_distances") is None and bare["collision_rate"] > 0
-    for encoder, knows in ((None, "obstacles"), ("points", "points")):
-        layer = SafetyFilter(keep=0.01)
-        result = evaluate(
-            path, "boxes", split="validation", num_queries=5, safety_filter=layer, encoder=encoder
-        )
-        assert result["env"]["link_distances"] == knows
-        assert result["collision_rate"] < bare["collision_rate"]
+    ("policy", "options", "source", "privileged"),
+    [
+        ("go-to-goal", {}, None, False),
+        ("random", {}, None, False),
+        ("sac-ee-wall-p1-s1", {}, None, False),
+        ("bc-combined-oracle-random_boxes_hard-s1", {}, None, True),
+        (POLICY, {}, "point_cloud", False),
+        (POLICY, {"safety_filter": False}, "point_cloud", False),
+        (POLICY, {"geometry_source": "ground_truth"}, "ground_truth", True),
+        (POLICY, {"geometry_source": "field"}, "field", False),
+        ("via-points", {}, "ground_truth", True),
+        ("planner", {}, "ground_truth", True),
+        ("planner", {"geometry_source": "point_cloud"}, "point_cloud", False),
+        # A filter without a geometry source of its own takes the ground truth.
+        ("go-to-goal", {"safety_filter": FILTER}, "ground_truth", True),
+        ("sac-ee-wall-p1-s1", {"safety_filter": FILTER}, "ground_truth", True),
+        ("go-to-goal", {"safety_filter": FILTER, "geometry_source": "field"}, "field", False),
+    ],
+)
+def test_result_and_header_say_whether_ground_truth_was_used(policy, options, source, privileged):
+    result = evaluate(policy, "wall", num_queries=1, **options)
+    assert (result["geometry_source"], result["privileged"]) == (source, privileged)
+    header = command._table(result).splitlines()[0]
+    assert ("geometry source" in header) == (source is not None)
+    assert source is None or f"geometry source {source}" in header
+    assert header.endswith(", privileged") == privileged
 
 
-def test_a_planner_that_looks():
-    """It knows only what is seen; here that is enough, mostly, and its plans are other ones."""
-    results = [
-        evaluate("planner", "random_boxes_hard", num_queries=8, split="validation", encoder=encoder)
-        for encoder in (None, "points")
-    ]
-    assert [result["encoder"] for result in results] == [None, "points"]
-    assert all(result["success_rate"] >= 0.75 for result in results)
-    assert results[0]["path_length"] != results[1]["path_length"]
+def test_points_without_link_distances_are_not_privileged():
+    env = {"encoder": "point_cloud", "num_points": 8}
+    still = {"policy": _no_motion, "task": "wall", "num_queries": 1}
+    result = evaluate(**still, env=env)
+    assert (result["geometry_source"], result["privileged"]) == ("point_cloud", False)
+    result = evaluate(**still, env=env, geometry_source="field")
+    assert (result["geometry_source"], result["privileged"]) == ("field", False)
+    with pytest.raises(EvaluationError, match="geometry_source is for via-points, planner, a safe"):
+        evaluate(**still, env=env, geometry_source="ground_truth")
 
 
-def test_a_planner_without_time_gives_up():
+def _no_motion(observation):
+    return np.zeros(7)
+
+
+def test_planner_without_time_gives_up():
     both = _queries((LEFT, RIGHT), (RIGHT, LEFT))
     result = evaluate("planner", "wall", queries=both, time_limit=1e-6)
     assert result["success_rate"] == result["collision_rate"] == 0
@@ -344,21 +385,20 @@ def test_a_planner_without_time_gives_up():
     assert result["planning_seconds"] > 0 and result["planning_seconds_solved"] is None
 
 
-def test_the_planner_without_ompl(monkeypatch):
+def test_planner_without_ompl_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl", None)
     monkeypatch.delitem(sys.modules, "roboarm_nmp.demo_generation.planning")
-    monkeypatch.delattr(demo_generation, "planning")
     queries = _queries((LEFT, HIGHER))
-    with pytest.raises(evaluation.EvaluationError, match="the policy planner needs OMPL"):
+    with pytest.raises(EvaluationError, match="the policy planner needs OMPL"):
         evaluate("planner", "wall", queries=queries)
     assert evaluate("via-points", "wall", queries=queries)["success_rate"] == 1
 
 
-def test_a_policy_with_longer_steps_is_not_comparable(query_file, tmp_path, capsys):
+def test_policy_with_longer_steps_is_not_comparable(query_file, tmp_path, capsys):
     def run(policy, *flags):
         arguments = ["--task", "no_obstacles", "--queries", query_file, "--num-queries", "3"]
         arguments += ["--policy", policy, "--json", tmp_path / "out.json", *flags]
-        assert evaluation.main([str(argument) for argument in arguments]) == 0
+        assert command.main([str(argument) for argument in arguments]) == 0
         return json.loads((tmp_path / "out.json").read_text()), capsys.readouterr().out
 
     usual = _save(tmp_path / "usual.pt", env={"goal_type": "config", "max_step": 0.03})
@@ -407,7 +447,7 @@ def test_each_query_is_in_its_own_scene(policy, tmp_path):
     assert evaluate(policy, task, queries=alone, tries=1)["collision_free_success_rate"] == 1.0
 
 
-def test_queries_of_a_scene_file(tmp_path):
+def test_queries_of_another_scene_file_are_refused(tmp_path):
     task, path = _write_scenes(tmp_path, Scene(), [Scene(), BLOCKED])
     assert evaluate("go-to-goal", task, split="original", queries=path)["mean_steps"] < 30
     (tmp_path / "other.yaml").write_text(Path(task).read_text())
@@ -418,19 +458,19 @@ def test_queries_of_a_scene_file(tmp_path):
         ((str(tmp_path / "no.yaml"), path), "no.yaml: No such file"),
     ]
     for (other, queries), message in cases:
-        with pytest.raises(evaluation.EvaluationError, match=message):
+        with pytest.raises(EvaluationError, match=message):
             evaluate("go-to-goal", other, queries=queries)
     save_scene(BLOCKED, task)  # after the queries were made
     for queries in (None, path):
-        with pytest.raises(evaluation.EvaluationError, match="out of date: made for another"):
+        with pytest.raises(EvaluationError, match="out of date: made for another"):
             evaluate("go-to-goal", task, queries=queries)
 
 
-def test_random_scenes_are_part_of_a_query(monkeypatch):
+def test_queries_in_random_scenes_need_scenes(monkeypatch):
     scenes = SimpleNamespace(base=Scene(), sample=lambda rng: Scene())
     monkeypatch.setitem(envs.TASKS, "varied", Task(scenes, "scenes that vary"))
     pairs = [(LEFT, RIGHT), (LEFT, RIGHT)]
-    with pytest.raises(evaluation.EvaluationError, match="varied has random scenes: these queries"):
+    with pytest.raises(EvaluationError, match="varied has random scenes: these queries"):
         evaluate("go-to-goal", "varied", queries=_queries(*pairs))
     queries = _queries(*pairs, scenes=[BLOCKED, Scene()])
     assert evaluate("go-to-goal", "varied", queries=queries)["collision_free_success_rate"] == 0.5
@@ -439,29 +479,26 @@ def test_random_scenes_are_part_of_a_query(monkeypatch):
 # --- The command
 
 
-def test_the_command_from_another_folder(query_file, tmp_path):
+def test_command_runs_in_any_folder_with_workers(query_file, tmp_path):
     arguments = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", query_file]
     arguments += ["--num-queries", "12", "--workers", "2"]
-    arguments += ["--json", tmp_path / "out.json", "--picture", tmp_path / "out.png"]
-    path = os.pathsep.join([str(SCRIPT.parents[1]), os.environ.get("PYTHONPATH", "")])
+    arguments += ["--json", tmp_path / "out.json", "--image", tmp_path / "out.png"]
     run = subprocess.run(
-        [sys.executable, SCRIPT, *arguments],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
+        [sys.executable, SCRIPT, *arguments], cwd=tmp_path, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr
     assert "go-to-goal on no_obstacles: 12 test queries" in run.stdout
     result = json.loads((tmp_path / "out.json").read_text())
-    assert f"success {result['success_rate']:>17.4f}" in run.stdout
+    assert f"success {result['success_rate']:>25.4f}" in run.stdout
     assert result["split"] == "test" and result["num_queries"] == 12
     assert set(result["versions"]) == {"python", "pybullet", "torch", "numpy"}
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
     assert sorted(os.listdir(tmp_path)) == ["out.json", "out.png"]
 
 
-def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
+def test_errors_of_the_command_are_one_line_before_any_work(
+    query_file, tmp_path, capsys, monkeypatch
+):
     def never(job, progress):
         raise AssertionError("work was done")
 
@@ -469,8 +506,6 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
     policy = str(_save(tmp_path / "policy.pt"))
     (tmp_path / "broken.pt").write_bytes(Path(policy).read_bytes()[:500])
     encoder = str(_save(tmp_path / "encoder.pt", kind="encoder"))
-    arguments = {"goal_type": "config", "link_distances": "obstacles"}
-    near = str(_save(tmp_path / "near.pt", env=arguments))
     arguments = {"goal_type": "config", "action_mode": "subgoal"}
     subgoal = str(_save(tmp_path / "subgoal.pt", env=arguments))
     unsaid = str(_save(tmp_path / "unsaid.pt", env={}))
@@ -481,14 +516,22 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"policy": str(tmp_path / "empty")}, "no such policy"),
         ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
         ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
-        ({"encoder": "points"}, "encoder is for via-points, planner and a last layer"),
-        ({"policy": near, "safety-margin": "0.1", "encoder": "points"}, "from obstacles, not"),
-        ({"policy": subgoal, "safety-margin": "0.01"}, "a last layer changes displacements"),
-        ({"policy": "go-to-goal", "safety-margin": "0.15"}, "keep must be a distance below 0.15"),
+        ({"geometry-source": "point_cloud"}, "geometry_source is for via-points, planner, a safe"),
+        ({"policy": "planner", "geometry-source": "vae"}, "vae has no decoder"),
+        (
+            {"policy": subgoal, "safety-margin": "0.01"},
+            "a safety filter needs action_mode 'relative'",
+        ),
+        (
+            {"policy": "go-to-goal", "safety-margin": "0.15"},
+            "margin must be in [0, 0.15) m, got 0.15",
+        ),
+        ({"policy": policy, "no-escape": None}, "--no-escape: the policy has no safety filter"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
         ({"task": "moon"}, "unknown task 'moon': one of no_obstacles"),
+        ({"task": "part.stl"}, "scene files are .yaml or .yml (docs/your_own_scene.md), got part"),
         ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),
         ({"queries": str(tmp_path / "no.h5")}, "no.h5"),
         ({"num-queries": "31"}, "num_queries must be 1 to 30, got 31"),
@@ -501,44 +544,56 @@ def test_errors_of_the_command(query_file, tmp_path, capsys, monkeypatch):
         ({"time-limit": "nan"}, "--time-limit must be above 0, and finite, got nan"),
         ({"json": str(tmp_path)}, "is a directory, not a file"),
         ({"json": str(tmp_path / "no such folder" / "a.json")}, "cannot write"),
-        ({"picture": str(tmp_path / "no such folder" / "a.png")}, "cannot write"),
+        ({"image": str(tmp_path / "no such folder" / "a.png")}, "cannot write"),
     ]
     good = {"policy": "go-to-goal", "task": "no_obstacles", "queries": str(query_file)}
     for change, message in cases:
         flags = good | change
-        arguments = [text for name, value in flags.items() for text in (f"--{name}", value)]
-        assert evaluation.main(arguments) == 2, change
+        arguments = [part for name, value in flags.items() for part in (f"--{name}", value) if part]
+        assert command.main(arguments) == 2, change
         output = capsys.readouterr()
         assert output.out == "" and message in output.err
         assert output.err.startswith("evaluate.py: ") and output.err.count("\n") == 1
     with pytest.raises(SystemExit) as stop:
-        evaluation.main(["--policy", "random", "--task", "wall", "--goal-type", "pose"])
+        command.main(["--policy", "random", "--task", "wall", "--goal-type", "pose"])
     assert stop.value.code == 2
 
 
-def test_devices_are_written_to_and_never_replaced(query_file, tmp_path):
+def test_device_files_are_written_to_and_never_replaced(query_file, tmp_path):
     flags = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", str(query_file)]
-    command = [sys.executable, evaluation.__file__, *flags, "--num-queries", "1", "--json"]
-    shown = subprocess.run([*command, "/dev/stdout"], capture_output=True, text=True, check=True)
+    run = [sys.executable, SCRIPT, *flags, "--num-queries", "1", "--json"]
+    shown = subprocess.run([*run, "/dev/stdout"], capture_output=True, text=True, check=True)
     assert json.loads(shown.stdout[shown.stdout.index("{") :])["num_queries"] == 1
     with open(tmp_path / "out.txt", "w") as file:  # the table, and the JSON after it
-        subprocess.run([*command, "/dev/stdout"], stdout=file, check=True)
+        subprocess.run([*run, "/dev/stdout"], stdout=file, check=True)
     text = (tmp_path / "out.txt").read_text()
     assert "success" in text[: text.index("{")] and text.rstrip().endswith("}")
-    full = subprocess.run([*command, "/dev/full"], capture_output=True, text=True)
+    full = subprocess.run([*run, "/dev/full"], capture_output=True, text=True)
     assert full.returncode == 2 and "Traceback" not in full.stderr
     assert full.stderr.rstrip().endswith("cannot write: [Errno 28] No space left on device")
     assert not Path("/dev/stdout").is_file() or Path("/dev/stdout").is_symlink()
 
 
-def test_a_query_that_is_refused_is_named(queries):
+def test_refused_query_is_named(queries):
     goal = queries.goal.copy()
     goal[3] = 7.0
     broken = SimpleNamespace(start=queries.start, goal=goal)
-    with pytest.raises(evaluation.EvaluationError, match="query 3: goal is outside the joint"):
+    with pytest.raises(EvaluationError, match="query 3: goal is outside the joint"):
         evaluate("go-to-goal", "no_obstacles", queries=broken)
 
 
-def test_an_action_that_is_no_number_is_an_error(queries):
-    with pytest.raises(evaluation.EvaluationError, match="query 0: an action is 7 finite numbers"):
+def test_action_that_is_not_finite_is_an_error(queries):
+    with pytest.raises(EvaluationError, match="query 0: an action is 7 finite numbers"):
         evaluate(lambda observation: np.full(7, np.nan), "no_obstacles", queries=queries)
+
+
+def test_options_out_of_range_and_unknown_options_are_refused():
+    for name, value in (("workers", 0), ("tries", 0), ("time_limit", 0.0), ("time_limit", np.inf)):
+        with pytest.raises(EvaluationError, match=f"{name} must be"):
+            evaluate("go-to-goal", "wall", **{name: value})
+    with pytest.raises(TypeError, match="encoder"):
+        evaluate("go-to-goal", "wall", encoder="point_cloud")
+
+
+def test_evaluate_is_available_at_the_top_level(queries):
+    assert roboarm_nmp.evaluate is evaluate
