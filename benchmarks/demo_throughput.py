@@ -4,28 +4,29 @@
     python benchmarks/demo_throughput.py                                  # 3 minutes
     python benchmarks/demo_throughput.py --planner-range 0 --simplify 3   # other options of ours
 
-Ours is `demo_generation.collect.Collector`. On `random_boxes_hard` it is only timed as a whole, new
-scenes and queries included (`--random`), because the plain way has one scene. Both ways get the
-first queries that it draws, its planner seeds, its limits on a plan, its three attempts on a query,
-and the same scene and arm; a demonstration counts if it reaches its goal (0.02 m and 0.05
-normalised) and touched nothing in any physics step. Drawing the queries is not timed: it is the
-same for both (and is in the column "end to end").
+`ours` is `demo_generation.collect.Collector`. On `random_boxes_hard` it is timed alone and end to
+end, with new scenes and queries (`--random`), because the plain way has one scene. On the other
+tasks both ways get the same queries, planner seeds, checks per plan, attempts, scene and arm. A
+demonstration counts if it reaches its goal (0.02 m and 0.05 normalised) without contact in any
+physics step. Sampling the queries takes both ways the same time, and counts in the column "end to
+end" only.
 
-The plain way is what PyBullet's and OMPL's own examples lead to:
+The plain way follows the examples of PyBullet and OMPL:
 
 - world: PyBullet's default physics (1/240 s); the URDF's self-collision switched on, without
-  filters. Link pairs that touch in every configuration or never can (`panda.SELF_COLLISION_PAIRS`
-  has the others) and the base on its table are skipped in Python when contacts are read.
+  filters. Link pairs that always or never collide (those not in `panda.SELF_COLLISION_PAIRS`) and
+  the base on its table are skipped in Python when contacts are read.
 - validity: `resetJointState` joint by joint, `performCollisionDetection`, `getContactPoints`;
-  any overlap is a collision. At the same fraction of the space's diagonal as ours.
+  any overlap is a collision. The resolution is ours, as a fraction of the space's diagonal.
 - plan: RRT-Connect in joint space (rad), then `simplifyMax`.
 - following: the plan, interpolated like ours, is commanded joint by joint with
-  `setJointMotorControl2` and default gains; on to the next point when the arm is within 0.01
-  (normalised) of this one, or after 30 physics steps. It gives up at the first touch.
+  `setJointMotorControl2` and default gains. The next point follows when the arm is within 0.01
+  (normalised) of this one, or after 30 physics steps. A contact ends the attempt.
 
-They take turns in one process, block by block, so that a machine whose speed drifts slows both.
-Seconds are processor time. A rate is all demonstrations by all seconds, because queries differ too
-much for a median over blocks; the interval (90 %) is from resampling the queries.
+The two alternate in one process, block by block, so that a drift of the machine's speed affects
+both. Seconds are processor time. A rate is the number of demonstrations by the sum of seconds,
+because queries differ too much for a median over blocks; the interval (90 %) is from resampling the
+queries.
 
 The last line is JSON.
 """
@@ -54,7 +55,7 @@ from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.envs.utils.random_streams import Stream
 
-# The tasks that the plain way can do: with a fixed scene, and a table and a floor.
+# The tasks for the plain way: those with a fixed scene, a table and a floor.
 FIXED = [
     name for name, task in envs.TASKS.items() if task.trainable and isinstance(task.scene, Scene)
 ]
@@ -73,12 +74,14 @@ def length_of(path):
 
 
 class Ours:
-    """The collector, on given queries; `checks` has the collision checks of each plan, `lengths`
-    the lengths of those that were found."""
+    """The collector on given queries.
+
+    `checks` has the collision checks of each plan, `lengths` the length of each path found.
+    """
 
     def __init__(self, options):
         self.collector = collect.Collector(options)
-        self.collector(0)  # what is compiled at the first call is compiled now
+        self.collector(0)  # compiles
         self.checks, self.lengths = [], []
         self._draw = self.collector.env.sample_query
         self._plan = self.collector.planner.plan
@@ -86,14 +89,14 @@ class Ours:
         self.collector.planner.plan = self._counted
 
     def draw(self, index):
-        """Query `index` as the collector draws it: (start, goal, the random numbers after it)."""
+        """Query `index` of the collector: (start, goal, state of the generator after it)."""
         options = self.collector.options
         rng = np.random.default_rng([options["seed"], Stream.DEMONSTRATIONS, index])
         return *self._draw(rng), rng.bit_generator.state
 
     def _given(self, rng):
         if self._query is None:
-            raise GivenUp  # the collector would go on to another query
+            raise GivenUp  # the collector would continue with another query
         start, goal, rng.bit_generator.state = self._query
         self._query = None
         return start, goal
@@ -173,7 +176,7 @@ class Plain:
         for i in panda.ARM_JOINTS:
             p.resetJointState(self.robot, i, configuration[i], physicsClientId=self.client)
 
-    def touches(self):
+    def in_contact(self):
         """Whether one of the contacts is a collision."""
         for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client):
             body, link, other_link = contact[2:5]
@@ -191,10 +194,10 @@ class Plain:
         self.plan_checks += 1
         self.teleport(state)
         p.performCollisionDetection(physicsClientId=self.client)
-        return not self.touches()
+        return not self.in_contact()
 
     def plan(self, start, goal, seed):
-        """A path (n, 7), rad; None if there was none within the limits."""
+        """A path (n, 7), rad; None if there is none within the limits."""
         self.plan_checks = 0
         deadline = time.monotonic() + TIME_LIMIT
         ou.RNG.setSeed(seed)
@@ -226,7 +229,7 @@ class Plain:
         return path
 
     def follow(self, path):
-        """Whether the arm gets from the start of a path to its end without touching anything."""
+        """Whether the arm follows a path from its start to its end without contact."""
         client, robot = self.client, self.robot
         self.teleport(path[0])
         targets = subgoals(path)[1:]
@@ -235,7 +238,7 @@ class Plain:
                 self.command(i, angle, panda.MAX_TORQUE[i])
             for _ in range(STEP_LIMIT):
                 p.stepSimulation(physicsClientId=client)
-                if self.touches():
+                if self.in_contact():
                     return False
                 joints = p.getJointStates(robot, panda.ARM_JOINTS, physicsClientId=client)
                 state = panda.normalise([joint[0] for joint in joints])
@@ -260,8 +263,11 @@ class Plain:
 
 
 def measure(args, number, progress):
-    """With the collector's `Args`: dict way -> (seconds (n,), solved (n,), checks, length); and the
-    seconds for drawing a query."""
+    """Both ways with the collector's `Args`.
+
+    Returns dict way -> (seconds (n,), solved (n,), checks, length), and the seconds for sampling a
+    query.
+    """
     options = {name: getattr(args, name) for name in collect.OPTIONS}
     ways = {"ours": Ours(options), "plain": Plain(options)}
     seconds, solved = {way: [] for way in ways}, {way: [] for way in ways}

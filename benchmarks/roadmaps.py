@@ -3,14 +3,14 @@
     pip install -c constraints.txt -e .
     python benchmarks/roadmaps.py    # random_boxes_hard, 20 scenes, 1,000 paths followed
 
-Making paths includes everything: sampling the scene, the roadmap, pruning and shortcuts. Seconds
-are the process's own and the wall clock's, which are the same where nothing else runs.
-Lengths are L2 in the normalised space: of the straight motion, of the shortest path in the roadmap
-as it is, and of that path after pruning and shortcuts; all three where the roadmap has a path
-without further search. RRT-Connect's paths (`Planner`, with its defaults) are for some of the same
-queries; it keeps 8 mm, not 15. `agreement` is the mean cosine between labels of two roadmaps of a
-scene that differ in their seed, `agreement_detours` that where the way is more than 1 longer than
-the straight motion: planners that agree can be imitated. The last line is JSON.
+Making paths includes sampling the scene, the roadmap, pruning and shortcuts. Seconds are the
+process's own and the wall clock's, which are the same on an idle machine. Lengths are L2 in the
+normalised space: of the straight motion, of the shortest path in the roadmap, and of that path
+after pruning and shortcuts, all three where the roadmap has a path without further search. Paths of
+`Planner` with its defaults are for some of the same queries; its margin is 8 mm, not 15.
+`agreement` is the mean cosine between labels of two roadmaps of a scene that differ in their seed,
+`agreement_detours` the same where the path is more than 1 longer than the straight motion: planners
+that agree can be imitated. The last line is JSON.
 """
 
 import argparse
@@ -40,7 +40,7 @@ def length_of(path):
 
 
 def along(path):
-    """Points on a path, some 0.02 apart."""
+    """Points on a path, about 0.02 apart."""
     pieces = [
         np.linspace(a, b, 1 + int(np.ceil(np.linalg.norm(b - a) / 0.02)))
         for a, b in zip(path[:-1], path[1:], strict=True)
@@ -71,7 +71,7 @@ def main():
     env, each = envs.make(args.task), args.num // args.scenes
     planner = Planner(env)
     lengths, near, peers, agreements = [], [], [], []
-    outcomes = {"arrived": 0, "touched": 0, "arrived_untouched": 0, "refused": 0}
+    outcomes = {"reached": 0, "collided": 0, "reached_collision_free": 0, "refused": 0}
     for index, (scene, paths) in enumerate(tqdm(made, desc="follow", unit=" scenes")):
         rng = np.random.default_rng([SEED, index])
         chosen = [paths[i] for i in rng.permutation(len(paths))[:each]]
@@ -98,9 +98,9 @@ def main():
             except ValueError:  # start or goal: free for the compiled checks, not for PyBullet
                 outcomes["refused"] += 1
                 continue
-            outcomes["arrived"] += execution.reached
-            outcomes["touched"] += execution.collided
-            outcomes["arrived_untouched"] += execution.reached and not execution.collided
+            outcomes["reached"] += execution.reached
+            outcomes["collided"] += execution.collided
+            outcomes["reached_collision_free"] += execution.reached and not execution.collided
             if i < args.peer / args.scenes:
                 with contextlib.suppress(PlanningError):
                     plan = planner.plan(path[0], path[-1], scene, seed=1)
@@ -110,7 +110,7 @@ def main():
     names = ("straight", "raw", "smoothed")
     result |= dict(zip(names, np.mean(lengths, axis=0).tolist(), strict=True))
     ours, theirs = np.mean(peers, axis=0).tolist() if peers else (None, None)
-    result |= {"planned": len(peers), "same_queries": ours, "rrt_connect": theirs}
+    result |= {"planned": len(peers), "same_queries": ours, "planner": theirs}
     cosines, excess = np.concatenate(agreements).T
     result |= {"agreement": float(np.nanmean(cosines))}
     result |= {"agreement_detours": float(np.nanmean(cosines[excess > 1.0]))}

@@ -257,8 +257,9 @@ def describe(demos):
 
     `steps`, `waypoints` and `path_length` (rad, sum of the joints' L2 displacements) are means;
     `steps_95` is the 95th percentile; `detour` the mean of path length over the straight line's, in
-    the normalised space; `solved` the share of queries that had a demonstration within the allowed
-    attempts.
+    the normalised space; `with_contacts` the number of demonstrations with contacts; `solved` the
+    share of queries with a demonstration within the allowed attempts. The counts of rejected
+    attempts follow.
     """
     moves = np.diff(demos.states.astype(np.float64), axis=0)
     inside = np.ones(len(moves), bool)
@@ -279,7 +280,7 @@ def describe(demos):
         "path_length": float(length_of(moves * (panda.UPPER - panda.LOWER) / 2).mean()),
         "detour": float((length_of(moves) / straight).mean()),
         "waypoints": float(np.diff(demos.plan_offsets).mean()),
-        "collided": int(demos.collided.sum()),
+        "with_contacts": int(demos.collided.sum()),
         "solved": len(demos) / (len(demos) + counts.get("queries_given_up", 0)),
         **counts,
     }
