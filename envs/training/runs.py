@@ -190,6 +190,7 @@ def _say_plainly(run, kind, error, trace):
     if (run / "checkpoint.pt").exists():
         checkpoint = f"--resume {run} continues from the last checkpoint"
     if isinstance(error, KeyboardInterrupt):
+        print(file=sys.stderr)  # ends the line of a progress bar
         exit_interrupted(error, checkpoint or f"{run} has no checkpoint yet")
     if isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
         text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()

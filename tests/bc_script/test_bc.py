@@ -1,4 +1,4 @@
-"""bc.py: its likelihood against torch.distributions, its data by hand, and that it can overfit."""
+"""bc.py: likelihood against torch.distributions, data by hand, overfitting five demonstrations."""
 
 import json
 
@@ -35,7 +35,7 @@ def test_log_likelihood_is_that_of_torch_distributions(num_modes):
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_action_is_the_likeliest_modes_mean():
+def test_action_is_the_most_likely_modes_mean():
     torch.manual_seed(0)
     actor = bc.Actor(bc.Args(goal_type="ee", num_modes=3), 10).eval()
     observation, goal = torch.randn(64, 10), torch.randn(64, 3)
@@ -46,7 +46,7 @@ def test_the_action_is_the_likeliest_modes_mean():
 
 
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
-def test_transitions_are_those_of_the_demonstrations(goal_type):
+def test_transitions_of_demonstrations_by_hand(goal_type):
     demos = load_demos("wall")
     observations, goals, actions, demo_index = bc.transitions(demos, goal_type, num_demos=3)
     assert demo_index.tolist() == [i for i in range(3) for _ in range(len(demos[i].actions))]
@@ -64,7 +64,7 @@ def test_transitions_are_those_of_the_demonstrations(goal_type):
     np.testing.assert_allclose(found, np.array(expected), atol=1e-5)
 
 
-def test_it_overfits_five_demonstrations_and_follows_them(tmp_path, short_episodes):
+def test_policy_overfits_five_demonstrations_and_follows_them(tmp_path, short_episodes):
     flags = (
         "--num-demos 5 --hidden-size 128 --batch-size 128 --total-updates 4000 --eval-every 4000"
     )
@@ -117,5 +117,5 @@ def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path, short_episode
         (["--resume", "nowhere"], "nowhere is no run's folder"),
     ],
 )
-def test_bad_flags(tmp_path, flags, message, capsys):
+def test_bad_flags_are_rejected(tmp_path, flags, message, capsys):
     assert message in refusal("bc", capsys, tmp_path, *flags)

@@ -1,7 +1,7 @@
 """Every trainer of a policy on a GPU, and with the `meta` device in its place.
 
-On that, as on a GPU, tensors of two devices do not mix and `.numpy()` is refused. It takes part in
-no kernel, so tensors of two types in one are looked for separately.
+On that, as on a GPU, tensors of two devices do not mix and `.numpy()` raises. It executes no
+kernels, so a separate test finds tensors of two dtypes in one kernel.
 """
 
 import json
@@ -11,11 +11,11 @@ import torch
 from one_type import OneType
 from trainers import PATHS, TRAINERS, command, run_here
 
-import roboarm_nmp.envs.training.protocol
+from roboarm_nmp.envs.training import protocol
 
 ONCE = "--total-timesteps 60 --horizon 30 --eval-every 30 --learning-starts 15 --num-envs 3"
 ONCE_BC = "--total-updates 2 --eval-every 2"
-SEEING = ["--task", "random_boxes_hard", "--encoder", "oracle", "--goal-type", "combined"]
+ENCODED = ["--task", "random_boxes_hard", "--encoder", "oracle", "--goal-type", "combined"]
 
 
 def flags(trainer):
@@ -23,41 +23,42 @@ def flags(trainer):
     return [*few, "--eval-queries", "1", "--test-queries", "1"]
 
 
-@pytest.mark.parametrize("seeing", [False, True])
+def num_updates(state):
+    """Of a checkpoint."""
+    return state["counts"]["updates"] if "counts" in state else state["progress"]["step"]
+
+
+@pytest.mark.parametrize("encoded", [False, True])
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_update_evaluation_and_resume_on_another_device(
-    trainer, seeing, tmp_path, another_device, short_episodes
+    trainer, encoded, tmp_path, another_device, short_episodes
 ):
-    more = SEEING if seeing else ["--goal-type", "ee"]
-    if seeing and trainer != "bc":
+    more = ENCODED if encoded else ["--goal-type", "ee"]
+    if encoded and trainer != "bc":
         more = [*more, "--demo-prob", "1"]
     run_here(*command(trainer, tmp_path, *flags(trainer), "--device", another_device, *more)[1:])
     (run,) = tmp_path.iterdir()
     state = torch.load(run / "checkpoint.pt", weights_only=True)
-    assert state["progress"]["updates"] > 0
+    assert num_updates(state) > 0
     assert {tensor.device.type for tensor in state["actor"].values()} == {another_device}
     (run / "result.json").unlink()
     longer, steps = ("--total-updates", 4) if trainer == "bc" else ("--total-timesteps", 120)
     run_here(PATHS[trainer], "--resume", run, longer, steps)
     assert json.loads((run / "result.json").read_text())["steps"] == steps
     resumed = torch.load(run / "checkpoint.pt", weights_only=True)
-    assert resumed["progress"]["updates"] > state["progress"]["updates"]
+    assert num_updates(resumed) > num_updates(state)
     assert {tensor.device.type for tensor in resumed["actor"].values()} == {another_device}
 
 
-def test_a_tensor_left_on_the_cpu_is_noticed(tmp_path, another_device, monkeypatch):
-    stack = roboarm_nmp.envs.training.protocol.stack
-    monkeypatch.setattr(
-        roboarm_nmp.envs.training.protocol,
-        "stack",
-        lambda observations, _: stack(observations, "cpu"),
-    )
+def test_tensor_left_on_the_cpu_raises(tmp_path, another_device, monkeypatch):
+    stack = protocol.stack
+    monkeypatch.setattr(protocol, "stack", lambda observations, _: stack(observations, "cpu"))
     with pytest.raises(RuntimeError, match="device"):
         run_here(*command("bc", tmp_path, *flags("bc"), "--device", another_device)[1:])
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_no_kernel_gets_two_types(trainer, tmp_path):
+def test_no_kernel_receives_two_dtypes(trainer, tmp_path):
     given = command(
         trainer, tmp_path, *flags(trainer), "--bf16", *(["True"] if trainer != "bc" else [])
     )[1:]
@@ -65,7 +66,7 @@ def test_no_kernel_gets_two_types(trainer, tmp_path):
         run_here(*given)
 
 
-def test_two_types_are_noticed():
+def test_two_dtypes_in_a_kernel_are_noticed():
     x, norm = torch.zeros(2, 8, dtype=torch.bfloat16), torch.nn.LayerNorm(8)
     linear = torch.nn.Linear(8, 8)
     with OneType():

@@ -1,4 +1,4 @@
-"""What all trainers share: runs, what they leave, kill and resume, bad flags."""
+"""All trainers of policies: their files, interrupted and resumed runs, bad flags."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from trainers import GPU, PATHS, TRAINERS, command, load, refusal, run_here, run
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.demonstrations import demo_path
 from roboarm_nmp.envs.networks.exported_networks import load_network
-from roboarm_nmp.envs.training.protocol import stack
+from roboarm_nmp.envs.training import protocol, runs
 
 
 @pytest.fixture(params=TRAINERS)
@@ -59,7 +59,7 @@ def shared_blocks(trainer):
     return blocks
 
 
-def test_shared_blocks_have_not_drifted_apart():
+def test_shared_blocks_are_the_same_in_all_trainers():
     trainers = {}  # block -> trainer -> lines
     for trainer in PATHS:
         for name, lines in shared_blocks(trainer).items():
@@ -74,7 +74,7 @@ def test_shared_blocks_have_not_drifted_apart():
 # --- Real runs
 
 
-def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run, trainer):
+def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
     result = json.loads((finished_run / "result.json").read_text())
     assert result["steps"] == 1200 and result["num_queries"] == 4
     assert 0 <= result["collision_free_success_rate"] <= result["success_rate"] <= 1
@@ -93,17 +93,17 @@ def test_a_run_leaves_results_policy_and_tensorboard_events(finished_run, traine
     assert "hyperparameters/text_summary" in events.Tags()["tensors"]
 
 
-def test_the_saved_policy_acts_without_the_script(finished_run, trainer):
+def test_saved_policy_acts_without_the_script(finished_run, trainer):
     policy = load_network(finished_run / "policy.pt")
     assert policy.metadata["kind"] == "policy" and policy.metadata["task"] == "no_obstacles"
     env = envs.make(policy.metadata["task"], **policy.metadata["env"])
     observation, _ = env.reset(seed=0)
-    action = policy(**stack([observation], "cpu"))[0].numpy()
+    action = policy(**protocol.stack([observation], "cpu"))[0].numpy()
     assert action.shape == (7,) and np.abs(action).max() <= 0.06
     env.step(action)
 
 
-def test_the_running_average_of_the_policy_is_what_is_saved(tmp_path, trainer, short_episodes):
+def test_running_average_of_the_policy_is_saved(tmp_path, trainer, short_episodes):
     module = load(trainer)
     length = "--total-updates" if trainer == "bc" else "--total-timesteps"
     flags = [length, "600", "--policy-average", "0.01", "--goal-type", "ee"]
@@ -136,7 +136,7 @@ def same(a, b):
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
-def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer, device):
+def test_killed_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(tmp_path, trainer, device):
     whole = run_script(trainer, tmp_path / "whole", "--device", device)
     process = subprocess.Popen(
         command(trainer, tmp_path / "killed", "--device", device),
@@ -151,7 +151,7 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer,
     killed = next((tmp_path / "killed").iterdir())
     assert not (killed / "result.json").exists()
     left = killed / ".checkpoint.pt.0123abcd.tmp"
-    left.write_bytes(b"half a checkpoint")  # must not be read
+    left.write_bytes(b"half a checkpoint")
 
     done = subprocess.run(
         [sys.executable, PATHS[trainer], "--resume", killed], capture_output=True, text=True
@@ -163,16 +163,62 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(tmp_path, trainer,
     assert results[0]["success_rate"] == results[1]["success_rate"]
 
 
-@pytest.mark.parametrize("stop, steps", [(None, 1200), (1.0, 600)])
-def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps):
-    success = {"success_rate": 1.0, "collision_free_success_rate": 1.0}
-    monkeypatch.setattr("roboarm_nmp.envs.training.protocol.evaluate", lambda *_: success)
-    flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
-    if stop is not None:
-        flags += ["--stop-at-success", stop]
-    run_here(*flags)
-    (result,) = tmp_path.glob("*/result.json")
-    assert json.loads(result.read_text())["steps"] == steps
+def signal_at(monkeypatch, step, number):
+    """Send this process a signal when a run has made `step` steps."""
+    advance = runs.Run.advance
+
+    def advance_and_signal(run, count=1):
+        done = advance(run, count)
+        if done == step:
+            os.kill(os.getpid(), number)
+        return done
+
+    monkeypatch.setattr(runs.Run, "advance", advance_and_signal)
+
+
+def interrupted_run(trainer, folder, capsys):
+    """The folder of a run that a signal ends, its exit code and its last line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        run_here(*command(trainer, folder)[1:])
+    (run,) = folder.iterdir()
+    return run, end.value.code, capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGTERM, 143, "terminated"), (signal.SIGINT, 130, "inter")]
+)
+def test_signal_between_evaluations_ends_in_a_checkpoint(
+    tmp_path, monkeypatch, capsys, trainer, number, code, word
+):
+    with monkeypatch.context() as patch:
+        signal_at(patch, 702, number)
+        run, ended, line = interrupted_run(trainer, tmp_path / "stopped", capsys)
+    assert ended == code and line.startswith(word)
+    assert "702; --resume" in line and str(run) in line
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    assert state["progress"]["step"] == 702
+    if trainer != "bc":  # transitions of running episodes are kept
+        assert len(state["buffer"]["arrays"]["remaining"]) == 702
+    run_here(PATHS[trainer], "--resume", run)
+    assert json.loads((run / "result.json").read_text())["steps"] == 1200
+    if trainer == "bc":  # it has no episodes, so its numbers stay the same
+        whole = run_script(trainer, tmp_path / "whole")
+        same(*(torch.load(one / "checkpoint.pt", weights_only=True) for one in (whole, run)))
+
+
+def test_signal_during_an_evaluation_ends_it_at_once(tmp_path, monkeypatch, capsys, trainer):
+    def evaluate(*_):
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise AssertionError("the evaluation went on")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(protocol, "evaluate", evaluate)
+        run, code, line = interrupted_run(trainer, tmp_path, capsys)
+    assert code == 143 and "600; --resume" in line
+    assert not (run / "policy.pt").exists()
+    run_here(PATHS[trainer], "--resume", run)
+    assert json.loads((run / "result.json").read_text())["policy_step"] == 1200
 
 
 # --- Bad input
@@ -194,10 +240,10 @@ def test_a_run_stops_at_success_only_if_asked(tmp_path, monkeypatch, stop, steps
             ["--demo-prob", "1", "--demos", str(demo_path("wall"))],
             "this file is for the task 'wall', not 'no_obstacles'",
         ),
-        (["--demos", "some.h5"], "--demos goes with --demo-prob"),
+        (["--demos", "demos.h5"], "--demos goes with --demo-prob"),
     ],
 )
-def test_bad_flags(tmp_path, flags, message, capsys):  # refused in a shared block
+def test_bad_flags_are_rejected(tmp_path, flags, message, capsys):  # by a shared block
     assert message in refusal("sac_her_mp", capsys, tmp_path, *flags)
 
 
@@ -209,13 +255,13 @@ def test_bad_flags(tmp_path, flags, message, capsys):  # refused in a shared blo
         ("bc", ["--learning-rate", "1e30"]),
     ],
 )
-def test_a_diverged_run_ends(name, flags, tmp_path):
+def test_diverged_run_ends(name, flags, tmp_path):
     with pytest.raises(FloatingPointError, match="the policy's actions are no longer finite"):
         run_here(*command(name, tmp_path, *flags)[1:])
     assert not list(tmp_path.glob("*/policy.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
 
 
-def test_resuming_refuses_another_configuration_and_a_damaged_checkpoint(
+def test_resuming_with_other_flags_or_a_damaged_checkpoint_is_rejected(
     finished_run, tmp_path, trainer
 ):
     resume = [sys.executable, PATHS[trainer], "--resume", finished_run]

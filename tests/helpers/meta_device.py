@@ -1,8 +1,8 @@
-"""PyTorch's `meta` device in CUDA's place: it refuses to mix with the CPU, as a GPU would.
+"""PyTorch's `meta` device in CUDA's place: its tensors do not mix with the CPU's.
 
-Its tensors have no contents. What a program asks of a GPU explicitly (`item`, `tolist`, `cpu`) is
-answered with ones; `.numpy()`, and an operation on tensors of two devices, raise as on a GPU.
-It has no kernels, so that mixed dtypes in one go unnoticed.
+They have no contents. Explicit transfers (`item`, `tolist`, `cpu`) return ones; `.numpy()`, and an
+operation on tensors of two devices, raise as on a GPU. It has no kernels, so it does not notice
+mixed dtypes in one.
 """
 
 import contextlib

@@ -1,13 +1,13 @@
-"""A check that no kernel gets floating-point tensors of two types, as it would on a GPU."""
+"""A check that no kernel receives floating-point tensors of two dtypes, which CUDA's reject."""
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 
 class OneType(TorchDispatchMode):
-    """Refuses floating-point tensors of two types in one kernel, as many of CUDA's do.
+    """Rejects floating-point tensors of two dtypes in one kernel, as many of CUDA's do.
 
-    It is asked about what really runs, autocast's casts done and gradients included.
+    It checks the executed kernels: after autocast's casts, gradients included.
     """
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):

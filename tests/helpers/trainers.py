@@ -2,6 +2,7 @@
 
 import importlib.util
 import runpy
+import signal
 import sys
 from unittest.mock import patch
 
@@ -15,7 +16,7 @@ PATHS = {
     "bc": ROOT / "bc_script" / "bc.py",
     "dagger": ROOT / "bc_script" / "dagger.py",
 }
-# Those that need nothing but a task; dagger.py needs roadmap paths.
+# Trainers that need only a task; dagger.py needs roadmap paths.
 TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
 GPU = pytest.param("cuda", marks=NO_GPU)  # a `--device`
@@ -23,7 +24,7 @@ TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-start
 TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1200"
 TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --eval-queries 3"
 TINY_BC += " --test-queries 4 --total-updates 1200"
-TINY_DAGGER = "--hidden-size 16 --token-size 16 --num-blocks 1 --batch-size 16 --pool-size 100"
+TINY_DAGGER = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --pool-size 100"
 TINY_DAGGER += " --examples-per-update 10 --total-updates 40 --round-every 15 --round-queries 1"
 TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1"
 
@@ -44,29 +45,32 @@ def command(trainer, folder, *flags):
 
 
 def run_script(trainer, folder, *flags):
-    """The folder of such a run, which is made in this process: without seconds of imports."""
+    """The folder of such a run, made in this process, which saves seconds of imports."""
     run_here(*command(trainer, folder, *flags)[1:])
     return next(folder.iterdir())
 
 
 def run_here(script, *arguments):
-    """A script in this process, so that what it imports can be changed first.
+    """Run a script in this process, so that a test can patch its imports.
 
-    It leaves torch's settings as they were.
+    Settings of torch and signal handlers are restored.
     """
     state, threads = torch.get_rng_state(), torch.get_num_threads()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     argv = patch.object(sys, "argv", [str(script), *map(str, arguments)])
     with argv, patch.object(sys, "excepthook", sys.excepthook):
         try:
             runpy.run_path(str(script), run_name="__main__")
         finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
             torch.use_deterministic_algorithms(False)
             torch.set_num_threads(threads)
             torch.set_rng_state(state)
 
 
 def refusal(trainer, capsys, folder, *flags):
-    """What such a run says of flags with which it ends before it has made anything."""
+    """The message of such a run that rejects its flags before it has made a file."""
     with pytest.raises(SystemExit) as end:
         run_here(*command(trainer, folder, *flags)[1:])
     assert end.value.code not in (None, 0) and not list(folder.iterdir())

@@ -1,6 +1,8 @@
-"""envs/training/protocol.py: what trainers count, and under which rules. (Whole runs: test_trainers.py.)"""
+"""envs/training/protocol.py: results and rules of evaluations. (Whole runs: test_trainers.py.)"""
 
 import json
+import signal
+import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -15,6 +17,28 @@ from roboarm_nmp.envs.networks.exported_networks import load_network, save_netwo
 from roboarm_nmp.envs.policies.registry import PolicyError, make_policy
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.training import protocol
+
+
+@dataclass
+class Flags(protocol.PolicyFlags):
+    goal_type: str = "config"
+    exp_name: str = "x"
+
+
+@pytest.fixture(autouse=True)
+def restored(monkeypatch):
+    """What a run sets for its process."""
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def a_run(folder, env_arguments, eval_envs, task="no_obstacles", validation=()):
+    """A `PolicyRun` without anything to train."""
+    args = Flags(task=task, runs_dir=folder / "runs")
+    return protocol.PolicyRun(args, {}, "cpu", env_arguments, eval_envs, validation)
 
 
 class Toward(torch.nn.Module):
@@ -120,16 +144,16 @@ def test_a_memory_is_fresh_in_every_episode_and_the_same_by_name(tmp_path):
     success, steps = np.mean(outcomes, axis=0)
     assert found["success_rate"] == success and found["episode_length"] == steps
 
-    args = SimpleNamespace(task="wall", exp_name="hesitant", seed=1)
-    protocol.save_policy(tmp_path, policy, several, "cpu", args, arguments, 7)
-    saved = load_network(tmp_path / "policy.pt")
+    run = a_run(tmp_path, arguments, several, task="wall")
+    run.save_policy(policy)
+    saved = load_network(run.folder / "policy.pt")
     assert saved.metadata["memory"] == 8 and "memory" in saved.inputs
     assert protocol.evaluate(saved, several, queries, "cpu") == found
     picture = protocol.rollout_image(saved, several[0], queries[0], "cpu", frames=3)
     assert (
         picture == protocol.rollout_image(policy, several[0], queries[0], "cpu", frames=3)
     ).all()
-    result = evaluate(tmp_path, "wall", split="validation", num_queries=5)
+    result = evaluate(run.folder, "wall", split="validation", num_queries=5)
     assert result["success_rate"] == success
     reached = [steps for success, steps in outcomes if success]
     assert result["mean_steps"] == pytest.approx(np.mean(reached))
@@ -178,36 +202,47 @@ def test_a_file_whose_memory_is_not_what_it_returns(tmp_path):
             make_policy(path, env)
 
 
-def test_of_equally_good_policies_the_latest_is_the_best(monkeypatch):
+def test_latest_of_equally_good_policies_is_the_best(tmp_path, monkeypatch):
     rates = iter([0.5, 0.7, 0.6, 0.7, 0.2])
     monkeypatch.setattr(protocol, "evaluate", lambda *_: {"success_rate": next(rates)})
-    monkeypatch.setattr(protocol, "rollout_image", lambda *_: None)
-    writer = SimpleNamespace(add_scalar=lambda *_: None, add_image=lambda *_, **__: None)
-    progress, best = {"best_success": -1.0, "best_step": 0}, []
-    for step in range(1, 6):
-        protocol.validate(None, [None], [None], "cpu", writer, step, progress)
-        best.append((progress["best_step"], progress["best_success"]))
-    assert best == [(1, 0.5), (2, 0.7), (2, 0.7), (4, 0.7), (4, 0.7)]
+    monkeypatch.setattr(protocol, "rollout_image", lambda *_: np.zeros((2, 2, 3), np.uint8))
+    run = a_run(tmp_path, {}, [None], validation=[None])
+    run.start(5, "step")
+    found = []
+    for _ in range(5):
+        run.advance()
+        is_best = run.validate(None)
+        found.append((is_best, run.best_step, run.best_score))
+    run.close()
+    assert found == [
+        (True, 1, 0.5),
+        (True, 2, 0.7),
+        (False, 2, 0.7),
+        (True, 4, 0.7),
+        (False, 4, 0.7),
+    ]
 
 
-def result_of(run, capsys, **env_arguments):
+def result_of(tmp_path, capsys, **env_arguments):
     """`result.json` and the printed lines for a policy that needs more than 50 steps."""
-    args = SimpleNamespace(task="no_obstacles", goal_type="config", exp_name="x", seed=1)
     env_arguments |= {"goal_type": "config"}
-    made = protocol.make_eval_envs(args.task, 3, **env_arguments)
-    protocol.save_policy(run, Toward(0.01), made, "cpu", args, env_arguments, 7)
-    queries = load_queries("no_obstacles", "test")[:3]
-    progress = {"seconds": 2.0, "best_success": 0.5, "best_step": 7}
-    protocol.final_test(run, args, env_arguments, queries, "cpu", progress, 10)
-    return json.loads((run / "result.json").read_text()), capsys.readouterr().out
+    made = protocol.make_eval_envs("no_obstacles", 3, **env_arguments)
+    run = a_run(tmp_path, env_arguments, made)
+    run.start(10, "step")
+    run.advance(7)
+    run.is_best(0.5)
+    run.save_policy(Toward(0.01))
+    run.advance(3)
+    run.checkpoint()
+    run.final_test(load_queries("no_obstacles", "test")[:3])
+    return json.loads((run.folder / "result.json").read_text()), capsys.readouterr().out
 
 
-def test_the_test_is_run_under_the_standard_rules(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(protocol, "asdict", vars)
+def test_final_test_is_run_under_the_standard_rules(tmp_path, capsys):
     standard, line = result_of(tmp_path, capsys)
     assert standard["success_rate"] > 0.5 and standard["episode_length"] > 50
     assert standard["rules"] == standard["rules_in_training"]
-    assert (standard["policy_step"], standard["steps"], standard["seconds"]) == (7, 10, 2)
+    assert (standard["policy_step"], standard["steps"], standard["seconds"]) == (7, 10, 0)
     assert standard["validation_success_rate"] == 0.5
     assert "trained with" not in line and "3 test queries: success" in line
     assert standard["deviations"] == {} and "not comparable" not in line
@@ -220,8 +255,7 @@ def test_the_test_is_run_under_the_standard_rules(tmp_path, capsys, monkeypatch)
         assert "tested under the standard rules, 400 steps, contacts allowed:" in lines
 
 
-def test_other_steps_are_not_comparable(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(protocol, "asdict", vars)
+def test_result_with_other_step_lengths_is_marked_as_not_comparable(tmp_path, capsys):
     result, lines = result_of(tmp_path, capsys, max_step=0.02)
     assert result["deviations"] == {"max_step": 0.02}
     assert "not comparable: max_step is 0.02, not 0.03" in lines

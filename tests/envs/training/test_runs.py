@@ -1,9 +1,12 @@
-"""envs/training/runs.py: flags of a run, what a checkpoint brings back. (Whole runs: test_trainers.py.)"""
+"""envs/training/runs.py: flags, checkpoints, logs, signals. (Whole runs: test_trainers.py.)"""
 
 import contextlib
 import io
 import json
+import math
+import os
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -31,8 +34,13 @@ class Args(runs.RunFlags):
 
 
 @pytest.fixture(autouse=True)
-def own_excepthook(monkeypatch):
+def restored(monkeypatch):
+    """What a run sets for its process."""
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture
@@ -44,9 +52,9 @@ def parse(monkeypatch):
     return parse
 
 
-def test_flags_come_back_as_they_were(parse, tmp_path):
+def test_flags_are_restored_by_resume(parse, tmp_path):
     flags = ["--runs-dir", tmp_path, "--data", "a.h5", "--files", "b.h5", "c.h5", "--name", "x"]
-    args = parse(*flags, "--radii", "0.3", "0.5", "--threads", "2")
+    args = parse(*flags, "--radii", "0.3", "0.5")
     run = runs.run_folder(args, "wall")
     assert run.parent == tmp_path and run.name.startswith("wall__test__1__")
     again = parse("--resume", run)
@@ -54,8 +62,8 @@ def test_flags_come_back_as_they_were(parse, tmp_path):
     args.resume = run
     assert again == args
     assert isinstance(again.data, Path) and all(isinstance(file, Path) for file in again.files)
-    changed = parse("--resume", run, "--steps", "20", "--data", "d.h5", "--threads", "3")
-    assert (changed.steps, changed.data, changed.threads) == (20, Path("d.h5"), 3)
+    changed = parse("--resume", run, "--steps", "20", "--data", "d.h5")
+    assert (changed.steps, changed.data) == (20, Path("d.h5"))
 
 
 @pytest.mark.parametrize(
@@ -67,13 +75,13 @@ def test_flags_come_back_as_they_were(parse, tmp_path):
         (["--seed", "2", "--exp-name", "z"], "--seed is 2 now, .*; --exp-name is 'z'"),
     ],
 )
-def test_a_run_is_not_resumed_as_another(parse, tmp_path, flags, message):
+def test_resuming_with_another_flag_is_rejected(parse, tmp_path, flags, message):
     run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
     with pytest.raises(SystemExit, match=message):
         parse("--resume", run, *flags)
 
 
-def test_a_run_older_than_a_flag_has_its_default(parse, tmp_path):
+def test_run_without_a_newer_flag_resumes_with_its_default(parse, tmp_path):
     run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
     saved = json.loads((run / "args.json").read_text())
     del saved["radii"]
@@ -83,7 +91,7 @@ def test_a_run_older_than_a_flag_has_its_default(parse, tmp_path):
         parse("--resume", run, "--radii", "0.3", "0.4")
 
 
-def test_no_run_and_no_gpu(parse, tmp_path, monkeypatch):
+def test_missing_run_or_gpu_is_rejected(parse, tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match="is no run's folder"):
         parse("--resume", tmp_path)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
@@ -96,7 +104,7 @@ def test_no_run_and_no_gpu(parse, tmp_path, monkeypatch):
         parse("--device", "cuda:2")
 
 
-def test_what_is_decided_about_bfloat16_is_kept(parse, tmp_path, monkeypatch):
+def test_resumed_run_keeps_its_choice_of_bfloat16(parse, tmp_path, monkeypatch):
     @dataclass
     class WithBf16(Args):
         bf16: bool | None = None
@@ -123,7 +131,7 @@ def parts():
         "optimizer": torch.optim.Adam(model.parameters(), lr=0.1, fused=True),
         "alpha": torch.zeros(1, requires_grad=True),
         "rng": np.random.default_rng(0),
-        "progress": {"updates": 0, "best": {}},
+        "counts": {"updates": 0, "best": {}},
     }
 
 
@@ -136,12 +144,12 @@ def learn(parts):
     parts["optimizer"].step()
     with torch.no_grad():
         parts["alpha"] += 1
-    parts["progress"]["updates"] += 1
-    parts["progress"]["best"] = {"loss": loss.item()}
+    parts["counts"]["updates"] += 1
+    parts["counts"]["best"] = {"loss": loss.item()}
     return loss.item()
 
 
-def test_a_checkpoint_brings_every_part_back(parse, tmp_path):
+def test_checkpoint_restores_every_part(parse, tmp_path):
     args = parse("--runs-dir", tmp_path)
     run = runs.run_folder(args, "wall")
     runs.seed_torch(args)
@@ -155,11 +163,11 @@ def test_a_checkpoint_brings_every_part_back(parse, tmp_path):
     args = parse("--resume", run)
     after = parts()
     runs.load_checkpoint(args, after)
-    assert after["progress"]["updates"] == 1 and after["alpha"].requires_grad
+    assert after["counts"]["updates"] == 1 and after["alpha"].requires_grad
     assert [learn(after) for _ in range(3)] == expected
     for newer, name in (
         ({"critic": torch.nn.Linear(1, 1)}, "critic"),
-        ({"progress": {"updates": 0, "best_step": 0}}, "best_step"),
+        ({"counts": {"updates": 0, "best_step": 0}}, "best_step"),
     ):
         with pytest.raises(SystemExit, match=f"of another version: it has no {name}"):
             runs.load_checkpoint(args, after | newer)
@@ -167,7 +175,7 @@ def test_a_checkpoint_brings_every_part_back(parse, tmp_path):
         runs.load_checkpoint(args, after | {"model": torch.nn.Linear(4, 2)})
 
 
-def test_the_random_numbers_of_the_runs_own_gpu(parse, tmp_path, monkeypatch):
+def test_random_numbers_of_the_runs_gpu_are_restored(parse, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
     states, given = {"cuda:0": torch.tensor([3]), "cuda:1": torch.tensor([7])}, []
@@ -179,7 +187,7 @@ def test_the_random_numbers_of_the_runs_own_gpu(parse, tmp_path, monkeypatch):
     assert given == [(torch.tensor([7]), "cuda:1")]
 
 
-def test_files_are_found_from_another_folder(parse, tmp_path, monkeypatch):
+def test_files_are_found_from_another_working_directory(parse, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     (tmp_path / "there").mkdir()
     monkeypatch.chdir(tmp_path / "here")
@@ -192,10 +200,10 @@ def test_files_are_found_from_another_folder(parse, tmp_path, monkeypatch):
     args = parse("--resume", run)
     assert args.data == tmp_path / "here" / "a.h5"
     assert args.name == str(tmp_path / "here" / "mine.yaml")
-    assert args.files == (Path("missing.h5"),)  # whoever reads it says that it is missing
+    assert args.files == (Path("missing.h5"),)  # its reader reports it
 
 
-def test_what_a_kill_has_left_is_cleared_away(parse, tmp_path):
+def test_leftovers_of_a_kill_are_removed(parse, tmp_path):
     run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
     left = run / ".checkpoint.pt.0123abcd.tmp"
     left.write_text("half of one")
@@ -210,10 +218,10 @@ def test_what_a_kill_has_left_is_cleared_away(parse, tmp_path):
 
 
 SCRIPT = """
-import resource, signal, sys
+import os, resource, signal, sys
 from dataclasses import dataclass
 import torch
-from envs import runs
+from roboarm_nmp.envs.training import runs
 
 @dataclass
 class Args(runs.RunFlags):
@@ -226,8 +234,15 @@ runs.save_checkpoint(run, {"numbers": numbers}, "cpu")
 """
 
 
+def script(folder, code):
+    """A process that runs `SCRIPT` and `code`, when it has ended; and its run's folder."""
+    command = [sys.executable, "-c", SCRIPT + code, "--runs-dir", folder]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    return ended, min(folder.iterdir())
+
+
 @pytest.mark.parametrize(
-    ("happening", "said"),
+    ("code", "message"),
     [
         (
             "resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900))\nsave()",
@@ -235,29 +250,70 @@ runs.save_checkpoint(run, {"numbers": numbers}, "cpu")
         ),
         ("torch.zeros(10**15)", "error: out of memory .+"),
         ("bytearray(10**15)", "error: out of memory"),
-        ("raise KeyboardInterrupt", "interrupted"),
     ],
 )
-def test_what_is_no_mistake_of_the_program_is_said_plainly(tmp_path, happening, said):
+def test_errors_that_are_no_mistake_of_the_program_get_a_line(tmp_path, code, message):
     save = "def save():\n    runs.save_checkpoint(run, {'numbers': numbers + 1}, 'cpu')\n"
-    command = [sys.executable, "-c", SCRIPT + save + happening, "--runs-dir", tmp_path]
-    ended = subprocess.run(command, capture_output=True, text=True)
-    run = next(tmp_path.iterdir())
+    ended, run = script(tmp_path, save + code)
     lines = ended.stderr.strip().splitlines()
     assert ended.returncode != 0 and "Traceback" not in ended.stderr
-    assert re.fullmatch(said, lines[-2])
-    assert lines[-1] == f"what the last checkpoint has is safe: --resume {run} goes on from there"
+    assert re.fullmatch(message, lines[-2])
+    assert lines[-1] == f"--resume {run} continues from the last checkpoint"
     assert {path.name for path in run.iterdir()} == {"args.json", "checkpoint.pt"}
     assert not torch.load(run / "checkpoint.pt", weights_only=True)["numbers"].any()
 
 
-def test_other_mistakes_keep_their_traceback(tmp_path):
-    command = [sys.executable, "-c", SCRIPT + "1 / 0", "--runs-dir", tmp_path]
-    ended = subprocess.run(command, capture_output=True, text=True)
+def test_other_errors_keep_their_traceback(tmp_path):
+    ended, _ = script(tmp_path, "1 / 0")
     assert "Traceback" in ended.stderr and "ZeroDivisionError" in ended.stderr
 
 
-def test_a_checkpoint_of_a_damaged_file_says_which(parse, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted")]
+)
+def test_signal_outside_the_loop_ends_a_run_with_a_line(tmp_path, number, code, word):
+    kill = f"os.kill(os.getpid(), signal.{number})"
+    ended, run = script(tmp_path, kill)
+    assert ended.returncode == code
+    line = f"{word}; --resume {run} continues from the last checkpoint"
+    assert ended.stderr.splitlines()[-1] == line and "Traceback" not in ended.stderr
+
+
+LOOP = """
+run = runs.Run(args, "wall", {"numbers": numbers}, "cpu")
+run.start(10, "update")
+while run.step < 10:
+    run.advance()
+    numbers += 1
+    if run.step == 3:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert run.interrupted  # and this step is completed
+        %s
+    if run.interrupted:
+        run.checkpoint()
+    assert run.step <= 3
+"""
+
+
+def test_signal_in_the_loop_ends_a_run_in_a_checkpoint(tmp_path):
+    ended, _ = script(tmp_path, LOOP % "pass")
+    run = sorted(tmp_path.iterdir())[-1]
+    assert ended.returncode == 143
+    line = f"terminated; checkpoint at update 3; --resume {run} continues there"
+    assert ended.stderr.splitlines()[-1] == line
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    assert state["progress"]["step"] == 3 and (state["numbers"] == 3).all()
+
+
+def test_second_signal_ends_a_run_at_once(tmp_path):
+    ended, _ = script(tmp_path, LOOP % "os.kill(os.getpid(), signal.SIGTERM)")
+    run = sorted(tmp_path.iterdir())[-1]
+    assert ended.returncode == 143
+    assert ended.stderr.splitlines()[-1] == f"terminated; {run} has no checkpoint yet"
+    assert not (run / "checkpoint.pt").exists()
+
+
+def test_damaged_checkpoint_is_rejected_by_name(parse, tmp_path):
     run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
     args = parse("--resume", run)
     runs.load_checkpoint(args, parts())  # stopped before the first checkpoint
@@ -279,7 +335,7 @@ def test_a_checkpoint_of_a_damaged_file_says_which(parse, tmp_path):
     assert unnoticed < 50
 
 
-def test_events_of_steps_that_are_done_again_are_hidden(parse, tmp_path):
+def test_events_of_repeated_steps_are_hidden(parse, tmp_path):
     args = parse("--runs-dir", tmp_path)
     run = runs.run_folder(args, "wall")
     for begin, end in ((0, 4), (2, 5)):  # stopped after step 4, its checkpoint was of step 2
@@ -294,7 +350,7 @@ def test_events_of_steps_that_are_done_again_are_hidden(parse, tmp_path):
     assert "|radii|(0.1, 0.2)|" in table
 
 
-def test_tracking_with_weights_and_biases(parse, tmp_path, monkeypatch):
+def test_track_logs_to_weights_and_biases(parse, tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"--track: wandb is not installed \(pip install wandb\)"):
         parse("--track")
     (tmp_path / "wandb.py").write_text("calls = []\ndef init(**kw): calls.append(kw)\n")
@@ -311,3 +367,77 @@ def test_tracking_with_weights_and_biases(parse, tmp_path, monkeypatch):
     assert call["sync_tensorboard"] and call["id"] == run.name and call["resume"] == "allow"
     assert (call["config"]["data"], call["config"]["steps"]) == ("a.h5", 10)
     json.dumps(call)  # plain values only
+
+
+def begin(parse, tmp_path, *flags):
+    """A `Run` and its parts."""
+    args, changing = parse("--runs-dir", tmp_path, *flags), parts()
+    return runs.Run(args, "wall", changing, torch.device("cpu")), changing
+
+
+def test_run_continues_with_step_time_and_best_evaluation(parse, tmp_path, monkeypatch):
+    run, changing = begin(parse, tmp_path)
+    run.start(10, "update")
+    assert (run.step, run.best_step, run.best_score, run.best_result) == (0, 0, -math.inf, {})
+    assert run.advance() == 1 and run.is_best(0.5, {"error": 2.0})
+    assert run.advance(3) == 4 and not run.is_best(0.4)
+    expected = learn(changing)
+    run._bar.start_t -= 100.0  # as if that had taken so long
+    run.checkpoint()
+    run.close()
+    learn(changing)
+
+    resumed, again = begin(parse, tmp_path, "--resume", run.folder)
+    assert resumed.folder == run.folder and resumed.step == 4
+    assert (resumed.best_step, resumed.best_score) == (1, 0.5)
+    assert resumed.best_result == {"error": 2.0} and 100 <= resumed.seconds < 110
+    assert again["counts"]["best"]["loss"] == expected
+    resumed.start(10, "update")
+    resumed.advance()
+    resumed.checkpoint()
+    assert 100 < resumed.seconds < 115
+    resumed.close()
+
+
+def test_equal_score_is_the_best_and_nan_never(parse, tmp_path):
+    run, _ = begin(parse, tmp_path)
+    run.start(10, "update")
+    found = []
+    for score in (math.nan, 0.5, 0.7, 0.6, 0.7, math.nan):
+        run.advance()
+        found.append(run.is_best(score))
+    run.close()
+    assert found == [False, True, True, False, True, False]
+    assert (run.best_step, run.best_score) == (5, 0.7)
+
+
+def test_log_writes_numbers_and_means_of_tensors(parse, tmp_path):
+    run, _ = begin(parse, tmp_path)
+    run.start(10, "update")
+    run.advance(7)
+    run.log({"losses/a": torch.tensor([1.0, 4.0]), "charts/b": 3})
+    run.log({"charts/b": np.float64(5.0)}, step=6)
+    run.log_image("eval/image", np.zeros((4, 6, 3), np.uint8))
+    run.close()
+    events = EventAccumulator(str(run.folder)).Reload()
+    assert [(one.step, one.value) for one in events.Scalars("losses/a")] == [(7, 2.5)]
+    assert [(one.step, one.value) for one in events.Scalars("charts/b")] == [(7, 3.0), (6, 5.0)]
+    (image,) = events.Images("eval/image")
+    assert (image.step, image.width, image.height) == (7, 6, 4)
+
+
+def test_result_has_the_flags(parse, tmp_path):
+    run, _ = begin(parse, tmp_path, "--name", "x")
+    run.write_result({"error": 0.5})
+    result = json.loads((run.folder / "result.json").read_text())
+    assert result["error"] == 0.5 and result["args"]["name"] == "x"
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, 1), ("2", 2)])
+def test_torch_has_one_thread_or_those_of_the_environment(tmp_path, given, expected):
+    env = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    env |= {} if given is None else {"OMP_NUM_THREADS": given}
+    code = SCRIPT + "runs.seed_torch(args)\nprint(torch.get_num_threads())"
+    command = [sys.executable, "-c", code, "--runs-dir", tmp_path]
+    ended = subprocess.run(command, capture_output=True, text=True, env=env, check=True)
+    assert ended.stdout == f"{expected}\n"

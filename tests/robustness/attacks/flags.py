@@ -1,4 +1,4 @@
-"""Commands with one to three flags at random values."""
+"""Commands with one to three flags of random values."""
 
 import contextlib
 import dataclasses
@@ -17,12 +17,12 @@ from attacks.children import RAN, REFUSED
 
 sys.path.append(str(ROOT))  # where `benchmarks` is
 MEGABYTES = 8000
-SECONDS = 60  # what is not refused is a whole run, and trials of a sweep are processes of their own
+SECONDS = 60  # a run that is not rejected is a whole one; trials of a sweep are processes
 NUMBERS = (0, -1, -5, 1, 2, 3.5, 2**31, 2**63, 2**70, 10**30, 1e-300, 1e-320, 1e300, 0.5)
 WORDS = ("nan", "inf", "-inf", "", " ", "x", "None", "../../x", "/proc", "/dev/null", "/dev/null/x")
 WORDS += ("no/such/folder", "a" * 300, "ü\n", "1,5", "1e3", "0x10", "--", "-", "wall", "empty.h5")
-PLAIN = 20  # the round of attempts in which every command has no odd flags: they do run
-# Where large numbers are only long work.
+PLAIN = 20  # the round of attempts without odd flags, in which every command runs
+# Flags whose large numbers only take long.
 LONG = ("total_timesteps", "total_updates", "num", "num_test", "num_validation", "scenes", "trials")
 LONG += ("paths_per_scene", "steps", "horizon", "tries", "num_nodes", "round_queries", "draws")
 LONG += (
@@ -38,37 +38,39 @@ LONG += (
 RUN = "--eval-queries 1 --test-queries 1 --runs-dir runs"
 RL = f"--task wall --num-envs 1 --hidden-size 8 --batch-size 4 --learning-starts 20 {RUN}"
 RL += " --total-timesteps 60 --eval-every 60 --horizon 20 --buffer-size 100"
+OUTSIDE = ("benchmarks.paper_tables",)  # of the package
 TINY = {
-    "roboarm_nmp.clean_rl_scripts.sac_her_mp": RL,
-    "roboarm_nmp.clean_rl_scripts.td3_her_mp": RL,
-    "roboarm_nmp.bc_script.bc": f"--task wall --hidden-size 8 --batch-size 4 --num-demos 5 {RUN}"
+    "clean_rl_scripts.sac_her_mp": RL,
+    "clean_rl_scripts.td3_her_mp": RL,
+    "bc_script.bc": f"--task wall --hidden-size 8 --batch-size 4 --num-demos 5 {RUN}"
     " --total-updates 4 --eval-every 4",
-    "roboarm_nmp.bc_script.dagger": f"--paths roadmaps --task wall --hidden-size 8 --token-size 8 {RUN}"
-    " --num-blocks 1 --batch-size 4 --pool-size 20 --examples-per-update 4 --total-updates 4"
+    "bc_script.dagger": f"--paths roadmaps --task wall --hidden-size 8 --token-width 8"
+    f" {RUN} --num-blocks 1 --batch-size 4 --pool-size 20 --examples-per-update 4 --total-updates 4"
     " --eval-every 4 --round-every 2 --round-queries 1",
-    "roboarm_nmp.scene_embedding_train.vae": "--observations observations --total-updates 2 --eval-every 2"
-    " --batch-size 1 --image-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
-    "roboarm_nmp.scene_embedding_train.vqvae": "--observations observations --total-updates 2 --eval-every 2"
-    " --batch-size 1 --image-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
-    "roboarm_nmp.scene_embedding_train.pointnet2": "--observations observations --total-updates 2"
+    "scene_embedding_train.vae": "--observations observations --total-updates 2 --eval-every 2"
+    " --batch-size 1 --picture-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
+    "scene_embedding_train.vqvae": "--observations observations --total-updates 2 --eval-every 2"
+    " --batch-size 1 --picture-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
+    "scene_embedding_train.pointnet2": "--observations observations --total-updates 2"
     " --eval-every 2 --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs"
     " --num-points 16 --num-centres 8 4 --num-neighbours 4",
-    "roboarm_nmp.scene_embedding_train.field": "--observations observations --total-updates 2 --eval-every 2"
+    "scene_embedding_train.field": "--observations observations --total-updates 2 --eval-every 2"
     " --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs --num-points 16",
-    "roboarm_nmp.clean_rl_scripts.evaluate": "--policy go-to-goal --task wall --num-queries 1 --json a.json",
-    "roboarm_nmp.demo_generation.collect": "--task wall --num 1 --workers 1 --output demos.h5",
-    "roboarm_nmp.demo_generation.make_queries": "--task mine.yaml --num-test 2 --num-validation 1 --workers 1"
+    "clean_rl_scripts.evaluate": "--policy go-to-goal --task wall --num-queries 1 --json a.json",
+    "demo_generation.collect": "--task wall --num 1 --workers 1 --output demos.h5",
+    "demo_generation.make_queries": "--task mine.yaml --num-test 2 --num-validation 1 --workers 1"
     " --output queries.h5",
-    "roboarm_nmp.demo_generation.roadmaps": "--output paths --task wall --scenes 1 --paths-per-scene 2"
+    "demo_generation.roadmaps": "--output paths --task wall --scenes 1 --paths-per-scene 2"
     " --num-nodes 50 --workers 1",
-    "roboarm_nmp.demo_generation.verify": "demos_of_wall.h5 --workers 1",
+    "demo_generation.verify": "demos_of_wall.h5 --workers 1",
     "demo_generation.export_minari": "--file demos_of_wall.h5 --overwrite",
-    "roboarm_nmp.scene_embedding_train.collect": "--num 1 --image-size 16 --num-samples 100 --workers 1"
+    "scene_embedding_train.collect": "--num 1 --image-size 16 --num-samples 100 --workers 1"
     " --output seen",
-    "roboarm_nmp.envs.show": "wall --output a.png --size 32 32",
-    "roboarm_nmp.clean_rl_scripts.sweep": "trainer.py --search x=1..3 --trials 1 --folder sweep",
+    "envs.show": "wall --output a.png --size 32 32",
+    "clean_rl_scripts.sweep": "trainer.py --search x=1..3 --trials 1 --folder sweep",
     "benchmarks.paper_tables": "--list --runs-dir runs",
 }
+TINY = {n if n in OUTSIDE else f"roboarm_nmp.{n}": flags for n, flags in TINY.items()}
 TRAINER = """
 import json, sys
 from dataclasses import dataclass
@@ -88,7 +90,7 @@ run.mkdir(parents=True)
 
 
 def attempts(seed, folder):
-    """The attempt: a function from a number to what came of a command with such flags."""
+    """The attempt: a function from a number to the outcome of a command with such flags."""
     fields = {name: _fields(name) for name in TINY}
     given = folder / "given"
     given.mkdir()
@@ -105,19 +107,19 @@ def attempts(seed, folder):
         shutil.copytree(given, here, symlinks=True)
         before = _everything(here)
         try:
-            code, said = _run(module, [*TINY[module].split(), *odd], here)
+            code, output = _run(module, [*TINY[module].split(), *odd], here)
             made = _everything(here) - before
         finally:
             shutil.rmtree(here)
         if children.repeating:
-            print(said)
-        if "Traceback" in said:
-            return f"traceback of {module}: {said.strip().splitlines()[-1][:120]}"
+            print(output)
+        if "Traceback" in output:
+            return f"traceback of {module}: {output.strip().splitlines()[-1][:120]}"
         if any(not path.name.isdigit() for path in folder.iterdir() if path != given):
             return f"{module} left something elsewhere"
         if plain and code != 0:
             return f"{module} does not run"
-        if code == 0 or "training has diverged" in said:
+        if code == 0 or "training has diverged" in output:
             return RAN
         if any(path.name.endswith((".tmp", ".part", ".journal")) for path in made):
             return f"{module} left {sorted(path.name for path in made)}"
@@ -136,7 +138,7 @@ def _fields(module):
 
 
 def _flags(fields, rng):
-    """One to three flags, as they stand in a command line."""
+    """One to three flags of a command line."""
     flags = []
     for name in rng.sample(sorted(fields), min(len(fields), rng.randint(1, 3))):
         flag = f"--{name.replace('_', '-')}"
@@ -152,34 +154,34 @@ def _flags(fields, rng):
 
 
 def _run(module, arguments, folder):
-    """The exit code and what was said, of a command run in this process, in a folder."""
+    """The exit code and the output of a command, run in this process, in a folder."""
     os.chdir(folder)
     sys.argv = [module, *arguments]
-    said, streams = open("said", "w+"), (os.dup(1), os.dup(2))  # noqa: SIM115 (closed below)
-    with said, contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
-        os.dup2(said.fileno(), 1)
-        os.dup2(said.fileno(), 2)
+    file, streams = open("output", "w+"), (os.dup(1), os.dup(2))  # noqa: SIM115 (closed below)
+    with file, contextlib.redirect_stderr(file), contextlib.redirect_stdout(file):
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
         try:
             runpy.run_module(module, run_name="__main__", alter_sys=True)
             code = 0
         except SystemExit as end:
             code = end.code or 0
             if isinstance(code, str):
-                print(code, file=said)
+                print(code, file=file)
         except BaseException as error:
             sys.excepthook(type(error), error, error.__traceback__)
             code = 1
-        said.flush()
-        said.seek(0)
-        text = said.read()
+        file.flush()
+        file.seek(0)
+        text = file.read()
     for number, stream in enumerate(streams, start=1):
         os.dup2(stream, number)
-    Path("said").unlink()
+    Path("output").unlink()
     return code, text
 
 
 def _make_inputs(folder):
-    """What the tiny commands need."""
+    """The input files of the tiny commands."""
     from roboarm_nmp.demo_generation import collect, roadmaps
     from roboarm_nmp.envs.scenes.files import save_scene
     from roboarm_nmp.envs.scenes.primitives import Scene
