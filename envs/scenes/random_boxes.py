@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
-# Positions and sizes are multiples of this (m), about a millimetre, and yaws of a 256th of a turn, so
-# that files are small.
+# Positions and sizes are multiples of this (m), about a millimetre, and yaws of a 256th of a turn,
+# so that files are small.
 GRID = 2.0**-10
 TURN = 2 * math.pi / 256
 # Uniform ranges, m: distance of the near side (of a pole's centre) from the robot's axis, and
