@@ -85,7 +85,7 @@ class RoboArmEnv(gym.Env):
         render_size: (width, height) of `rgb_array` images in pixels.
 
     Raises:
-        ValueError: an argument is out of its range; the message says what was expected.
+        ValueError: an argument is out of its range; the message gives the range.
         RuntimeError: of all methods that need the simulator: the environment is closed.
     """
 
@@ -215,7 +215,7 @@ class RoboArmEnv(gym.Env):
         return self.world.scene
 
     def set_scene(self, scene):
-        """Put the arm into another `Scene`. That ends the episode; an equal one changes nothing."""
+        """Put the arm into another `Scene`. This ends the episode. An equal one does nothing."""
         if self.world.set_scene(scene):
             self.start_configuration = None
 

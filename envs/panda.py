@@ -71,8 +71,8 @@ JOINT_FRAMES = (
     (0.0, 0.0, 0.0, np.pi / 2),
     (0.088, 0.0, 0.0, np.pi / 2),
 )
-# What moves with joint 7: the hand, in m along that joint's axis and turned about it (rad); in the
-# hand's frame the fingers, which open along y; the grasp target, between the fingertips.
+# Fixed to joint 7: the hand, in m along that joint's axis and turned about it (rad); in the hand's
+# frame the fingers, which open along y; the grasp target, between the fingertips.
 FLANGE_LENGTH, HAND_YAW = 0.107, -np.pi / 4
 HAND_TO_FINGER = (0.0, 0.0, 0.0584)
 _FLANGE_TO_EE = FLANGE_LENGTH + 0.105
@@ -86,9 +86,9 @@ def forward_kinematics(configuration):
 
 
 def joint_frames(configuration):
-    """Joint angles in rad, (..., 7) -> joint by joint, its place (..., 3), m, and axes (..., 3, 3).
+    """Joint angles in rad, (..., 7) -> per joint, its position (..., 3), m, and axes (..., 3, 3).
 
-    A generator; the axes are columns, and a joint turns about the third.
+    A generator. The axes are columns, and a joint turns about the third.
     """
     configuration = np.asarray(configuration, dtype=np.float64)
     position = np.zeros((*configuration.shape[:-1], 3))
@@ -136,9 +136,9 @@ def load(client, drawn=True):
 
 
 def load_coarse(client, colour):
-    """Load the arm as `load` does, but only to be looked at: its collision meshes, in one colour.
+    """Load the arm for images only: its collision meshes, with a tenth of the faces, in one colour.
 
-    They have a tenth of the faces. `colour`: (red, green, blue, alpha) in [0, 1].
+    `colour`: (red, green, blue, alpha) in [0, 1].
     """
     urdf = (_FOLDER / "panda.urdf").read_text()
     urdf = urdf.replace("package://meshes/visual", "package://meshes/collision")
@@ -169,7 +169,7 @@ def set_configuration(client, robot, configuration):
 
 
 def command(client, robot, configuration, gains):
-    """Point the seven position controllers at joint angles (list of 7, rad)."""
+    """Set the targets of the seven position controllers: joint angles (list of 7, rad)."""
     p.setJointMotorControlArray(
         robot,
         ARM_JOINTS,

@@ -1,17 +1,17 @@
-"""Sub-goals: the points of a plan that the arm is sent to, one per environment step."""
+"""Sub-goals: the points of a plan that are commanded one by one, one per environment step."""
 
 import numpy as np
 
 from roboarm_nmp.envs import panda
 
-# A plan is followed by commanding one sub-goal per step. This far apart, the controller's lag
-# seldom makes a step longer than the paper's 0.03, to which it is clipped.
+# With this spacing, the controller's lag seldom makes a step longer than the paper's 0.03, to which
+# it is clipped.
 MAX_STEP = 0.03
 SUBGOAL_SPACING = 0.95 * MAX_STEP
 
 
 def subgoals(path):
-    """Points along a path at most `SUBGOAL_SPACING` apart, every waypoint among them.
+    """Points along a path at most `SUBGOAL_SPACING` apart, including all waypoints.
 
     Args:
         path: (n, 7), rad.
@@ -23,7 +23,7 @@ def subgoals(path):
 
 
 def all_subgoals(plan, plan_offsets):
-    """The sub-goals of all plans (k, 7), and the offsets (n + 1,) of each plan's first one."""
+    """The sub-goals of all plans (k, 7), and the offset of each plan's first sub-goal (n + 1,)."""
     waypoints = panda.normalise(plan.astype(np.float64))
     moves = np.diff(waypoints, axis=0)
     steps = np.ceil(np.sqrt(np.square(moves).sum(1)) / SUBGOAL_SPACING)
@@ -37,9 +37,9 @@ def all_subgoals(plan, plan_offsets):
 
 
 def schedule(plan, plan_offsets, offsets):
-    """The sub-goal (m, 7) due at each executed configuration, the one before and the one after.
+    """For each executed configuration the previous, the due and the next sub-goal, each (m, 7).
 
-    The last one is repeated as long as the execution went on; so is the first, as `before`.
+    Before the first sub-goal and after the last, these are repeated.
     """
     points, first = all_subgoals(plan, plan_offsets)
     demo = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))

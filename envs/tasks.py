@@ -1,8 +1,8 @@
 """The tasks: name -> scene, or a distribution of scenes, and whether training on it is allowed.
 
-Paper: section 4. It gives no dimensions. Those of its own tasks were chosen to be what the names
-say, then calibrated so that the go-to-goal policy succeeds as often as in the paper
-(docs/tasks.md). MotionBenchMaker's scenes are as published.
+Paper: section 4. It names the tasks, but gives no dimensions. They are calibrated so that the
+go-to-goal policy reaches the paper's success rates (docs/tasks.md). MotionBenchMaker's scenes are
+as published.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ def get_task(task):
     """The `Task` of a name in `TASKS` or `TRAINING_SCENES`, or of the path of a scene file.
 
     Raises:
-        ValueError: neither; or the scene file is malformed.
+        ValueError: an unknown name, or a malformed scene file.
     """
     if has_name(task):
         return TASKS[task] if task in TASKS else TRAINING_SCENES[task]
@@ -54,22 +54,22 @@ def get_task(task):
 
 
 def is_task(task):
-    """Whether `task` is a name or looks like the path of a scene file."""
+    """Whether `task` is a name, or a path with the suffix of a scene file."""
     return has_name(task) or Path(task).suffix in SCENE_FILES
 
 
 def has_name(task):
-    """Whether `task` is one of `TASKS` or `TRAINING_SCENES`, and no scene file."""
+    """Whether `task` is one of `TASKS` or `TRAINING_SCENES`."""
     return task in TASKS or task in TRAINING_SCENES
 
 
 def task_name(task):
-    """What files made for a task say it is: its name, or that of the scene file."""
+    """The name of a task in files: its own, or that of its scene file without suffix."""
     return task if task in TASKS else Path(task).stem
 
 
 def _two_walls(gap):
-    """Walls left and right of the base: the arm goes from front to back through the gap."""
+    """Walls left and right of the base. The arm moves from front to back through the gap."""
     length, height = 0.7, 0.745
     return Scene(
         tuple(
@@ -84,15 +84,15 @@ _WIDE_TABLE = Box((0.0, 0.0, -0.02), (1.6, 1.6, 0.04))
 
 
 def _racks(quarters, near, width, heights, sides=True, table=_WIDE_TABLE):
-    """Racks of boards, all alike, around the robot.
+    """Equal racks of boards around the robot.
 
     Args:
-        quarters: where: 0 in front of the robot, 1 to its left, 2 behind it, 3 to its right.
+        quarters: their sides: 0 in front of the robot, 1 to its left, 2 behind it, 3 to its right.
         near: distance of their fronts from the robot's axis, m.
         width: m.
         heights: of the boards' centres, m.
-        sides: closed sides as high as the rack; without them, four poles.
-        table: what they stand on.
+        sides: closed sides as high as the rack; otherwise four poles.
+        table: the box under them.
     """
     depth, board, pole = 0.35, 0.03, 0.04
     top = heights[-1] + board / 2
@@ -110,8 +110,8 @@ def _racks(quarters, near, width, heights, sides=True, table=_WIDE_TABLE):
 
 
 # MotionBenchMaker's nominal scenes (Chamzas et al., RA-L 7(2), 2022), to the millimetre. They have
-# neither table nor floor: the shelves stand 0.7 m below the robot's base, and a floor at its height
-# would be in the way of 42 of the 100 original goals of the thin one (docs/tasks.md).
+# neither table nor floor: the shelves stand 0.7 m below the robot's base. A floor at the base's
+# height would collide with 42 of the 100 original goals of the thin shelf (docs/tasks.md).
 _CAN = {"radius": 0.03, "length": 0.14}
 
 
@@ -186,7 +186,7 @@ TASKS = {
         trainable=False,
     ),
 }
-# Not a task of the benchmark: it has no queries. Paths in such scenes are to learn from.
+# Not a task of the benchmark: it has no queries. Paths in these scenes are training data.
 TRAINING_SCENES = {
     "mixed_scenes": Task(MixedScenes(), "random boxes, walls with gaps, or racks of shelves")
 }

@@ -26,7 +26,7 @@ POSITION_GAINS = [0.6] * panda.NUM_JOINTS
 HOLD_STEPS = 5
 HOLD_DRIFT = 1e-3
 # Colour and friction.
-FLOOR_LOOK, TABLE_LOOK = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
+FLOOR_STYLE, TABLE_STYLE = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
 OBSTACLE_COLOUR = (0.36, 0.50, 0.65, 1)
 MAX_SAMPLING_TRIES = 10_000
 MAX_EDGE = 4096  # pixels of an image: 20,000 by 20,000 would need all of a machine's memory
@@ -70,16 +70,16 @@ class World:
     """A scene with the arm in it, in a physics engine of its own.
 
     Copies (`copy.deepcopy`, pickle) are independent worlds in the same state, with the same future,
-    bit for bit: they repeat what happened since the arm was placed, contacts included. For that
-    a world remembers 0.3 kB per environment step. A copy has no window, of which PyBullet allows
-    one per process.
+    bit for bit, contacts included: they repeat all commands since the arm was placed. A world
+    stores 0.3 kB per environment step for that. A copy has no window, of which PyBullet allows one
+    per process.
 
     Args:
         scene: a `Scene`; by default an empty one.
         window: open PyBullet's window.
-        drawn: give bodies the looks that images show. They cost 50 MB of memory, and PyBullet takes
-            up to six times as long to add a cylinder or a sphere. Otherwise images show nothing
-            but specks, until `draw`.
+        drawn: give bodies visual shapes. They cost 50 MB of memory, and PyBullet takes up to six
+            times as long to add a cylinder or a sphere. Otherwise obstacles are specks in images,
+            until `draw`.
 
     Attributes:
         client: PyBullet's number of the engine; None once it is closed.
@@ -125,7 +125,7 @@ class World:
         self.set_scene(scene)
 
     def draw(self):
-        """Give the bodies their looks, now and from now on."""
+        """Give all bodies visual shapes, now and from now on."""
         self.check_open()
         if not self._drawn:
             self._drawn = True
@@ -154,13 +154,13 @@ class World:
         self._restore(snapshot)
 
     def _snapshot(self):
-        """Where the arm was placed, what happened since then, and its state."""
+        """Where the arm was placed, its commands since then, and its present state."""
         joints = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
         joint_states = [joint[:2] for joint in joints]  # angles and velocities
         return self._start, self._events, self._target, joint_states
 
     def _restore(self, snapshot):
-        """Repeat what happened, which restores contacts, too, bit for bit."""
+        """Repeat a snapshot's commands, which restores contacts, too, bit for bit."""
         start, events, target, joint_states = snapshot
         if start is not None:
             self.place(start)
@@ -200,11 +200,11 @@ class World:
         before, self.scene = self._parts, scene
         self._parts = []
         if scene.floor is not None:
-            self._parts.append((floor_box(scene.floor), *FLOOR_LOOK))
+            self._parts.append((floor_box(scene.floor), *FLOOR_STYLE))
         if scene.table is not None:
-            self._parts.append((scene.table, *TABLE_LOOK))
-        look = (OBSTACLE_COLOUR, scene.friction)
-        self._parts += [(obstacle, *look) for obstacle in scene.obstacles]
+            self._parts.append((scene.table, *TABLE_STYLE))
+        style = (OBSTACLE_COLOUR, scene.friction)
+        self._parts += [(obstacle, *style) for obstacle in scene.obstacles]
         # The first bodies stay as far as they are the same: floor and table, mostly.
         same = 0
         while same < min(len(before), len(self._parts)) and before[same] == self._parts[same]:
@@ -228,20 +228,20 @@ class World:
         else:
             kind, collision = p.GEOM_SPHERE, {"radius": obstacle.radius}
             visual = collision
-        client, look = self.client, self._speck
+        client, shape = self.client, self._speck
         if self._drawn:
-            look = p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client)
+            shape = p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client)
         body = p.createMultiBody(
             0.0,  # kg: it never moves
             p.createCollisionShape(kind, **collision, physicsClientId=client),
-            look,
+            shape,
             basePosition=obstacle.position,
             baseOrientation=orientation,
             physicsClientId=client,
         )
         if friction != FRICTION:
             p.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
-        if obstacle is self.scene.table:  # the base is bolted to it
+        if obstacle is self.scene.table:  # the arm's base is bolted to the table
             p.setCollisionFilterPair(self.robot, body, -1, -1, 0, physicsClientId=client)
         self._bodies.append(body)
         self._bodies_made += 1
@@ -293,9 +293,9 @@ class World:
         raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
 
     def check_free(self, **configurations):
-        """Raise ValueError, naming the contacts, if one of some configurations is in collision.
+        """Raise ValueError, naming the contacts, if one of the configurations is in collision.
 
-        The joints are then left as they were; otherwise the arm has moved. E.g.
+        The episode then continues as if it had not been checked; otherwise the arm has moved. E.g.
         `check_free(start=start)`, joint angles (7, rad).
         """
         self.check_open()

@@ -1,4 +1,4 @@
-"""Scenes as YAML files, for people to write: read, written, and refused with the line at fault.
+"""Scenes as YAML files, which people can write. Mistakes are reported with their line.
 
 All lengths in metres, in the frame of the robot's base (x forward, y left, z up):
 
@@ -13,10 +13,11 @@ All lengths in metres, in the frame of the robot's base (x forward, y left, z up
                    orientation: [0, 0, 0, 1]}                               # quaternion x, y, z, w
       - sphere: {position: [0.3, -0.4, 0.5], radius: 0.1}
 
-A box and a cylinder may have `yaw` or `orientation`, not both. A number is whatever Python's
-`float` reads and is finite, without quotes: `1e-2` too, which YAML 1.1 takes for text. YAML's
-anchors and aliases (`&a`, `*a`) work; tags (`!a`) and merge keys (`<<`) are refused. Where things
-are is not checked here: the simulator says whether the arm touches them.
+A box and a cylinder may have `yaw` or `orientation`, not both. A quaternion whose norm differs from
+1 by up to 1 % is normalised. A number is any finite number that Python's `float` reads, without
+quotes; also `1e-2`, which YAML 1.1 treats as text. YAML's anchors and aliases (`&a`, `*a`) work;
+tags (`!a`) and merge keys (`<<`) are rejected. Positions are not checked here: the simulator
+reports collisions with the arm.
 """
 
 import math
@@ -47,9 +48,9 @@ _HEADER = """\
 
 
 class SceneFileError(ValueError):
-    """A scene file that cannot be used. The message: `PATH:LINE: reason`, lines from 1.
+    """A scene file that cannot be used. The message is `PATH:LINE: reason`, with lines from 1.
 
-    `PATH: reason` where no line is at fault: the file cannot be read, or a scene cannot be written.
+    It is `PATH: reason` where a file cannot be read, or a scene cannot be written.
     """
 
 
@@ -57,7 +58,7 @@ def load_scene(path):
     """The `Scene` in a YAML file (format: see the module). Nothing in the file is executed.
 
     Raises:
-        SceneFileError: the file is missing or is not a scene, down to a misspelt key.
+        SceneFileError: the file is missing, or is not a scene; also for a misspelt key.
     """
     try:
         contents = Path(path).read_bytes()
@@ -70,13 +71,12 @@ def load_scene(path):
 
 
 def save_scene(scene, path):
-    """Write a scene so that `load_scene` gives an equal one: every float exactly.
+    """Write a scene so that `load_scene` returns an equal one, with every float exact.
 
     Atomic: at every moment `path` is the old file or the whole new one.
 
     Raises:
-        SceneFileError: `load_scene` would refuse the file (a size that is not positive, say);
-            nothing is written then.
+        SceneFileError: `load_scene` would reject the file, which is then not written.
         OSError: the file cannot be written; an old file is left as it was.
     """
     path = Path(path)
@@ -118,8 +118,8 @@ def _format_fields(obstacle):
     return "{" + ", ".join(fields) + "}"
 
 
-# --- Reading. PyYAML only composes nodes, which know their lines; the rest is done here, by walking
-# down the format. So neither aliases that contain themselves nor deep ones need any care.
+# --- Reading. PyYAML only composes nodes, which have line numbers; the functions below descend the
+# format. So neither aliases that contain themselves nor deep ones need any care.
 
 
 class _Mistake(Exception):
@@ -158,7 +158,7 @@ def _parse(contents):
         raise _Mistake(line, f"byte {contents[error.start]:#04x} is not UTF-8 text") from error
     node = _compose(text)
     if node is None or _is_plain(node) and node.value == "":
-        raise _Mistake(1, "the file is empty (a scene with nothing of its own is {})")
+        raise _Mistake(1, "the file is empty (a scene without obstacles of its own is {})")
     return _scene(node)
 
 
@@ -262,7 +262,7 @@ _KINDS = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
 
 
 def _orientation(fields, what):
-    """Quaternion (x, y, z, w) from `orientation` or `yaw`; neither: not turned."""
+    """Quaternion (x, y, z, w) from `orientation` or `yaw`; the identity without both."""
     if "yaw" in fields and "orientation" in fields:
         raise _mistake(fields["yaw"], f"{what} has both yaw and orientation, only one is allowed")
     if "yaw" in fields:
@@ -278,7 +278,7 @@ def _orientation(fields, what):
 
 
 def _mapping(node, what, required=(), optional=()):
-    """The values (nodes) of a mapping by key, with all the required keys and no unknown one."""
+    """The values (nodes) of a mapping by key, with all required keys and no unknown key."""
     known = ", ".join((*required, *optional))
     if not isinstance(node, yaml.MappingNode):
         raise _mistake(node, f"{what} must be a mapping with keys {known}, got {_describe(node)}")
@@ -324,7 +324,7 @@ def _switch(node):
 
 
 def _is_plain(node):
-    """Whether a node is a scalar without quotes; a quoted one is text, whatever it looks like."""
+    """Whether a node is a scalar without quotes; a quoted one is always text."""
     return isinstance(node, yaml.ScalarNode) and node.style is None
 
 

@@ -1,8 +1,8 @@
-"""Scenes of several kinds to learn from: random boxes, walls with gaps, and racks of shelves.
+"""Training scenes of several kinds: random boxes, walls with gaps, and racks of shelves.
 
-For policies and encoders that are to know them all. Sizes and places are uniform in the ranges
-below, which were written down before anything was trained with them; none of the scenes is one of
-the tasks' own, but for the random boxes (docs/tasks.md).
+For policies and encoders that have to generalise to all of them. Sizes and positions are uniform
+in the ranges below, which were fixed before the first training. None of the scenes is one of the
+tasks' own, except for the random boxes (docs/tasks.md).
 """
 
 import math
@@ -12,8 +12,8 @@ from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import FRICTION, TURN, RandomBoxes, rounded
 
 BOXES = RandomBoxes(2, 8)
-# m. Walls stand on the table, edge-on to the robot; two of three pairs leave a gap that the robot
-# stands in. Further ones are anywhere between those before.
+# m. Walls stand on the table, edge-on to the robot. In two of three scenes the second wall is
+# opposite the first, with the robot in the gap.
 WALL = {
     "near": (0.14, 0.35),
     "length": (0.4, 0.8),
@@ -21,8 +21,8 @@ WALL = {
     "height": (0.4, 1.0),
 }
 WALLS, OPPOSITE, TURNED = 3, 2 / 3, math.radians(15)
-# m. Racks of boards that face the robot: with sides, with poles, or with neither. Things stand on
-# the boards of half of them.
+# m. Racks of boards that face the robot: with sides, with poles, or with neither. Objects stand on
+# the boards of half of the racks.
 RACK = {
     "near": (0.3, 0.75),
     "width": (0.3, 1.2),
@@ -31,9 +31,9 @@ RACK = {
     "spacing": (0.18, 0.4),
 }
 RACKS, BOARDS, TOP, BOARD, POLE = 4, 6, 1.1, 0.03, 0.04
-UPRIGHTS = 2, 4, 0  # two sides, four poles, or nothing that holds the boards
-THINGS, RADIUS, LENGTH = 12, (0.02, 0.05), (0.08, 0.2)  # at most so many cylinders in a rack; m
-MOST = 32  # obstacles: as many as the encoder `oracle` has room for
+UPRIGHTS = 2, 4, 0  # two sides, four poles, or neither
+OBJECTS, RADIUS, LENGTH = 12, (0.02, 0.05), (0.08, 0.2)  # most cylinders in a rack; m
+MOST = 32  # obstacles, the capacity of the encoder `oracle`
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ def _walls(rng):
         size = shape["length"], shape["thickness"], shape["height"]
         turned = rng.uniform(-TURNED, TURNED)
         walls.append(_placed(centre, size, azimuth + turned))
-        # The next one is opposite of this one, or at least a sixth of a turn from it. A third one
-        # may come near the first.
+        # The next wall is opposite this one, or at least a sixth of a turn from it. A third wall
+        # may be near the first.
         between = math.pi if number == 0 and opposite else rng.uniform(math.pi / 3, math.pi * 5 / 6)
         azimuth += between
     return walls
@@ -81,7 +81,7 @@ def _racks(rng):
     for quarter in rng.permutation(4)[:count]:
         shape = {name: rng.uniform(*limits) for name, limits in RACK.items()}
         near, depth, width = shape["near"], shape["depth"], shape["width"]
-        width = min(width, 2.0 * near)  # neighbours do not run into each other
+        width = min(width, 2.0 * near)  # neighbouring racks do not intersect
         uprights = int(rng.choice(UPRIGHTS))
         most = 1 + int((TOP - shape["lowest"]) / shape["spacing"])
         boards = int(rng.integers(2, min(BOARDS, most, MOST // count - uprights) + 1))
@@ -92,8 +92,8 @@ def _racks(rng):
         y = (width - size[1]) / 2
         of_rack = [((near + depth / 2, 0.0, z), (depth, width, BOARD)) for z in heights]
         of_rack += [((x, side, top / 2), size) for x in xs[uprights] for side in (y, -y)]
-        things = int(rng.integers(min(THINGS, MOST // count - len(of_rack)) + 1))
-        for _ in range(things * int(rng.integers(2))):
+        objects = int(rng.integers(min(OBJECTS, MOST // count - len(of_rack)) + 1))
+        for _ in range(objects * int(rng.integers(2))):
             radius, length = rng.uniform(*RADIUS), rng.uniform(*LENGTH)
             aside = width / 2 - BOARD - radius
             place = rng.uniform(near + radius, near + depth - radius), rng.uniform(-aside, aside)
@@ -105,7 +105,7 @@ def _racks(rng):
 
 
 def _placed(centre, size, azimuth):
-    """What was described in front of the robot, turned about its axis.
+    """An obstacle described in front of the robot, turned about the robot's axis.
 
     A box with three sizes, or an upright cylinder with its radius and length.
     """

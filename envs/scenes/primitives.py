@@ -45,7 +45,7 @@ def unit_quaternion(orientation):
 
 
 def _normalise(body):
-    """Vectors may be given as lists or arrays; bodies can be compared and hashed all the same."""
+    """Make tuples of lists and arrays, so that bodies can be compared and hashed."""
     for name in ("position", "size"):
         value = getattr(body, name, ())
         if type(value) is not tuple:

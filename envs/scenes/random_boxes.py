@@ -1,7 +1,7 @@
 """Random scenes: shelves, poles and walls around the arm (paper, section 4).
 
-The paper names the kinds of obstacles and how many there are. The distribution is ours, calibrated
-to go-to-goal's success in the paper (docs/tasks.md).
+The paper gives the kinds of obstacles and their numbers. The distribution is calibrated to
+go-to-goal's success rate in the paper (docs/tasks.md).
 """
 
 import math
@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
-# Positions and sizes are multiples of this (m), about a millimetre, and yaws of a turn's 256th
-# part: few digits make small files.
+# Positions and sizes are multiples of this (m), about a millimetre, and yaws of a 256th of a turn,
+# so that files are small.
 GRID = 2.0**-10
 TURN = 2 * math.pi / 256
-# Ranges, all uniform, in m: distance of the near side from the robot's axis (of the centre, for
-# poles), and sizes. A shelf is a board, wider than deep; walls and poles stand on the table.
+# Uniform ranges, m: distance of the near side (of a pole's centre) from the robot's axis, and
+# sizes. A shelf is a board, wider than deep; walls and poles stand on the table.
 SHELVES, POLES = 0.33, 0.57  # shares of the obstacles; the rest are walls
 SHELF = {"near": (0.28, 0.42), "depth": (0.15, 0.3), "width": (0.3, 0.5), "thickness": (0.02, 0.04)}
 SHELF_HEIGHT = (0.3, 0.9)
@@ -25,15 +25,15 @@ WALL = {
     "thickness": (0.01, 0.03),
     "height": (1.2, 1.5),
 }
-# Rough obstacles: along smooth ones the arm slides to its goal, however many there are.
+# Obstacles are rough, because the arm slides along smooth ones to its goal.
 FRICTION = 2.45
-# Nothing comes nearer than this (m) to the robot's axis below the shoulder's top (m).
+# The least distance (m) of obstacles from the robot's axis, below the shoulder's top (m).
 KEEP_CLEAR, SHOULDER = 0.14, 0.45
 
 
 @dataclass(frozen=True)
 class RandomBoxes:
-    """Scenes with `fewest` to `most` obstacles, each one box, all numbers equally likely."""
+    """Scenes of `fewest` to `most` boxes, all numbers equally likely."""
 
     fewest: int
     most: int
@@ -46,7 +46,7 @@ class RandomBoxes:
         sector = 2 * math.pi / count
         boxes = []
         while len(boxes) < count:
-            # Each in a sector of its own, so that they stand all around the robot.
+            # Each box has a sector of its own, so that they stand all around the robot.
             azimuth = first + sector * (len(boxes) + rng.uniform(-0.5, 0.5))
             box = _sample_box(rng, azimuth)
             if _distance_to_robot(box) >= KEEP_CLEAR:

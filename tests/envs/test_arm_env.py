@@ -678,7 +678,7 @@ def test_single_goals_have_scalar_rewards_and_ends(reward, goal_type, size, stop
         (HOME, "here", "goal must be numbers"),
     ],
 )
-def test_bad_queries_leave_the_running_episode_alone(env, start, goal, message):
+def test_bad_query_is_rejected_and_the_episode_goes_on(env, start, goal, message):
     env.reset_specific(HOME, NEAR_HOME)
     with pytest.raises(ValueError, match=message):
         env.reset_specific(start, goal)
@@ -736,12 +736,12 @@ def test_position_goals_are_for_goal_type_ee():
         ({"render_mode": "ansi"}, "render_mode must be one of"),
     ],
 )
-def test_bad_arguments(arguments, message):
+def test_bad_argument_is_rejected_with_its_range(arguments, message):
     with pytest.raises(ValueError, match=message):
         envs.make("no_obstacles", **arguments)
 
 
-def test_unknown_task_and_missing_reset():
+def test_unknown_task_missing_reset_and_wrong_scene_are_rejected():
     with pytest.raises(ValueError, match="unknown task 'walls': one of no_obstacles, wall"):
         envs.make("walls")
     with pytest.raises(RuntimeError, match="call reset"):

@@ -1,4 +1,4 @@
-"""Scene files: exact round trips, and every mistake is refused with its line."""
+"""Scene files: exact round trips, and every mistake is rejected with its line."""
 
 import math
 import os
@@ -71,11 +71,10 @@ def random_scene(seed):
     return Scene(obstacles, table, (FLOOR, None, *numbers(1))[seed // 3 % 3])
 
 
-# --- What is read
+# --- Reading
 
 
-def test_the_example_of_the_documentation(load):
-    """And so a scene from a file is the one written in Python."""
+def test_documented_example_equals_the_scene_written_in_python(load):
     assert load(DOCUMENTED) == EXAMPLE
     assert load("table: true\nfloor: -0.6\nobstacles: []\n") == Scene()
 
@@ -111,7 +110,7 @@ def test_the_example_of_the_documentation(load):
         ),
     ],
 )
-def test_what_is_read(load, text, scene):
+def test_text_is_read_as_scene(load, text, scene):
     assert load(text) == scene
 
 
@@ -163,7 +162,7 @@ def test_numbers_of_numpy_are_written(tmp_path):
     assert load_scene(tmp_path / "scene.yaml") == Scene((expected,), floor=float(np.float32(-0.7)))
 
 
-def test_files_are_for_people(tmp_path):
+def test_written_file_is_short_and_has_comments(tmp_path):
     path = str(tmp_path / "scene.yaml")  # a string does as well
     save_scene(EXAMPLE, path)
     lines = Path(path).read_text().splitlines()
@@ -180,7 +179,7 @@ def test_files_are_for_people(tmp_path):
     ]
 
 
-def test_what_could_not_be_loaded_is_not_written(tmp_path):
+def test_scene_that_could_not_be_loaded_is_not_written(tmp_path):
     path = tmp_path / "scene.yaml"
     save_scene(EXAMPLE, path)
     before = path.read_bytes()
@@ -210,7 +209,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch, step):
     assert load_scene(path) == Scene()
 
 
-# --- What is refused
+# --- Mistakes
 
 
 def obstacle(text):
@@ -365,7 +364,7 @@ def sphere(position="[0, 0, 0]", radius="1"):
         ),
     ],
 )
-def test_mistakes_are_refused_with_their_line(load, tmp_path, contents, line, reason):
+def test_mistake_is_rejected_with_its_line(load, tmp_path, contents, line, reason):
     with pytest.raises(SceneFileError) as caught:
         load(contents)
     message = str(caught.value)
@@ -375,13 +374,13 @@ def test_mistakes_are_refused_with_their_line(load, tmp_path, contents, line, re
     assert "\n" not in message and len(message.removeprefix(start)) < 200
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_unreadable_file_is_reported(tmp_path):
     for path, reason in ((tmp_path / "none.yaml", "No such file"), (tmp_path, "Is a directory")):
         with pytest.raises(SceneFileError, match=f"^{path}: {reason}"):
             load_scene(path)
 
 
-def test_damaged_files_are_refused_or_read(load):
+def test_damaged_file_is_rejected_or_read(load):
     """Whatever bytes a file has, the only error is `SceneFileError`, on one of its lines."""
     rng = np.random.default_rng(0)
     good = DOCUMENTED.encode()
@@ -397,7 +396,7 @@ def test_damaged_files_are_refused_or_read(load):
         b'"\\x',
         b"\r\n",
     ]
-    refused = 0
+    rejected = 0
     for _ in range(400):
         contents = bytearray(good)
         for _ in range(rng.integers(1, 4)):
@@ -408,5 +407,5 @@ def test_damaged_files_are_refused_or_read(load):
         except SceneFileError as error:
             line = int(re.search(r"scene\.yaml:(\d+): ", str(error))[1])
             assert 1 <= line <= len(contents.splitlines()) + 1
-            refused += 1
-    assert 100 < refused < 400
+            rejected += 1
+    assert 100 < rejected < 400

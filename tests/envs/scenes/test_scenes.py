@@ -1,4 +1,4 @@
-"""Scenes that vary: drawn at a reset, stored with queries and demonstrations, put back in place."""
+"""Scenes: their values, their distributions, in the environment, and in files."""
 
 import math
 from dataclasses import replace
@@ -61,7 +61,7 @@ def distance_to_robot(box):
     return np.linalg.norm(beyond, axis=1).min()
 
 
-# --- What is no scene
+# --- Values
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def distance_to_robot(box):
         {"obstacles": (Sphere((0, 0, 0), 1),) * 10_001},
     ],
 )
-def test_what_is_no_scene_is_refused_with_the_reason(fields):
+def test_wrong_scene_is_rejected_with_the_reason(fields):
     with pytest.raises(ValueError, match=r"obstacle needs finite|at most|floor must|friction must"):
         Scene(**fields)
 
@@ -149,7 +149,7 @@ def test_every_number_of_obstacles_is_equally_likely(level, fewest, most):
     assert np.abs(found - expected).max() < 4.5 * math.sqrt(expected)
 
 
-def test_obstacles_are_shelves_poles_and_walls_that_leave_the_robot_its_place():
+def test_obstacles_are_shelves_poles_and_walls_clear_of_the_robot():
     rng = np.random.default_rng(1)
     boxes = [box for _ in range(200) for box in TASKS[HARD].scene.sample(rng).obstacles]
     sizes = np.array([box.size for box in boxes])
@@ -168,13 +168,13 @@ def test_scenes_differ_and_a_seed_fixes_them():
     assert len({boxes.sample(rng) for _ in range(20)}) == 20
 
 
-def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
+def test_mixed_scenes_are_of_three_kinds_and_clear_of_the_robot():
     mixed = envs.get_task("mixed_scenes").scene
     assert mixed.sample(np.random.default_rng(3)) == mixed.sample(np.random.default_rng(3))
     drawn = [mixed.sample(np.random.default_rng([0, i])) for i in range(300)]
     assert len(set(drawn)) == 300 and not {task.scene for task in TASKS.values()} & set(drawn)
     assert max(len(scene.obstacles) for scene in drawn) <= MAX_OBSTACLES
-    walls = racks = things = 0
+    walls = racks = objects = 0
     for scene in drawn:
         assert scene == replace(mixed.base, obstacles=scene.obstacles)
         boxes = [obstacle for obstacle in scene.obstacles if isinstance(obstacle, Box)]
@@ -185,11 +185,11 @@ def test_mixed_scenes_are_of_three_kinds_and_leave_the_robot_its_place():
             places[:, 2], sizes[:, 2] / 2, atol=GRID
         )
         racks += len(np.unique(places[:, :2], axis=0)) < len(places)  # boards above each other
-        things += len(boxes) < len(scene.obstacles)
-    assert 70 < walls < 130 and 70 < racks < 130 and 40 < things < racks
+        objects += len(boxes) < len(scene.obstacles)
+    assert 70 < walls < 130 and 70 < racks < 130 and 40 < objects < racks
 
 
-def test_there_are_no_queries_in_mixed_scenes():
+def test_mixed_scenes_have_no_queries():
     with pytest.raises(
         DatasetError, match="mixed_scenes are scenes for training: there are no queries"
     ):
@@ -216,7 +216,7 @@ def test_every_reset_draws_a_scene_in_which_start_and_goal_are_feasible(env):
     assert len(scenes) == 5
 
 
-def test_a_scene_stays_for_as_many_episodes_as_asked():
+def test_scene_stays_for_episodes_per_scene():
     shelves = Shelves()
     env = RoboArmEnv(shelves, episodes_per_scene=3)
     heights = []
@@ -240,7 +240,7 @@ def test_a_seed_fixes_scene_and_query(env):
 
 
 def test_replay_is_exact_among_other_scenes(env):
-    """Whatever scenes were there before, in this env or never: the same, bit for bit."""
+    """Bit for bit, after other scenes in this environment and in a fresh one."""
 
     def run(env, seed):
         rng = np.random.default_rng(seed)
@@ -259,20 +259,20 @@ def test_replay_is_exact_among_other_scenes(env):
     fresh.close()
 
 
-def test_the_world_is_made_anew_now_and_then_and_nothing_changes(env, monkeypatch):
+def test_world_made_anew_changes_no_number(env, monkeypatch):
     env.reset(seed=2)
     before = env.reset(seed=3)[0]
     monkeypatch.setattr("roboarm_nmp.envs.world.MAX_BODIES_MADE", 10)
     for seed in range(10):
         env.reset(seed=seed)
     after = env.reset(seed=3)[0]
-    # Robot, floor, table, obstacles, and nothing left over.
+    # Robot, floor, table, obstacles, and no others.
     assert p.getNumBodies(physicsClientId=env.client) == 3 + len(env.scene.obstacles)
     for name in before:
         np.testing.assert_array_equal(before[name], after[name])
 
 
-def test_what_two_scenes_share_stays_and_the_rest_is_exchanged():
+def test_changing_the_scene_changes_its_obstacles():
     one, two = Box((0.5, 0.0, 0.3), (0.1, 0.1, 0.6)), Box((0.0, 0.5, 0.3), (0.1, 0.1, 0.6))
     env = RoboArmEnv(Scene((one, two)))
     reaching = np.array([0.0, 0.6, 0.0, -1.6, 0.0, 2.2, 0.7])  # into `one`
@@ -311,7 +311,7 @@ def test_friction_is_that_of_the_scene():
 # --- In files
 
 
-def some_queries(n, rng):
+def random_queries(n, rng):
     return tuple(rng.uniform(-0.08, -0.01, (2, n, 7)).astype(np.float32))
 
 
@@ -325,8 +325,8 @@ def write(path, scenes):
     rng = np.random.default_rng(6)
     index = [0, 1, 1, 2, 0, 2, 2]
     splits = {
-        "test": (*some_queries(7, rng), [scenes[i] for i in index]),
-        "validation": (*some_queries(2, rng), scenes[:2]),
+        "test": (*random_queries(7, rng), [scenes[i] for i in index]),
+        "validation": (*random_queries(2, rng), scenes[:2]),
     }
     write_queries(path, HARD, 0, splits, "made by a test", {})
     return index
@@ -348,20 +348,20 @@ def test_queries_in_scenes_without_obstacles(tmp_path):
     assert load_queries(tmp_path / "queries.h5")[3].scene == empty
 
 
-def test_a_scene_with_another_table_is_refused(tmp_path, scenes):
+def test_scene_with_another_table_is_rejected(tmp_path, scenes):
     scenes[1] = replace(scenes[1], table=None)
     with pytest.raises(DatasetError, match="differs from the task's in more than its obstacles"):
         write(tmp_path / "queries.h5", scenes)
     assert not (tmp_path / "queries.h5").exists()
 
 
-def test_a_split_that_is_not_there(tmp_path, scenes):
+def test_missing_split_is_reported(tmp_path, scenes):
     write(tmp_path / "queries.h5", scenes)
     with pytest.raises(DatasetError, match="queries.h5: has no original queries"):
         load_queries(tmp_path / "queries.h5", "original")
 
 
-def test_scenes_that_make_no_sense_are_refused(tmp_path, scenes):
+def test_damaged_scenes_are_rejected(tmp_path, scenes):
     write(tmp_path / "queries.h5", scenes)
     path = tmp_path / "queries.h5"
     attributes, arrays = dataset_format.read_file(path, dataset_format.QUERY_SCHEMA, HARD)
@@ -398,7 +398,7 @@ def test_sampled_queries_are_solved_and_have_scenes_of_their_own():
         assert len(planner.plan(*ends, scene, seed=1)) >= 2
 
 
-def test_queries_in_a_row_share_a_scene_if_asked():
+def test_consecutive_queries_share_a_scene_on_request():
     sampler = make_queries.Sampler(HARD, solvable=False, queries_per_scene=2)
     made = [sampler((0, split, index)) for split in ("test", "validation") for index in range(4)]
     scenes = [from_array(query["obstacles"]) for query in made]
