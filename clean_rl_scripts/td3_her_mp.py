@@ -77,6 +77,8 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """train with hidden layers in bfloat16; by default where the hardware has it"""
     eval_every: flags.PositiveInt = 25_000
     """environment steps between evaluations on validation queries; the best policy is saved"""
+    stop_at_success: flags.Share | None = None
+    """stop at this success rate on validation queries, e.g. 0.9; by default never"""
 
 
 # ALGO LOGIC: networks
@@ -354,7 +356,7 @@ class TD3:
 
 if __name__ == "__main__":
     # SHARED: checks and environments
-    args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries"})
+    args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = runs.seed_torch(args)
     runs.resolve_bf16(args)
     if args.buffer_size < args.horizon:
@@ -378,7 +380,7 @@ if __name__ == "__main__":
     episodes, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
     # END SHARED
 
-    while run.step < args.total_timesteps:
+    while run.step < args.total_timesteps and not run.reached(args.stop_at_success):
         # ALGO LOGIC: act
         if run.step < args.learning_starts:
             actions = (2 * torch.rand(args.num_envs, 7) - 1).numpy() * agent.actor.action_scale

@@ -444,6 +444,10 @@ class Run:
         """Show values at the end of the progress bar."""
         self._bar.set_postfix(**values)
 
+    def reached(self, score):
+        """Whether the best evaluation so far has this score; False for None."""
+        return score is not None and self.best_score >= score
+
     def is_best(self, score, result=None):
         """Note an evaluation. Returns whether no earlier one had a higher score.
 

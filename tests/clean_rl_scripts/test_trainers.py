@@ -221,6 +221,18 @@ def test_signal_during_an_evaluation_ends_it_at_once(tmp_path, monkeypatch, caps
     assert json.loads((run / "result.json").read_text())["policy_step"] == 1200
 
 
+@pytest.mark.parametrize("stop, steps", [(None, 1200), (1.0, 600)])
+def test_run_stops_at_a_success_rate_only_on_request(tmp_path, monkeypatch, stop, steps):
+    success = {"success_rate": 1.0, "collision_free_success_rate": 1.0}
+    monkeypatch.setattr(protocol, "evaluate", lambda *_: success)
+    flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
+    if stop is not None:
+        flags += ["--stop-at-success", stop]
+    run_here(*flags)
+    (result,) = tmp_path.glob("*/result.json")
+    assert json.loads(result.read_text())["steps"] == steps
+
+
 # --- Bad input
 
 

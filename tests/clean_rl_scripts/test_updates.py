@@ -203,7 +203,7 @@ def test_policy_is_updated_every_policy_frequency_updates(module, kind):
 
 @pytest.mark.parametrize("module, kind", [(sac, "SAC"), (td3, "TD3")])
 def test_agent_learns_the_best_action(module, kind):
-    """One-step episodes; the reward is minus the squared distance from an action set by the goal."""
+    """One-step episodes; the reward is minus the squared distance from the goal's action."""
     flags = {"policy_lr": 3e-3, "q_lr": 3e-3, "policy_frequency": 1, "policy_average": 0.05}
     flags |= {"target_entropy": None, "alpha": 0.002} if kind == "SAC" else {}
     agent = make(module, kind, **flags)

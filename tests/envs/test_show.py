@@ -1,4 +1,4 @@
-"""roboarm_nmp.envs.show: what is in its pictures and animations, who moves the arm, and its errors."""
+"""envs.show: its images and animations, the policy in them, and its errors."""
 
 import os
 import socket

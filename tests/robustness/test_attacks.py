@@ -1,4 +1,4 @@
-"""Hostile inputs: a few of those of `python tests/robustness/attack.py`, and, marked `slow`, all of them."""
+"""Hostile inputs: a few of those of tests/robustness/attack.py, and, marked `slow`, all of them."""
 
 import os  # noqa: F401 (these two for what happens)
 import time  # noqa: F401

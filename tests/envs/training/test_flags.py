@@ -34,6 +34,7 @@ OF_REINFORCEMENT = (
     ("--horizon", "0"),
     ("--max-step", "0"),
     ("--policy-average", "0"),
+    ("--stop-at-success", "90"),
 )
 CASES = [
     *((script, *case) for script in (*POLICIES, *ENCODERS) for case in OF_ALL),
