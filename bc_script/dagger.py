@@ -12,6 +12,7 @@ the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a safety filter
 under `# ALGO LOGIC`. The part between `# SHARED` and `# END SHARED` is the same in `bc.py`.
 """
 
+import math
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from tqdm import tqdm
 
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
@@ -157,7 +159,7 @@ class Actor(nn.Module):
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        size = 10 + {"config": 7, "combined": 10}[args.goal_type] + 28 + 2 * 80
+        size = 10 + GOAL_SIZES[args.goal_type] + 28 + 2 * math.prod(panda.LINK_DISTANCES_SHAPE)
         self.token_in = nn.Linear(token_size, args.token_width)
         self.arm_in = nn.Linear(size, args.token_width)
         self.fuse = Bf16Linear(args.token_width, args.token_width, args.bf16)

@@ -20,6 +20,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
 from roboarm_nmp.envs.training import flags, protocol, runs
 
@@ -129,9 +130,11 @@ class Features(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         end = 10 + 7 * args.velocities  # of the end-effector position, before which are velocities
         self.ee = slice(end - 3, end)
-        # Link distances follow, eight numbers a link, the first of which is the distance.
-        self.distances = slice(end, end + 80, 8) if args.link_distances else None
-        goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
+        # Link distances follow, the first number of each link is the distance.
+        links, numbers = panda.LINK_DISTANCES_SHAPE
+        near = slice(end, end + links * numbers, numbers)
+        self.distances = near if args.link_distances else None
+        goal_size = GOAL_SIZES[args.goal_type]
         self.size = self(torch.zeros(1, observation_size), torch.zeros(1, goal_size)).shape[1]
 
     def forward(self, observation, desired_goal):
@@ -221,7 +224,7 @@ class HerReplayBuffer:
         self.arrays = {name: np.zeros((capacity, n), np.float32) for name, n in sizes.items()}
         self.arrays |= {name: np.zeros(capacity, np.int32) for name in ("remaining", "latent")}
         self.latents, self.latent_numbers = np.zeros((1, latent_size), np.float32), {}
-        self.env, self.capacity, self.rng = env, capacity, rng
+        self.env, self.capacity, self.rng = env.unwrapped, capacity, rng
         self.her_probability, self.position, self.size = her_probability, 0, 0
 
     def add_episode(self, transitions):
