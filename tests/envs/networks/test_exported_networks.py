@@ -150,8 +150,9 @@ def test_loaded_network_computes_the_same_as_its_module_for_any_batch(name, tmp_
 
 def test_networks_do_not_depend_on_torch_defaults(tmp_path, torch_default):
     """Saved, loaded and called under another default dtype or device, they compute the same."""
-    for name, (make, inputs) in ARCHITECTURES.items():
+    for name in ("actor", "conv", "points"):  # constants, integers, new tensors in the forward
         torch.manual_seed(0)
+        make, inputs = ARCHITECTURES[name]
         module, batch = make().eval(), inputs(3)
         save_network(tmp_path / f"{name}.pt", module, batch, {})
         expected = _leaves(load_network(tmp_path / f"{name}.pt")(**batch))
