@@ -26,6 +26,7 @@ from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
+from roboarm_nmp.envs.training.evaluation import is_privileged
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
 from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite
 
@@ -371,7 +372,8 @@ class PolicyRun(Run):
 
         Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed,
         also where the policy was trained under others: results are to be compared. File and line
-        say so, and they name the step length where it is not the standard one (`deviations`).
+        say so, and they name the step length where it is not the standard one (`deviations`), and
+        whether the policy observes ground-truth obstacles (`privileged`).
         """
         self.close()
         args = self.args
@@ -386,6 +388,7 @@ class PolicyRun(Run):
         result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
         result |= {"policy": str(self.folder / "policy.pt"), "policy_step": self.best_step}
         result |= {"validation_success_rate": self.best_score, "steps": self.step}
+        result |= {"privileged": is_privileged(own)}
         self.write_result(result | {"seconds": round(self.seconds)})
         if rules != trained:
             print(
@@ -394,8 +397,9 @@ class PolicyRun(Run):
         for name, value in result["deviations"].items():
             print(f"not comparable: {name} is {value}, not {STANDARD_RULES[name]}")
         success, collision_free = result["success_rate"], result["collision_free_success_rate"]
+        privileged = ", privileged" if result["privileged"] else ""
         print(
-            f"{args.task}, goal {args.goal_type}, {len(queries)} test queries: success "
+            f"{args.task}, goal {args.goal_type}, {len(queries)} test queries{privileged}: success "
             f"{success:.3f}, collision-free success {collision_free:.3f}; {self.step} steps in "
             f"{self.seconds:.0f} s. {self.folder / 'result.json'}"
         )
