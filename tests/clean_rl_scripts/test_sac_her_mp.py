@@ -350,11 +350,14 @@ def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, de
 
 
 def test_successful_episodes_inject_no_demonstration(tmp_path, demo_file, monkeypatch):
-    make_envs, easy = protocol.make_envs, {"ee_tolerance": 5.0}  # m: every step succeeds
+    make_envs, easy = protocol.make_envs, {"ee_tolerance": 0.3}  # m
     monkeypatch.setattr(protocol, "make_envs", lambda *args, **kw: make_envs(*args, **kw | easy))
     _, events = demo_run(tmp_path, demo_file, "1")
-    assert events.Scalars("charts/success")[-1].value == 1
-    assert events.Scalars("charts/demos_injected")[-1].value == 0
+    episodes = len(events.Scalars("charts/episodic_length"))
+    assert episodes <= 100  # as many as `success` is the mean of
+    failures = round(episodes * (1 - events.Scalars("charts/success")[-1].value))
+    assert 0 < failures < episodes
+    assert events.Scalars("charts/demos_injected")[-1].value == failures
 
 
 # --- Real runs

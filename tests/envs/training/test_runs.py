@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -342,6 +343,7 @@ def test_events_of_repeated_steps_are_hidden(parse, tmp_path):
         with runs.summary_writer(run, args, begin) as writer:
             for step in range(begin + 1, end + 1):
                 writer.add_scalar("loss", 10 * begin + step, step)
+        time.sleep(1.1)  # TensorBoard orders files by their names, which have the second
     events = EventAccumulator(str(run))
     events.Reload()
     found = [(event.step, event.value) for event in events.Scalars("loss")]
