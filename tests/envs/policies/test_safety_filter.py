@@ -130,7 +130,7 @@ def test_signed_distances_within_a_range_are_the_same_and_beyond_it_infinite():
 
 
 def test_unknown_geometry_source_is_rejected():
-    with pytest.raises(ValueError, match="or an encoder with a decoder: lidar: cannot be read"):
+    with pytest.raises(ValueError, match="or an encoder with a decoder: no such encoder: lidar"):
         envs.make("wall", link_distances=True, geometry_source="lidar")
 
 
