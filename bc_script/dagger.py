@@ -36,6 +36,7 @@ from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, gr
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training import flags, protocol, runs
+from roboarm_nmp.envs.utils.random_streams import Stream
 
 
 @dataclass
@@ -218,7 +219,6 @@ def update(actor, optimizer, batch, length_weight):
 
 # ALGO LOGIC: a round of DAgger
 STUCK = 5.0  # states in which the policy makes no progress are so much likelier to be labelled
-ROUND = 7  # stream of random numbers; 6 is that of `RoadmapExamples.draw`
 
 
 def dagger_round(actor, env, safety_filter, examples, args, step, device):
@@ -226,7 +226,7 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
 
     Returns the new examples, and the share of queries on which the policy reached the goal.
     """
-    rng = np.random.default_rng([args.seed, ROUND, step])
+    rng = np.random.default_rng([args.seed, Stream.DAGGER_ROUNDS, step])
     parts, reached, visited = [], [], []
 
     def act(**observation):

@@ -1,6 +1,8 @@
 """The planner: exact ends, no collisions, the clearance asked for, and the same path for a seed."""
 
+import copy
 import math
+import pickle
 import subprocess
 import sys
 import textwrap
@@ -163,6 +165,18 @@ def test_seed_gives_the_same_search_in_another_process():
         assert result.returncode == 0, result.stderr
         searches.append(sorted(x for x in result.stdout.splitlines() if x.startswith("search:")))
     assert searches[0] == searches[1] and len(searches[0]) == len(names)
+
+
+def test_copy_plans_the_same_paths_in_a_world_of_its_own():
+    env, (start, goal, _) = envs.make("double_walls"), load_queries("double_walls")[0]
+    planner = Planner(env)
+    path = planner.plan(start, goal, seed=3).tobytes()
+    for other in (copy.deepcopy(planner), pickle.loads(pickle.dumps(planner))):
+        assert other.env is not env and other.env.client != env.client
+        assert other.plan(start, goal, seed=3).tobytes() == path
+        other.env.close()
+    assert planner.plan(start, goal, seed=3).tobytes() == path
+    env.close()
 
 
 # --- Planners
