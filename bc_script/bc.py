@@ -21,6 +21,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.episodes import observed
 from roboarm_nmp.envs.datasets.format import DatasetError
@@ -117,8 +118,8 @@ class Features(nn.Module):
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        goal_size = {"ee": 3, "config": 7, "combined": 10}[args.goal_type]
-        self.size = self(torch.zeros(1, observation_size), torch.zeros(1, goal_size)).shape[1]
+        example = torch.zeros(1, observation_size), torch.zeros(1, GOAL_SIZES[args.goal_type])
+        self.size = self(*example).shape[1]
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""

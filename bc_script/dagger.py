@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
@@ -34,6 +35,7 @@ from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, gr
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training import flags, protocol, runs
+from roboarm_nmp.envs.utils.random_streams import Stream
 
 
 @dataclass
@@ -157,7 +159,7 @@ class Actor(nn.Module):
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        size = 10 + {"config": 7, "combined": 10}[args.goal_type] + 28 + 2 * 80
+        size = 10 + GOAL_SIZES[args.goal_type] + 28 + 2 * 80
         self.token_in = nn.Linear(token_size, args.token_width)
         self.arm_in = nn.Linear(size, args.token_width)
         self.fuse = Bf16Linear(args.token_width, args.token_width, args.bf16)
@@ -216,7 +218,6 @@ def update(actor, optimizer, batch, length_weight):
 
 # ALGO LOGIC: a round of DAgger
 STUCK = 5.0  # states in which the policy makes no progress are so much likelier to be labelled
-ROUND = 7  # stream of random numbers; 6 is that of `RoadmapExamples.draw`
 
 
 def dagger_round(actor, env, safety_filter, examples, args, step, device):
@@ -224,7 +225,7 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
 
     Returns the new examples, and the share of queries on which the policy reached the goal.
     """
-    rng = np.random.default_rng([args.seed, ROUND, step])
+    rng = np.random.default_rng([args.seed, Stream.DAGGER_ROUNDS, step])
     parts, reached, visited = [], [], []
 
     def act(**observation):
@@ -277,7 +278,6 @@ def with_scene(batch, latents, token_size):
 if __name__ == "__main__":
     args = runs.parse_args(Args, may_change={"test_queries"})
     device = runs.seed_torch(args)
-    runs.resolve_bf16(args)
     validation, test = protocol.load_task(args)
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:

@@ -20,10 +20,10 @@ import numpy as np
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.episodes import observed
+from roboarm_nmp.envs.utils.random_streams import Stream
 
 AHEAD = 0.1  # normalised: an example's direction is to the point of its path so far ahead
 PER_PATH = 4  # examples of each chosen path, which share the link distances at its goal
-DRAW = 6  # stream of random numbers; those before belong to files of `demo_generation`
 
 
 class RoadmapExamples:
@@ -60,7 +60,7 @@ class RoadmapExamples:
             count: of examples.
             noise: standard deviation (normalised, each joint) around the paths.
         """
-        rng = np.random.default_rng([self.seed, DRAW, number])
+        rng = np.random.default_rng([self.seed, Stream.DAGGER_EXAMPLES, number])
         scene, first, last = self.choose_paths(rng, -(-count // PER_PATH))
         path = np.arange(count) // PER_PATH
         first, last = first[path], last[path]
