@@ -5,6 +5,7 @@ to bottom, and the processes that it spawns find it under its module's name.
 """
 
 import difflib
+import gc
 import runpy
 import sys
 
@@ -53,6 +54,7 @@ def main(arguments=None):
         hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(commands)}"
         print(f"{prog}: unknown command {name!r}: {hint}", file=sys.stderr)
         return 2
+    gc.set_threshold(50_000)  # PyTorch's import makes many objects: 0.2 s of collections
     sys.argv = [f"{prog} {name}", *arguments[1:]]
     runpy.run_module(f"roboarm_nmp.{commands[name][0]}", run_name="__main__", alter_sys=True)
     return 0

@@ -118,8 +118,8 @@ class Features(nn.Module):
         low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        goal_size = GOAL_SIZES[args.goal_type]
-        self.size = self(torch.zeros(1, observation_size), torch.zeros(1, goal_size)).shape[1]
+        example = torch.zeros(1, observation_size), torch.zeros(1, GOAL_SIZES[args.goal_type])
+        self.size = self(*example).shape[1]
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""

@@ -279,7 +279,6 @@ def with_scene(batch, latents, token_size):
 if __name__ == "__main__":
     args = runs.parse_args(Args, may_change={"test_queries"})
     device = runs.seed_torch(args)
-    runs.resolve_bf16(args)
     validation, test = protocol.load_task(args)
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:

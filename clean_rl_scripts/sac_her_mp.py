@@ -134,8 +134,8 @@ class Features(nn.Module):
         links, numbers = panda.LINK_DISTANCES_SHAPE
         near = slice(end, end + links * numbers, numbers)
         self.distances = near if args.link_distances else None
-        goal_size = GOAL_SIZES[args.goal_type]
-        self.size = self(torch.zeros(1, observation_size), torch.zeros(1, goal_size)).shape[1]
+        example = torch.zeros(1, observation_size), torch.zeros(1, GOAL_SIZES[args.goal_type])
+        self.size = self(*example).shape[1]
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""
@@ -303,9 +303,8 @@ class SAC:
         self.actor = Actor(args, observation_size).to(device)
         self.actor_average = Actor(args, observation_size).to(device).eval()  # evaluated and saved
         self.actor_average.load_state_dict(self.actor.state_dict())
-        self.critics, self.critics_target = (
-            Critics(args, self.actor.features.size).to(device) for _ in range(2)
-        )
+        size = self.actor.features.size
+        self.critics, self.critics_target = (Critics(args, size).to(device) for _ in range(2))
         self.critics_target.load_state_dict(self.critics.state_dict())
         self.log_alpha = torch.full((1,), math.log(args.alpha), device=device, requires_grad=True)
         parameters = [{"params": self.actor.parameters(), "lr": args.policy_lr}]
@@ -364,7 +363,6 @@ if __name__ == "__main__":
     # SHARED: checks and environments
     args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = runs.seed_torch(args)
-    runs.resolve_bf16(args)
     if args.buffer_size < args.horizon:
         sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
     validation, test = protocol.load_task(args)
@@ -373,7 +371,6 @@ if __name__ == "__main__":
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     # END SHARED
 
-    # ALGO LOGIC: networks, replay buffer
     agent = SAC(args, eval_envs[0].observation_space["observation"].shape[0], device)
     # SHARED: run and episodes
     rng = np.random.default_rng(args.seed)
@@ -421,8 +418,7 @@ if __name__ == "__main__":
                 run.log({"charts/SPS": int(run.rate)})
 
         # Evaluate, save the best policy, checkpoint
-        over = global_step >= args.total_timesteps
-        evaluating = over or global_step % args.eval_every < args.num_envs
+        evaluating = run.step % args.eval_every < args.num_envs or run.step >= args.total_timesteps
         if evaluating and run.validate(agent.actor_average):
             run.save_policy(agent.actor_average)
         if evaluating or run.interrupted:

@@ -32,7 +32,7 @@ import torch.nn.functional as F
 
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.training.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
-from roboarm_nmp.envs.training.runs import Run, check_finite, parse_args, resolve_bf16, seed_torch
+from roboarm_nmp.envs.training.runs import Run, check_finite, parse_args, seed_torch
 from roboarm_nmp.scene_embedding_train.clouds import (
     example_clouds,
     load_obstacle_points,
@@ -310,7 +310,6 @@ if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     if args.latent_size % SECTORS:
         sys.exit(f"--latent-size must be a multiple of {SECTORS}, got {args.latent_size}")
-    resolve_bf16(args)
     observations, num_training, validation = load_observations(args)
     names, *data = load_obstacle_points(observations, args.num_points)
     data.append(load_obstacles(observations))

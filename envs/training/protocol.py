@@ -1,11 +1,11 @@
-"""The benchmark's protocol, as every trainer of a policy follows it.
+"""The benchmark's protocol, for trainers of policies.
 
-Validation queries say which policy of a run is the best; that one is saved, `policy.pt`, and at the
-end it is tested on test queries, with the result in `result.json`. (The evaluation on all queries,
-with more numbers, is `clean_rl_scripts/evaluate.py`.)
+The policy of a run that is the best on validation queries is saved, `policy.pt`. At the end of the
+run it is tested on test queries: `result.json`. (An evaluation on all queries, with more numbers:
+`envs.training.evaluation`.)
 
-The functions that take flags of the command line are for scripts: where the user is wrong, they end
-the program with a message.
+Functions that take flags are for scripts: on a mistake of the user, they end the program with a
+message.
 """
 
 import collections
@@ -23,16 +23,15 @@ from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
 from roboarm_nmp.envs.policies.registry import recurrent_size
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip
-from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.envs.training.evaluation import is_privileged
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
 from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite
 
-NUM_ENVS = 8  # that an evaluation runs together at most; the first of them takes the pictures
+NUM_ENVS = 8  # at most, that an evaluation runs together; the first of them renders
 IMAGE_SIZE = (240, 180)
-# The rules that every test is run under; how long its steps are is a policy's own.
+# The rules of every test. The step length, a rule too, may be the policy's own.
 RULES = [name for name in STANDARD_RULES if name != "max_step"]
 
 
@@ -112,7 +111,7 @@ def make_envs(task, number, **kwargs):
     """A list of environments of a task; `kwargs` as for `envs.make`.
 
     Raises:
-        SystemExit: an argument is refused.
+        SystemExit: an argument is rejected.
     """
     try:
         return [envs.make(task, **kwargs) for _ in range(number)]
@@ -123,24 +122,24 @@ def make_envs(task, number, **kwargs):
 
 
 def make_eval_envs(task, num_queries, **kwargs):
-    """The environments of `validate` and `final_test` for so many queries, as `make_envs`.
+    """The environments for evaluations on `num_queries` queries; arguments as for `make_envs`.
 
-    At least two, as `save_policy` wants.
+    At least two, which `PolicyRun.save_policy` needs.
     """
-    pictured = make_envs(task, 1, render_mode="rgb_array", render_size=IMAGE_SIZE, **kwargs)
-    return pictured + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
+    rendering = make_envs(task, 1, render_mode="rgb_array", render_size=IMAGE_SIZE, **kwargs)
+    return rendering + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
 
 
 def make_training_envs(args, demo_prob=None, demos=None):
-    """`args.num_envs` environments, on random queries, or with `demo_prob` on demonstrations'.
+    """`args.num_envs` environments, with random queries or those of demonstrations (`demo_prob`).
 
     Args:
         args: the flags, with `EnvFlags` among them.
-        demo_prob: value of the flag, if the trainer has it.
-        demos: demonstration file, as well; by default the task's own.
+        demo_prob: value of the flag --demo-prob, if the trainer has it.
+        demos: value of the flag --demos, a file; by default the task's own.
 
     Raises:
-        SystemExit: an argument is refused, or the demonstrations do not fit.
+        SystemExit: an argument is rejected, or the demonstrations do not fit.
     """
     if demo_prob is None and demos is not None:
         sys.exit("--demos goes with --demo-prob")
@@ -157,10 +156,10 @@ def make_training_envs(args, demo_prob=None, demos=None):
 
 
 def begin_episodes(envs, seed, step):
-    """First observations of fresh episodes, from random numbers that depend on seed and step alone.
+    """First observations of new episodes, whose random numbers depend on seed and step only.
 
-    Whoever begins new ones at every checkpoint needs no simulator state to go on exactly like an
-    uninterrupted run.
+    A trainer that begins new episodes at every checkpoint continues exactly without saving the
+    simulator's state.
     """
     seeds = np.random.SeedSequence([seed, step]).generate_state(len(envs)).tolist()
     return [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
@@ -287,7 +286,7 @@ class PolicyRun(Run):
 
     Args:
         args: the flags, `task`, `goal_type`, `exp_name` and `seed` among them.
-        state: dict from a name to what changes in the run, as for `runs.Run`.
+        state: dict from names to the parts of the run, as for `runs.Run`.
         device: of the run.
         env_arguments: dict of `envs.make`'s arguments, which `policy.pt` is evaluated with.
         eval_envs: of `make_eval_envs`, with these arguments.
@@ -326,7 +325,7 @@ class PolicyRun(Run):
             policy: as for `evaluate`.
 
         Returns:
-            Whether no policy of the run was better so far. False where a signal has interrupted the
+            Whether no policy of the run was better so far. False if a signal has interrupted the
             evaluation.
         """
         queries, envs, device = self.validation, self.eval_envs, self.device
@@ -371,10 +370,12 @@ class PolicyRun(Run):
         """Test `policy.pt` on test queries: `result.json`, and a line on the console. Ends the run.
 
         Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed,
-        also where the policy was trained under others: results are to be compared. File and line
-        say so, and they name the step length where it is not the standard one (`deviations`), and
-        whether the policy observes ground-truth obstacles (`privileged`).
+        for comparable results. File and line contain the rules of the training, if they are others,
+        the step length, if it is not the standard one (`deviations`), and whether the policy
+        observes ground-truth obstacles (`privileged`).
         """
+        from roboarm_nmp.envs.policies.safety_filter import SafetyFilter  # Numba: not for --help
+
         self.close()
         args = self.args
         policy = load_network(self.folder / "policy.pt").to(self.device)

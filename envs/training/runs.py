@@ -63,28 +63,30 @@ class RunFlags:
     """The flags of every trainer's run."""
 
     seed: Seed = 1
-    """seed of everything random; the same seed gives the same run on the same machine and device"""
+    """seed of all random numbers; runs with the same seed, machine and device are identical"""
     runs_dir: Path = Path("runs")
-    """the run's folder is made in here: TensorBoard events, checkpoint, the best network
-    (`policy.pt` or `encoder.pt`), result.json"""
+    """parent of the run's folder, which has TensorBoard events, the checkpoint, the best network
+    (`policy.pt` or `encoder.pt`) and result.json"""
     resume: Path | None = None
-    """continue the run in this folder from its last checkpoint; its own flags are used"""
+    """continue the run in this folder from its last checkpoint, with its flags"""
     device: str = "cpu"
     """`cpu`, `cuda` or one of several, `cuda:1`"""
     track: bool = False
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-MAY_CHANGE = {"resume", "runs_dir", "track"}  # they do not change what is computed
+MAY_CHANGE = {"resume", "runs_dir", "track"}  # they change no number
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 def parse_args(Args, may_change=()):
-    """The flags of the command line; with --resume those of the run, which it must not contradict.
+    """The flags of the command line; with --resume the run's, which must not be contradicted.
+
+    A flag `bf16` that is None is decided: whether the hardware has bfloat16.
 
     Args:
         Args: the dataclass of the flags.
-        may_change: names of further flags with which a run may be resumed at another value.
+        may_change: names of more flags that a resumed run may have at another value.
 
     Raises:
         SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
@@ -114,6 +116,8 @@ def parse_args(Args, may_change=()):
             sys.exit(f"--device {args.device}: PyTorch sees {number or 'no'} CUDA device(s) here")
     if args.track and importlib.util.find_spec("wandb") is None:
         sys.exit("--track: wandb is not installed (pip install wandb)")
+    if getattr(args, "bf16", False) is None:  # args.json has the choice: resuming keeps it
+        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
     return args
 
 
@@ -139,17 +143,17 @@ def _args_of_run(Args, run, may_change):
 
 
 def _from_json(value, kind, begun_in):
-    """A flag's value as the dataclass has it: JSON knows neither tuples nor paths.
+    """A flag's value as the dataclass has it: JSON has neither tuples nor paths.
 
-    A file that is not to be found from here is that from the folder where the run was begun.
+    A file that does not exist from here is the one from the folder where the run began.
     """
     if isinstance(value, list):
         return tuple(_from_json(one, kind, begun_in) for one in value)
     is_path = Path in (kind, *typing.get_args(kind))
     if not isinstance(value, str) or not (is_path or value.endswith(SCENE_FILES)):
         return value
-    there = begun_in / value
-    value = there if there.exists() and not Path(value).exists() else value
+    first = begun_in / value
+    value = first if first.exists() and not Path(value).exists() else value
     return Path(value) if is_path else str(value)
 
 
@@ -163,11 +167,11 @@ def write_json(path, content):
 
 
 def run_folder(args, task):
-    """The run's folder: that of --resume, or else a new one, with the flags in its `args.json`.
+    """The run's folder: that of --resume, otherwise a new one, with the flags in `args.json`.
 
     Args:
         args: the flags.
-        task: the name of what is learned, the first part of the folder's name.
+        task: the first part of the folder's name.
     """
     if args.resume is not None:
         clear_leftovers(args.resume)
@@ -204,31 +208,23 @@ def _say_plainly(run, kind, error, trace):
 
 
 def seed_torch(args):
-    """Make torch repeat itself: seed, threads, deterministic kernels. Returns the device."""
+    """Seed PyTorch and make it deterministic. Returns the device."""
     if "OMP_NUM_THREADS" not in os.environ:  # one thread is fastest for small networks
         torch.set_num_threads(1)
     torch.manual_seed(args.seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
     torch.use_deterministic_algorithms(True)
-    # Else every new tensor is filled with NaN first, to show who reads what was never written.
+    # Otherwise, deterministic mode also fills every new tensor with NaN, a check that costs time.
     torch.utils.deterministic.fill_uninitialized_memory = False
     return torch.device(args.device)
 
 
-def resolve_bf16(args):
-    """Decide `args.bf16` where it is None: in bfloat16 where the hardware has it.
-
-    To be called before `run_folder`, whose `args.json` says what was decided: a run that goes on
-    elsewhere stays as it is.
-    """
-    if args.bf16 is None:
-        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
-
-
 def check_finite(name, values):
-    """Raise FloatingPointError, which ends a run with a line, where training has diverged.
+    """Raise FloatingPointError, which ends a run with a line, if training has diverged.
 
-    `values`: tensor or array of numbers, which the line calls `name`.
+    Args:
+        name: of the values, a plural, for the message.
+        values: tensor or array.
     """
     if not torch.as_tensor(values).isfinite().all():
         raise FloatingPointError(f"{name} are no longer finite")
@@ -239,13 +235,12 @@ def save_checkpoint(run, parts, device):
 
     Args:
         run: the run's folder.
-        parts: dict from a name to what changes in the run: anything with `state_dict` and
-            `load_state_dict` (modules, optimisers), a tensor, a dict of plain values, or a NumPy
-            generator.
-        device: of the run. If it is a GPU, its random numbers are saved, too.
+        parts: dict from names to the parts: anything with `state_dict` and `load_state_dict`
+            (modules, optimisers), a tensor, a dict of plain values, or a NumPy generator.
+        device: of the run. For a GPU, its random numbers are saved, too.
 
     Raises:
-        FloatingPointError: a module's parameters are not finite. The checkpoint stays what it was.
+        FloatingPointError: a module's parameters are not finite. The old checkpoint remains.
     """
     for name, part in parts.items():
         if isinstance(part, torch.nn.Module):
@@ -258,27 +253,27 @@ def save_checkpoint(run, parts, device):
     try:
         with new_contents(run / "checkpoint.pt") as temporary:
             torch.save(state, temporary)
-    except RuntimeError as error:  # PyTorch's words for a disk that is full
+    except RuntimeError as error:  # PyTorch's, for a full disk
         raise OSError(errno.ENOSPC, str(error).splitlines()[0], "checkpoint.pt") from error
 
 
 def load_checkpoint(args, parts):
-    """Give the parts the states they had in the checkpoint of --resume, if there is one.
+    """Restore the parts from the checkpoint of --resume, if there is one.
 
     Args:
         args: the flags.
-        parts: as given to `save_checkpoint`, with the same names. They stay on their devices.
+        parts: as for `save_checkpoint`, with the same names. They stay on their devices.
 
     Raises:
-        SystemExit: the checkpoint is damaged, or of other parts.
+        SystemExit: the checkpoint is damaged, or has other parts.
     """
     if args.resume is None or not (args.resume / "checkpoint.pt").exists():
         return
     path = args.resume / "checkpoint.pt"
-    try:  # on the CPU first: what is not a network belongs there
+    try:  # on the CPU first, where replay buffers belong
         check_archive(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever a damaged file leads to
+    except Exception as error:  # a damaged file leads to any of many
         sys.exit(f"--resume: {path} is damaged: {error}")
     try:
         for name, part in parts.items():
@@ -316,8 +311,8 @@ def _restore(part, state):
 def summary_writer(run, args, step):
     """TensorBoard's writer for a run that is at `step`, with a table of the flags.
 
-    What an earlier process wrote after its last checkpoint is hidden. With `args.track`, what is
-    written goes to Weights & Biases too.
+    Events after `step`, from an earlier process, are hidden. With `args.track`, events go to
+    Weights & Biases, too.
     """
     if args.track:
         import wandb
@@ -332,22 +327,6 @@ def summary_writer(run, args, step):
     rows = "\n".join(f"|{name}|{value}|" for name, value in asdict(args).items())
     writer.add_text("hyperparameters", f"|param|value|\n|-|-|\n{rows}")
     return writer
-
-
-def progress_bar(total, done, unit):
-    """A bar of `total` steps, of which `done` were done by earlier processes."""
-    quiet = 0.2 if sys.stderr.isatty() else 30  # seconds; a log file needs fewer lines
-    return tqdm(total=total, initial=done, unit=unit, smoothing=0.05, mininterval=quiet)
-
-
-def elapsed(bar):
-    """Seconds since the bar began."""
-    return bar.format_dict["elapsed"]
-
-
-def rate(bar):
-    """Mean steps per second since the bar began."""
-    return (bar.n - bar.initial) / elapsed(bar)
 
 
 class Run:
@@ -369,8 +348,8 @@ class Run:
 
         Args:
             args: the flags.
-            name: of what is learned, the first part of the folder's name.
-            state: dict from a name to what changes in the run, as for `save_checkpoint`.
+            name: the first part of the folder's name, e.g. the task.
+            state: dict from names to the parts of the run, as for `save_checkpoint`.
             device: of the run.
         """
         self.args, self.device = args, device
@@ -392,7 +371,9 @@ class Run:
         """Open TensorBoard's writer and a progress bar of `total` steps, called `unit`."""
         self.writer = summary_writer(self.folder, self.args, self.step)
         self._seconds_before = self.seconds
-        self._bar = progress_bar(total, self.step, unit)
+        interval = 0.2 if sys.stderr.isatty() else 30  # s: a log file needs fewer lines
+        options = {"unit": unit, "smoothing": 0.05, "mininterval": interval}
+        self._bar = tqdm(total=total, initial=self.step, **options)
         self._may_raise = False
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):

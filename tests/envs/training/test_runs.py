@@ -114,7 +114,6 @@ def test_resumed_run_keeps_its_choice_of_bfloat16(parse, tmp_path, monkeypatch):
         monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: supported)
         monkeypatch.setattr("sys.argv", ["trainer.py", *map(str, flags)])
         args = runs.parse_args(WithBf16)
-        runs.resolve_bf16(args)
         return args.bf16, runs.run_folder(args, "wall")
 
     for number, supported in enumerate((False, True)):
