@@ -25,7 +25,6 @@ from roboarm_nmp.envs.policies.registry import recurrent_size
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
-from roboarm_nmp.envs.training.evaluation import is_privileged
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
 from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite
 
@@ -374,7 +373,9 @@ class PolicyRun(Run):
         the step length, if it is not the standard one (`deviations`), and whether the policy
         observes ground-truth obstacles (`privileged`).
         """
-        from roboarm_nmp.envs.policies.safety_filter import SafetyFilter  # Numba: not for --help
+        # Here, because Numba takes a while to import, which --help would wait for.
+        from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+        from roboarm_nmp.envs.training.evaluation import is_privileged
 
         self.close()
         args = self.args
