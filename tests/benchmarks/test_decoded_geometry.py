@@ -161,5 +161,5 @@ def test_inference_times(tmp_path):
     assert times["num_queries"] == 3 and times[policy]["encoding"] == 0
     assert 0 < times[policy]["action"] < times[policy]["total"] < 60
     assert times["RRT-Connect"]["rendering"] == 0 < times["RRT-Connect"]["planning"] < 5.5
-    seen = times["RRT-Connect, points"]
+    seen = times["RRT-Connect, point_cloud"]
     assert seen["rendering"] > 0.001 and seen["total"] > seen["planning"]

@@ -458,7 +458,7 @@ def test_an_interrupt_writes_nothing(tmp_path, capsys, monkeypatch):
 
 def test_the_command_without_torch(tmp_path):
     code = (
-        "import sys; from envs import show; code = show.main(sys.argv[1:]);"
+        "import sys; from roboarm_nmp.envs import show; code = show.main(sys.argv[1:]);"
         "assert 'torch' not in sys.modules; sys.exit(code)"
     )
     root = str(ROOT)
