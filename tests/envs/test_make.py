@@ -101,7 +101,7 @@ def test_encoded_scene_follows_appended_link_distances():
         ),
         (
             {"link_distances": True, "geometry_source": "obstacles"},
-            "a geometry source is 'ground_truth', 'point_cloud' or an encoder with a decoder",
+            "a geometry source is ground_truth, point_cloud or an encoder with a decoder",
         ),
         (
             {"link_distances": True, "geometry_source": "vae"},
