@@ -608,7 +608,6 @@ def test_bad_resolutions_are_rejected(wall, resolution):
         Box((0.5, 0, 0), (0.1, np.nan, 0.1)),
         Box((0.5, np.nan, 0), (0.1, 0.1, 0.1)),
         Box((0.5, 0, np.inf), (0.1, 0.1, 0.1)),
-        Box((0.5, 0, 0), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0, 0.0)),
         Box((0.5, 0, 0), (0.1, 0.1, np.inf)),
         Cylinder((0.5, 0, 0), 0.0, 0.1),
         Cylinder((0.5, 0, 0), 0.1, -0.1),
