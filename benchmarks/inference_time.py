@@ -97,9 +97,7 @@ def times(policy, queries, source=None, time_limit=5.0):
     if source is not None and not is_planner:
         arguments = arguments | {"geometry_source": source}
     env = roboarm_nmp.make(TASK, **arguments)
-    begin = make_policy(
-        found, env, time_limit=time_limit, geometry_source=source or "ground_truth"
-    )
+    begin = make_policy(found, env, time_limit=time_limit, geometry_source=source or "ground_truth")
     if is_planner:
         source = source or "ground_truth"
     else:

@@ -139,8 +139,9 @@ class Cell:
         if self.algorithm not in RECIPES:
             return True  # an algorithm of one's own
         has_configuration = self.algorithm in ("sac", "td3") and self.goal_type != "ee"
-        if has_configuration and not args.get("relative_configuration"):
-            return False  # from before it was an input by default
+        # Goal minus configuration is an input of all runs but the oldest.
+        if has_configuration and not args.get("relative_configuration", "plain_networks" in args):
+            return False
         given = self.flags()
         for flag, value in dict(zip(given[::2], given[1::2], strict=True)).items():
             had = args.get(flag.removeprefix("--").replace("-", "_"))

@@ -24,7 +24,7 @@ from pathlib import Path
 os.environ["OMP_NUM_THREADS"] = "1"
 SCRIPT = Path(__file__).parents[1] / "clean_rl_scripts" / "sac_her_mp.py"
 LEARNING_STARTS = 2000
-PLAIN = ["--no-layer-norm", "--no-relative-goal", "--no-trigonometric"]
+PLAIN = ["--plain-networks"]
 
 
 def ours(num_envs, steps, flags):

@@ -1,20 +1,20 @@
 """Search over the flags of a trainer, with Optuna on this machine or Ray Tune on a cluster.
 
-    python clean_rl_scripts/sweep.py clean_rl_scripts/td3_her_mp.py \\
+    roboarm sweep clean_rl_scripts/td3_her_mp.py \\
         --folder sweeps/td3 --trials 20 --search policy-lr=1e-6..5e-3:log q-lr=1e-6..5e-3:log \\
         -- --task double_walls_wide_gap --total-timesteps 100000
 
-What is searched over: `NAME=LOW..HIGH` (whole numbers if both are; `:log` for equally likely orders
-of magnitude) or `NAME=a,b,c` (`NAME=true,false` for flags that are on or off). Flags after `--` are
-given to every trial as they are. A trial's value is the trainer's best validation success.
+(Or `python clean_rl_scripts/sweep.py ...`.) The search space: `NAME=LOW..HIGH` (integers if both
+are; `:log` for a logarithmic scale) or `NAME=a,b,c` (`NAME=true,false` for boolean flags). Every
+trial receives the flags after `--`, too. A trial's value is the trainer's best validation success.
 
-The folder holds each trial's run, the search itself (`study.log`) and `trials.csv`; `tensorboard
---logdir FOLDER` shows curves and, under HPARAMS, the comparison. The same command goes on with a
-search that was stopped or killed; trials that were running go on from their checkpoints. (With one
-worker, and uninterrupted, a search repeats itself; otherwise its samples depend on who ends first.)
+The folder contains each trial's run, the search itself (`study.log`) and `trials.csv`; `tensorboard
+--logdir FOLDER` shows curves and, under HPARAMS, the comparison. The same command continues an
+interrupted search; trials that were running continue from their checkpoints. (An uninterrupted
+search with one worker is reproducible; otherwise samples depend on the order in which trials end.)
 
-(Paper, appendix "Parameter sweeps": learning rates from 1e-6 to 5e-3; for SAC, entropy tuning on
-and off, and alpha from 1e-5 to 10.)
+(Paper, appendix "Parameter sweeps": learning rates from 1e-6 to 5e-3; for SAC, with and without
+entropy tuning, `target-entropy=-7,None`, and alpha from 1e-5 to 10.)
 """
 
 import csv
@@ -22,6 +22,7 @@ import fcntl
 import io
 import json
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -29,10 +30,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from torch.utils.tensorboard import SummaryWriter
 
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers, check
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
+from roboarm_nmp.envs.utils.signals import Terminated, exit_interrupted
 from roboarm_nmp.envs.utils.workers import check_ray
 
 try:
@@ -45,6 +46,7 @@ except ImportError:
     sys.exit('sweep.py needs the extra `sweep`: pip install -c constraints.txt -e ".[sweep]"')
 
 METRIC = "validation_success_rate"
+RUNNING = set()  # processes of trainers
 
 
 @dataclass
@@ -52,11 +54,11 @@ class Args:
     trainer: tyro.conf.Positional[Path]
     """A trainer's script."""
     search: tuple[str, ...]
-    """What is searched over (see above)."""
+    """The search space (see above)."""
     trials: PositiveInt = 20
     """Number of trials."""
     folder: Path = Path("sweep")
-    """Where it all is."""
+    """Folder of the search."""
     seed: Seed = 0
     """Seed of the search."""
     workers: Workers = 1
@@ -75,7 +77,7 @@ def parse_search(text):
         return name, CategoricalDistribution(values.split(","))
     values, _, scale = values.partition(":")
     if scale not in ("", "log"):
-        raise ValueError(f"{text!r}: after the colon there can only be `log`")
+        raise ValueError(f"{text!r}: only `log` may follow the colon")
     low, _, high = values.partition("..")
     try:
         whole = low.lstrip("-").isdigit() and high.lstrip("-").isdigit()
@@ -87,7 +89,7 @@ def parse_search(text):
 
 
 def suggest(trial, name, space):
-    """Optuna's value of one flag for a trial."""
+    """Optuna's value of a flag for a trial."""
     if isinstance(space, CategoricalDistribution):
         return trial.suggest_categorical(name, space.choices)
     kind = trial.suggest_int if isinstance(space, IntDistribution) else trial.suggest_float
@@ -106,27 +108,36 @@ def flags_of(params):
 
 
 class Stopped(Exception):
-    """A trial ended before its time; the next call of the search goes on with it."""
+    """A trial was interrupted; the next call of the search continues it."""
 
 
 def train(trainer, flags, folder):
-    """The result (dict) of one run of the trainer in `folder`, which goes on if it was stopped.
+    """The result (dict) of a run of the trainer in `folder`, which continues if it was stopped.
 
     Raises:
-        RuntimeError: it failed; the message has the end of what it said. Or it trains no policy.
-        Stopped: it was killed.
+        RuntimeError: the trainer failed; the message has the end of its output. Or it trains no
+            policy.
+        Stopped: a signal ended the trainer.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "log.txt", "ab") as log:
-        # The trainer inherits the lock: one that outlived its killed sweep is waited for.
+        # The trainer inherits the lock: this waits for one that has outlived its killed sweep.
         fcntl.flock(log, fcntl.LOCK_EX)
         if not any(folder.glob("*/result.json")):
             begun = sorted(folder.glob("*/checkpoint.pt"))
             which = ["--resume", begun[-1].parent] if begun else ["--runs-dir", folder, *flags]
             command = [sys.executable, trainer, *which]
-            code = subprocess.run(command, stdout=log, stderr=log).returncode
-            if code < 0:  # a signal: Ctrl-C, or too little memory
-                raise Stopped(f"the trainer was stopped by signal {-code}")
+            process = subprocess.Popen(command, stdout=log, stderr=log)
+            RUNNING.add(process)
+            try:
+                code = process.wait()
+            except KeyboardInterrupt:  # its signal ends the trainer, too, after a checkpoint
+                process.wait()
+                raise
+            finally:
+                RUNNING.discard(process)
+            if code < 0 or code in (130, 143):  # Ctrl-C, SIGTERM, or too little memory
+                raise Stopped(f"the trainer was stopped: exit code {code}")
             if code > 0:
                 end = (folder / "log.txt").read_text(errors="replace").strip()[-500:]
                 raise RuntimeError(f"the trainer ended with {code}: {end}")
@@ -136,8 +147,15 @@ def train(trainer, flags, folder):
     return result
 
 
+def _on_sigterm(number, frame):
+    """End the running trainers, after their checkpoints, and the search."""
+    for process in list(RUNNING):
+        process.terminate()
+    raise Terminated
+
+
 def folder_of(trial):
-    """Name of a trial's folder: that of the trial that it goes on with, if there was one."""
+    """Name of a trial's folder: that of the trial that it continues, if any."""
     return trial.user_attrs.get("folder", f"trial_{trial.number:03d}")
 
 
@@ -148,9 +166,9 @@ def sweep(trainer, search, trials, folder, flags, seed, workers):
         trainer: path of a script with the flags `--runs-dir` and `--resume` that writes
             `result.json` into its run's folder.
         search: dict of flag -> Optuna distribution.
-        trials: number of trials, those already there included.
-        folder: path; what a search needs to go on is in here.
-        flags: list of flags given to every trial.
+        trials: number of trials, finished ones included.
+        folder: path of the search's files.
+        flags: list of flags of every trial.
         seed: of the search, >= 0.
         workers: trials at a time.
 
@@ -169,7 +187,7 @@ def sweep(trainer, search, trials, folder, flags, seed, workers):
     if study.user_attrs.get("search", described) != described:
         raise ValueError(f"{folder} holds another search: {study.user_attrs['search']}")
     study.set_user_attr("search", described)
-    # Another stream of random numbers each time, or the samples would be the first ones again.
+    # A new stream of random numbers each time, otherwise the first samples would be repeated.
     study.sampler = optuna.samplers.TPESampler(
         seed=seed + len(study.trials), constant_liar=workers > 1
     )
@@ -226,16 +244,18 @@ def write_report(study, search, folder):
         if trial.state == TrialState.FAIL and not error:
             row["state"] = "stopped"
         rows.append(row | {"seconds": seconds, "error": error[-1] if error else ""})
-        where = folder / folder_of(trial)
-        if trial.state == TrialState.COMPLETE and not (where / "hparams").exists():
-            with SummaryWriter(where) as writer:
+        path = folder / folder_of(trial)
+        if trial.state == TrialState.COMPLETE and not (path / "hparams").exists():
+            from torch.utils.tensorboard import SummaryWriter  # slow to import, and not for --help
+
+            with SummaryWriter(path) as writer:
                 value = {f"sweep/{METRIC}": trial.value}
                 writer.add_hparams(trial.params, value, run_name="hparams")
     write_csv(folder / "trials.csv", rows)
 
 
 def write_csv(path, rows):
-    """Rows (dicts with the same keys), written in one piece."""
+    """Write rows (dicts with the same keys), atomically."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, rows[0] if rows else [])
     writer.writeheader()
@@ -255,8 +275,8 @@ def sweep_on_ray(address, trainer, search, trials, folder, flags, seed):
     trainer, folder = trainer.resolve(), folder.resolve()
 
     def trial(params):
-        where = folder / "runs" / tune.get_context().get_trial_id()
-        tune.report({METRIC: train(trainer, [*flags, *flags_of(params)], where)[METRIC]})
+        path = folder / "runs" / tune.get_context().get_trial_id()
+        tune.report({METRIC: train(trainer, [*flags, *flags_of(params)], path)[METRIC]})
 
     ray.init(address=address, log_to_driver=False, logging_level="warning")
     try:
@@ -289,7 +309,7 @@ def sweep_on_ray(address, trainer, search, trials, folder, flags, seed):
 
 
 def _check(args, flags):
-    """The search, as `sweep` takes it. Raises ValueError for arguments that cannot work."""
+    """The search space, as for `sweep`. Raises ValueError: an argument is not valid."""
     check(args)
     if not args.trainer.is_file():
         raise ValueError(f"no such trainer: {args.trainer}")
@@ -314,6 +334,7 @@ def main(arguments=None):
     cut = arguments.index("--") if "--" in arguments else len(arguments)
     flags = arguments[cut + 1 :]
     args = tyro.cli(Args, args=arguments[:cut], prog="sweep.py", description=__doc__)
+    signal.signal(signal.SIGTERM, _on_sigterm)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
         search = _check(args, flags)
@@ -329,9 +350,8 @@ def main(arguments=None):
             values = [t.value for t in study.trials if t.state == TrialState.COMPLETE]
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as interrupt:
+        exit_interrupted(interrupt, "the same command continues the search")
     if not values:
         sys.exit(f"error: every trial failed; see {args.folder / 'trials.csv'}")
     print(

@@ -104,6 +104,7 @@ def test_runs_from_before_goal_minus_configuration_are_others():
         args = recipe | {"task": "wall", "goal_type": goal_type}
         assert cell.is_recipe_of(args) is fits
         assert cell.is_recipe_of(args | {"relative_configuration": True})
+        assert cell.is_recipe_of(args | {"plain_networks": False})
         assert cell.is_recipe_of(args | {"relative_configuration": False}) is fits
 
 

@@ -1,4 +1,4 @@
-"""The search over a trainer's flags, with a trainer that takes no time."""
+"""clean_rl_scripts/sweep.py, with a trainer that takes no time."""
 
 import csv
 import importlib.util
@@ -74,21 +74,21 @@ def rows(trainer):
         ("autotune=true,false", "autotune", CategoricalDistribution(("true", "false"))),
     ],
 )
-def test_what_is_searched_over(text, name, distribution):
+def test_search_space_is_parsed(text, name, distribution):
     assert sweep.parse_search(text) == (name, distribution)
 
 
 @pytest.mark.parametrize(
     "text", ["lr", "=1..2", "lr=", "lr=1..2:logarithmic", "lr=a..b", "lr=2.0..1.0", "lr=0..1:log"]
 )
-def test_what_cannot_be_searched_over_is_refused(trainer, text, capsys):
+def test_bad_search_space_is_rejected(trainer, text, capsys):
     with pytest.raises(SystemExit) as exit:
         sweep.main([str(trainer), "--search", text])
     assert str(exit.value).startswith("error: ") and text in str(exit.value)
     assert not list(trainer.parent.glob("sweep*"))
 
 
-def test_a_search_finds_what_is_best(trainer, capsys):
+def test_search_finds_the_best_flags(trainer, capsys):
     sweep.main(arguments(trainer, "on=true,false", "--trials", "25"))
     found = rows(trainer)
     assert len(found) == 25 and {row["state"] for row in found} == {"complete", "fail"}
@@ -110,7 +110,7 @@ def test_a_search_finds_what_is_best(trainer, capsys):
     )
 
 
-def test_a_search_repeats_itself_and_goes_on(trainer, tmp_path, capsys):
+def test_search_is_reproducible_and_continues(trainer, tmp_path, capsys):
     sweep.main(arguments(trainer, "--trials", "4"))
     first = [row["lr"] for row in rows(trainer)]
     sweep.main(arguments(trainer, "--trials", "6", "--folder", tmp_path / "again"))
@@ -142,15 +142,24 @@ def start(trainer, seconds):
     return process, command
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_killed_it_goes_on_with_the_trials_that_were_running(trainer, number):
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130), (signal.SIGTERM, 143)]
+)
+def test_interrupted_search_continues_its_running_trials(trainer, number, code):
     process, command = start(trainer, 1000)
     begun = {
         path.parent.parent.name: json.loads(path.read_text())["lr"]
         for path in trainer.parent.glob("sweep/*/*/checkpoint.pt")
     }
-    os.killpg(process.pid, number)
-    assert process.wait(30) == (-9 if number == signal.SIGKILL else 130)
+    trainers = psutil.Process(process.pid).children()
+    assert len(trainers) == 2
+    if number == signal.SIGTERM:  # it reaches the search only, which ends its trainers
+        process.terminate()
+    else:  # Ctrl-C in a terminal reaches all
+        os.killpg(process.pid, number)
+    assert process.wait(30) == code
+    if number == signal.SIGTERM:
+        assert not any(one.is_running() for one in trainers)
     subprocess.run(command, check=True)
     found = {row["trial"]: row for row in rows(trainer)}
     assert len(found) == 4 and set(begun) < set(found)
@@ -160,7 +169,7 @@ def test_killed_it_goes_on_with_the_trials_that_were_running(trainer, number):
         assert float(found[trial]["lr"]) == result["lr"] == begun.get(trial, result["lr"])
 
 
-def test_a_trainer_that_outlived_its_search_is_waited_for(trainer):
+def test_search_waits_for_trainers_that_outlived_it(trainer):
     process, command = start(trainer, 4)
     trainers = psutil.Process(process.pid).children()
     process.kill()
@@ -194,12 +203,12 @@ def test_on_ray(trainer):
         cluster.shutdown()
 
 
-def test_a_trainer_of_no_policy_is_a_failure(trainer):
+def test_trainer_without_a_policy_fails(trainer):
     trainer.write_text(TRAINER.replace("validation_success_rate", "error_near"))
     with pytest.raises(SystemExit, match="every trial failed"):
         sweep.main(arguments(trainer, "--trials", "1"))
 
 
-def test_every_trial_failed(trainer):
+def test_search_ends_with_an_error_if_every_trial_fails(trainer):
     with pytest.raises(SystemExit, match="every trial failed"):
         sweep.main(arguments(trainer, "--trials", "2", "--", "--other", "no number"))

@@ -1,4 +1,4 @@
-"""docs/your_own_algorithm.md, followed as it says."""
+"""docs/your_own_algorithm.md: its example is carried out."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from roboarm_nmp import envs
 PAGE = (ROOT / "docs" / "your_own_algorithm.md").read_text()
 
 
-def test_the_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
+def test_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
     name, before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:3]
     source = PATHS["sac_her_mp"].read_text()
     assert source.count(before) == 1
@@ -30,19 +30,12 @@ def test_the_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
     subprocess.run(again, check=True, capture_output=True)
     assert json.loads((run / "result.json").read_text())["steps"] == 1800
     evaluate = [sys.executable, str(ROOT / "clean_rl_scripts" / "evaluate.py"), "--task", "wall"]
-    evaluate += [
-        "--policy",
-        str(run),
-        "--num-queries",
-        "3",
-        "--json",
-        str(tmp_path / "result.json"),
-    ]
+    evaluate += ["--policy", str(run), "--num-queries", "3", "--json", tmp_path / "result.json"]
     subprocess.run(evaluate, check=True, capture_output=True)
     assert json.loads((tmp_path / "result.json").read_text())["num_queries"] == 3
 
 
-def test_the_example_relabels_with_the_ends_of_episodes(tmp_path, monkeypatch):
+def test_example_relabels_with_the_ends_of_episodes(tmp_path, monkeypatch):
     _, before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:3]
     script = tmp_path / "sac_final_mp.py"
     script.write_text(PATHS["sac_her_mp"].read_text().replace(before, after))
@@ -68,6 +61,6 @@ def test_the_example_relabels_with_the_ends_of_episodes(tmp_path, monkeypatch):
     env.close()
 
 
-def test_the_pages_commands_name_what_exists():
+def test_commands_of_the_page_name_existing_files():
     for path in re.findall(r"(?:clean_rl_scripts|benchmarks|bc_script)/\w+\.\w+", PAGE):
         assert Path(path).name == "sac_final_mp.py" or (ROOT / path).exists(), path

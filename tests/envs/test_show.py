@@ -19,6 +19,7 @@ from roboarm_nmp.envs import panda, show
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, write_queries
 from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import TASKS, Task
 
@@ -63,14 +64,14 @@ def frames_of(path):
 # --- Pictures
 
 
-def test_an_environment_that_does_not_render_is_drawn_for_pictures():
+def test_environment_without_render_mode_is_drawn_for_images():
     scene = Scene((Sphere((0.5, 0.3, 0.4), 0.1), Cylinder((0.5, -0.3, 0.3), 0.05, 0.3)))
     query, task = Query(BENT, BENT + 0.1, scene), "random_boxes_hard"
     plain, drawn = envs.make(task), env_of(task)
-    expected = show.picture(drawn, query, SMALL)
-    assert not np.array_equal(expected, show.picture(drawn, Query(BENT, BENT, Scene()), SMALL))
+    expected = show.render_query(drawn, query, SMALL)
+    assert not np.array_equal(expected, show.render_query(drawn, Query(BENT, BENT, Scene()), SMALL))
     plain.reset_specific(*query)
-    found = [show.picture(plain, query, SMALL) for _ in range(2)]
+    found = [show.render_query(plain, query, SMALL) for _ in range(2)]
     for one in found:
         different = (one != expected).any(-1) & ~green(expected)  # which is the goal's ball
         assert different.sum() < 20
@@ -78,16 +79,16 @@ def test_an_environment_that_does_not_render_is_drawn_for_pictures():
     drawn.close()
 
 
-def test_a_picture_has_the_goal_as_a_ball_and_as_a_ghost(env):
+def test_image_shows_the_goal_as_a_ball_and_as_a_ghost(env):
     ball = panda.forward_kinematics(AT_THE_SIDE).astype(np.float32)
-    with_ghost = show.picture(env, Query(BENT, AT_THE_SIDE, Scene()), (160, 120))
-    ball_only = show.picture(env, Query(BENT, ball, Scene()), (160, 120))
+    with_ghost = show.render_query(env, Query(BENT, AT_THE_SIDE, Scene()), (160, 120))
+    ball_only = show.render_query(env, Query(BENT, ball, Scene()), (160, 120))
     assert with_ghost.shape == ball_only.shape == (120, 160, 3)
     assert with_ghost.dtype == ball_only.dtype == np.uint8
     assert 5 < green(ball_only).sum() < 60
     assert green(with_ghost).sum() > 300
     # The other way round, the ghost is where the arm was.
-    swapped = show.picture(env, Query(AT_THE_SIDE, BENT, Scene()), (160, 120))
+    swapped = show.render_query(env, Query(AT_THE_SIDE, BENT, Scene()), (160, 120))
     assert (
         np.abs(np.argwhere(green(with_ghost)).mean(0) - np.argwhere(green(swapped)).mean(0)).max()
         > 5
@@ -98,9 +99,9 @@ def test_an_obstacle_in_front_hides_the_ghost_unless_seen_from_elsewhere(env, mo
     half = np.deg2rad(-35.0 / 2)  # turned to the first of the camera's places
     wall = Box((0.8, -0.56, 0.7), (0.02, 2.4, 2.4), (0.0, 0.0, np.sin(half), np.cos(half)))
     query = Query(BENT, AT_THE_SIDE, Scene((wall,), None, None))
-    assert green(show.picture(env, query, SMALL)).sum() > 20
+    assert green(show.render_query(env, query, SMALL)).sum() > 20
     monkeypatch.setattr(show, "YAWS", show.YAWS[:1])
-    assert green(show.picture(env, query, SMALL)).sum() == 0
+    assert green(show.render_query(env, query, SMALL)).sum() == 0
 
 
 def test_the_camera_sees_everything_and_stands_no_further_than_needed(env):
@@ -146,7 +147,7 @@ def test_the_camera_looks_at_the_arm_from_where_it_is_free(env):
     }
 
 
-def test_a_grid_of_pictures(tmp_path, capsys):
+def test_images_of_several_queries_form_a_grid(tmp_path, capsys):
     assert run("wall", "--output", tmp_path / "a.png", "--draws", 3, "--query", 5, *SIZE) == 0
     assert "test query 5 to 7" in capsys.readouterr().out
     grid = np.asarray(Image.open(tmp_path / "a.png"))
@@ -155,7 +156,7 @@ def test_a_grid_of_pictures(tmp_path, capsys):
     env = env_of("wall")
     queries = load_queries("wall")
     for tile, number in zip(tiles, (5, 6, 7), strict=False):
-        assert np.array_equal(tile, show.picture(env, queries[number], SMALL))
+        assert np.array_equal(tile, show.render_query(env, queries[number], SMALL))
         assert green(tile).any()
     env.close()
     assert not np.array_equal(tiles[0], tiles[1]) and (tiles[3] == 255).all()
@@ -184,11 +185,13 @@ def save(path, module=None, **metadata):
     return path
 
 
-def test_a_rollout_is_an_episode(env):
+def test_rollout_ends_at_the_goal(env):
     goal = panda.normalise(AT_THE_SIDE)
     query = Query(BENT, AT_THE_SIDE, Scene())
-    path, info = show.rollout(env, query, lambda observation: goal - observation["observation"][:7])
-    assert info["is_success"] and info["elapsed_steps"] == len(path) - 1 > 10
+    policy = lambda observation: goal - observation["observation"][:7]  # noqa: E731
+    trajectory = rollout(env, query, policy)
+    path = trajectory.configurations
+    assert trajectory.success and len(trajectory) == len(path) - 1 > 10
     assert np.allclose(path[0], BENT, atol=1e-6)
     ends = panda.forward_kinematics(path)
     target = panda.forward_kinematics(AT_THE_SIDE)
@@ -209,7 +212,7 @@ def test_an_animation_of_a_network_and_of_the_same_policy(tmp_path, capsys, monk
     assert durations[-1] == 1000 * show.PAUSE
     changes = np.abs(np.diff(frames.astype(int), axis=0)).sum((1, 2, 3))
     assert (changes > 0).mean() > 0.9
-    still = show.picture(env_of("wall"), load_queries("wall")[2], SMALL)
+    still = show.render_query(env_of("wall"), load_queries("wall")[2], SMALL)
     assert green(frames[0]).sum() == pytest.approx(green(still).sum(), rel=0.5)
 
     # Fewer frames of more steps each.
@@ -232,21 +235,21 @@ def test_random_actions_depend_on_the_seed(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("policy", "touched"),
+    ("policy", "contact"),
     [
-        ("go-to-goal", "something"),
-        ("via-points", "nothing"),
-        ("planner", "nothing"),
-        ("bc-config-double_walls-s1", "something"),
+        ("go-to-goal", "with contact"),
+        ("via-points", "collision-free"),
+        ("planner", "collision-free"),
+        ("bc-config-double_walls-s1", "with contact"),
     ],
 )
-def test_policies_by_name(policy, touched, tmp_path, capsys, monkeypatch):
+def test_policies_by_name(policy, contact, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 1)
     # Straight to this goal the arm slides along a wall; there is a way around.
     arguments = ["--policy", policy, "--query", 11, "--split", "validation", *SIZE]
     assert run("double_walls", "--output", tmp_path / "a.gif", *arguments) == 0
     text = capsys.readouterr().out
-    assert f"{policy}: reached the goal in " in text and f"touching {touched}" in text
+    assert f"{policy}: reached the goal in " in text and contact in text
 
 
 def test_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatch):
@@ -255,7 +258,7 @@ def test_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatch):
     arguments = ["--policy", policy, "--query", 1, "--split", "validation", *SIZE]
     assert run("random_boxes_hard", "--output", tmp_path / "a.gif", *arguments) == 0
     text = capsys.readouterr().out
-    assert f"{policy}: reached the goal in " in text and "touching nothing" in text
+    assert f"{policy}: reached the goal in " in text and "collision-free" in text
 
 
 def test_a_demonstration(tmp_path, capsys, monkeypatch):
@@ -266,10 +269,10 @@ def test_a_demonstration(tmp_path, capsys, monkeypatch):
     assert f"demonstration 7: {len(demo.states) - 1} steps" in capsys.readouterr().out
     frames, _ = frames_of(tmp_path / "a.gif")
     assert len(frames) in (4, 5) and green(frames[0]).sum() > 2 * green(frames[-1]).sum()
-    # The still picture is of the demonstration's query.
+    # The still image is of the demonstration's query.
     assert run("wall", "--output", tmp_path / "a.png", *arguments) == 0
-    picture = show.picture(env_of("wall"), Query(demo.start, demo.goal, demo.scene), SMALL)
-    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), picture)
+    image = show.render_query(env_of("wall"), Query(demo.start, demo.goal, demo.scene), SMALL)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), image)
 
 
 # --- Where the queries come from
@@ -295,7 +298,7 @@ def test_random_queries_where_there_is_no_file(tmp_path, capsys):
     assert run(task, "--output", tmp_path / "d.png", "--query", 1, *SIZE) == 0
     assert "test query 1" in capsys.readouterr().out
     env = env_of(str(task))
-    expected = show.picture(env, Query(AT_THE_SIDE, BENT, env.scene), SMALL)
+    expected = show.render_query(env, Query(AT_THE_SIDE, BENT, env.scene), SMALL)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "d.png")), expected)
 
 
@@ -431,7 +434,7 @@ def test_errors(tmp_path, capsys, monkeypatch):
     assert sorted(os.listdir(tmp_path)) == before
 
 
-def test_an_old_picture_stays_until_the_new_one_is_whole(tmp_path, capsys, monkeypatch):
+def test_old_image_stays_until_the_new_one_is_whole(tmp_path, capsys, monkeypatch):
     path = tmp_path / "a.png"
     path.write_bytes(b"old")
 
