@@ -18,11 +18,22 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 LONG = (
     *("test_trainers", "test_encoder_policies", "test_encoder_trainers", "test_devices"),
     *("test_td3_her_mp", "test_dagger", "test_bc", "test_collect", "test_own_algorithm"),
-    *("test_evaluate", "test_paper_tables", "test_own_scene", "test_sac_her_mp", "test_learning"),
+    *("test_evaluation", "test_paper_tables", "test_own_scene", "test_sac_her_mp", "test_learning"),
 )
 
 
+# Files for daily work, with the marker `fast`: less than a minute together.
+FAST = {
+    *("test_imports", "test_make", "test_wrappers", "test_scenes", "test_scene_files"),
+    *("test_collision", "test_episodes", "test_policies", "test_signals"),
+}
+
+
+@pytest.hookimpl(tryfirst=True)  # before the items are selected by `-m`
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.path.stem in FAST and "slow" not in item.keywords:
+            item.add_marker("fast")
     ranks = {name: rank for rank, name in enumerate(LONG)}
     items.sort(key=lambda item: ranks.get(item.path.stem, len(LONG)))
 
