@@ -1,4 +1,4 @@
-"""Policies that see the scene through an encoder: buffer, demonstrations, training, evaluation."""
+"""Policies that observe an encoded scene: buffer, demonstrations, training, evaluation."""
 
 import json
 import subprocess
@@ -49,15 +49,15 @@ def steps(env, length):
     return transitions
 
 
-def test_the_buffer_gives_each_transition_the_code_of_its_scene(env):
+def test_buffer_samples_have_the_latent_code_of_their_scene(env):
     sac = load("sac_her_mp")
     env.reset(seed=0)
     buffer = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
-    assert buffer.rows.shape[1] < 50  # latents are not in the rows
-    known = {}
+    assert buffer.arrays["observation"].shape[1] < 50  # stored without latents
+    stored = {}
     for _ in range(8):  # the oldest ones are overwritten
         episode = steps(env, 10)
-        known |= {t["observation"][:10].tobytes(): t for t in episode}
+        stored |= {t["observation"][:10].tobytes(): t for t in episode}
         buffer.add_episode(episode)
     copy = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
     copy.load_state_dict(buffer.state_dict())
@@ -66,12 +66,12 @@ def test_the_buffer_gives_each_transition_the_code_of_its_scene(env):
         assert batch["observation"].shape == (200, 10 + SIZE)
         assert batch["observation"].dtype == np.float32
         for row, following in zip(batch["observation"], batch["next_observation"], strict=True):
-            transition = known[row[:10].tobytes()]
+            transition = stored[row[:10].tobytes()]
             np.testing.assert_array_equal(row, transition["observation"])
             np.testing.assert_array_equal(following, transition["next_observation"])
 
 
-def test_demonstrations_have_the_code_of_their_scene(env):
+def test_demonstrations_have_the_latent_code_of_their_scene(env):
     demos = load_demos(HARD)
     for i in (0, 7):
         for transition in demo_transitions(demos[i], env):
@@ -79,9 +79,9 @@ def test_demonstrations_have_the_code_of_their_scene(env):
                 np.testing.assert_array_equal(transition[name][10:], oracle(demos[i].scene))
 
 
-def test_link_distances_in_the_observation_the_buffer_and_demonstrations():
-    knows = {"encoder": "oracle", "link_distances": "obstacles", "append_link_distances": True}
-    env = envs.make(HARD, **knows)
+def test_appended_link_distances_in_observations_buffer_and_demonstrations():
+    arguments = {"encoder": "oracle", "append_link_distances": True}
+    env = envs.make(HARD, **arguments, link_distances=True, geometry_source="ground_truth")
     env.reset(seed=0)
     buffer = load("sac_her_mp").HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
     episode = steps(env, 10)
@@ -90,8 +90,8 @@ def test_link_distances_in_the_observation_the_buffer_and_demonstrations():
     near = env.link_distances_at(observations[:, :7])
     np.testing.assert_array_equal(observations[:, 10:90], near.reshape(10, 80))
     np.testing.assert_array_equal(observations[0, 90:], oracle(env.unwrapped.scene))
-    known = {row.tobytes() for row in observations}
-    assert {row.tobytes() for row in buffer.sample(100)["observation"]} == known
+    rows = {row.tobytes() for row in observations}
+    assert {row.tobytes() for row in buffer.sample(100)["observation"]} == rows
     demo = load_demos(HARD)[7]  # in another scene than the environment's
     transitions = demo_transitions(demo, env)
     env.reset_specific(demo.start, demo.goal, demo.scene)
@@ -100,25 +100,24 @@ def test_link_distances_in_the_observation_the_buffer_and_demonstrations():
         np.testing.assert_allclose(one["observation"][10:90], near, atol=1e-6)
         np.testing.assert_array_equal(one["observation"][90:], oracle(demo.scene))
     env.close()
-    for append in (True, 1.5, "yes"):
-        with pytest.raises(ValueError, match="is a bool and needs link_distances"):
-            envs.make(HARD, append_link_distances=append)
 
 
 def flags(trainer):
     more = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
-    return more if trainer == "bc" else [*more, "--demo-prob", "1", "--link_distances", "obstacles"]
+    distances = ["--link-distances", "--geometry-source", "ground_truth"]
+    return more if trainer == "bc" else [*more, "--demo-prob", "1", *distances]
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
+def test_policy_with_an_encoder_is_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
     run = run_script(trainer, tmp_path / "whole", *flags(trainer), "--goal-type", "combined")
     network = torch.load(run / "policy.pt", weights_only=True)
     assert network["metadata"]["env"]["encoder"] == "oracle"
     arguments = ["--policy", run, "--num-queries", "3", "--task", HARD]
     arguments += ["--json", tmp_path / "result.json"]
     assert evaluate.main(list(map(str, arguments))) == 0
-    assert json.loads((tmp_path / "result.json").read_text())["goal_type"] == "combined"
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["goal_type"] == "combined" and result["privileged"]
     assert network["metadata"]["env"].get("append_link_distances", False) == (trainer != "bc")
     if trainer == "bc":
         show = [sys.executable, "-m", "roboarm_nmp.envs.show", HARD, "--policy", str(run)]
@@ -136,15 +135,15 @@ def test_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_what_is_no_encoder_is_refused(trainer, tmp_path, capsys):
+def test_file_that_is_no_encoder_is_rejected(trainer, tmp_path, capsys):
     (tmp_path / "runs").mkdir()
     (tmp_path / "encoder.pt").write_text("nothing")
     given = ("--encoder", str(tmp_path / "encoder.pt"))
-    said = refusal(trainer, capsys, tmp_path / "runs", *given)
-    assert "--encoder: " in said and "not a network file" in said
+    message = refusal(trainer, capsys, tmp_path / "runs", *given)
+    assert "--encoder: " in message and "not a network file" in message
 
 
-def test_one_encoder_serves_all_environments_of_a_process(env):
+def test_environments_of_a_process_share_one_encoder(env):
     other = envs.make(HARD, encoder="oracle")
     assert env.encoder is other.encoder is oracle
     other.close()

@@ -1,4 +1,4 @@
-"""Policies by name, and the commands of an installed package."""
+"""Policies by name: baselines, pretrained policies, and what importing them needs."""
 
 import subprocess
 import sys
@@ -9,6 +9,7 @@ from paths import ROOT
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.networks.exported_networks import to_float16
+from roboarm_nmp.envs.policies.baselines import PLANNERS
 from roboarm_nmp.envs.policies.registry import (
     PolicyError,
     find_policy,
@@ -22,16 +23,17 @@ from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 
 def test_pretrained_policies_are_found_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    kept = {path.stem: path for path in (ROOT / "envs/policies/pretrained").glob("*.pt")}
-    assert len(kept) > 10 and pretrained_policies() == kept
+    files = {path.stem: path for path in (ROOT / "envs/policies/pretrained").glob("*.pt")}
+    found = {name: path.resolve() for name, path in pretrained_policies().items()}
+    assert len(files) > 10 and found == files
     assert policy_file("bc-config-double_walls-s1").samefile(
         ROOT / "envs/policies/pretrained/bc-config-double_walls-s1.pt"
     )
     path, arguments = find_policy("sac-ee-wall-p1-s1")
-    assert path == kept["sac-ee-wall-p1-s1"] and arguments["goal_type"] == "ee"
-    # A file or folder of that name comes first.
+    assert path.samefile(files["sac-ee-wall-p1-s1"]) and arguments["goal_type"] == "ee"
+    # A file or folder of that name takes precedence.
     (tmp_path / "sac-ee-wall-p1-s1").mkdir()
-    names = ", ".join(sorted(kept))
+    names = ", ".join(sorted(files))
     with pytest.raises(PolicyError, match=f"no such policy.*or a name: {names}"):
         policy_file("sac-ee-wall-p1-s2")
     (tmp_path / "sac-ee-wall-p1-s1" / "policy.pt").write_bytes(b"")
@@ -39,13 +41,13 @@ def test_pretrained_policies_are_found_from_anywhere(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", pretrained_policies())
-def test_pretrained_policies_are_in_half_precision(name, tmp_path):
+def test_pretrained_policies_are_stored_in_float16(name, tmp_path):
     path = pretrained_policies()[name]
     to_float16(path, tmp_path / "policy.pt")
     assert (tmp_path / "policy.pt").read_bytes() == path.read_bytes()
 
 
-def test_a_policy_in_an_environment_without_what_it_sees():
+def test_policy_without_its_encoder_in_the_environment_is_rejected():
     path, arguments = find_policy("bc-combined-oracle-random_boxes_hard-s1")
     assert arguments["encoder"] == "oracle"
     del arguments["encoder"]
@@ -55,7 +57,7 @@ def test_a_policy_in_an_environment_without_what_it_sees():
     env.close()
 
 
-def test_a_policy_whose_actions_mean_something_else():
+def test_policy_with_actions_of_another_mode_is_rejected():
     env = envs.make("wall", action_mode="subgoal")
     trained = find_policy("sac-ee-wall-p1-s1")[0]
     for policy in ("go-to-goal", "via-points", "planner", trained):
@@ -65,18 +67,38 @@ def test_a_policy_whose_actions_mean_something_else():
     env.close()
 
 
-def test_a_pretrained_policy_brings_what_it_sees_and_its_safety_filter():
+def test_pretrained_policy_brings_its_observations_and_its_safety_filter():
     path, arguments = find_policy("dagger-combined-point_cloud-random_boxes_hard-s1")
     assert arguments == {
         "goal_type": "combined",
-        "encoder": "points:32",
-        "link_distances": "points",
+        "encoder": "point_cloud",
+        "num_points": 32,
+        "geometry_source": "point_cloud",
+        "link_distances": True,
     }
-    assert own_safety_filter(path) == SafetyFilter(keep=0.01, escape=True)
+    assert own_safety_filter(path) == SafetyFilter(margin=0.01, escape=True)
     assert own_safety_filter(policy_file("bc-config-double_walls-s1")) is None
+    assert own_safety_filter("planner") is None
 
 
-def test_envs_needs_neither_the_planner_nor_the_trainers():
+def test_unknown_geometry_source_is_rejected():
+    env = envs.make("wall")
+    for policy in PLANNERS:
+        with pytest.raises(
+            PolicyError, match="a geometry source is .* or an encoder with a decoder"
+        ):
+            make_policy(policy, env, geometry_source="nowhere")
+    env.close()
+
+
+def test_safety_filter_needs_link_distances():
+    env = envs.make("wall")
+    with pytest.raises(PolicyError, match="needs link_distances"):
+        make_policy("go-to-goal", env, safety_filter=SafetyFilter())
+    env.close()
+
+
+def test_envs_imports_neither_the_planner_nor_the_trainers():
     names = ("policies.registry", "show", "datasets.queries", "world")
     imports = "; ".join(f"import roboarm_nmp.envs.{name}" for name in names)
     code = f"import sys; {imports}; print(*sys.modules)"
