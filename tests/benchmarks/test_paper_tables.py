@@ -176,16 +176,16 @@ def test_the_page_without_any_result():
     assert "**" not in page and page.rstrip().endswith("None yet.")
 
 
-def test_the_pictures(results, tmp_path):
+def test_figures_are_drawn(results, tmp_path):
     unseen = {"wall": {"dagger, point_cloud": {"success_rate": 0.99}}}
     story = functools.partial(paper_tables.draw_story, baselines=BASELINES, unseen=unseen)
     for draw in (paper_tables.draw_curves, paper_tables.draw_bars, story):
-        draw(list(CELLS.values()), results, path=tmp_path / "picture.png")
-        with Image.open(tmp_path / "picture.png") as picture:
-            assert len(picture.convert("RGB").getcolors(1_000_000)) > 10
+        draw(list(CELLS.values()), results, path=tmp_path / "figure.png")
+        with Image.open(tmp_path / "figure.png") as image:
+            assert len(image.convert("RGB").getcolors(1_000_000)) > 10
 
 
-def test_the_picture_of_tasks_shows_means_over_seeds(results, monkeypatch):
+def test_figure_of_tasks_shows_means_over_seeds(results, monkeypatch):
     figures = []
     monkeypatch.setattr(paper_tables, "_save", lambda figure, path: figures.append(figure))
     paper_tables.draw_story(list(CELLS.values()), results, BASELINES, {}, None)

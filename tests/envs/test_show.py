@@ -252,7 +252,7 @@ def test_policies_by_name(policy, contact, tmp_path, capsys, monkeypatch):
     assert f"{policy}: reached the goal in " in text and contact in text
 
 
-def test_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatch):
+def test_animation_of_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 1)
     policy = "dagger-combined-point_cloud-random_boxes_hard-s1"
     arguments = ["--policy", policy, "--query", 1, "--split", "validation", *SIZE]
@@ -261,7 +261,7 @@ def test_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatch):
     assert f"{policy}: reached the goal in " in text and "collision-free" in text
 
 
-def test_a_demonstration(tmp_path, capsys, monkeypatch):
+def test_demonstration_is_shown(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 3)
     demo = load_demos("wall")[7]
     arguments = ["--policy", "demo", "--query", 7, *SIZE]
@@ -450,7 +450,7 @@ def test_old_image_stays_until_the_new_one_is_whole(tmp_path, capsys, monkeypatc
     assert path.read_bytes().startswith(b"\x89PNG") and os.listdir(tmp_path) == ["a.png"]
 
 
-def test_an_interrupt_writes_nothing(tmp_path, capsys, monkeypatch):
+def test_interrupt_writes_nothing(tmp_path, capsys, monkeypatch):
     def interrupt(*arguments):
         raise KeyboardInterrupt
 

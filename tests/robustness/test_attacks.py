@@ -38,7 +38,7 @@ def test_all(name, tmp_path):
         ("bytearray(10**10)", "traceback: MemoryError in attempt"),
     ],
 )
-def test_what_happens_to_an_attempt_is_told_and_the_others_are_made(happening, expected):
+def test_outcome_of_each_attempt_is_reported_and_the_others_are_made(happening, expected):
     source = (
         f"import os, time\ndef attempt(number):\n    if number == 2: {happening}\n    return 'ran'"
     )

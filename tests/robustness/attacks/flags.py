@@ -48,9 +48,9 @@ TINY = {
     f" {RUN} --num-blocks 1 --batch-size 4 --pool-size 20 --examples-per-update 4 --total-updates 4"
     " --eval-every 4 --round-every 2 --round-queries 1",
     "scene_embedding_train.vae": "--observations observations --total-updates 2 --eval-every 2"
-    " --batch-size 1 --picture-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
+    " --batch-size 1 --image-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
     "scene_embedding_train.vqvae": "--observations observations --total-updates 2 --eval-every 2"
-    " --batch-size 1 --picture-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
+    " --batch-size 1 --image-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
     "scene_embedding_train.pointnet2": "--observations observations --total-updates 2"
     " --eval-every 2 --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs"
     " --num-points 16 --num-centres 8 4 --num-neighbours 4",
