@@ -88,14 +88,15 @@ for _name, _policy, _filter, _source in (
 VARIANTS = ("no filter", "with the filter", "filter and escape")
 # Decoded points are less exact than observed ones.
 CELLS[DECODED] = [*CELLS[DECODED], "--safety-margin", "0.015"]
+PRIVILEGED = ("ground truth (privileged)",) * 2
 # Rows of the first table: policy, what it receives of the scene, its filter's source, its cell.
 ROWS = (
     ("`go-to-goal`", "nothing", "point cloud", "go-to-goal, filter, point_cloud"),
-    ("`go-to-goal`", "nothing", "ground truth", "go-to-goal, filter, ground_truth"),
+    ("`go-to-goal`", "nothing", "ground truth (privileged)", "go-to-goal, filter, ground_truth"),
     ("`bc.py`", "latent code (VAE)", "point cloud", "bc, vae"),
     ("`bc.py`", "latent code (VQ-VAE)", "point cloud", "bc, vqvae"),
     ("`bc.py`", "latent code (PointNet++)", "point cloud", "bc, pointnet2"),
-    ("`bc.py`", "ground truth", "ground truth", "bc, oracle"),
+    ("`bc.py`", *PRIVILEGED, "bc, oracle"),
     ("`dagger.py`", "latent code (VAE), link distances", "point cloud", "dagger, vae"),
     ("`dagger.py`", "latent code (VQ-VAE), link distances", "point cloud", "dagger, vqvae"),
     (
@@ -112,7 +113,7 @@ ROWS = (
     ),
     ("`dagger.py`", "point cloud", "point cloud", OBSERVED),
     ("`dagger.py`, mixed scenes", "point cloud", "point cloud", f"{OBSERVED}, mixed scenes"),
-    ("`dagger.py`", "ground truth", "ground truth", "dagger, oracle"),
+    ("`dagger.py`", *PRIVILEGED, "dagger, oracle"),
 )
 # Columns of the second table, for every task.
 EVERYWHERE = (
@@ -142,7 +143,7 @@ KEPT = (
         "collision_free_success_rate_interval",
     ),
     *("num_queries", "ms_per_action", "planning_seconds", "mean_steps", "path_length"),
-    *("env", "geometry_source", "safety_filter", "seed"),
+    *("env", "geometry_source", "privileged", "safety_filter", "seed"),
 )
 FILTER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the safety filter that a result had
 ENCODER_MARK = "†"
@@ -294,7 +295,7 @@ def tables(results, others):
             "plan from the decoded cloud, field",
         ),
         ("plan from the point cloud", "point cloud", "plan from the point cloud"),
-        ("RRT-Connect", "ground truth", "RRT-Connect"),
+        ("RRT-Connect", PRIVILEGED[0], "RRT-Connect"),
     ):
         seconds = f"searches {hard[name]['planning_seconds']:.3f} s" if name in hard else "not run"
         lines += _row(policy, receives, "no filter", _cell(hard.get(name)), "", "", seconds)
