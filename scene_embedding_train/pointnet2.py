@@ -31,6 +31,7 @@ from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.perception.sensors import NOTHING
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Width
 from roboarm_nmp.envs.training.runs import Run, check_finite, parse_args, seed_torch
+from roboarm_nmp.scene_embedding_train import training_data
 from roboarm_nmp.scene_embedding_train.clouds import (
     IGNORED,
     batch_of,
@@ -44,16 +45,12 @@ from roboarm_nmp.scene_embedding_train.clouds import (
     scene_cloud,
     thin_out,
 )
-from roboarm_nmp.scene_embedding_train.training_data import (
-    EncoderFlags,
-    encoder_metadata,
-    load_observations,
-    write_result,
-)
 
 
 @dataclass
-class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
+class Args(
+    training_data.EncoderFlags
+):  # whose flags are in `training_data.py` and `envs/training/runs.py`
     exp_name: str = "pointnet2"
     """name of the experiment, part of the run's folder"""
 
@@ -252,10 +249,10 @@ if __name__ == "__main__":
         sys.exit("--num-points must be at least --num-centres, and these --num-neighbours")
     if few < NEAREST:
         sys.exit(f"--num-centres must be at least {NEAREST}")
-    observations, num_training, validation = load_observations(args)
+    observations, num_training, validation = training_data.load_observations(args)
     clouds = load_clouds(observations, args.num_points)
     example = example_clouds(observations, clouds.sensors)
-    metadata = encoder_metadata(args, observations, clouds.sensors)
+    metadata = training_data.encoder_metadata(args, observations, clouds.sensors)
     device = seed_torch(args)
     rng = np.random.default_rng(args.seed)
 
@@ -298,7 +295,7 @@ if __name__ == "__main__":
             run.checkpoint()
     run.close()
 
-    result = write_result(run, num_training)
+    result = training_data.write_result(run, num_training)
     summary = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor "
     summary += "{iou_static:.3f}, obstacles {iou_obstacle:.3f}; absent points {absent:.3f}"
     print(f"{summary.format(**result)}. {run.folder / 'result.json'}")
