@@ -104,7 +104,7 @@ def _shared(kind, *args):
 
 
 class SceneEncoder:
-    """Base class. It caches z_E, so that an equal scene is encoded once.
+    """Base class. It caches z_E, so that an equal scene is encoded once by the class's `_encode`.
 
     Copies, and unpickled encoders in other processes, are the one of `make_encoder`.
 
@@ -130,9 +130,6 @@ class SceneEncoder:
         """z_E of a `Scene`, float32 (size,); not to be changed."""
         z = self._of_demos.get(scene)
         return self._cached(scene) if z is None else z
-
-    def _encode(self, scene):
-        raise NotImplementedError
 
     def encode_demos(self, demos):
         """z_E of all scenes of `envs.datasets.demonstrations.Demos`: float32 (n, size).
