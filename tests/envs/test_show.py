@@ -10,7 +10,6 @@ import numpy as np
 import pybullet as p
 import pytest
 import torch
-from paths import ROOT
 from PIL import Image
 from torch import nn
 
@@ -19,7 +18,6 @@ from roboarm_nmp.envs import panda, show
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, write_queries
 from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import TASKS, Task
 
@@ -61,7 +59,7 @@ def frames_of(path):
     return np.stack(frames), durations
 
 
-# --- Pictures
+# --- Images
 
 
 def test_environment_without_render_mode_is_drawn_for_images():
@@ -95,7 +93,7 @@ def test_image_shows_the_goal_as_a_ball_and_as_a_ghost(env):
     )
 
 
-def test_an_obstacle_in_front_hides_the_ghost_unless_seen_from_elsewhere(env, monkeypatch):
+def test_obstacle_in_front_hides_the_ghost_from_one_side_only(env, monkeypatch):
     half = np.deg2rad(-35.0 / 2)  # turned to the first of the camera's places
     wall = Box((0.8, -0.56, 0.7), (0.02, 2.4, 2.4), (0.0, 0.0, np.sin(half), np.cos(half)))
     query = Query(BENT, AT_THE_SIDE, Scene((wall,), None, None))
@@ -104,7 +102,7 @@ def test_an_obstacle_in_front_hides_the_ghost_unless_seen_from_elsewhere(env, mo
     assert green(show.render_query(env, query, SMALL)).sum() == 0
 
 
-def test_the_camera_sees_everything_and_stands_no_further_than_needed(env):
+def test_camera_is_as_near_as_the_whole_scene_allows(env):
     scene = Scene(
         (Box((1.3, 0.0, 0.1), (1.2, 1.0, 1.6)), Sphere((-0.5, 0.9, 0.3), 0.1)), None, None
     )
@@ -120,14 +118,13 @@ def test_the_camera_sees_everything_and_stands_no_further_than_needed(env):
         for configuration in (BENT, AT_THE_SIDE):
             points.append(panda.forward_kinematics(configuration))
         homogeneous = np.column_stack([points, np.ones(len(points))])
-        seen = homogeneous @ np.reshape(view, (4, 4))
-        seen = seen[:, :2] / -seen[:, 2:3] / slopes
-        assert np.abs(seen).max() < 1
-        assert np.abs(seen).max() > 0.8
+        projected = homogeneous @ np.reshape(view, (4, 4))
+        projected = projected[:, :2] / -projected[:, 2:3] / slopes
+        assert 0.8 < np.abs(projected).max() < 1
     env.set_scene(Scene())
 
 
-def test_the_camera_looks_at_the_arm_from_where_it_is_free(env):
+def test_camera_is_where_obstacles_do_not_hide_the_arm(env):
     views = {}
     for task in ("boxes", "benchmaker_bookshelf_tall", "benchmaker_bookshelf_thin"):
         env.set_scene(TASKS[task].scene)
@@ -162,7 +159,7 @@ def test_images_of_several_queries_form_a_grid(tmp_path, capsys):
     assert not np.array_equal(tiles[0], tiles[1]) and (tiles[3] == 255).all()
 
 
-# --- Animations, and who moves the arm
+# --- Animations
 
 
 class Straight(nn.Module):
@@ -185,20 +182,7 @@ def save(path, module=None, **metadata):
     return path
 
 
-def test_rollout_ends_at_the_goal(env):
-    goal = panda.normalise(AT_THE_SIDE)
-    query = Query(BENT, AT_THE_SIDE, Scene())
-    policy = lambda observation: goal - observation["observation"][:7]  # noqa: E731
-    trajectory = rollout(env, query, policy)
-    path = trajectory.configurations
-    assert trajectory.success and len(trajectory) == len(path) - 1 > 10
-    assert np.allclose(path[0], BENT, atol=1e-6)
-    ends = panda.forward_kinematics(path)
-    target = panda.forward_kinematics(AT_THE_SIDE)
-    assert np.linalg.norm(ends[-1] - target) <= 0.021 < np.linalg.norm(ends[-2] - target)
-
-
-def test_an_animation_of_a_network_and_of_the_same_policy(tmp_path, capsys, monkeypatch):
+def test_animation_has_as_many_frames_as_steps_or_as_allowed(tmp_path, capsys, monkeypatch):
     save(tmp_path / "policy.pt")
     arguments = ["--query", 2, *SIZE]
     assert run("wall", "--output", tmp_path / "a.gif", "--policy", tmp_path, *arguments) == 0
@@ -243,7 +227,7 @@ def test_random_actions_depend_on_the_seed(tmp_path, monkeypatch):
         ("bc-config-double_walls-s1", "with contact"),
     ],
 )
-def test_policies_by_name(policy, contact, tmp_path, capsys, monkeypatch):
+def test_outcome_of_a_policy_is_printed(policy, contact, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 1)
     # Straight to this goal the arm slides along a wall; there is a way around.
     arguments = ["--policy", policy, "--query", 11, "--split", "validation", *SIZE]
@@ -285,7 +269,7 @@ def write_two_queries(task):
     write_queries(task.with_name("mine_queries.h5"), str(task), 0, splits, "a test", {})
 
 
-def test_random_queries_where_there_is_no_file(tmp_path, capsys):
+def test_queries_are_random_without_a_query_file(tmp_path, capsys):
     (tmp_path / "mine.yaml").write_text("obstacles: [sphere: {position: [0, 0.9, 0], radius: 0.1}]")
     task = tmp_path / "mine.yaml"
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
@@ -311,7 +295,7 @@ class OneSphere:
         return Scene((Sphere((rng.uniform(-1, 1), 0.9, 0.3), 0.1),))
 
 
-def test_scenes_that_vary(tmp_path, monkeypatch):
+def test_queries_of_varying_scenes_show_their_scenes(tmp_path, monkeypatch):
     monkeypatch.setitem(TASKS, "one_sphere", Task(OneSphere(), "for a test"))
     assert run("one_sphere", "--output", tmp_path / "a.png", "--draws", 2, *SIZE) == 0
     grid = np.asarray(Image.open(tmp_path / "a.png")).astype(int)
@@ -343,7 +327,7 @@ def window(monkeypatch):
     return sleeps
 
 
-def test_the_window_goes_on_until_ctrl_c(window, tmp_path, capsys, monkeypatch):
+def test_window_continues_until_ctrl_c(window, tmp_path, capsys, monkeypatch):
     def sleep(seconds):
         window.append(seconds)
         if len(window) == 4:
@@ -359,7 +343,7 @@ def test_the_window_goes_on_until_ctrl_c(window, tmp_path, capsys, monkeypatch):
     assert window[1:] == [show.PAUSE] * 3
 
 
-def test_a_display_that_does_not_answer(monkeypatch, capsys):
+def test_display_that_does_not_answer_is_an_error(monkeypatch, capsys):
     monkeypatch.setattr("roboarm_nmp.envs.world.DISPLAY_SECONDS", 2)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -374,7 +358,7 @@ def test_a_display_that_does_not_answer(monkeypatch, capsys):
     env.close()
 
 
-def test_the_window_ends_with_escape(window, monkeypatch):
+def test_window_ends_with_escape(window, monkeypatch):
     monkeypatch.setattr(show.time, "sleep", lambda seconds: p.disconnect(window[0].client))
     assert run("wall", "--policy", "demo") == 0
 
@@ -382,7 +366,7 @@ def test_the_window_ends_with_escape(window, monkeypatch):
 # --- What goes wrong
 
 
-def test_errors(tmp_path, capsys, monkeypatch):
+def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
     def never(*arguments):
         raise AssertionError("work was done")
 
@@ -401,8 +385,12 @@ def test_errors(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("roboarm_nmp.envs.world.MAX_SAMPLING_TRIES", 5)
     png, gif = ["--output", tmp_path / "out.png"], ["--output", tmp_path / "out.gif"]
     many = len(load_queries("wall"))
+    not_a_scene = "scene files are .yaml or .yml (docs/your_own_scene.md), got "
     cases = [
         (["moon", *png], "unknown task 'moon': one of no_obstacles"),
+        *((["part" + kind, *png], f"{not_a_scene}part{kind}") for kind in (".stl", ".ply", ".obj")),
+        ([tmp_path / "a.scene", *png], f"{not_a_scene}{tmp_path / 'a.scene'}"),
+        ([tmp_path / "empty", *png], f"{not_a_scene}{tmp_path / 'empty'}"),
         ([tmp_path / "bad.yaml", *png], "bad.yaml:2: unknown kind of obstacle bax"),
         ([tmp_path / "none.yaml", *png], "none.yaml: No such file"),
         ([tmp_path / "full.yaml", *png], "no feasible configuration"),
@@ -442,7 +430,9 @@ def test_old_image_stays_until_the_new_one_is_whole(tmp_path, capsys, monkeypatc
         raise OSError("the disk is full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)  # after something was written, somewhere
+        patch.setattr(
+            os, "fsync", full
+        )  # after a part of the image was written to a temporary file
         assert run("wall", "--output", path, *SIZE) == 2
     assert "the disk is full" in capsys.readouterr().err
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]
@@ -459,15 +449,13 @@ def test_interrupt_writes_nothing(tmp_path, capsys, monkeypatch):
     assert "nothing was written" in capsys.readouterr().err and os.listdir(tmp_path) == []
 
 
-def test_the_command_without_torch(tmp_path):
+def test_images_of_tasks_do_not_import_torch(tmp_path):
     code = (
         "import sys; from roboarm_nmp.envs import show; code = show.main(sys.argv[1:]);"
         "assert 'torch' not in sys.modules; sys.exit(code)"
     )
-    root = str(ROOT)
     result = subprocess.run(
         [sys.executable, "-c", code, "wall", "--output", str(tmp_path / "a.png"), *SIZE],
-        env=os.environ | {"PYTHONPATH": root},
         capture_output=True,
         text=True,
     )
