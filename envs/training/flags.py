@@ -39,7 +39,7 @@ Seed = _number(int, 0, 2**32 - 1, "in [0, 2^32)", "IN [0, 2^32)")
 Workers = _number(int, 1, 256, "in [1, 256]", "IN [1, 256]")
 Layers = _number(int, 1, 100, "in [1, 100]", "IN [1, 100]")
 Width = _number(int, 1, 2**16, "in [1, 65536]", "IN [1, 65536]")
-Pixels = _number(int, 1, 4096, "in [1, 4096]", "IN [1, 4096]")  # PyBullet gets slow long before
+Pixels = _number(int, 1, 4096, "in [1, 4096]", "IN [1, 4096]")  # larger images are very slow
 Environments = _number(int, 1, 1000, "in [1, 1000]", "IN [1, 1000]")  # PyBullet has room for 1,024
 Share = _number(float, 0.0, 1.0, "in [0, 1]", "IN [0, 1]")
 PositiveShare = _number(float, sys.float_info.min, 1.0, "above 0, and at most 1", "IN (0, 1]")
@@ -67,7 +67,7 @@ def check(args):
 
 
 def _range_of(kind):
-    """The `Range` in a type, in whatever union or tuple it is; None if there is none."""
+    """The `Range` in a type, also inside a union or tuple; None without one."""
     for one in getattr(kind, "__metadata__", ()):
         if isinstance(one, Range):
             return one

@@ -318,7 +318,7 @@ def summary_writer(run, args, step):
         import wandb
 
         config = json.loads(_to_json(asdict(args)))
-        # Under the run's name, so that a resumed run goes on there as well.
+        # Under the run's name, so that a resumed run continues there, too.
         names = {"project": "roboarm-nmp", "name": run.name, "id": run.name, "dir": str(run)}
         wandb.init(**names, config=config, resume="allow", sync_tensorboard=True)
     from torch.utils.tensorboard import SummaryWriter  # slow to import, and not for --help
