@@ -29,6 +29,7 @@ from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception import geometry_source, point_clouds
 from roboarm_nmp.envs.perception.encoders import NetworkEncoder, make_encoder
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
+from roboarm_nmp.envs.policies.rollout import rollout
 
 TASK = "random_boxes_hard"
 SHOWN = ("rendering", "encoding", "planning", "action", "total")
@@ -108,19 +109,16 @@ def times(policy, queries, source=None, time_limit=5.0):
         rendering, encoding = observing_times(encoder, source, query.scene)
         began = time.perf_counter()
         act = begin(number, query).act  # None: no path was found
-        planning, acting, actions = time.perf_counter() - began, 0.0, 0
-        observation, info = env.reset_specific(*query)
-        ended = info["is_success"] or act is None
-        while not ended:
-            began = time.perf_counter()
-            action = act(observation)
+        planning = time.perf_counter() - began
+
+        def act_and_sense(observation):
             if "link_distances" in observation:  # which the environment has computed
                 env.link_distances_at(observation["observation"][:7])
-            acting += time.perf_counter() - began
-            actions += 1
-            observation, _, terminated, truncated, info = env.step(action)
-            ended = terminated or truncated
-        return rendering, encoding, planning, acting, actions, info["is_success"]
+            return act(observation)
+
+        trajectory = rollout(env, query, act and act_and_sense)
+        acting = trajectory.times.sum()
+        return rendering, encoding, planning, acting, len(trajectory), trajectory.success
 
     episode(0, queries[0])  # loads compiled code, which does not count
     rows = [episode(*one) for one in enumerate(tqdm(queries, desc=str(policy), unit="query"))]
