@@ -76,7 +76,7 @@ def episode(demo, env):
     """A demonstration as the environment would have recorded it, up to reaching the goal.
 
     Args:
-        demo: an `envs.datasets.Demo`.
+        demo: an `envs.datasets.demonstrations.Demo`.
         env: a `RoboArmEnv` with relative actions and no velocities.
 
     Returns:
@@ -139,7 +139,7 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
     """Write `Demos` into Minari's local storage; returns the dataset's id and number of steps.
 
     Args:
-        demos: an `envs.datasets.Demos`.
+        demos: an `envs.datasets.demonstrations.Demos`.
         goal_type: `ee`, `config` or `combined`.
         dataset_id: a name with a version, `namespace/name-v0`; None for the default.
         exact: follow the plans again, see above.

@@ -139,7 +139,7 @@ def make_queries(
     Raises:
         ValueError: unknown task; the journal belongs to other queries, or is in use.
         RuntimeError: no query can be found, or workers keep dying.
-        DatasetError, OSError: as `envs.datasets.write_queries` does.
+        DatasetError, OSError: as `envs.datasets.queries.write_queries` does.
         Whatever is raised, what is in the journal is safe.
     """
     query_path(task)  # rejects an unknown task
