@@ -25,7 +25,6 @@ import torch.nn as nn
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.format import DatasetError
@@ -314,6 +313,9 @@ if __name__ == "__main__":
         args, state, device, env_arguments, eval_envs, validation, safety_filter
     )
     visited |= on_device(visited, device)
+
+    # Here, because SciPy and Numba take a while to import, which --help would wait for.
+    from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 
     # ALGO LOGIC: data. The pool is not in checkpoints: a resumed run draws the same examples again.
     latents = torch.as_tensor(eval_envs[0].encoder.encode_demos(paths), device=device)

@@ -64,15 +64,13 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     policy_frequency: flags.PositiveInt = 2
     """updates of the critics per update of the policy (CleanRL: both are equally frequent)"""
     policy_average: flags.PositiveShare = 0.0003
-    """share of the policy that moves, in each of its updates, into the running average that is
-    evaluated and saved (1: no averaging, as CleanRL)"""
+    """share of the policy that moves per update into the average that is saved (1: no averaging)"""
     hidden_size: flags.Width = 256
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: flags.Layers = 2
     """number of hidden layers of policy and critics"""
     plain_networks: bool = False
-    """the networks of CleanRL: raw observations and goals as inputs, no LayerNorm in the critics,
-    and actions in [-1, 1] instead of twice the longest step"""
+    """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not twice `max_step`)"""
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
     eval_every: flags.PositiveInt = 25_000
