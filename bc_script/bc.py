@@ -64,8 +64,9 @@ class Args(protocol.PolicyFlags):
     """train with hidden layers in bfloat16"""
     encoder: str | None = None
     """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
-    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `point_cloud` for
-    observed points, or `oracle` for the ground-truth obstacles; by default nothing"""
+    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/guide/perception.md),
+    `point_cloud` for observed points, or `oracle` for the ground-truth obstacles; by default
+    nothing"""
     num_points: flags.PositiveInt = 64
     """points of the encoder `point_cloud`"""
     eval_every: flags.PositiveInt = 50_000

@@ -44,7 +44,7 @@ class Args(protocol.PolicyFlags):
     exp_name: str = "dagger"
     """name of the experiment, part of the name of the run's folder"""
     task: str = "random_boxes_hard"
-    """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/your_own_scene.md)"""
+    """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
     goal_type: Literal["config", "combined"] = "combined"
     """what the goal is: configuration, or that and the end-effector's position"""
     paths: Path = Path("roadmaps")
@@ -66,7 +66,7 @@ class Args(protocol.PolicyFlags):
     """examples in memory, from which batches are sampled"""
     examples_per_update: flags.PositiveInt = 256
     """new examples per update, all of one scene, which replace the oldest ones; with an eighth of a
-    batch, reusing them too often causes overfitting (docs/experiments.md)"""
+    batch, reusing them too often causes overfitting (docs/lab_notebook.md)"""
     noise: flags.NonNegativeFloat = 0.03
     """standard deviation of the configurations around paths (normalised, each joint)"""
     length_weight: flags.NonNegativeFloat = 0.1

@@ -5,9 +5,9 @@
     python benchmarks/baselines.py --table                      # only writes the table
 
 Each cell is a call of `clean_rl_scripts/evaluate.py` (goal `ee`): `go-to-goal` on all test queries,
-the others on the first `--num`. Results go to docs/baselines.json at once, so an
-interrupted run goes on where it was; docs/baselines.md is the table of what is there. The planner's
-numbers depend on the machine, so nothing else should run beside it. Times are per query.
+the others on the first `--num`. Results go to benchmarks/results/baselines.json at once, so an
+interrupted run goes on where it was; docs/benchmark/baselines.md is the table of what is there. The
+planner's numbers depend on the machine, so nothing else should run beside it. Times are per query.
 """
 
 import argparse
@@ -26,8 +26,9 @@ from roboarm_nmp.envs.datasets.queries import load_queries, query_path
 from roboarm_nmp.envs.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
-RESULTS, TABLE = ROOT / "docs" / "baselines.json", ROOT / "docs" / "baselines.md"
-UNSEEN = ROOT / "docs" / "unseen_obstacles.json"  # another benchmark's
+RESULTS = ROOT / "benchmarks/results/baselines.json"
+TABLE = ROOT / "docs/benchmark/baselines.md"
+UNSEEN = ROOT / "benchmarks/results/unseen_obstacles.json"  # another benchmark's
 CELLS = {
     "go-to-goal": ["--policy", "go-to-goal"],
     "via-points, K = 16": ["--policy", "via-points", "--tries", "16"],

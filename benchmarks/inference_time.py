@@ -1,6 +1,6 @@
 """How long policies take, beside RRT-Connect on the same queries (paper: "Prediction times").
 
-    python benchmarks/inference_time.py POLICY ...       # runs' folders, or names (docs/results.md)
+    python benchmarks/inference_time.py POLICY ...  # runs' folders, or names of pretrained policies
     python benchmarks/inference_time.py --num 200 bc-combined-vae-random_boxes_hard-s1
 
 Seconds on one core, means over the first test queries of `random_boxes_hard`: rendering the

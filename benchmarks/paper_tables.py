@@ -10,10 +10,11 @@ A cell is a run: algorithm, goal type, task, p of the demo injection. It is trai
 on. Its best policy by validation goes to envs/policies/pretrained, in half precision, is
 evaluated on test queries as it is there, and gets its result beside it, in JSON: what has one is
 done, with the same flags and as many steps or more; on more queries than before the same policy is
-only evaluated again. (With `--no-keep-policies` the result stays alone.) The page, docs/results.md,
+only evaluated again. (With `--no-keep-policies` the result stays alone.) The page,
+docs/benchmark/results.md,
 and its figures are made of those results, of the planners' and of `go-to-goal`'s
-(docs/baselines.json), and of the paper's numbers (`paper_cells.csv`: sections 5.2 and 5.3 and the
-tables of the appendix; means and standard deviations of four seeds).
+(benchmarks/results/baselines.json), and of the paper's numbers (`paper_cells.csv`: sections 5.2 and
+5.3 and the tables of the appendix; means and standard deviations of four seeds).
 """
 
 import csv
@@ -46,18 +47,18 @@ from roboarm_nmp.envs.training.flags import PositiveInt, Seed, check
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
-CELLS = Path(__file__).with_name("paper_cells.csv")
+CELLS = ROOT / "benchmarks/results/paper_cells.csv"
 POLICIES = ROOT / "envs" / "policies" / "pretrained"
-BASELINES = ROOT / "docs" / "baselines.json"
-UNSEEN = ROOT / "docs" / "unseen_obstacles.json"
-PAGE, FIGURES = ROOT / "docs" / "results.md", ROOT / "docs" / "figures"
+BASELINES = ROOT / "benchmarks/results/baselines.json"
+UNSEEN = ROOT / "benchmarks/results/unseen_obstacles.json"
+PAGE, FIGURES = ROOT / "docs/benchmark/results.md", ROOT / "docs" / "figures"
 SCRIPTS = {
     "bc": ROOT / "bc_script" / "bc.py",
     "sac": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
     "td3": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
 }
 STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
-# Settings for long runs (docs/training.md).
+# Settings for long runs (docs/algorithms/training.md).
 RECIPES = {
     "bc": ["--eval-every", "25000"],
     "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3"],
@@ -72,7 +73,7 @@ ENCODERS = {
 }
 LINES = {"bc": ":", "sac": "-", "td3": "--"}  # of the curves
 FAR_BELOW = 0.05  # of the paper's mean: worth an explanation
-# In docs/baselines.json; the second in `UNSEEN`.
+# In benchmarks/results/baselines.json; the second in `UNSEEN`.
 GO_TO_GOAL, REACTIVE = "go-to-goal", "go-to-goal, filter, point_cloud"
 RRT_CONNECT = "RRT-Connect, 5 s"
 PLAN_FROM_POINTS = "plan from the point cloud, 5 s"
@@ -406,7 +407,7 @@ def runs_table(cells, results):
 
 
 def page(cells, results, baselines, unseen):
-    """docs/results.md."""
+    """docs/benchmark/results.md."""
     goals = [cell for cell in cells if not cell.encoder and cell.hindsight != "no"]
     lines = [
         "# Results",
@@ -426,7 +427,7 @@ def page(cells, results, baselines, unseen):
         "`python benchmarks/paper_tables.py` runs cells and writes this page;",
         "`clean_rl_scripts/evaluate.py --policy NAME` runs any policy below that was kept.",
         "Minutes are of one core of an AMD EPYC or Intel Xeon, mostly beside other jobs.",
-        "Earlier runs: [experiments.md](experiments.md#the-first-long-runs).",
+        "Earlier runs: [lab notebook](../lab_notebook.md#the-first-long-runs).",
         "The words: [glossary.md](glossary.md).",
     ]
     for goal_type, text in GOALS.items():
@@ -442,7 +443,7 @@ def page(cells, results, baselines, unseen):
     names = {"yes": "hindsight", "no": "no hindsight"}
     lines += table(hindsight, results, lambda cell: names[cell.hindsight], {})
     lines += ["", "How far learning without hindsight had come when ours stopped:"]
-    lines += ["[experiments.md](experiments.md#demonstrations)."]
+    lines += ["[lab notebook](../lab_notebook.md#demonstrations)."]
     lines += ["", "## Encoders: trained on `random_boxes_hard`, goal `combined`", ""]
     encoded = [cell for cell in cells if cell.encoder]
     imitated = imitated_rows(unseen, dict.fromkeys(cell.task for cell in encoded))
@@ -457,7 +458,7 @@ def page(cells, results, baselines, unseen):
         ]
     lines += long_runs(cells, results)
     lines += ["", "Why policies with a latent code fail to generalise to scenes of other kinds:"]
-    lines += ["[experiments.md](experiments.md#behavioural-cloning-in-scenes-of-other-kinds)."]
+    lines += ["[lab notebook](../lab_notebook.md#behavioural-cloning-in-scenes-of-other-kinds)."]
     lines += ["", "## The runs", ""]
     done = [cell for cell in cells if cell.name in results]
     if not done:
@@ -469,8 +470,8 @@ def page(cells, results, baselines, unseen):
     )
     lines[-1] += ". Each kept policy's JSON has all of its flags, also where it says `other flags`"
     lines[-1] += ": TD3 with goal `ee` there is older than its penalty, others than goal minus"
-    lines[-1] += " configuration ([experiments.md](experiments.md#goal-minus-configuration)). (The"
-    lines[-1] += " paper's networks have two hidden layers, with encoders four.)"
+    lines[-1] += " configuration ([lab notebook](../lab_notebook.md#goal-minus-configuration))."
+    lines[-1] += " (The paper's networks have two hidden layers, with encoders four.)"
     below = []
     for cell in done:
         mean = mean_success(cell, results)
@@ -479,7 +480,7 @@ def page(cells, results, baselines, unseen):
     lines += ["", f"Below the paper by more than {FAR_BELOW}: {', '.join(below) or 'none'}"]
     lines[-1] += " of these runs."
     if below:
-        lines[-1] += " What was found: [experiments.md](experiments.md#demonstrations);"
+        lines[-1] += " What was found: [lab notebook](../lab_notebook.md#demonstrations);"
         lines[-1] += " with encoders, see below their table."
     lines += ["", "![success over steps](figures/results_curves.png)"]
     lines += ["", "![success per task](figures/results_bars.png)", ""]
@@ -489,7 +490,8 @@ def page(cells, results, baselines, unseen):
 def draw_story(cells, results, baselines, unseen, path):
     """Per task: from go-to-goal to RRT-Connect, the paper's best cell, and our best.
 
-    `unseen` (docs/unseen_obstacles.json) has policies with point clouds and a safety filter.
+    `unseen` (benchmarks/results/unseen_obstacles.json) has policies with point clouds and a safety
+    filter.
     """
     tasks = list(dict.fromkeys(cell.task for cell in cells))
     figure, axes = plt.subplots(figsize=(10, 4.5), layout="constrained")

@@ -4,10 +4,10 @@
     roboarm queries --task random_boxes_hard --solvable --queries-per-scene 5 --seed 78 \\
         --num-test 1 --num-validation 1000 --output fresh.h5
     python benchmarks/scaling.py --paths roadmaps --queries fresh.h5 --runs-dir runs/scaling
-    python benchmarks/scaling.py --figure      # only draws what docs/scaling.json has
+    python benchmarks/scaling.py --figure      # only draws what benchmarks/results/scaling.json has
 
 Each run is a short training with 32 observed points, in which one setting is varied, evaluated on
-the fresh queries. What is done is skipped. Results go to docs/scaling.json and to
+the fresh queries. What is done is skipped. Results go to benchmarks/results/scaling.json and to
 docs/figures/unseen_scaling.png.
 """
 
@@ -30,7 +30,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 ROOT = Path(__file__).resolve().parent.parent
-RESULTS = ROOT / "docs" / "scaling.json"
+RESULTS = ROOT / "benchmarks/results/scaling.json"
 FIGURE = ROOT / "docs" / "figures" / "unseen_scaling.png"
 UPDATES = 4000
 # Scenes, of 300 paths each; updates between rounds of DAgger, of 40 queries each (0: none).

@@ -1,9 +1,10 @@
-"""The figures of docs/unseen_obstacles.md: an animation of a policy, and bars of its results.
+"""The figures of docs/benchmark/unseen_obstacles.md: an animation of a policy, and bars of its
+results.
 
     python benchmarks/unseen_figures.py
 
 The animation is of validation queries: above `go-to-goal`, below the policy, in the same scenes.
-The bars are of docs/unseen_obstacles.json (benchmarks/unseen_obstacles.py).
+The bars are of benchmarks/results/unseen_obstacles.json (benchmarks/unseen_obstacles.py).
 """
 
 import argparse

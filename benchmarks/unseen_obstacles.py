@@ -1,4 +1,4 @@
-"""Policies in unseen scenes, without and with a safety filter: docs/unseen_obstacles.md.
+"""Policies in unseen scenes, without and with a safety filter: docs/benchmark/unseen_obstacles.md.
 
     python benchmarks/unseen_obstacles.py --keep runs/RUN         # a run of dagger.py: its policy
     python benchmarks/unseen_obstacles.py --workers 2             # hours; what is done is skipped
@@ -6,9 +6,9 @@
     python benchmarks/unseen_obstacles.py --table                 # only writes the tables
 
 Each cell is a call of `clean_rl_scripts/evaluate.py` on the first `--num` test queries, goal
-`combined`. Results go to docs/unseen_obstacles.json at once; the tables in
-docs/unseen_obstacles.md, between its marks, show these results. Nothing may be chosen by them: use
-`evaluate.py --split validation` for that.
+`combined`. Results go to benchmarks/results/unseen_obstacles.json at once; the tables in
+docs/benchmark/unseen_obstacles.md, between its marks, show these results. Nothing may be chosen by
+them: use `evaluate.py --split validation` for that.
 """
 
 import argparse
@@ -34,12 +34,13 @@ from roboarm_nmp.envs.policies.safety_filter import VERSION
 from roboarm_nmp.envs.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
-RESULTS, PAGE = (ROOT / "docs" / f"unseen_obstacles.{ending}" for ending in ("json", "md"))
-BASELINES = ROOT / "docs" / "baselines.json"
-PAPER_CELLS = ROOT / "benchmarks" / "paper_cells.csv"
+RESULTS = ROOT / "benchmarks/results/unseen_obstacles.json"
+PAGE = ROOT / "docs/benchmark/unseen_obstacles.md"
+BASELINES = ROOT / "benchmarks/results/baselines.json"
+PAPER_CELLS = ROOT / "benchmarks/results/paper_cells.csv"
 POLICIES = ROOT / "envs" / "policies" / "pretrained"
 HARD = "random_boxes_hard"
-# The margin of the safety filter: see docs/experiments.md.
+# The margin of the safety filter: see docs/lab_notebook.md.
 GROUND_TRUTH = ["--safety-margin", "0.01"]
 POINT_CLOUD = ["--safety-margin", "0.01", "--geometry-source", "point_cloud"]
 STRAIGHT = ["--policy", "go-to-goal", "--goal-type", "combined"]
@@ -128,8 +129,8 @@ WITH_ENCODERS = (
 UNSEEN = [
     name for name, task in envs.TASKS.items() if name.startswith("random") or not task.trainable
 ]
-# Results of docs/baselines.json, which do not depend on the goal type: `combined` is reached like
-# `ee`.
+# Results of benchmarks/results/baselines.json, which do not depend on the goal type: `combined` is
+# reached like `ee`.
 OF_BASELINES = {
     "go-to-goal": "go-to-goal",
     "plan from the point cloud": "plan from the point cloud, 5 s",

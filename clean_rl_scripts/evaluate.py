@@ -77,7 +77,7 @@ from roboarm_nmp.envs.utils.files import check_writable, write_atomically
 class Args:
     policy: str
     """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy network, a run's folder
-    with a `policy.pt` in it, or the name of a pretrained policy (docs/results.md)"""
+    with a `policy.pt` in it, or the name of a pretrained policy (docs/benchmark/results.md)"""
     task: str
     """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml)"""
     goal_type: Literal["ee", "config", "combined"] | None = None

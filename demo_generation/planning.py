@@ -48,12 +48,13 @@ MARGIN = 0.003
 MARGIN_GROWTH = 0.03
 # A search that has taken long is likely to take much longer, so margin and clearance shrink: after
 # so many collision checks, they are scaled by this factor.
-# (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmarks.md.)
+# (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmark/performance.md.)
 MARGIN_SCHEDULE = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
 # After so many checks without a path, RRT-Connect hands over to another planner for half as many.
 # They alternate, each turn twice as long as the last: LBKPIECE1 quickly finds some paths out of
 # shelves that RRT-Connect does not find.
-# (Chosen on the same queries, and on the original MotionBenchMaker problems: docs/benchmarks.md.)
+# (Chosen on the same queries, and on the original MotionBenchMaker problems:
+# docs/benchmark/performance.md.)
 OTHER_PLANNER, FIRST_TURN = "LBKPIECE1", 8_000
 # Searches at most, per plan, for a path that can be followed within an episode.
 SEARCHES = 3
@@ -179,7 +180,7 @@ class Planner:
             search.
         planner_range: longest motion (L2, normalised) that the planner tries at once, if it has
             such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with RRTConnect,
-            docs/benchmarks.md.)
+            docs/benchmark/performance.md.)
         simplify: rounds of removing vertices and cutting corners; 0 for none.
         geometry_source: a function from a `Scene` to the `CollisionChecker` to plan with. The
             default is that of the ground-truth obstacles; `envs.perception.geometry_source` has

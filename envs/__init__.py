@@ -23,7 +23,7 @@ def make(
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
     Args:
-        task: name of a task (`TASKS`), or path of a scene file (docs/your_own_scene.md).
+        task: name of a task (`TASKS`), or path of a scene file (docs/customise/scene.md).
         encoder: appends the encoded scene to `observation`: `oracle`, `point_cloud`, or the name or
             path of an encoder's network (`envs.perception.encoders`); None for nothing.
         num_points: of the encoder `point_cloud`.
@@ -35,7 +35,7 @@ def make(
             `geometry_source`.
         append_link_distances: with `link_distances`: append them to `observation`, too, before z_E.
         goal_link_distances: with `link_distances`: add those at a goal that is a configuration. Use
-            False with hindsight relabelling (docs/environment.md, "Hindsight relabelling").
+            False with hindsight relabelling (docs/guide/environment.md, "Hindsight relabelling").
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:

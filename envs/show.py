@@ -67,8 +67,8 @@ class Args:
     """The policy in the window and in an animation: `go-to-goal` (straight to the goal
     configuration), `random`, `via-points`, `planner` (as in clean_rl_scripts/evaluate.py), a policy
     network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy
-    (docs/results.md). `demo` replays the task's demonstrations; --query is then the number of a
-    demonstration."""
+    (docs/benchmark/results.md). `demo` replays the task's demonstrations; --query is then the
+    number of a demonstration."""
     query: NonNegativeInt = 0
     """Number of the (first) query to show, from 0."""
     split: Literal["test", "validation", "original"] = "test"

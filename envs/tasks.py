@@ -1,8 +1,8 @@
 """The tasks: name -> scene, or a distribution of scenes, and whether training on it is allowed.
 
 Paper: section 4. It names the tasks, but gives no dimensions. They are calibrated so that the
-go-to-goal policy reaches the paper's success rates (docs/tasks.md). MotionBenchMaker's scenes are
-as published.
+go-to-goal policy reaches the paper's success rates (docs/guide/tasks.md). MotionBenchMaker's scenes
+are as published.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ def get_task(task):
             raise ValueError(f"{task}: a scene file may not have the name of a task")
         return Task(load_scene(task), f"the scene in {task}")
     if Path(task).suffix or Path(task).name != str(task):
-        raise ValueError(f"scene files are .yaml or .yml (docs/your_own_scene.md), got {task}")
+        raise ValueError(f"scene files are .yaml or .yml (docs/customise/scene.md), got {task}")
     raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}, or a scene file (.yaml)")
 
 
@@ -111,7 +111,7 @@ def _racks(quarters, near, width, heights, sides=True, table=_WIDE_TABLE):
 
 # MotionBenchMaker's nominal scenes (Chamzas et al., RA-L 7(2), 2022), to the millimetre. They have
 # neither table nor floor: the shelves stand 0.7 m below the robot's base. A floor at the base's
-# height would collide with 42 of the 100 original goals of the thin shelf (docs/tasks.md).
+# height would collide with 42 of the 100 original goals of the thin shelf (docs/guide/tasks.md).
 _CAN = {"radius": 0.03, "length": 0.14}
 
 

@@ -17,7 +17,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.scenes.primitives import FRICTION, Box, Cylinder, Scene, floor_box
 
 # One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
-# controller; docs/environment.md has the measured tracking error.
+# controller; docs/guide/environment.md has the measured tracking error.
 TIME_STEP = 1.0 / 120.0
 SUBSTEPS = 4
 POSITION_GAINS = [0.6] * panda.NUM_JOINTS

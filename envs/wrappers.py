@@ -130,7 +130,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
     wrapped environment are available.
 
     Hindsight relabelling replaces goals, and must replace `goal_link_distances`, too: see
-    docs/environment.md, "Hindsight relabelling".
+    docs/guide/environment.md, "Hindsight relabelling".
 
     Args:
         env: a `RoboArmEnv`, possibly in a `SceneEncodingWrapper`.
@@ -167,7 +167,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
         if self._of_goals and np.ndim(desired_goal) > 1:
             warnings.warn(
                 "rewards of a batch of goals: after hindsight relabelling, goal_link_distances "
-                'belong to another goal (docs/environment.md, "Hindsight relabelling")',
+                'belong to another goal (docs/guide/environment.md, "Hindsight relabelling")',
                 stacklevel=2,
             )
         compute_reward = self.env.get_wrapper_attr("compute_reward")

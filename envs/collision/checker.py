@@ -12,7 +12,7 @@ The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`
 world. The shapes are: the convex hulls of the links' collision meshes, `BULLET_MARGIN` thicker on
 all sides; boxes and cylinders, with edges rounded by as much; spheres; the table and the floor; and
 `panda.SELF_COLLISION_PAIRS`. As in PyBullet, the base collides only with the arm itself. How often
-the two disagree: docs/benchmarks.md.
+the two disagree: docs/benchmark/performance.md.
 
 Two shapes are compared in three stages, each only if the one before could not separate them: the
 link's bounding sphere against the box around the obstacle; the link's bounding box against that
@@ -21,8 +21,8 @@ stops as soon as their distance is certain to be above or below the margin. Wher
 `signed_distances` needs the depth, which EPA (van den Bergen, 2001) computes.
 
 Numba compiles the functions in `kernels` at their first call, once per machine
-(docs/environment.md, "Collision checks"). They compute in float64, and an answer does not depend on
-the batch around it.
+(docs/guide/environment.md, "Collision checks"). They compute in float64, and an answer does not
+depend on the batch around it.
 """
 
 import functools

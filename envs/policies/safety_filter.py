@@ -16,7 +16,7 @@ linearised by the gradient of d: one half-space of actions per link. d_min is th
 
 Cyclic projection onto the half-spaces finds an action that satisfies them, where there is one. The
 change is close to the smallest one (L2), and exact for a single half-space; for two, it is at most
-15 % longer (docs/experiments.md, "Projection").
+15 % longer (docs/lab_notebook.md, "Projection").
 
 The nearest point of a link may change during the step. So the distances at q + a are computed, too,
 and add a second half-space per link. Distances come from the observation's geometry source, table
@@ -42,7 +42,7 @@ from roboarm_nmp.envs.subgoals import MAX_STEP
 # arrivals counted as local minima, and the gain was the same near a goal as elsewhere.
 VERSION = 3
 
-# The numbers below were chosen on validation and fresh queries: docs/experiments.md.
+# The numbers below were chosen on validation and fresh queries: docs/lab_notebook.md.
 ACTIVATION_DISTANCE = 0.15  # m. Links with larger distances are not constrained.
 CBF_GAIN = 0.2  # gamma: share of the remaining clearance that one step may use
 ARRIVAL_DISTANCE = 0.2  # L2, normalised: from here to the goal, the gain grows linearly to 1

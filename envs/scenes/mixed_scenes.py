@@ -2,7 +2,7 @@
 
 For policies and encoders that have to generalise to all of them. Sizes and positions are uniform
 in the ranges below, which were fixed before the first training. None of the scenes is one of the
-tasks' own, except for the random boxes (docs/tasks.md).
+tasks' own, except for the random boxes (docs/guide/tasks.md).
 """
 
 import math

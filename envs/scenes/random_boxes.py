@@ -1,7 +1,7 @@
 """Random scenes: shelves, poles and walls around the arm (paper, section 4).
 
 The paper gives the kinds of obstacles and their numbers. The distribution is calibrated to
-go-to-goal's success rate in the paper (docs/tasks.md).
+go-to-goal's success rate in the paper (docs/guide/tasks.md).
 """
 
 import math

@@ -39,7 +39,7 @@ class PolicyFlags(RunFlags):
     """The flags of every trainer of a policy: those of its run, the task and the evaluations."""
 
     task: str = "no_obstacles"
-    """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/your_own_scene.md)"""
+    """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
     eval_queries: PositiveInt = 200
     """validation queries per evaluation"""
     test_queries: PositiveInt = 1_000
@@ -64,8 +64,9 @@ class EnvFlags:
     """joint velocities in the observation"""
     encoder: str | None = None
     """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
-    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/sensors.md), `point_cloud` for
-    observed points, or `oracle` for the ground-truth obstacles; by default nothing"""
+    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/guide/perception.md),
+    `point_cloud` for observed points, or `oracle` for the ground-truth obstacles; by default
+    nothing"""
     geometry_source: str | None = None
     """where link distances take the obstacles from: `ground_truth`, `point_cloud`, or an encoder
     with a decoder (`field`, or a path), which then also gives the points of `point_cloud`"""

@@ -169,7 +169,7 @@ def test_file_records_the_command_that_makes_it(whole):
 
 @pytest.mark.parametrize("task", ["double_walls", "random_boxes_hard"])
 def test_pretrained_demonstrations_have_the_queries_of_their_seed(task):
-    """Only their plans are those of an earlier planner (docs/demonstrations.md)."""
+    """Only their plans are those of an earlier planner (docs/guide/demonstrations.md)."""
     pretrained = load_demos(task)
     collector = collect.Collector(options(task=task))
     for index in (0, 1, 4_321):

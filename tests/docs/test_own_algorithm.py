@@ -1,4 +1,4 @@
-"""docs/your_own_algorithm.md: its example is carried out."""
+"""docs/customise/algorithm.md: its example is carried out."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from trainers import PATHS, TINY, load
 
 from roboarm_nmp import envs
 
-PAGE = (ROOT / "docs" / "your_own_algorithm.md").read_text()
+PAGE = (ROOT / "docs/customise/algorithm.md").read_text()
 
 
 def test_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):

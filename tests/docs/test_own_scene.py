@@ -1,4 +1,4 @@
-"""docs/your_own_scene.md from top to bottom with tiny numbers, and what it says of errors."""
+"""docs/customise/scene.md from top to bottom with tiny numbers, and what it says of errors."""
 
 import contextlib
 import importlib
@@ -31,7 +31,7 @@ from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, Box, Cylinder, Scen
 SCRIPTS = ROOT / "clean_rl_scripts"
 sys.path.append(str(SCRIPTS))
 BLOCKS = re.findall(
-    r"^```(\w*)\n(.*?)^```", (ROOT / "docs/your_own_scene.md").read_text(), re.S | re.M
+    r"^```(\w*)\n(.*?)^```", (ROOT / "docs/customise/scene.md").read_text(), re.S | re.M
 )
 COMMANDS = [
     line.partition("#")[0].strip()

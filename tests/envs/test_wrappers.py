@@ -112,8 +112,8 @@ def make_env(**arguments):
 
 
 def documented_buffer():
-    """The class in docs/environment.md."""
-    text = (ROOT / "docs" / "environment.md").read_text()
+    """The class in docs/guide/environment.md."""
+    text = (ROOT / "docs/guide/environment.md").read_text()
     code = re.search(r"```python\n(import warnings\n.*?)```", text, re.S)[1]
     namespace = {"HerReplayBuffer": HerReplayBuffer}
     exec(code, namespace)
