@@ -4,14 +4,14 @@
 
 For each task, and `mixed_scenes`: one test query (where scenes vary, six draws), the arm at its
 start and as a ghost at the goal; and where the scene is fixed, the end-effector paths of the first
-demonstrations, from light (start) to dark (goal).
+demonstrations, from light (start) to dark (goal). `task_gallery.png` shows all tasks with names.
 """
 
 from pathlib import Path
 
 import numpy as np
 import pybullet as p
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 from roboarm_nmp import envs
@@ -24,6 +24,7 @@ from roboarm_nmp.envs.show import render_query
 SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls
 ROWS, COLUMNS = 2, 3  # of scenes that vary
+GALLERY_COLUMNS, LABEL = 5, 22  # of all tasks; height (pixels) of their names
 NUM_DEMOS = 24
 COLOURS = ((0.85, 0.30, 0.25), (0.20, 0.45, 0.80), (0.95, 0.65, 0.15), (0.25, 0.60, 0.35))
 FOLDER = Path(__file__).parent / "figures"
@@ -47,8 +48,21 @@ def draw_path(client, positions, colour):
             )
 
 
+def save_gallery(tiles):
+    """All tasks in a grid: a dict from names to images, all of one size."""
+    height, width, _ = next(iter(tiles.values())).shape
+    rows = -(-len(tiles) // GALLERY_COLUMNS)
+    grid = Image.new("RGB", (GALLERY_COLUMNS * width, rows * (height + LABEL)), "white")
+    draw, font = ImageDraw.Draw(grid), ImageFont.load_default(15)
+    for i, (name, tile) in enumerate(tiles.items()):
+        left, top = i % GALLERY_COLUMNS * width, i // GALLERY_COLUMNS * (height + LABEL)
+        grid.paste(Image.fromarray(tile), (left, top))
+        draw.text((left + width // 2, top + height + 3), name, "black", font, anchor="ma")
+    save(np.asarray(grid), "task_gallery.png")
+
+
 def main():
-    fixed = []
+    gallery = {}
     for task in tqdm([*envs.TASKS, "mixed_scenes"], unit="task"):
         env = envs.make(task, render_mode="rgb_array")
         if not isinstance(envs.get_task(task).scene, Scene):
@@ -58,6 +72,8 @@ def main():
                 query = Query(*env.sample_query(rng), env.scene)
                 pixels.append(render_query(env, query, SIZE)[::2, ::2])
             height, width, channels = pixels[0].shape
+            if task in envs.TASKS:
+                gallery[task] = pixels[0]
             grid = np.reshape(pixels, (ROWS, COLUMNS, height, width, channels)).swapaxes(1, 2)
             save(grid.reshape(ROWS * height, COLUMNS * width, channels), f"{task}.png")
             env.close()
@@ -65,8 +81,8 @@ def main():
         query = load_queries(task)[QUERY]
         pixels = render_query(env, query, SIZE)
         save(pixels, f"{task}.png")
+        gallery[task] = pixels[::2, ::2]
         if demo_path(task).exists():
-            fixed.append(pixels[::2, ::2])
             demos, everywhere = load_demos(task), []
             for i in range(NUM_DEMOS):
                 positions = panda.forward_kinematics(panda.denormalise(demos[i].states))
@@ -75,7 +91,7 @@ def main():
             pixels = render_query(env, query, SIZE, np.concatenate(everywhere))
             save(pixels, f"{task}_demos.png")
         env.close()
-    save(np.concatenate(fixed, axis=1), "fixed_tasks.png")
+    save_gallery(dict(sorted(gallery.items(), key=lambda item: item[0].startswith("random"))))
 
 
 if __name__ == "__main__":
