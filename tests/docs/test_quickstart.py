@@ -56,6 +56,6 @@ def test_page_works_from_top_to_bottom(tmp_path, monkeypatch, capsys):
         next(out for line, out in printed.items() if f"evaluate --policy {name}" in line)
         for name in ("runs/RUN", "dagger", "go-to-goal")
     )
-    assert f"{folder.name} on no_obstacles: 5 test queries" in of_run
+    assert folder.name in of_run and "on no_obstacles: 5 test queries" in of_run
     assert "success                    1.0000" in pretrained
     assert "success                    1.0000" not in baseline
