@@ -57,5 +57,7 @@ def test_page_works_from_top_to_bottom(tmp_path, monkeypatch, capsys):
         for name in ("runs/RUN", "dagger", "go-to-goal")
     )
     assert folder.name in of_run and "on no_obstacles: 5 test queries" in of_run
-    assert "success                    1.0000" in pretrained
-    assert "success                    1.0000" not in baseline
+    success = [
+        float(re.search(r"^  success +(\S+)", out, re.M)[1]) for out in (pretrained, baseline)
+    ]
+    assert success[0] > 0.5 > success[1]
