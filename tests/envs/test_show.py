@@ -7,7 +7,6 @@ import sys
 import time
 
 import numpy as np
-import pybullet as p
 import pytest
 import torch
 from PIL import Image
@@ -20,6 +19,7 @@ from roboarm_nmp.envs.datasets.queries import Query, load_queries, write_queries
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import TASKS, Task
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 SMALL = (96, 72)
 SIZE = ["--size", "96", "72"]
