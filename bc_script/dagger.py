@@ -232,7 +232,7 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         visited.append(observation["observation"][0, :7].cpu().numpy())
         return actor(**observation)
 
-    bar = progress_bar(None, "round", args.round_queries, unit="queries", transient=True)
+    bar = progress_bar(None, "round", args.round_queries, unit="query", transient=True)
     while len(reached) < args.round_queries:
         number, first, last = examples.choose_paths(rng, 1)
         scene, ends = examples.paths.scenes[number], examples.paths.points[np.r_[first, last]]
@@ -329,7 +329,7 @@ if __name__ == "__main__":
 
     pool = [None] * num_draws
     numbers = range(run.step, run.step + num_draws)
-    for number in progress_bar(numbers, "drawing examples", unit="batches"):
+    for number in progress_bar(numbers, "drawing examples", unit="batch"):
         pool[number % num_draws] = draw(number)
     pool = concat(pool)
     background = ThreadPoolExecutor(1)

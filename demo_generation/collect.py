@@ -209,7 +209,7 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             description=options["task"],
             total=num,
             initial=num - len(missing),
-            unit="demos",
+            unit="demo",
             disable=not progress,
         )
         if ray_address is None:

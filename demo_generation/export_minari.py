@@ -175,7 +175,7 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
         raise ValueError(f"the dataset {dataset_id} exists ({path}); --overwrite replaces it")
     planner = demos.parameters.get("options", {}).get("planner", "a planner")
     env = gymnasium.make(envs.gymnasium_id(demos.task), goal_type=goal_type)
-    bar = progress_bar(range(len(demos)), dataset_id, unit="episodes", disable=not progress)
+    bar = progress_bar(range(len(demos)), dataset_id, unit="episode", disable=not progress)
     root = get_dataset_path().resolve()
     _clear_leftovers(root)
     with (

@@ -155,7 +155,7 @@ def make_queries(
             description=str(task),
             total=len(jobs),
             initial=len(jobs) - len(missing),
-            unit="queries",
+            unit="query",
             disable=not progress,
         )
         arguments = (task, solvable, queries_per_scene)

@@ -543,7 +543,7 @@ def collect(args, progress=True):
         made_by,
         open_shard,
         counted="path_count",
-        unit="paths",
+        unit="path",
         per_scene=args.paths_per_scene,
         progress=progress,
     )

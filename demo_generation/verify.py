@@ -120,7 +120,7 @@ def verify(task_or_path, num_workers=1, repair=False, progress=True):
         raise DatasetError(f"{path}: has no record of the options it was collected with")
     counts, kept = Counter(), {}
     results = workers.run(Verifier, (path, repair), range(len(demos)), num_workers, write_line)
-    bar = progress_bar(results, path.name, len(demos), unit="demos", disable=not progress)
+    bar = progress_bar(results, path.name, len(demos), unit="demo", disable=not progress)
     with contextlib.closing(results):
         for index, verdict, demo in bar:
             counts[verdict] += 1

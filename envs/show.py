@@ -331,7 +331,7 @@ def _show(args):
 
 def _draw(args, env, queries, begin):
     numbers = range(args.query, args.query + args.draws)
-    bar = progress_bar(numbers, "drawing", unit="images", transient=True)
+    bar = progress_bar(numbers, "drawing", unit="image", transient=True)
     images = [render_query(env, queries.get(number), args.size) for number in bar]
     columns = math.ceil(math.sqrt(args.draws))
     blank = [np.full_like(images[0], 255)] * (-args.draws % columns)
@@ -354,7 +354,7 @@ def _animate(args, env, queries, begin):
     last = len(configurations) - 1
     steps = [*range(0, last, max(1, math.ceil(last / MAX_FRAMES))), last]
     frames = render_configurations(env, query, configurations[steps], args.size)
-    bar = progress_bar(frames, "drawing", len(steps), unit="frames", transient=True)
+    bar = progress_bar(frames, "drawing", len(steps), unit="frame", transient=True)
     frames = [Image.fromarray(frame) for frame in bar]
     # One palette and no dithering: still parts of the scene have the same pixels in all frames.
     # This method keeps the green of the small ball.

@@ -107,7 +107,7 @@ def collect(args, progress=True):
         made_by,
         open_shard,
         counted="configuration",
-        unit="scenes",
+        unit="scene",
         progress=progress,
     )
     return Observations(args.output)

@@ -112,7 +112,7 @@ def unpack(observations, name, arrays, shards):
             spans = zip(observations.offsets, observations.offsets[1:], strict=False)
             total = len(observations.offsets) - 1
             spans = zip(spans, shards, strict=True)
-            bar = progress_bar(spans, f"unpacking {name}", total, unit="shards")
+            bar = progress_bar(spans, f"unpacking {name}", total, unit="shard")
             for (begin, end), rows in bar:
                 for one, array in whole.items():
                     array[begin:end] = rows[one]

@@ -217,7 +217,7 @@ def _simulate(path, queries, hold_steps, progress):
     total = sum(len(queries[split]) for split in queries)
     with (
         contextlib.closing(world),
-        progress_bar(None, Path(path).name, total, "queries", disable=not progress) as bar,
+        progress_bar(None, Path(path).name, total, "query", disable=not progress) as bar,
     ):
         for split in queries:
             for row, (start, goal, scene) in enumerate(queries[split]):

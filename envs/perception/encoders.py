@@ -314,7 +314,7 @@ class NetworkEncoder(SceneEncoder):
 
 def _progress(scenes, description):
     """The different ones of some scenes, with a progress bar."""
-    return progress_bar(dict.fromkeys(scenes), description, unit="scenes")
+    return progress_bar(dict.fromkeys(scenes), description, unit="scene")
 
 
 def _read_latents(path, key):

@@ -346,7 +346,7 @@ def _run(job, progress):
     count = len(job.start)
     chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
     outcomes, successes = [None] * count, 0
-    bar = progress_bar(total=count, unit="queries", disable=not progress)
+    bar = progress_bar(total=count, unit="query", disable=not progress)
     threads = torch.get_num_threads()
     try:
         with bar, contextlib.closing(_results(job, chunks)) as results:

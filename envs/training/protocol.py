@@ -203,7 +203,7 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0, descript
         FloatingPointError: the policy's actions or its recurrent state are not finite.
     """
     rollouts = _rollouts(policy, envs, queries, device, safety_filter, seed)
-    bar = {"unit": "queries", "transient": True, "disable": description is None}
+    bar = {"unit": "query", "transient": True, "disable": description is None}
     results = [
         (trajectory.success, trajectory.collides, len(trajectory))
         for trajectory in progress_bar(rollouts, description, len(queries), **bar)

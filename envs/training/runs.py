@@ -372,7 +372,7 @@ class Run:
         """Open TensorBoard's writer and a progress bar of `total` steps; `unit` names one."""
         self.writer = summary_writer(self.folder, self.args, self.step)
         self._seconds_before = self.seconds
-        self._unit, options = unit, {"unit": f"{unit}s", "smoothing": 0.05}
+        self._unit, options = unit, {"unit": unit, "smoothing": 0.05}
         self._bar = progress_bar(None, "training", total, initial=self.step, **options)
         self._may_raise = False
         if threading.current_thread() is threading.main_thread():
@@ -423,7 +423,7 @@ class Run:
 
     def show(self, **values):
         """Show values at the end of the progress bar."""
-        self._bar.set_postfix(**values)
+        self._bar.set_postfix(values)  # in their order
 
     def reached(self, score):
         """Whether the best evaluation so far has this score; False for None."""

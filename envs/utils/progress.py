@@ -29,7 +29,7 @@ def progress_bar(
     iterable=None,
     description="",
     total=None,
-    unit="steps",
+    unit="step",
     initial=0,
     transient=False,
     disable=False,
@@ -41,14 +41,14 @@ def progress_bar(
         iterable: to iterate over, or None: `update(n)` counts.
         description: of the work; precedes the numbers.
         total: number of units; by default the length of `iterable`.
-        unit: of the numbers, a plural.
+        unit: of the numbers, a singular.
         initial: number of units that are done already.
         transient: the bar disappears at its end, and work of less than 30 s leaves no line in a log
             file.
         disable: show nothing.
         smoothing: of the rate, as in tqdm: 0 for the mean, 1 for the latest.
     """
-    options = {"total": total, "initial": initial, "unit": f" {unit}", "smoothing": smoothing}
+    options = {"total": total, "initial": initial, "unit": unit, "smoothing": smoothing}
     options |= {"leave": not transient, "disable": disable}
     if sys.stderr.isatty():
         return tqdm(iterable, desc=description, mininterval=0.2, **options)
