@@ -9,6 +9,8 @@ import gc
 import runpy
 import sys
 
+from roboarm_nmp.envs.utils.signals import end_with_one_line
+
 TRAINERS = {
     "sac": ("clean_rl_scripts.sac_her_mp", "SAC with HER and demonstrations"),
     "td3": ("clean_rl_scripts.td3_her_mp", "TD3 with HER and demonstrations"),
@@ -56,6 +58,7 @@ def main(arguments=None):
         return 2
     gc.set_threshold(50_000)  # PyTorch's import makes many objects: 0.2 s of collections
     sys.argv = [f"{prog} {name}", *arguments[1:]]
+    end_with_one_line("nothing was written")  # until the script has better advice
     runpy.run_module(f"roboarm_nmp.{commands[name][0]}", run_name="__main__", alter_sys=True)
     return 0
 

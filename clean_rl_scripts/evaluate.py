@@ -71,6 +71,7 @@ from roboarm_nmp.envs.training.flags import (
     Workers,
 )
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 
 @dataclass
@@ -116,14 +117,14 @@ class Args:
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 for arguments that cannot be used."""
     args = tyro.cli(Args, args=arguments, description=__doc__)
-    # Here, so that --help need not wait for PyTorch.
-    from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
-
     try:
         flags.check(args)
         for path in (args.json, args.image):
             if path is not None:
                 check_writable(path)
+        # Here, so that neither --help nor these errors wait for PyTorch.
+        from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
+
         options = vars(args) | {"safety_filter": _safety_filter(args)}
         for name in ("safety_margin", "escape", "json", "image"):
             del options[name]
@@ -205,4 +206,5 @@ def _table(result):
 
 
 if __name__ == "__main__":
+    end_with_one_line("nothing was written; the same command starts again")
     sys.exit(main())

@@ -33,7 +33,7 @@ import tyro
 
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers, check
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
-from roboarm_nmp.envs.utils.signals import Terminated, exit_interrupted
+from roboarm_nmp.envs.utils.signals import Terminated, end_with_one_line, exit_interrupted
 from roboarm_nmp.envs.utils.workers import check_ray
 
 try:
@@ -360,4 +360,5 @@ def main(arguments=None):
 
 
 if __name__ == "__main__":
+    end_with_one_line("nothing was written")
     main()

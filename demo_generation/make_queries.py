@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
@@ -36,8 +35,9 @@ from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.files import check_writable
+from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
@@ -151,16 +151,15 @@ def make_queries(
         jobs = [(seed, "test", number) for number in range(num_test)]
         jobs += [(seed, "validation", number) for number in range(num_validation)]
         missing = [job for job in jobs if f"{job[1]}/{job[2]}" not in journal.entries]
-        bar = tqdm(
-            desc=task,
+        bar = progress_bar(
+            description=str(task),
             total=len(jobs),
             initial=len(jobs) - len(missing),
-            unit=" queries",
-            mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+            unit="query",
             disable=not progress,
         )
         arguments = (task, solvable, queries_per_scene)
-        results = workers.run(Sampler, arguments, missing, num_workers, warn=bar.write)
+        results = workers.run(Sampler, arguments, missing, num_workers, warn=write_line)
         with bar, contextlib.closing(results):
             for query in results:
                 journal.append(query)
@@ -243,10 +242,8 @@ def main(args):
             print(text)
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command continues from here")
 
 
 if __name__ == "__main__":
-    raise_on_sigterm()
+    end_with_one_line("the same command continues from here")
     main(tyro.cli(Args, prog="roboarm queries", description=__doc__))

@@ -43,7 +43,7 @@ from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 # L2, normalised, between checked states of a motion before a path wants to take it.
 COARSE = 8 * RESOLUTION
@@ -543,7 +543,7 @@ def collect(args, progress=True):
         made_by,
         open_shard,
         counted="path_count",
-        unit="paths",
+        unit="path",
         per_scene=args.paths_per_scene,
         progress=progress,
     )
@@ -553,8 +553,6 @@ def collect(args, progress=True):
 def main(args):
     try:
         made = collect(args)
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command continues from here")
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
@@ -563,5 +561,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    raise_on_sigterm()
+    end_with_one_line("the same command continues from here")
     main(tyro.cli(Args, prog="roboarm roadmaps", description=__doc__))

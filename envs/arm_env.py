@@ -8,11 +8,11 @@ import time
 
 import gymnasium as gym
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import (
     HOLD_STEPS,
     MAX_EDGE,

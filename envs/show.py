@@ -22,10 +22,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import pybullet as p
 import tyro
 from PIL import Image
-from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs import panda
@@ -36,7 +34,10 @@ from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import to_array
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeInt, Pixels, PositiveInt, Seed
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
+from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 from roboarm_nmp.envs.world import why_no_window
 
 SIZE = (640, 480)
@@ -329,7 +330,8 @@ def _show(args):
 
 
 def _draw(args, env, queries, begin):
-    bar = tqdm(range(args.query, args.query + args.draws), "drawing", disable=None)
+    numbers = range(args.query, args.query + args.draws)
+    bar = progress_bar(numbers, "drawing", unit="image", transient=True)
     images = [render_query(env, queries.get(number), args.size) for number in bar]
     columns = math.ceil(math.sqrt(args.draws))
     blank = [np.full_like(images[0], 255)] * (-args.draws % columns)
@@ -352,7 +354,8 @@ def _animate(args, env, queries, begin):
     last = len(configurations) - 1
     steps = [*range(0, last, max(1, math.ceil(last / MAX_FRAMES))), last]
     frames = render_configurations(env, query, configurations[steps], args.size)
-    frames = [Image.fromarray(frame) for frame in tqdm(frames, "drawing", len(steps), disable=None)]
+    bar = progress_bar(frames, "drawing", len(steps), unit="frame", transient=True)
+    frames = [Image.fromarray(frame) for frame in bar]
     # One palette and no dithering: still parts of the scene have the same pixels in all frames.
     # This method keeps the green of the small ball.
     palette = frames[0].quantize(COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=3)
@@ -397,8 +400,6 @@ def _window(args, env, queries, begin):
             text = _outcome(args, queries, number, len(configurations) - 1, trajectory)
             print(text, flush=True)
             time.sleep(PAUSE)
-    except KeyboardInterrupt:
-        pass
     except p.error:
         if p.isConnected(client):
             raise  # otherwise Escape was pressed
@@ -429,11 +430,9 @@ def main(arguments=None):
     except (OSError, ValueError) as error:
         print(f"error: {error}".replace("\n", " "), file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("interrupted: nothing was written", file=sys.stderr)
-        return 130
     return 0
 
 
 if __name__ == "__main__":
+    end_with_one_line("nothing was written")
     sys.exit(main())

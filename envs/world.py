@@ -11,10 +11,10 @@ import subprocess
 import sys
 
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.scenes.primitives import FRICTION, Box, Cylinder, Scene, floor_box
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 # One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
 # controller; docs/guide/environment.md has the measured tracking error.

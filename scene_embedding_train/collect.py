@@ -25,7 +25,7 @@ from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld,
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 
 @dataclass
@@ -107,7 +107,7 @@ def collect(args, progress=True):
         made_by,
         open_shard,
         counted="configuration",
-        unit="scenes",
+        unit="scene",
         progress=progress,
     )
     return Observations(args.output)
@@ -116,8 +116,6 @@ def collect(args, progress=True):
 def main(args):
     try:
         made = collect(args)
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command continues from here")
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
@@ -125,5 +123,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    raise_on_sigterm()
+    end_with_one_line("the same command continues from here")
     main(tyro.cli(Args, prog="roboarm observations", description=__doc__))

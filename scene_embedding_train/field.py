@@ -349,7 +349,7 @@ if __name__ == "__main__":
             points, valid, obstacles = batch_of(data, validation[:1], device)
             field = functools.partial(model, points, valid)
             run.log_image("eval/slices", comparison(obstacles, field, REACH))
-            run.show(near=f"{result['error_near']:.4f}")
+            run.show(validation_error_near=f"{result['error_near']:.4f}")
             if run.is_best(-result["error_near"], result):
                 encoder = ExportedEncoder(model, tuple(names), args.num_points)
                 details = metadata | {"step": step} | result

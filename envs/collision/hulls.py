@@ -4,11 +4,11 @@ import functools
 import math
 
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.kernels import BULLET_MARGIN, CELLS, ROW, SPHERE
 from roboarm_nmp.envs.scenes.primitives import Cylinder, Sphere, to_array
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 MAX_MARGIN = 0.5
 """m. Margins and radii of points must be smaller."""

@@ -11,6 +11,7 @@ from roboarm_nmp.envs.datasets.demonstrations import describe, load_demos
 from roboarm_nmp.envs.datasets.format import locate
 from roboarm_nmp.envs.datasets.queries import query_path, validate
 from roboarm_nmp.envs.tasks import TASKS
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 
 def main(arguments=None):
@@ -74,4 +75,5 @@ def _describe(options):
 
 
 if __name__ == "__main__":
+    end_with_one_line("no file has changed")
     sys.exit(main())

@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 
 import gymnasium as gym
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import MAX_EDGE, World
 
 # Classes (paper, appendix "Training and verifying the encoders").

@@ -8,6 +8,7 @@ horizon and longest step of `RoboArmEnv`'s defaults, contacts allowed. The same 
 same numbers, times excepted, whatever the number of workers.
 """
 
+import contextlib
 import math
 import platform
 import time
@@ -19,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.arm_env import deviations
@@ -35,6 +35,7 @@ from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.envs.utils import workers
+from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 
 CHUNK = 10  # queries a worker takes at a time
 
@@ -345,27 +346,28 @@ def _run(job, progress):
     count = len(job.start)
     chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
     outcomes, successes = [None] * count, 0
-    bar = tqdm(total=count, unit="query", disable=None if progress else True)
+    bar = progress_bar(total=count, unit="query", disable=not progress)
     threads = torch.get_num_threads()
     try:
-        with bar:
-            for indices, chunk in _results(job, chunks, bar.write):
+        with bar, contextlib.closing(_results(job, chunks)) as results:
+            for indices, chunk in results:
                 outcomes[indices.start : indices.stop] = chunk
                 successes += sum(outcome.success for outcome in chunk)
                 bar.update(len(chunk))
-                if bar.n:  # 0 as long as no bar is shown
+                if bar.n:  # 0 if no bar is shown
                     bar.set_postfix(success=f"{successes / bar.n:.3f}")
     finally:
         torch.set_num_threads(threads)
     return outcomes
 
 
-def _results(job, chunks, warn):
-    """The chunks and their outcomes, in any order."""
+def _results(job, chunks):
+    """Yield the chunks and their outcomes, in any order."""
     count = job.options.workers
     if count == 1:
-        return map(_Worker(job), chunks)
-    return workers.run(_Worker, (job,), chunks, min(count, len(chunks)), warn)
+        yield from map(_Worker(job), chunks)
+    else:
+        yield from workers.run(_Worker, (job,), chunks, min(count, len(chunks)), write_line)
 
 
 # --- The result

@@ -6,6 +6,7 @@ returns the function that does jobs; it has an importable, top-level name.
 
 import collections
 import concurrent.futures
+import contextlib
 import importlib.util
 import multiprocessing
 import os
@@ -37,7 +38,8 @@ def run(make_worker, arguments, jobs, workers, warn=print):
         try:
             while waiting or running:
                 while waiting and len(running) < 2 * workers:
-                    running[executor.submit(_work, waiting[0])] = waiting[0]
+                    with _sigint_blocked():  # the first call starts the processes
+                        running[executor.submit(_work, waiting[0])] = waiting[0]
                     waiting.popleft()
                 done, _ = concurrent.futures.wait(
                     running, return_when=concurrent.futures.FIRST_COMPLETED
@@ -62,9 +64,21 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             executor.shutdown(cancel_futures=True)
 
 
+@contextlib.contextmanager
+def _sigint_blocked():
+    """A context whose new processes never receive SIGINT, not even while they import modules.
+
+    A terminal sends Ctrl-C to them, too, but the parent handles it.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _start(make_worker, arguments):
     global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_follow_parent, daemon=True).start()
     _worker = make_worker(*arguments)
 

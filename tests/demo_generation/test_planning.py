@@ -10,7 +10,6 @@ import zlib
 
 import numpy as np
 import psutil
-import pybullet as p
 import pytest
 from paths import ROOT
 
@@ -28,6 +27,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 # Configurations on `wall`: two without contact, and three in collision.
 READY = np.array([1.0, -0.5, 0.0, -1.8, 0.0, 1.5, 0.0], np.float32)

@@ -100,7 +100,7 @@ def main_of(name):
 def error_of(command):
     """The one line of a command that must fail."""
     result = run(command)
-    lines = [line for line in result.error.splitlines() if line and "0%|" not in line]  # its bar
+    lines = [line for line in result.error.splitlines() if line and "0%, " not in line]  # its bar
     lines = [line for line in lines if not line.startswith("pybullet build time")]
     assert result.code in (1, 2) and len(lines) == 1, result.error
     return lines[0]

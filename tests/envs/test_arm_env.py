@@ -9,7 +9,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import psutil
-import pybullet as p
 import pytest
 import stable_baselines3
 import torch
@@ -20,6 +19,7 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, from_array, to_array
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 HOME = np.array([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], dtype=np.float32)
 NEAR_HOME = HOME + np.float32(0.1)

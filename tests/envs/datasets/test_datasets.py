@@ -10,7 +10,6 @@ import time
 
 import h5py
 import numpy as np
-import pybullet as p
 import pybullet_data
 import pytest
 from paths import ROOT
@@ -28,6 +27,7 @@ from roboarm_nmp.envs.datasets.queries import (
     write_queries,
 )
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 
 def random_splits(seed=0, test=30, validation=10):

@@ -8,13 +8,12 @@ import pytest
 
 COMMAND = """
 import time
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
-raise_on_sigterm()
+from roboarm_nmp.envs.utils.signals import end_with_one_line
+end_with_one_line("nothing has begun")
+end_with_one_line("start again")
 try:
     print("ready", flush=True)
     time.sleep(60)
-except KeyboardInterrupt as interrupt:
-    exit_interrupted(interrupt, "start again")
 finally:
     print("cleaned up")
 """
@@ -35,4 +34,10 @@ def test_signal_unwinds_the_command_and_sets_its_exit_code(number, code, line):
     process.send_signal(number)
     stdout, stderr = process.communicate(timeout=30)
     assert (process.returncode, stdout) == (code, "cleaned up\n")
-    assert stderr.splitlines()[-1] == line and "Traceback" not in stderr
+    assert stderr.splitlines() == [line]
+
+
+def test_other_errors_keep_their_traceback():
+    code = COMMAND.replace("time.sleep(60)", "1 / 0")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 1 and "ZeroDivisionError" in ended.stderr
