@@ -28,7 +28,6 @@ from typing import Literal
 
 import gymnasium
 import numpy as np
-import tyro
 from tqdm import tqdm
 
 from roboarm_nmp import envs
@@ -36,6 +35,7 @@ from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_episode
 from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
+from roboarm_nmp.envs.training import flags
 
 PREFIX = ".exporting-"  # of incomplete folders; Minari ignores hidden ones
 
@@ -227,4 +227,4 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="roboarm minari", description=__doc__))
+    main(flags.parse(Args, others="dataset"))

@@ -239,7 +239,7 @@ def test_run_stops_at_a_success_rate_only_on_request(tmp_path, monkeypatch, stop
 @pytest.mark.parametrize(
     "flags, message",
     [
-        (["--task", "walls"], "unknown task 'walls': one of no_obstacles, wall"),
+        (["--task", "walls"], "unknown task 'walls': did you mean wall?"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
         (["--resume", "nowhere"], "nowhere is no run's folder"),
         (["--goal-type", "pose"], "goal-type"),
