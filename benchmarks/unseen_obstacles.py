@@ -213,6 +213,20 @@ def run(tasks, names, num, workers):
             results = load_results()  # again: another run of this may have added to it
             results.setdefault(task, {})[name] = result
             write_results(results)
+            write_card(task, result)
+
+
+def write_card(task, result):
+    """Put a policy's result on its own task, with its own filter, into its model card's file."""
+    path = POLICIES / f"{result['flags'][1]}.json"
+    if len(result["flags"]) > 2 or not path.exists():
+        return
+    card = json.loads(path.read_text())
+    if card["args"]["task"] == task:
+        keys = ("success_rate", "success_rate_interval")
+        keys += ("collision_free_success_rate", "num_queries")
+        card |= {key: result[key] for key in keys}
+        write_atomically(path, (json.dumps(card, indent=1) + "\n").encode())
 
 
 def is_done(result, name, num):

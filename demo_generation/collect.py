@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.following import follow
@@ -28,6 +27,7 @@ from roboarm_nmp.envs.datasets.queries import query_path, validate
 from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
+    CORES,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveInt,
@@ -52,8 +52,8 @@ class Args:
     """Number of demonstrations."""
     seed: Seed = 0
     """Seed of queries and plans. (The pretrained files have 0, and plans of an earlier version.)"""
-    workers: Workers = 2
-    """Number of processes. The file does not depend on it."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores. The file does not depend on it."""
     planner: str = "RRTConnect"
     """One of OMPL's planners, by name."""
     max_checks: PositiveInt = 30_000
@@ -287,4 +287,4 @@ def main(args):
 
 if __name__ == "__main__":
     end_with_one_line("the same command continues from here")
-    main(tyro.cli(Args, prog="roboarm collect", description=__doc__))
+    main(flags.parse(Args, others="planner"))

@@ -28,13 +28,13 @@ from typing import Literal
 
 import gymnasium
 import numpy as np
-import tyro
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_episode
 from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
+from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.utils.progress import progress_bar
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
@@ -223,4 +223,4 @@ def main(args):
 
 if __name__ == "__main__":
     end_with_one_line("no dataset was written")
-    main(tyro.cli(Args, prog="roboarm minari", description=__doc__))
+    main(flags.parse(Args, others="dataset"))

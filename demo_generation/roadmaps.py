@@ -31,7 +31,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -41,7 +40,7 @@ from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Seed, Workers
+from roboarm_nmp.envs.training.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
@@ -469,8 +468,8 @@ class Args:
     """Scenes in each file."""
     seed: Seed = 0
     """Seed of scenes and roadmaps."""
-    workers: Workers = 2
-    """Number of processes. The files do not depend on it."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores. The files do not depend on it."""
     ray_address: str | None = None
     """Address of a Ray cluster (`auto`, `HOST:PORT`) to use instead of local processes."""
 
@@ -562,4 +561,4 @@ def main(args):
 
 if __name__ == "__main__":
     end_with_one_line("the same command continues from here")
-    main(tyro.cli(Args, prog="roboarm roadmaps", description=__doc__))
+    main(flags.parse(Args, others="roadmap"))

@@ -23,7 +23,7 @@ from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos, writ
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.tasks import is_task
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import Workers
+from roboarm_nmp.envs.training.flags import CORES, Workers
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 from roboarm_nmp.envs.utils.signals import end_with_one_line, exit_interrupted
@@ -36,8 +36,8 @@ REPAIR_ATTEMPTS = 10
 class Args:
     files: tyro.conf.Positional[tuple[str, ...]]
     """Demonstration files, or tasks (names or scene files)."""
-    workers: Workers = 2
-    """Number of processes."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores."""
     repair: bool = False
     """Plan failed demonstrations anew, on the same queries, and replace the file."""
 
@@ -178,4 +178,4 @@ def main(args):
 
 if __name__ == "__main__":
     end_with_one_line("nothing has changed")
-    main(tyro.cli(Args, prog="roboarm verify", description=__doc__))
+    main(flags.parse(Args))

@@ -1,10 +1,10 @@
 """Show a task in PyBullet's window, as an image, or as an animation of a policy.
 
-    python -m roboarm_nmp.envs.show double_walls
-    python -m roboarm_nmp.envs.show double_walls --output image.png
-    python -m roboarm_nmp.envs.show my_scene.yaml --output images.png --draws 9
-    python -m roboarm_nmp.envs.show wall --output episode.gif --policy runs/my_run
-    python -m roboarm_nmp.envs.show double_walls --output episode.gif --policy planner
+    roboarm show double_walls
+    roboarm show double_walls --output image.png
+    roboarm show my_scene.yaml --output images.png --draws 9
+    roboarm show wall --output episode.gif --policy runs/my_run
+    roboarm show double_walls --output episode.gif --policy planner
 
 The arm is white; at the goal it is transparent green. The green ball is the goal position of the
 end effector. An image shows the start. The window shows the policy's episodes one after another, in
@@ -422,9 +422,7 @@ def _save(image, path, kind, **options):
 
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 where nothing can be shown."""
-    args = tyro.cli(
-        Args, args=arguments, prog="python -m roboarm_nmp.envs.show", description=__doc__
-    )
+    args = flags.parse(Args, arguments, others="image")
     try:
         _show(args)
     except (OSError, ValueError) as error:

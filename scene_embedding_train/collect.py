@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import tyro
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
+from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
@@ -44,8 +43,8 @@ class Args:
     """Scenes in each file."""
     seed: Seed = 0
     """Seed of scenes and configurations."""
-    workers: Workers = 2
-    """Number of processes. The files do not depend on it."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores. The files do not depend on it."""
     output: Path = Path("observations")
     """Folder to write to."""
     ray_address: str | None = None
@@ -124,4 +123,4 @@ def main(args):
 
 if __name__ == "__main__":
     end_with_one_line("the same command continues from here")
-    main(tyro.cli(Args, prog="roboarm observations", description=__doc__))
+    main(flags.parse(Args, others="sensor"))

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,11 +11,13 @@ from pathlib import Path
 
 import pytest
 import tyro
+from paths import ROOT
 
 from roboarm_nmp import __main__ as command
 
 NAMES = [*(name for name in command.COMMANDS if name != "train")]
 NAMES += [f"train {name}" for name in command.TRAINERS]
+WITHOUT_GROUPS = ("data", "policies")  # which have few flags
 
 
 def run(*arguments):
@@ -24,10 +27,23 @@ def run(*arguments):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_subcommand_has_help(name):
+def test_every_subcommand_has_help_with_an_example_and_groups(name):
     done = run(*name.split(), "--help")
     assert done.returncode == 0, done.stderr
-    assert "usage:" in done.stdout and "--help" in done.stdout
+    assert f"usage: roboarm {name} [-h]" in done.stdout
+    examples = [line for line in done.stdout.splitlines() if "usage:" not in line]
+    assert any(f"roboarm {name} " in line for line in examples)
+    if name not in WITHOUT_GROUPS:
+        groups = re.findall(r"[a-z-]+ options ─", done.stdout)
+        assert len(groups) > 1 and len(set(groups)) == len(groups)
+    if name.startswith("train "):
+        assert {"algorithm options ─", "evaluation options ─", "run options ─"} <= {*groups}
+
+
+def test_help_of_a_script_has_the_scripts_name():
+    script = ROOT / "clean_rl_scripts" / "evaluate.py"
+    done = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True)
+    assert "usage: evaluate.py [-h]" in done.stdout, done.stderr
 
 
 def test_help_is_quick_and_lists_all_subcommands():

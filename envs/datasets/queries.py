@@ -32,6 +32,7 @@ from roboarm_nmp.envs.datasets.format import (
 )
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task
+from roboarm_nmp.envs.utils.names import suggest
 from roboarm_nmp.envs.utils.progress import progress_bar
 from roboarm_nmp.envs.world import HOLD_STEPS, World
 
@@ -104,8 +105,7 @@ def load_queries(task_or_path, split="test"):
         ValueError: unknown split; a malformed scene file.
     """
     if split not in (*SPLITS, ORIGINAL):
-        known = ", ".join((*SPLITS, ORIGINAL))
-        raise ValueError(f"split must be one of {known}, got {split!r}")
+        raise ValueError(f"unknown split {split!r}: {suggest(split, (*SPLITS, ORIGINAL))}")
     path, task = locate(task_or_path, query_path)
     queries = _read_queries(path, task)[0]
     if split not in queries:

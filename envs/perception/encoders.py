@@ -31,6 +31,7 @@ from roboarm_nmp.envs.perception.point_clouds import (
 from roboarm_nmp.envs.perception.sensors import PointCloud, observe_scene, sensors_from_json
 from roboarm_nmp.envs.scenes.primitives import ROW, Scene, padded_rows
 from roboarm_nmp.envs.utils.files import cache_folder, write_atomically
+from roboarm_nmp.envs.utils.names import suggest
 from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 
 ORACLE = "oracle"
@@ -76,9 +77,10 @@ def make_encoder(name, num_points=NUM_POINTS, geometry_source=None):
         return _shared(NetworkEncoder, PRETRAINED / f"{name}.pt", name)
     path = Path(name).absolute()  # a relative path is another file in another folder
     if not os.path.exists(path):
+        known = [ORACLE, POINT_CLOUD, *pretrained_encoders()]
         raise NetworkError(
-            f"no such encoder: {name} (expected {ORACLE}, {POINT_CLOUD}, the path of an encoder's "
-            f"network file, or a pretrained encoder: {', '.join(pretrained_encoders())})"
+            f"no such encoder: {name}: {suggest(name, known)} (or the path of an encoder's network "
+            f"file)"
         )
     return _shared(NetworkEncoder, path, name)
 

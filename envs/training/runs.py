@@ -42,7 +42,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 
 from roboarm_nmp.envs.tasks import SCENE_FILES
 from roboarm_nmp.envs.training import flags
@@ -92,7 +91,7 @@ def parse_args(Args, may_change=()):
         SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
     """
     end_with_one_line("nothing was written")
-    args = tyro.cli(Args)
+    args = flags.parse(Args)
     if args.resume is not None:
         args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
     try:
@@ -130,7 +129,7 @@ def _args_of_run(Args, run, may_change):
     begun_in = Path(saved.get("begun_in", "."))
     defaults = Args(**{name: _from_json(saved[name], kinds[name], begun_in) for name in known})
     defaults.resume = run
-    args = tyro.cli(Args, default=defaults)
+    args = flags.parse(Args, default=defaults)
     had, given = (json.loads(_to_json(asdict(one))) for one in (defaults, args))
     contradicted = [
         f"--{name.replace('_', '-')} is {given[name]!r} now, the run had {had[name]!r}"

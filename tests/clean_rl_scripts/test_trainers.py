@@ -254,7 +254,7 @@ def test_run_folder_is_printed_before_demonstrations_are_encoded(
 @pytest.mark.parametrize(
     "flags, message",
     [
-        (["--task", "walls"], "unknown task 'walls': one of no_obstacles, wall"),
+        (["--task", "walls"], "unknown task 'walls': did you mean wall?"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
         (["--resume", "nowhere"], "nowhere is no run's folder"),
         (["--goal-type", "pose"], "goal-type"),

@@ -384,8 +384,8 @@ def rejection(args):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ({"task": "double_wals"}, "unknown task 'double_wals': one of no_obstacles, wall"),
-        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': one of"),
+        ({"task": "double_wals"}, "unknown task 'double_wals': did you mean double_walls"),
+        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': did you mean RRTConnect"),
         ({"num": 0}, "--num must be at least 1"),
         ({"workers": 0}, r"--workers must be in \[1, 256\], got 0"),
         ({"seed": -1}, r"--seed must be in \[0, 2\^32\)"),

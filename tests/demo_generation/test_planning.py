@@ -502,7 +502,7 @@ def test_query_nearer_than_the_clearance_is_planned(box):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': one of .*RRTConnect"),
+        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': did you mean RRTConnect"),
         ({"planner": "PRM"}, "unknown planner 'PRM'"),
         ({"planner": None}, "unknown planner None"),
         ({"max_checks": 0}, "max_checks must be positive or None, got 0"),

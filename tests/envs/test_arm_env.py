@@ -742,7 +742,7 @@ def test_bad_argument_is_rejected_with_its_range(arguments, message):
 
 
 def test_unknown_task_missing_reset_and_wrong_scene_are_rejected():
-    with pytest.raises(ValueError, match="unknown task 'walls': one of no_obstacles, wall"):
+    with pytest.raises(ValueError, match="unknown task 'walls': did you mean wall?"):
         envs.make("walls")
     with pytest.raises(RuntimeError, match="call reset"):
         envs.make("no_obstacles").step(np.zeros(7))
