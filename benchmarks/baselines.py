@@ -48,6 +48,7 @@ CELLS = {
 REACTIVE = "go-to-goal, filter, point_cloud"  # which that one runs
 PLANNERS = tuple(CELLS)[1:]
 COLUMNS = ("go-to-goal", REACTIVE, *PLANNERS)
+SHOWN = {REACTIVE: "go-to-goal with safety filter"}
 SOURCES = {
     "go-to-goal": "none",
     REACTIVE: "point cloud",
@@ -91,10 +92,11 @@ def tables(results, unseen):
     success = matrix(results, "success_rate", share)
     for row, task in zip(success, envs.TASKS, strict=True):
         row.insert(1, papers.get(task, NOTHING))
-    head = ["task", *COLUMNS]
+    names = [SHOWN.get(name, name) for name in COLUMNS]
+    head = ["task", *names]
     return {
         "baselines-policies": policies(results),
-        "baselines-success": table(["task", "paper's go-to-goal", *COLUMNS], success),
+        "baselines-success": table(["task", "paper's go-to-goal", *names], success),
         "baselines-collision-free": table(
             head, matrix(results, "collision_free_success_rate", share)
         ),
@@ -126,7 +128,7 @@ def policies(results):
         counts = sorted({result["num_queries"] for result in done})
         widths = [np.diff(result["success_rate_interval"])[0] / 2 for result in done]
         dates = sorted({result["date"] for result in done})
-        row = [name, SOURCES.get(name, "ground truth (privileged)")]
+        row = [SHOWN.get(name, name), SOURCES.get(name, "ground truth (privileged)")]
         row += ["yes" if name in PLANNERS else "no", " or ".join(f"{n:,}" for n in counts)]
         rows.append([*row, share(max(widths)), dates[-1]])
     head = ["policy", "geometry source", "search", "queries per task"]

@@ -121,6 +121,18 @@ WITH_ENCODERS = (
     *("dagger, vae", "dagger, vqvae", "dagger, pointnet2", "dagger, field"),
     *(DECODED, OBSERVED, "dagger, oracle"),
 )
+# How the columns are called in the tables.
+SHOWN = {
+    "go-to-goal, filter, point_cloud": "go-to-goal with safety filter",
+    "dagger, vae": "VAE",
+    "dagger, vqvae": "VQ-VAE",
+    "dagger, pointnet2": "PointNet++",
+    "dagger, field": "field",
+    DECODED: "decoded points (field)",
+    OBSERVED: "DAgger, point cloud",
+    f"{OBSERVED}, mixed scenes": "DAgger, mixed scenes",
+    "dagger, oracle": "DAgger, privileged",
+}
 UNSEEN = [
     name for name, task in envs.TASKS.items() if name.startswith("random") or not task.trainable
 ]
@@ -343,7 +355,8 @@ def matrix(results, key, columns, tasks, papers=None):
         shown = [share(one[key]) + _mark(one) if one else NOTHING for one in found]
         paper = [share(papers.get(task))] if papers else []
         rows.append([f"`{task}`", *paper, *shown])
-    return table(["task", *["paper's best"] * bool(papers), *columns], rows)
+    names = [SHOWN.get(name, name) for name in columns]
+    return table(["task", *["paper's best"] * bool(papers), *names], rows)
 
 
 def with_footnotes(text):
