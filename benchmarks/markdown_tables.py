@@ -34,8 +34,9 @@ def share(value):
 
 
 def interval(ends):
+    """The ends of an interval; the space between them does not break a line."""
     low, high = ends
-    return f"[{low:.3f}, {high:.3f}]"
+    return f"[{low:.3f},\u00a0{high:.3f}]"
 
 
 def csv_table(name):
