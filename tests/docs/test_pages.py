@@ -44,10 +44,10 @@ def anchors(page):
 
 
 def links(page):
-    """(text's target, whether it is an image) of Markdown and HTML links."""
+    """Targets of Markdown and HTML links and images."""
     text = prose(page)
     found = re.findall(r"\]\(\s*<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\s*\)", text)
-    found += re.findall(r"^\[[^\]]+\]: +(\S+)", text, re.M)
+    found += re.findall(r"^\[[^\]]+\]: +(\S+)$", text, re.M)
     return found + re.findall(r'(?:src|href)="([^"]+)"', text)
 
 
