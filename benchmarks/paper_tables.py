@@ -327,7 +327,7 @@ def steps_of(found):
 
 
 def method_of(cell):
-    return cell.label + (f", {ENCODERS[cell.encoder]}" if cell.encoder else "")
+    return cell.label + (f" with {ENCODERS[cell.encoder]}" if cell.encoder else "")
 
 
 def results_table(cells, results, baselines):

@@ -127,7 +127,7 @@ def bars(results):
 
 def by_task(results):
     """A PNG file's bytes: success and its interval per task. `results`: task -> cell -> result."""
-    figure, axes = plt.subplots(figsize=(9, 3.8), layout="constrained")
+    figure, axes = plt.subplots(figsize=(10, 3.8), layout="constrained")
     tasks, best = list(envs.TASKS), papers_best()
     shifts = np.linspace(-0.28, 0.28, len(BY_TASK))
     for (label, cell, marker), shift in zip(BY_TASK, shifts, strict=True):
