@@ -1,5 +1,6 @@
 """The results page: from the paper's cells and a folder of results, and from a run."""
 
+import contextlib
 import functools
 import json
 import re
@@ -189,15 +190,23 @@ def test_figure_of_tasks_shows_means_over_seeds(results, monkeypatch):
 def test_a_trainer_does_not_outlive_the_command(tmp_path):
     script = ROOT / "benchmarks" / "paper_tables.py"
     flags = ["--only", "bc-ee-boxes", "--steps", "1000000", "--runs-dir", str(tmp_path)]
-    process = subprocess.Popen([sys.executable, str(script), *flags], stderr=subprocess.PIPE)
-    until = time.time() + 60
-    while not list(tmp_path.glob("*/*/args.json")):
-        assert time.time() < until
-        time.sleep(0.05)
-    (trainer,) = psutil.Process(process.pid).children()
-    process.terminate()
-    assert b"killed" in process.communicate(timeout=20)[1] and process.returncode == 1
-    assert not trainer.is_running()
+    process = psutil.Popen([sys.executable, str(script), *flags], stderr=subprocess.PIPE)
+    trainers = []
+    try:
+        until = time.time() + 120
+        while not list(tmp_path.glob("*/*/args.json")):
+            assert time.time() < until
+            time.sleep(0.05)
+        trainers = process.children()
+        process.terminate()
+        assert b"killed" in process.communicate(timeout=20)[1] and process.returncode == 1
+        assert len(trainers) == 1 and not trainers[0].is_running()
+    finally:  # also where the assertions fail
+        with contextlib.suppress(psutil.NoSuchProcess):
+            trainers += process.children()
+        for one in (*trainers, process):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                one.kill()
 
 
 def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
