@@ -338,7 +338,7 @@ def test_seed_of_several_numbers_gives_a_path_of_its_own(worlds):
 
 
 def test_other_planner_solves_a_query_that_rrt_connect_alone_does_not(monkeypatch):
-    """This query takes RRT-Connect half a million checks or more: docs/benchmark/performance.md."""
+    """This query takes RRT-Connect half a million checks or more: docs/lab_notebook.md."""
     env = envs.make("benchmaker_bookshelf_thin")
     query, planner = load_queries("benchmaker_bookshelf_thin", "original")[88], Planner(env)
     planner.plan(*query, seed=4, time_limit=60.0)
