@@ -75,8 +75,8 @@ def reinforcement(algorithm):
                 row += [interval(result), share(result["collision_free_success_rate"])]
                 row += [f"{result['num_queries']:,}"]
                 rows.append([*row, of_paper[algorithm, "ee", task, p, "yes", ""]])
-    header = ["task", "demonstrations p", "steps", "success", "95 % interval"]
-    header += ["collision-free success", "test queries", "paper's success (1,000,000 steps)"]
+    header = ["task", "p", "steps", "success", "95 % interval", "collision-free success"]
+    header += ["test queries", "paper's success"]
     return markdown(header, rows)
 
 
@@ -93,7 +93,7 @@ def behavioural_cloning():
             row += [share(statistics.mean(free)), of_paper["bc", goal, task, "", "", ""]]
             rows.append(row)
     header = ["goal", "task", "batches", "seeds", "success", "standard deviation over seeds"]
-    header += ["collision-free success", "paper's success (1,000,000 batches)"]
+    header += ["collision-free success", "paper's success"]
     return markdown(header, rows)
 
 
