@@ -59,7 +59,7 @@ SCRIPTS = {
     "td3": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
 }
 STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
-# Settings for long runs (docs/algorithms/training.md).
+# Settings for long runs (docs/algorithms).
 RECIPES = {
     "bc": ["--eval-every", "25000"],
     "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3"],

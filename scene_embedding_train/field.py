@@ -12,7 +12,7 @@ however thin; the others are anywhere.
 Obstacles stand all around the robot, so each of eight sectors has an eighth of z_E. No weight
 depends on the direction, so scenes are rotated and mirrored at random. (Convolutions over a grid
 seen from above, and one layer to all of z_E, had twice the error after as many updates:
-docs/lab_notebook.md.)
+docs/lab_notebook.md, "Encoders".)
 
 What is saved: `encoder.pt`, an exported network from the clouds to z_E, and `encoder.decoder.pt`,
 one from z_E and points to distances. To make an encoder of your own, copy this file and change the
