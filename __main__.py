@@ -43,7 +43,10 @@ def _usage(prog, commands):
 
 
 def main(arguments=None):
-    """Run a subcommand. Returns the exit code: 0, or 2 for an unknown command."""
+    """Run a subcommand.
+
+    Returns the exit code: 0, 1 without a package that it needs, 2 for an unknown command.
+    """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     prog, commands = "roboarm", COMMANDS
     if arguments[:1] == ["train"]:
@@ -59,12 +62,19 @@ def main(arguments=None):
     gc.set_threshold(50_000)  # PyTorch's import makes many objects: 0.2 s of collections
     sys.argv = [f"{prog} {name}", *arguments[1:]]  # its first is replaced by the script's path
     end_with_one_line("nothing was written")  # until the script has better advice
-    runpy.run_module(
-        f"roboarm_nmp.{commands[name][0]}",
-        init_globals={"PROGRAM": f"{prog} {name}"},  # for `envs.training.flags.program`
-        run_name="__main__",
-        alter_sys=True,
-    )
+    try:
+        runpy.run_module(
+            f"roboarm_nmp.{commands[name][0]}",
+            init_globals={"PROGRAM": f"{prog} {name}"},  # for `envs.training.flags.program`
+            run_name="__main__",
+            alter_sys=True,
+        )
+    except ModuleNotFoundError as error:
+        if error.name != "ompl":
+            raise
+        needs = f"{prog} {name} needs OMPL, which has no packages for every Python"
+        print(f"{needs}: docs/install.md says for which", file=sys.stderr)
+        return 1
     return 0
 
 

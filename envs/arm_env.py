@@ -19,6 +19,7 @@ from roboarm_nmp.envs.world import (
     SUBSTEPS,
     TIME_STEP,
     World,
+    image_array,
     why_no_window,
 )
 
@@ -463,7 +464,7 @@ class RoboArmEnv(gym.Env):
             renderer=p.ER_TINY_RENDERER,
             physicsClientId=self.client,
         )
-        return np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
+        return image_array(pixels, width, height)
 
     def close(self):
         """Disconnect from PyBullet. Closing twice is allowed."""

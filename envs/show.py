@@ -38,7 +38,7 @@ from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
 from roboarm_nmp.envs.utils.progress import progress_bar
 from roboarm_nmp.envs.utils.signals import end_with_one_line
-from roboarm_nmp.envs.world import why_no_window
+from roboarm_nmp.envs.world import image_array, why_no_window
 
 SIZE = (640, 480)
 OVERSAMPLING = 2  # the software renderer has jagged edges
@@ -233,7 +233,7 @@ def _shoot(env, camera, size):
         physicsClientId=env.client,
     )
     return _Shot(
-        np.reshape(pixels, (height, width, 4))[..., :3].astype(np.float32),
+        image_array(pixels, width, height).astype(np.float32),
         np.reshape(depth, (height, width)),
         np.reshape(bodies, (height, width)) == env.robot,
     )

@@ -66,6 +66,15 @@ def why_no_window():
     return None if answer.returncode == 0 else f"DISPLAY is {display}, which cannot be opened"
 
 
+def image_array(pixels, width, height):
+    """The colours that `getCameraImage` returns, as uint8 (height, width, 3).
+
+    A PyBullet built without NumPy returns a tuple of integers, which `bytes` converts six times as
+    fast as NumPy does.
+    """
+    return np.frombuffer(bytes(pixels), np.uint8).reshape(height, width, 4)[..., :3].copy()
+
+
 class World:
     """A scene with the arm in it, in a physics engine of its own.
 

@@ -26,6 +26,16 @@ def run(*arguments):
     )
 
 
+@pytest.mark.parametrize("name", ["collect", "queries"])
+def test_planning_without_ompl_is_refused_in_one_line(name, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    monkeypatch.delitem(sys.modules, "roboarm_nmp.demo_generation.planning", raising=False)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    assert command.main([name, "--task", "wall"]) == 1
+    message = capsys.readouterr().err
+    assert f"roboarm {name} needs OMPL" in message and message.count("\n") == 1
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_subcommand_has_help_with_an_example_and_groups(name):
     done = run(*name.split(), "--help")

@@ -1,7 +1,7 @@
 """The command `roboarm data`: validates files of queries, describes files of demonstrations.
 
-    roboarm data validate envs/data/wall.h5 --simulate
-    roboarm data describe wall boxes
+roboarm data validate envs/data/wall.h5 --simulate
+roboarm data describe wall boxes
 """
 
 import argparse

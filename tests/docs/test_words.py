@@ -5,7 +5,8 @@ import re
 import pytest
 from paths import ROOT
 
-PAGES = [ROOT / "docs/index.md", ROOT / "docs/quickstart.md", *(ROOT / "docs/guide").glob("*.md")]
+PAGES = [ROOT / f"docs/{name}.md" for name in ("index", "install", "quickstart")]
+PAGES += (ROOT / "docs/guide").glob("*.md")
 # What they are now: safety filter, margin, escape, local minimum, link distances, decoded, geometry
 # source, latent code, collision-free, contact, pretrained, image, repair, overfit, objects.
 OLD = (

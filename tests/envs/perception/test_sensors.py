@@ -6,6 +6,7 @@ import re
 import gymnasium as gym
 import numpy as np
 import psutil
+import pybullet as p
 import pytest
 from gymnasium.utils.env_checker import check_env
 from paths import ROOT
@@ -42,6 +43,23 @@ def world():
     world = SensorWorld()
     yield world
     world.close()
+
+
+def test_images_do_not_depend_on_how_pybullet_was_built(world, monkeypatch):
+    """Without NumPy it returns tuples of numbers in place of arrays."""
+
+    def get_camera_image(*arguments, **options):
+        width, height, *images = camera_image(*arguments, **options)
+        return width, height, *(tuple(np.ravel(image).tolist()) for image in images)
+
+    world.show(Scene((BALL,)), HOME)
+    camera = Camera((2.0, 0.2, 0.7), size=(40, 30), outputs=OUTPUTS)
+    as_built, camera_image = camera.observe(world), p.getCameraImage
+    monkeypatch.setattr(p, "getCameraImage", get_camera_image)
+    of_tuples = camera.observe(world)
+    for name in OUTPUTS:
+        np.testing.assert_array_equal(of_tuples[name], as_built[name])
+        assert as_built[name] in camera.space[name] and of_tuples[name] in camera.space[name]
 
 
 @pytest.mark.parametrize(("size", "fov"), [((224, 224), 60.0), ((160, 120), 40.0)])
