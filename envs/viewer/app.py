@@ -129,8 +129,7 @@ class _Page:
     """
 
     def __init__(self, server, simulation, args, choices, loader):
-        # Here, so that --help need not wait for Numba.
-        from roboarm_nmp.envs.viewer.drawing import Drawing
+        from roboarm_nmp.envs.viewer.drawing import Drawing  # it imports Numba
 
         self.server, self.simulation, self.args = server, simulation, args
         self.choices, self._load = choices, loader
@@ -328,27 +327,28 @@ class _Page:
         _set(self._play, "label", "Pause" if self.playing else "Play")
 
     def _update_status(self):
+        from roboarm_nmp.envs.viewer.drawing import outcome
+
         simulation = self.simulation
-        lines = [
-            f"**{simulation.episodes.task}**, {simulation.split} query {simulation.number}",
-            "",
-        ]
-        lines += ["| | arm | steps | contacts | ms per action | correction |", "|-|-|-|-|-|-|"]
+        task, split, number = simulation.episodes.task, simulation.split, simulation.number
+        lines = [f"**{task}**, {split} query {number}"]
         for arm in simulation.arms:
-            mark = "✅" if arm.success else "❌" if arm.ended else "▶"
-            ms = "" if arm.ms_per_action is None else f"{arm.ms_per_action:.1f}"
-            change = "" if arm.correction is None else f"{arm.correction:.3f}"
-            change = "escape" if arm.escaping else change
-            cells = mark, arm.name, arm.steps, arm.contact_steps, ms, change
-            lines.append("| " + " | ".join(map(str, cells)) + " |")
-        lines += [f"\n{arm.name}: {arm.problem}" for arm in simulation.arms if arm.problem]
+            mark = "✅" if arm.success else "❌" if arm.ended and not arm.problem else "▶"
+            cells = [f"{mark} **{arm.name}**", outcome(arm)]
+            if arm.ms_per_action is not None:
+                cells.append(f"{arm.ms_per_action:.1f} ms per action")
+            if arm.escaping:
+                cells.append("the filter escapes from a local minimum")
+            elif arm.correction is not None:
+                cells.append(f"correction by the filter {arm.correction:.3f}")
+            lines.append(f"{cells[0]}: {'; '.join(cells[1:])}.")
         kinematic = any(arm.kinematic for arm in simulation.arms) and simulation.edited
-        lines += ["", KINEMATIC if kinematic else PHYSICS]
+        lines.append(KINEMATIC if kinematic else PHYSICS)
         if self.playing and not simulation.ended:
-            lines.append(f" {self._rate:.0f} frames per second.")
+            lines[-1] += f" {self._rate:.0f} frames per second."
         if self._message:
-            lines += ["", f"**{self._message}**"]
-        _set(self._status, "content", "\n".join(lines))
+            lines.append(f"**{self._message}**")
+        _set(self._status, "content", "\n\n".join(lines))
 
     # --- What controls do. Callbacks run in viser's threads, the rest in the loop.
 
@@ -618,15 +618,15 @@ def _open(url):
 def _place_camera(server, arms):
     from roboarm_nmp.envs.viewer.drawing import SPACING
 
-    middle = -SPACING * (arms - 1) / 2
-    back = 1.7 + 0.75 * (arms - 1)
-    server.initial_camera.position = (back, middle + 0.5, 0.9 + 0.3 * arms)
-    server.initial_camera.look_at = (0.0, middle, 0.35)
+    middle = SPACING * (arms - 1) / 2
+    server.initial_camera.position = (1.5 + 0.9 * arms, middle + 0.6, 0.9 + 0.3 * arms)
+    server.initial_camera.look_at = (0.0, middle, 0.4)
+    server.initial_camera.fov = math.radians(50)
 
 
 def _record(args):
     """Write a replay of the query, one HTML file."""
-    from roboarm_nmp.envs.viewer.drawing import COARSE_MESH_CELL, Drawing
+    from roboarm_nmp.envs.viewer.drawing import COARSE_MESH_CELL, Drawing, outcome
 
     simulation = _simulation(args)
     given, _ = _choices(args, simulation.episodes.recording)
@@ -649,13 +649,7 @@ def _record(args):
         _stop(server)
     print(f"{args.record}: written, {len(contents) / 1000:.0f} kB")
     for arm in simulation.arms:
-        print(f"  {arm.name}: {_outcome(arm)}")
-
-
-def _outcome(arm):
-    from roboarm_nmp.envs.viewer.drawing import outcome
-
-    return outcome(arm)
+        print(f"  {arm.name}: {outcome(arm)}")
 
 
 def view(args, prog="roboarm view"):

@@ -20,7 +20,7 @@ from roboarm_nmp.envs.scenes.primitives import Box, Cylinder
 SPACING = 2.2  # m, between the bases of two arms
 # Visual meshes are reduced by merging the vertices in each cube of this size (m).
 # Ghosts and recordings have the larger one: browsers without a GPU render slowly.
-MESH_CELL, COARSE_MESH_CELL = 0.005, 0.011
+MESH_CELL, COARSE_MESH_CELL = 0.005, 0.013
 ORIENTATION_STEPS = 2**14  # quaternions are rounded, so that recordings stay small
 DECODED_BY = "field"  # the encoder whose decoded points are shown where an arm uses none
 
@@ -128,7 +128,8 @@ class ArmDrawing:
                 self._meshes[link].append((handle, shown))
 
         node = name
-        add(-1, node)
+        if colour is None:  # the bases of ghosts are where the arm's is
+            add(-1, node)
         for joint, (x, y, z, roll) in enumerate(panda.JOINT_FRAMES):
             node = f"{node}/frame{joint}"
             scene.add_frame(node, show_axes=False, position=(x, y, z), wxyz=_about_x(roll))
@@ -182,7 +183,7 @@ class _Place:
     """The handles of one arm and of the scene around it."""
 
     def __init__(self, scene, index, cell):
-        self.name, self.offset = f"/arm{index}", np.array([0.0, -SPACING * index, 0.0])
+        self.name, self.offset = f"/arm{index}", np.array([0.0, SPACING * index, 0.0])
         scene.add_frame(self.name, show_axes=False, position=self.offset)
         self.arm = ArmDrawing(scene, f"{self.name}/robot", cell)
         self.start = ArmDrawing(scene, f"{self.name}/start", COARSE_MESH_CELL, START_COLOUR, 0.3)
@@ -215,7 +216,11 @@ class Drawing:
         self.simulation, self._scene, self._cell = simulation, server.scene, cell
         self.show, self.selected, self.on_click = {"start", "goal", "correction"}, None, None
         self._places = []
-        self._scene.configure_environment_map("warehouse", environment_intensity=0.35)
+        # An environment map would be a third of a recording.
+        self._scene.configure_environment_map(None)
+        self._scene.add_light_hemisphere(
+            "/sky", sky_color=(255, 255, 255), ground_color=(190, 190, 190), intensity=0.7
+        )
 
     def offset(self, index):
         """Where the base of an arm is drawn, m, (3,)."""
@@ -236,11 +241,11 @@ class Drawing:
     def _add_floor(self):
         """A floor under all arms."""
         floor = self.simulation.query.scene.floor
-        middle = -SPACING * (len(self._places) - 1) / 2
+        middle = SPACING * (len(self._places) - 1) / 2
         self._scene.add_grid(
             "/floor",
             width=8.0,
-            height=8.0 + 2 * abs(middle),
+            height=8.0 + 2 * middle,
             position=(0.0, middle, -0.6 if floor is None else floor),
             cell_color=(225, 225, 225),
             section_color=(200, 200, 200),
@@ -315,7 +320,7 @@ class Drawing:
         place.goal.visible = place.ball.visible = "goal" in self.show
         place.goal.set(query.goal)
         place.ball.position = panda.forward_kinematics(query.goal)
-        text = f"{arm.name}: {outcome(arm)}"
+        text = f"{arm.name}{_label(arm)}"  # seldom another: a browser takes long to draw text
         if place.label.text != text:
             place.label.text = text
 
@@ -365,18 +370,16 @@ class Drawing:
             handle.points, handle.colors = points, colours
 
     def _contacts(self, place, arm):
-        points, handle = arm.contacts.points, place.shapes.get("contacts")
-        if len(points):
+        points, handle = arm.contacts.points.astype(np.float32), place.shapes.get("contacts")
+        if handle is None and len(points):
+            options = {"point_size": 0.03, "point_shape": "circle", "precision": "float32"}
             place.shapes["contacts"] = self._scene.add_point_cloud(
-                f"{place.name}/contacts",
-                points,
-                CONTACT_COLOUR,
-                point_size=0.03,
-                point_shape="circle",
+                f"{place.name}/contacts", points, CONTACT_COLOUR, **options
             )
         elif handle is not None:
-            handle.remove()
-            del place.shapes["contacts"]
+            handle.visible = len(points) > 0
+            if len(points):
+                handle.points = points
 
 
 def outcome(arm):
@@ -389,6 +392,15 @@ def outcome(arm):
     if arm.ended:
         return f"goal not reached in {arm.steps} steps, {contact}"
     return f"step {arm.steps}, {'CONTACT' if arm.in_contact else contact}"
+
+
+def _label(arm):
+    contact = ", with contact" if arm.contact_steps else ""
+    if arm.problem is not None and arm.ended:
+        return f": {arm.problem}"
+    if arm.ended:
+        return f": goal {'' if arm.success else 'not '}reached{contact or ', no contact'}"
+    return contact
 
 
 def _shape(body):
