@@ -358,8 +358,13 @@ class PolicyArm(_Arm):
         if self._kinematics is None:
             self._kinematics = KinematicWorld(query.scene, drawn=False)
         self.env.unwrapped.world = self._kinematics
+        self._kinematics.set_scene(query.scene)
+        collides = self._kinematics.in_collision(query.goal)
         self._start(query._replace(start=panda.denormalise(self.state)))
         self.kinematic = True
+        if collides:
+            self.problem = "the goal is in collision"
+            self.ended |= self._plans
 
     def _start(self, query):
         self._clear()

@@ -75,6 +75,8 @@ def open_page(browser, url):
     page.set_default_timeout(1000 * TIMEOUT)
     page.goto(url)
     page.wait_for_selector(CANVAS)
+    with contextlib.suppress(playwright.TimeoutError):  # viser's note that there is no GPU
+        page.locator(".mantine-Notification-closeButton").click(timeout=10_000)
     return page
 
 
