@@ -40,7 +40,7 @@ from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Sphere
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, Seed
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 from roboarm_nmp.envs.world import SUBSTEPS, TIME_STEP
 
 PORT = 8080
@@ -654,7 +654,7 @@ def _record(args):
 
 def view(args, prog="roboarm view"):
     """Run the viewer. Returns the exit code: 0, or 2 where nothing can be viewed."""
-    raise_on_sigterm()
+    end_with_one_line("the same command starts again")
     try:
         _check(args)
         if args.record is not None:
@@ -664,14 +664,12 @@ def view(args, prog="roboarm view"):
     except (OSError, ValueError) as error:
         print(f"{prog}: {error}".replace("\n", " "), file=sys.stderr)
         return 2
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command starts again")
     return 0
 
 
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 where nothing can be viewed."""
-    return view(tyro.cli(Args, args=arguments, prog="roboarm view", description=__doc__))
+    return view(flags.parse(Args, arguments))
 
 
 if __name__ == "__main__":

@@ -9,8 +9,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
+from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.viewer.app import PORT, Args, Port, view
 
 TASK, POLICY = "random_boxes_hard", "dagger-combined-point_cloud-random_boxes_hard-s1"
@@ -31,7 +30,7 @@ class DemoArgs:
 
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 where nothing can be viewed."""
-    args = tyro.cli(DemoArgs, args=arguments, prog="roboarm demo", description=__doc__)
+    args = flags.parse(DemoArgs, arguments)
     return view(
         Args(task=TASK, policy=(POLICY, "go-to-goal"), query=QUERY, **vars(args)), "roboarm demo"
     )

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs import panda
@@ -33,6 +32,7 @@ from roboarm_nmp.envs.policies.rollout import Episode
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
 
 GROUND_TRUTH = "ground_truth"
