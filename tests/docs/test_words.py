@@ -5,7 +5,9 @@ import re
 import pytest
 from paths import ROOT
 
-PAGES = [ROOT / "docs/index.md", ROOT / "docs/quickstart.md", *(ROOT / "docs/guide").glob("*.md")]
+FOLDERS = ("guide", "algorithms", "customise", "reference")
+PAGES = [ROOT / "docs" / f"{name}.md" for name in ("index", "quickstart", "lab_notebook")]
+PAGES += [page for name in FOLDERS for page in sorted((ROOT / "docs" / name).glob("*.md"))]
 # What they are now: safety filter, margin, escape, local minimum, link distances, decoded, geometry
 # source, latent code, collision-free, contact, pretrained, image, repair, overfit, objects.
 OLD = (
