@@ -55,8 +55,8 @@ def test_every_reference_of_the_page_exists():
                 found = getattr(found, part)
             assert found.__doc__, name
             break
-    for _, target in re.findall(r"^\[(\w+)\]: (\S+)", PAGE, re.M):
-        assert (ROOT / "docs/reference" / target).exists(), target
+    for script in re.findall(r"`(examples/\w+\.py)`", PAGE):
+        assert (ROOT / script).exists(), script
 
 
 def test_stable_baselines3_policy_of_the_page_acts_as_its_model(page, capsys):
