@@ -1,6 +1,7 @@
 """envs.show: its images and animations, the policy in them, and its errors."""
 
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import numpy as np
 import pybullet as p
 import pytest
 import torch
+from paths import ROOT
 from PIL import Image
 from torch import nn
 
@@ -275,6 +277,16 @@ def test_animation_of_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatc
     assert run("random_boxes_hard", "--output", tmp_path / "a.gif", *arguments) == 0
     text = capsys.readouterr().out
     assert f"{policy}: reached the goal in " in text and "collision-free" in text
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md"])
+def test_first_animation_of_a_page_is_collision_free(page, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+    monkeypatch.chdir(tmp_path)
+    commands = re.findall(r"^roboarm show (.* --output \S+\.gif)", (ROOT / page).read_text(), re.M)
+    assert run(*commands[0].split(), *SIZE) == 0
+    text = capsys.readouterr().out
+    assert "reached the goal" in text and "collision-free" in text
 
 
 def test_demonstration_is_shown(tmp_path, capsys, monkeypatch):
