@@ -4,6 +4,7 @@
     python benchmarks/unseen_figures.py --no-animation
 
 The animation is of validation queries: above `go-to-goal`, below the policy, in the same scenes.
+The policy must reach each goal without a contact: otherwise choose other --queries.
 The others show benchmarks/results/unseen_obstacles.json (benchmarks/unseen_obstacles.py).
 """
 
@@ -49,7 +50,10 @@ BY_TASK = (
 
 
 def animation(policy, numbers, size):
-    """A GIF file's bytes: a column per validation query; above `go-to-goal`, below the policy."""
+    """A GIF file's bytes: a column per validation query; above `go-to-goal`, below the policy.
+
+    Raises ValueError: in one of these episodes, the policy is in contact or misses the goal.
+    """
     queries, rows = load_queries(HARD, "validation"), []
     for name in ("go-to-goal", policy):
         found, arguments = find_policy(name)
@@ -60,12 +64,15 @@ def animation(policy, numbers, size):
         for number in numbers:
             query = queries[number]
             trajectory = rollout(env, query, begin(number, query).act)
+            if name == policy and (trajectory.collides or not trajectory.success):
+                raise ValueError(f"query {number}: {name} is in contact or misses the goal")
             # All at the same speed: what arrives early stands still for the rest.
             steps = np.linspace(0, 200, FRAMES).round().astype(int)
             configurations = trajectory.configurations[np.minimum(steps, len(trajectory))]
             columns.append(list(render_configurations(env, query, configurations, size)))
             ended = "reached" if trajectory.success else "not reached"
-            print(f"{name}, query {number}: {ended} in {len(trajectory)} steps")
+            contact = "with contact" if trajectory.collides else "collision-free"
+            print(f"{name}, query {number}: {ended} in {len(trajectory)} steps, {contact}")
         env.close()
         rows.append(np.concatenate(columns, axis=2))
     frames = [Image.fromarray(frame) for frame in np.concatenate(rows, axis=1)]

@@ -64,7 +64,7 @@ def save_gallery(tiles):
 def main():
     gallery = {}
     for task in tqdm([*envs.TASKS, "mixed_scenes"], unit="task"):
-        env = envs.make(task, render_mode="rgb_array")
+        env = envs.make(task, render_mode="rgb_array", goal_type="combined")
         if not isinstance(envs.get_task(task).scene, Scene):
             pixels, rng = [], np.random.default_rng(0)
             for _ in range(ROWS * COLUMNS):

@@ -6,7 +6,9 @@ import pytest
 from paths import ROOT
 
 FOLDERS = ("guide", "algorithms", "customise", "reference")
-PAGES = [ROOT / "docs" / f"{name}.md" for name in ("index", "install", "quickstart", "lab_notebook")]
+PAGES = [
+    ROOT / "docs" / f"{name}.md" for name in ("index", "install", "quickstart", "lab_notebook")
+]
 PAGES += [page for name in FOLDERS for page in sorted((ROOT / "docs" / name).glob("*.md"))]
 # What they are now: safety filter, margin, escape, local minimum, link distances, decoded, geometry
 # source, latent code, collision-free, contact, pretrained, image, repair, overfit, objects.
