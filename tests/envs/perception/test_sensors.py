@@ -6,7 +6,6 @@ import re
 import gymnasium as gym
 import numpy as np
 import psutil
-import pybullet as p
 import pytest
 from gymnasium.utils.env_checker import check_env
 from paths import ROOT
@@ -27,6 +26,7 @@ from roboarm_nmp.envs.perception.sensors import (
     sensors_to_json,
 )
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.wrappers import SensorWrapper
 
 HOME = np.array([0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8])
