@@ -669,7 +669,7 @@ def view(args, prog="roboarm view"):
 
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 where nothing can be viewed."""
-    return view(flags.parse(Args, arguments))
+    return view(flags.parse(Args, arguments, others="viewer"))
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ class DemoArgs:
 
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 where nothing can be viewed."""
-    args = flags.parse(DemoArgs, arguments)
+    args = flags.parse(DemoArgs, arguments, others="viewer")
     return view(
         Args(task=TASK, policy=(POLICY, "go-to-goal"), query=QUERY, **vars(args)), "roboarm demo"
     )
