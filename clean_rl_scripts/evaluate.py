@@ -93,7 +93,7 @@ class Args:
     num_queries: PositiveInt | None = None
     """only the first so many queries of the split"""
     workers: Workers = CORES
-    """processes; each uses one core. By default as many as there are cores"""
+    """processes, one core each; by default as many as there are cores"""
     stop_on_collision: bool = False
     """end an episode at the first contact"""
     geometry_source: str | None = None

@@ -48,7 +48,15 @@ the name of a task.
 |---|---|---|
 | `--task` |  | the task that the files must be for |
 | `--simulate` | `no` | also check in the simulator that every start and goal is feasible |
-"""
+""",
+    "policies": """\
+`roboarm policies` lists the [pretrained policies and encoders](pretrained.md);
+`roboarm policies NAME` describes a policy.
+
+| flag | default | meaning |
+|---|---|---|
+| `--json` | `no` | print JSON, with all flags of the training |
+""",
 }  # commands whose flags are not in a dataclass
 
 
@@ -110,7 +118,9 @@ def page():
     shared = {}  # class of flags -> trainers that have them
     sections = []
     for name, (path, summary) in commands.items():
-        Args = getattr(importlib.import_module(f"roboarm_nmp.{path}"), "Args", None)
+        module = importlib.import_module(f"roboarm_nmp.{path}")
+        # `demo` has the `Args` of `view`, too.
+        Args = getattr(module, "DemoArgs", None) or getattr(module, "Args", None)
         sections += ["", f"## roboarm {name}", "", f"{summary[:1].upper()}{summary[1:]}."]
         if Args is None:
             sections += ["", BY_HAND[name].rstrip()]
