@@ -3,7 +3,7 @@
     python examples/own_pytorch_loop.py --task wall --demos 2000 --epochs 5
 
 Prints the loss of each epoch, then the success rate of the network on 50 validation queries. The
-network sees the observation and the goal configuration, and imitates the demonstrated direction.
+network receives the observation and the goal configuration, and imitates the directions.
 """
 
 import argparse

@@ -29,7 +29,7 @@ GOAL = np.array([-1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)
 
 
 class Cloud:
-    """What the policy observes of the points, in the place of an encoder: some, far apart."""
+    """The policy's input, in place of an encoder: as many points, as far apart as possible."""
 
     def __init__(self, points, number):
         self.size, self._z = 3 * number, farthest_points(points, number).ravel()
