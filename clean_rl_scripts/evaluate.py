@@ -138,7 +138,7 @@ def main(arguments=None):
     except ValueError as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
-    print(_table(result | {"policy": args.policy}))
+    print(_table(result | {"policy": args.policy}), flush=True)  # before JSON on /dev/stdout
     try:
         if args.json is not None:
             write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())

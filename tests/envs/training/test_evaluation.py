@@ -614,7 +614,9 @@ def test_errors_of_the_command_are_one_line_before_any_work(
 
 def test_device_files_are_written_to_and_never_replaced(query_file, tmp_path):
     flags = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", str(query_file)]
-    run = [sys.executable, SCRIPT, *flags, "--num-queries", "1", "--json"]
+    # With buffered output, as by default.
+    run = ["env", "-u", "PYTHONUNBUFFERED", sys.executable, SCRIPT, *flags]
+    run += ["--num-queries", "1", "--json"]
     shown = subprocess.run([*run, "/dev/stdout"], capture_output=True, text=True, check=True)
     assert json.loads(shown.stdout[shown.stdout.index("{") :])["num_queries"] == 1
     with open(tmp_path / "out.txt", "w") as file:  # the table, and the JSON after it
