@@ -564,7 +564,8 @@ def _view(args):
     """Serve the page until Ctrl-C."""
     from roboarm_nmp.envs.viewer.simulation import WaitingArm
 
-    server, simulation = _server(args.host, args.port), _simulation(args)
+    simulation = _simulation(args)
+    server = _server(args.host, args.port)
     task = simulation.episodes.task
     given, offered = _choices(args, simulation.episodes.recording)
     for choice in given:
