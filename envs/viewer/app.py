@@ -333,7 +333,7 @@ class _Page:
         task, split, number = simulation.episodes.task, simulation.split, simulation.number
         lines = [f"**{task}**, {split} query {number}"]
         for arm in simulation.arms:
-            mark = "✅" if arm.success else "❌" if arm.ended and not arm.problem else "▶"
+            mark = "✓" if arm.success else "✗" if arm.ended and not arm.problem else "▶"
             cells = [f"{mark} **{arm.name}**", outcome(arm)]
             if arm.ms_per_action is not None:
                 cells.append(f"{arm.ms_per_action:.1f} ms per action")
@@ -564,7 +564,8 @@ def _view(args):
     """Serve the page until Ctrl-C."""
     from roboarm_nmp.envs.viewer.simulation import WaitingArm
 
-    server, simulation = _server(args.host, args.port), _simulation(args)
+    simulation = _simulation(args)
+    server = _server(args.host, args.port)
     task = simulation.episodes.task
     given, offered = _choices(args, simulation.episodes.recording)
     for choice in given:
@@ -615,13 +616,17 @@ def _open(url):
         return False
 
 
-def _place_camera(server, arms):
+def camera(arms):
+    """Where the camera of a page with so many arms is at first, m; its target; its field (rad)."""
     from roboarm_nmp.envs.viewer.drawing import SPACING
 
     middle = SPACING * (arms - 1) / 2
-    server.initial_camera.position = (1.5 + 0.9 * arms, middle + 0.6, 0.9 + 0.3 * arms)
-    server.initial_camera.look_at = (0.0, middle, 0.4)
-    server.initial_camera.fov = math.radians(50)
+    return (1.4 + arms, middle + 0.6, 0.9 + 0.3 * arms), (0.0, middle, 0.4), math.radians(50)
+
+
+def _place_camera(server, arms):
+    first = server.initial_camera
+    first.position, first.look_at, first.fov = camera(arms)
 
 
 def _record(args):
