@@ -2,8 +2,8 @@
 
     python docs/make_command_line.py
 
-Names, defaults and meanings come from the dataclasses `Args` of the scripts. A test fails when the
-page is out of date.
+Names, defaults and meanings come from the dataclasses of flags in the scripts. A test fails when
+the page is out of date.
 """
 
 import ast
@@ -39,6 +39,14 @@ and meanings.
 |---|---|
 """
 BY_HAND = {
+    "policies": """\
+`roboarm policies` lists the pretrained policies and encoders. `roboarm policies NAME` shows the
+card of one policy. [Pretrained](pretrained.md) has all cards.
+
+| flag | default | meaning |
+|---|---|---|
+| `--json` | `no` | print JSON, with all flags of training |
+""",
     "data": """\
 `roboarm data validate FILE ...` checks query files. Exit code 1 reports a bad file.
 `roboarm data describe FILE ...` prints statistics of demonstration files. A `FILE` is a path, or
@@ -49,15 +57,15 @@ the name of a task.
 | `--task` |  | the task that the files must be for |
 | `--simulate` | `no` | also check in the simulator that every start and goal is feasible |
 """,
-    "policies": """\
-`roboarm policies` lists the [pretrained policies and encoders](pretrained.md);
-`roboarm policies NAME` describes a policy.
-
-| flag | default | meaning |
-|---|---|---|
-| `--json` | `no` | print JSON, with all flags of the training |
-""",
 }  # commands whose flags are not in a dataclass
+
+
+def flags_of(module):
+    """The dataclass of a script's flags, `Args` or `...Args`; None if it has none of its own."""
+    for name, value in vars(module).items():
+        if name.endswith("Args") and value.__module__ == module.__name__:
+            return value
+    return None
 
 
 def meanings(cls):
@@ -99,10 +107,11 @@ def table(cls):
         flag = f"`--{name.replace('_', '-')}`"
         if tyro.conf.Positional in getattr(kinds[name], "__metadata__", ()):
             flag = f"`{name.upper()}`"
-        options = ", ".join(f"`{value}`" for value in choices(kinds[name]))
-        meaning = f"{options}: {meaning}" if options else meaning
+        options = [f"`{value}`" for value in choices(kinds[name])]
+        if any(option not in meaning for option in options):
+            meaning = f"{', '.join(options)}: {meaning}"
         default = words(fields[name].default)
-        if re.search("by default.* cores", meaning):  # another number on another machine
+        if re.search("(?i)by default.* cores", meaning):  # another number on another machine
             default = ""
         lines.append(f"| {flag} | {default} | {meaning} |")
     return lines
@@ -118,9 +127,7 @@ def page():
     shared = {}  # class of flags -> trainers that have them
     sections = []
     for name, (path, summary) in commands.items():
-        module = importlib.import_module(f"roboarm_nmp.{path}")
-        # `demo` has the `Args` of `view`, too.
-        Args = getattr(module, "DemoArgs", None) or getattr(module, "Args", None)
+        Args = flags_of(importlib.import_module(f"roboarm_nmp.{path}"))
         sections += ["", f"## roboarm {name}", "", f"{summary[:1].upper()}{summary[1:]}."]
         if Args is None:
             sections += ["", BY_HAND[name].rstrip()]

@@ -32,11 +32,24 @@ def blocks(page):
     return [re.sub(r"\\\n\s*", " ", text) for kind, text in found if kind in SHELL]
 
 
+def parts_of(line):
+    """The words of each part of a line, between `&&`, `;` and `|`."""
+    lexer = shlex.shlex(line, posix=True, punctuation_chars="&;|")
+    lexer.whitespace_split, lexer.commenters = True, ""
+    parts = [[]]
+    for word in lexer:
+        if word in ("&&", ";", "|", "||", "&"):
+            parts.append([])
+        else:
+            parts[-1].append(word)
+    return parts
+
+
 def commands_of(text):
     """Lists of words: each command that the project's parsers accept, without its comment."""
     for line in text.splitlines():
-        for part in re.split(r"&&|;|\|", re.sub(r"(^|\s)#.*", "", line).removeprefix("$ ")):
-            words = shlex.split(part)
+        line = re.sub(r"(^|\s)#.*", "", line).removeprefix("$ ")
+        for words in parts_of(line):
             while words and re.fullmatch(r"[A-Z_]+=\S*|time|nice", words[0]):
                 words = words[1:]
             if words[:3] == ["python", "-m", "roboarm_nmp"]:
