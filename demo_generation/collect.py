@@ -254,9 +254,9 @@ def _check(args):
     demo_path(args.task)  # rejects an unknown task, also with --output
     if not envs.get_task(args.task).trainable:
         raise ValueError(f"{args.task} is for testing only: training on it is not allowed")
+    check_writable(path)
     if path.exists() and not args.overwrite:
         raise ValueError(f"{path} exists; --overwrite replaces it")
-    check_writable(path)
     workers.check_ray(args.ray_address)
     if query_path(args.task).exists():
         validate(query_path(args.task), args.task)  # demonstrations must not be of its queries
