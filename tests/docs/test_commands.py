@@ -5,6 +5,7 @@ values have the right type, and tasks, policies and encoders are known.
 """
 
 import argparse
+import dataclasses
 import io
 import re
 import runpy
@@ -32,25 +33,21 @@ def blocks(page):
     return [re.sub(r"\\\n\s*", " ", text) for kind, text in found if kind in SHELL]
 
 
-def parts_of(line):
-    """The words of each part of a line, between `&&`, `;` and `|`."""
-    lexer = shlex.shlex(line, posix=True, punctuation_chars="&;|")
-    lexer.whitespace_split, lexer.commenters = True, ""
-    parts = [[]]
-    for word in lexer:
-        if word in ("&&", ";", "|", "||", "&"):
-            parts.append([])
-        else:
-            parts[-1].append(word)
-    return parts
-
-
 def commands_of(text):
     """Lists of words: each command that the project's parsers accept, without its comment."""
     for line in text.splitlines():
-        line = re.sub(r"(^|\s)#.*", "", line).removeprefix("$ ")
-        for words in parts_of(line):
-            while words and re.fullmatch(r"[A-Z_]+=\S*|time|nice", words[0]):
+        if not re.search(r"(^|&& |; |\$ |\S=\S* )(time )?(roboarm|python) ", line.strip()):
+            continue  # perhaps an output, with single quotes
+        lexer = shlex.shlex(line.strip().removeprefix("$ "), posix=True, punctuation_chars=";&|")
+        lexer.whitespace_split = True
+        commands = [[]]
+        for word in lexer:
+            if set(word) <= set(";&|"):
+                commands.append([])
+            else:
+                commands[-1].append(word)
+        for words in commands:
+            while words and re.fullmatch(r"[A-Z_]+=\S*|time", words[0]):
                 words = words[1:]
             if words[:3] == ["python", "-m", "roboarm_nmp"]:
                 words = ["roboarm", *words[3:]]
@@ -135,7 +132,9 @@ def test_command_is_accepted_by_its_parser(command, monkeypatch):
     if isinstance(args, int):
         assert args == 0, error.getvalue()
         return
-    values = vars(args)
+    values = {}
+    for name, value in vars(args).items():  # a group of flags or a flag
+        values |= vars(value) if dataclasses.is_dataclass(value) else {name: value}
     for task in as_list(values.get("task")):
         assert task in {*TASKS, *OTHER_TASKS} or is_example(task), f"{page}: unknown task {task}"
     for policy in as_list(values.get("policy")):
