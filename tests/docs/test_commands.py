@@ -5,6 +5,7 @@ values have the right type, and tasks, policies and encoders are known.
 """
 
 import argparse
+import dataclasses
 import io
 import re
 import runpy
@@ -135,7 +136,9 @@ def test_command_is_accepted_by_its_parser(command, monkeypatch):
     if isinstance(args, int):
         assert args == 0, error.getvalue()
         return
-    values = vars(args)
+    values = {}
+    for name, value in vars(args).items():  # flags, or groups of flags
+        values |= vars(value) if dataclasses.is_dataclass(value) else {name: value}
     for task in as_list(values.get("task")):
         assert task in {*TASKS, *OTHER_TASKS} or is_example(task), f"{page}: unknown task {task}"
     for policy in as_list(values.get("policy")):
