@@ -13,7 +13,7 @@ from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.viewer.app import PORT, Args, Port, view
 
 TASK, POLICY = "random_boxes_hard", "dagger-combined-point_cloud-random_boxes_hard-s1"
-QUERY = 0  # of the test queries: the policy has no contact, go-to-goal has many
+QUERY = 10  # of the test queries: the policy has no contact, go-to-goal has many
 
 
 @dataclass

@@ -219,7 +219,7 @@ class Drawing:
         # An environment map would be a third of a recording.
         self._scene.configure_environment_map(None)
         self._scene.add_light_hemisphere(
-            "/sky", sky_color=(255, 255, 255), ground_color=(190, 190, 190), intensity=0.7
+            "/sky", sky_color=(255, 255, 255), ground_color=(190, 190, 190), intensity=0.9
         )
 
     def offset(self, index):

@@ -71,9 +71,12 @@ def viewer(*arguments, cwd=None):
         process.communicate()
 
 
-def open_page(browser, url):
+def open_page(browser, url, requests=None):
+    """A page, once it has drawn something; `requests`, a list, gets the addresses it asks for."""
     page = browser.new_page(viewport=SIZE)
     page.set_default_timeout(1000 * TIMEOUT)
+    if requests is not None:
+        page.on("request", lambda request: requests.append(request.url))
     page.goto(url)
     page.wait_for_selector(CANVAS)
     # viser's note that there is no GPU hides the arm.
@@ -175,11 +178,8 @@ def test_replay_plays_without_a_server(browser, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert path.stat().st_size < 1_000_000
-    page = browser.new_page(viewport=SIZE)
     requests = []
-    page.on("request", lambda request: requests.append(request.url))
-    page.goto(path.as_uri())
-    page.wait_for_selector(CANVAS)
+    page = open_page(browser, path.as_uri(), requests)
     images = [screenshot(page)]
     wait_for(lambda: images.append(screenshot(page)) or np.abs(images[-1] - images[0]).max() > 100)
     assert images[-1].std() > 10
