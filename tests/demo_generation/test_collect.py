@@ -123,7 +123,7 @@ def finish(output, whole, *flags):
     assert result.returncode == 0, result.stderr
     assert output.read_bytes() == whole.read_bytes()
     assert list(output.parent.iterdir()) == [output]
-    return int(re.search(rf"(\d+)/{NUM} ", result.stderr).group(1))
+    return int(re.search(rf"(\d+)/{NUM}, ", result.stderr).group(1))
 
 
 # --- The same file
@@ -300,7 +300,7 @@ def test_flipped_bit_drops_its_entry_and_is_reported(whole, journal, output):
     result = run(output)
     assert result.returncode == 0 and output.read_bytes() == whole.read_bytes()
     assert f"{collect.journal_of(output)}: damaged, " in result.stderr
-    begun = int(re.search(rf"(\d+)/{NUM} ", result.stderr).group(1))
+    begun = int(re.search(rf"(\d+)/{NUM}, ", result.stderr).group(1))
     assert NUM - 2 <= begun < NUM  # two of them, if it was the end of a line
 
 
