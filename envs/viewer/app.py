@@ -364,6 +364,11 @@ class _Page:
     def _restart(self):
         self.simulation.restart()
 
+    def begin_together(self):
+        """Once an arm is made: all begin again, unless there were edits in the meantime."""
+        if not self.simulation.edited:
+            self.simulation.restart()
+
     def _set_speed(self):
         self.speed = self._speed.value
 
@@ -562,10 +567,17 @@ def _arm(args, task, choice, seed):
 
 def _view(args):
     """Serve the page until Ctrl-C."""
-    from roboarm_nmp.envs.viewer.simulation import WaitingArm
-
     simulation = _simulation(args)
     server = _server(args.host, args.port)
+    try:
+        _serve(server, simulation, args)
+    finally:
+        _stop(server)
+
+
+def _serve(server, simulation, args):
+    from roboarm_nmp.envs.viewer.simulation import WaitingArm
+
     task = simulation.episodes.task
     given, offered = _choices(args, simulation.episodes.recording)
     for choice in given:
@@ -587,7 +599,7 @@ def _view(args):
                 else:
                     page.do(simulation.replace, index, arm)
                     if restart:
-                        page.do(simulation.restart)
+                        page.do(page.begin_together)
 
         threading.Thread(target=work, daemon=True).start()
 
@@ -603,10 +615,7 @@ def _view(args):
     first = len(simulation.arms) - len(given)
     for index in sorted(range(len(given)), key=lambda i: given[i].policy not in BASELINES):
         load(page, first + index, given[index], args.seed, restart=True)
-    try:
-        page.run()
-    finally:
-        _stop(server)
+    page.run()
 
 
 def _open(url):

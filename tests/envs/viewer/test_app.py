@@ -1,7 +1,9 @@
 """`roboarm view` and `roboarm demo`: their errors, each in one line, and the replay."""
 
 import contextlib
+import signal
 import socket
+import subprocess
 import sys
 import webbrowser
 
@@ -14,8 +16,8 @@ pytest.importorskip("viser")
 
 @pytest.fixture(autouse=True)
 def own_signals(monkeypatch):
-    """SIGTERM stays as it is in the test run."""
-    monkeypatch.setattr(app, "raise_on_sigterm", lambda: None)
+    """Signals stay as they are in the test run."""
+    monkeypatch.setattr(app, "end_with_one_line", lambda advice: None)
 
 
 @contextlib.contextmanager
@@ -92,17 +94,19 @@ def test_missing_browser_gives_one_line_with_the_address(capfd, monkeypatch, fai
     assert f"no browser could be opened: open http://127.0.0.1:{port} yourself" == second
 
 
-def test_interrupt_ends_with_one_line(capfd, monkeypatch):
-    def interrupt(page):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(app._Page, "run", interrupt)
+@pytest.mark.parametrize(("number", "word"), [("SIGINT", "interrupted"), ("SIGTERM", "terminated")])
+def test_signal_ends_the_command_with_one_line(number, word):
     with port_in_use() as port:
         pass
-    with pytest.raises(SystemExit) as ended:
-        app.main(["no_obstacles", "--port", str(port), "--no-open"])
-    assert ended.value.code == 130
-    assert capfd.readouterr().err.splitlines() == ["interrupted; the same command starts again"]
+    command = [sys.executable, "-m", "roboarm_nmp", "view", "no_obstacles", "--no-open"]
+    process = subprocess.Popen(
+        [*command, "--port", str(port)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline().startswith("http://127.0.0.1")
+    process.send_signal(getattr(signal, number))
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == {"SIGINT": 130, "SIGTERM": 143}[number]
+    assert errors.splitlines() == [f"{word}; the same command starts again"] and output == ""
 
 
 def test_recordings_of_demonstrations_and_of_policies_are_written(capfd, tmp_path):
