@@ -7,6 +7,7 @@ goal is dragged, and while an obstacle is dragged, a change in every frame. The 
 Chromium with a software renderer, has another core. (Install `.[test,viewer]` and Chromium.)
 """
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -66,6 +67,7 @@ def frames_per_second(server, simulation, drawing, edit):
 
 def main():
     """Print a table."""
+    argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
     torch.set_num_threads(1)
     chromium = shutil.which("chromium") or sys.exit("there is no Chromium")
     server = app._server("127.0.0.1", PORT)

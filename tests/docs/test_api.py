@@ -4,7 +4,6 @@ import importlib
 import re
 
 import numpy as np
-import pybullet as p
 import pytest
 import torch
 from paths import ROOT
@@ -16,6 +15,7 @@ from roboarm_nmp.envs.networks.exported_networks import load_network
 from roboarm_nmp.envs.policies.export import save_policy
 from roboarm_nmp.envs.policies.registry import PolicyError
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 PAGE = (ROOT / "docs/reference/api.md").read_text()
 SNIPPETS = re.findall(r"^```python\n(.*?)^```", PAGE, re.S | re.M)

@@ -46,7 +46,8 @@ OF_REINFORCEMENT = (
 CASES = [
     *((script, *case) for script in (*POLICIES, *ENCODERS) for case in OF_ALL),
     *((script, *case) for script in REINFORCEMENT for case in OF_REINFORCEMENT),
-    *((script, f"--{name}-queries", "0") for script in POLICIES for name in ("eval", "test")),
+    *((script, "--eval-queries", "0") for script in POLICIES),
+    *((script, "--test-queries", "-1") for script in POLICIES),
     ("sac_her_mp", "--alpha", "0"),
     ("sac_her_mp", "--tau", "0"),
     ("sac_her_mp", "--target-entropy", "-inf"),
