@@ -61,7 +61,9 @@ def run(make_worker, arguments, jobs, workers, warn=print):
                 process.terminate()
             raise
         finally:
-            executor.shutdown(cancel_futures=True)
+            # (A signal may arrive while the pool's thread is being started: it cannot be joined.)
+            with contextlib.suppress(RuntimeError):
+                executor.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager

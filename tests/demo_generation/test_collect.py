@@ -690,7 +690,7 @@ def test_terminated_verify_leaves_the_file_unchanged(damaged):
     wait_for(lambda: worker_processes(process) or process.poll() is not None)
     process.terminate()
     _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 143 and "Traceback" not in stderr
+    assert process.returncode == 143 and "Traceback" not in stderr, stderr
     last = stderr.splitlines()[-1]
     assert last == f"terminated; {path} is unchanged: the same command verifies it again"
     assert path.read_bytes() == before
