@@ -38,7 +38,7 @@ def run(make_worker, arguments, jobs, workers, warn=print):
         try:
             while waiting or running:
                 while waiting and len(running) < 2 * workers:
-                    with _sigint_blocked():  # the first call starts the processes
+                    with _starting_processes():  # at the first job
                         running[executor.submit(_work, waiting[0])] = waiting[0]
                     waiting.popleft()
                 done, _ = concurrent.futures.wait(
@@ -67,16 +67,26 @@ def run(make_worker, arguments, jobs, workers, warn=print):
 
 
 @contextlib.contextmanager
-def _sigint_blocked():
-    """A context whose new processes never receive SIGINT, not even while they import modules.
+def _starting_processes():
+    """A context for starting processes. SIGINT and SIGTERM wait for its end: none starts by halves.
 
-    A terminal sends Ctrl-C to them, too, but the parent handles it.
+    The new processes never receive SIGINT, not even while they import modules: a terminal sends
+    Ctrl-C to them, too, but the parent handles it.
     """
+    arrived, handlers = [], {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if callable(signal.getsignal(number)):
+                handlers[number] = signal.signal(number, lambda one, frame: arrived.append(one))
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in arrived:
+            signal.raise_signal(number)
 
 
 def _start(make_worker, arguments):
