@@ -31,9 +31,10 @@ def run(make_worker, arguments, jobs, workers, warn=print):
     """
     waiting, deaths = collections.deque(jobs), 0
     while waiting:
-        executor = concurrent.futures.ProcessPoolExecutor(
-            workers, multiprocessing.get_context("spawn"), _start, (make_worker, arguments)
-        )
+        with _starting_processes():
+            executor = concurrent.futures.ProcessPoolExecutor(
+                workers, multiprocessing.get_context("spawn"), _start, (make_worker, arguments)
+            )
         running = {}
         try:
             while waiting or running:
@@ -61,24 +62,22 @@ def run(make_worker, arguments, jobs, workers, warn=print):
                 process.terminate()
             raise
         finally:
-            # (A signal may arrive while the pool's thread is being started: it cannot be joined.)
-            with contextlib.suppress(RuntimeError):
-                executor.shutdown(cancel_futures=True)
+            executor.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
 def _starting_processes():
-    """A context for starting processes. SIGINT and SIGTERM wait for its end: none starts by halves.
+    """A context for starting processes: SIGINT and SIGTERM, also of a terminal, wait for its end.
 
-    The new processes never receive SIGINT, not even while they import modules: a terminal sends
-    Ctrl-C to them, too, but the parent handles it.
+    Neither this process is interrupted between two of its steps, nor a new one killed while this
+    one writes to it, which would wait for ever. New processes begin with both signals blocked.
     """
-    arrived, handlers = [], {}
+    numbers, arrived, handlers = {signal.SIGINT, signal.SIGTERM}, [], {}
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in numbers:  # not only blocked: another thread may receive them
             if callable(signal.getsignal(number)):
                 handlers[number] = signal.signal(number, lambda one, frame: arrived.append(one))
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:
@@ -91,6 +90,8 @@ def _starting_processes():
 
 def _start(make_worker, arguments):
     global _worker
+    # SIGINT stays blocked: a terminal sends Ctrl-C to this process, too, but the parent handles it.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     threading.Thread(target=_follow_parent, daemon=True).start()
     _worker = make_worker(*arguments)
 
