@@ -20,9 +20,12 @@ from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, write_queries
 from roboarm_nmp.envs.datasets.trajectories import load_joint_path
 from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.policies.registry import find_policy, make_policy
+from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import TASKS, Task
 from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.envs.viewer import demo
 
 SMALL = (96, 72)
 SIZE = ["--size", "96", "72"]
@@ -288,6 +291,15 @@ def test_first_animation_of_the_quickstart_is_collision_free(tmp_path, capsys, m
     assert run(*commands[0].split(), *SIZE) == 0
     text = capsys.readouterr().out
     assert "reached the goal" in text and "collision-free" in text
+
+
+def test_policy_in_the_animation_of_the_readme_is_collision_free():
+    """docs/make_hero.py shows the query of `roboarm demo`."""
+    policy, arguments = find_policy(demo.POLICY)
+    env, query = envs.make(demo.TASK, **arguments), load_queries(demo.TASK)[demo.QUERY]
+    trajectory = rollout(env, query, make_policy(policy, env)(demo.QUERY, query).act)
+    assert trajectory.success and not trajectory.collides
+    env.close()
 
 
 def test_demonstration_is_shown(tmp_path, capsys, monkeypatch):
