@@ -120,9 +120,6 @@ class Args:
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 for arguments that cannot be used."""
     args = flags.parse(Args, arguments)
-    # Here, so that --help need not wait for PyTorch.
-    from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
-
     try:
         flags.check(args)
         for path in (args.json, args.image):

@@ -49,7 +49,6 @@ import zipfile
 from pathlib import Path
 
 import torch
-from torch.fx.experimental import symbolic_shapes
 from torch.utils import _pytree as pytree
 
 from roboarm_nmp.envs.networks import operations as network_operations
@@ -321,7 +320,7 @@ def _float32_by_default():
 @contextlib.contextmanager
 def _without_graph():
     """PyTorch prints the graph of a module that it cannot export: pages, without a reason."""
-    logger = logging.getLogger(symbolic_shapes.__name__)
+    logger = logging.getLogger("torch.fx.experimental.symbolic_shapes")
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
@@ -336,7 +335,7 @@ def _reason(error):
     text = str(error).strip() or type(error).__name__
     place = re.search(r'File "[^"]*?([^"/]+)", line (\d+), in (\w+)', text)
     where = f" ({place[1]}, line {place[2]}, in {place[3]})" if place else ""
-    if isinstance(error, symbolic_shapes.GuardOnDataDependentSymNode):
+    if type(error).__name__ == "GuardOnDataDependentSymNode":  # to import it takes a second
         return f"its forward branches on a value{where}, which a list of operations cannot do"
     line = text.splitlines()[0]
     return (line if len(line) <= MAX_REASON else f"{line[:MAX_REASON]} ...") + where
