@@ -15,6 +15,12 @@ import re
 import statistics
 from pathlib import Path
 
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from PIL import Image
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES, FIGURES = ROOT / "docs" / "algorithms", ROOT / "docs" / "figures"
 RUNS, ENCODERS = ROOT / "envs/policies/pretrained", ROOT / "envs/perception/pretrained"
@@ -29,10 +35,22 @@ NAMES = {
     "point_cloud": "none: observed points",
     "oracle": "none: ground-truth obstacles (privileged)",
 }
+ENCODER_MEASURES = {
+    "vae": "squared error, foreground",
+    "vqvae": "squared error, foreground",
+    "pointnet2": "IoU of obstacles",
+    "field": "distance error below 10 cm (cm)",
+}
 
 
 def read(path):
     return json.loads(path.read_text())
+
+
+def columns(name):
+    """The rows of a CSV file of `benchmarks/results`: dicts of column -> text."""
+    with open(RESULTS / name, newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def runs(cell):
@@ -42,8 +60,7 @@ def runs(cell):
 
 def paper():
     """The paper's mean success by cell: dict of its columns' values -> text."""
-    with open(RESULTS / "paper_cells.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = columns("paper_cells.csv")
     keys = ("algorithm", "goal_type", "task", "demo_prob", "hindsight", "encoder")
     same = [row for row in rows if row["task"] == row["trained_on"]]
     return {tuple(row[key] for key in keys): row["mean"] for row in same}
@@ -215,12 +232,6 @@ def draw(path, lines, tasks, unit):
     `lines`: dict of label -> (pattern of the cells' names with `{task}`, colour). The dashed line
     is go-to-goal on test queries.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from PIL import Image
-
     baselines = read(RESULTS / "baselines.json")
     figure, axes = plt.subplots(
         1, len(tasks), figsize=(2.1 * len(tasks), 2.6), sharey=True, layout="constrained"
@@ -241,11 +252,58 @@ def draw(path, lines, tasks, unit):
     for panel in axes:
         handles |= dict(zip(*panel.get_legend_handles_labels()[::-1], strict=True))
     figure.legend(handles.values(), handles, loc="outside upper center", ncols=4, fontsize=8)
+    save(figure, path)
+
+
+def save(figure, path):
     contents = io.BytesIO()
     figure.savefig(contents, dpi=110)
     plt.close(figure)
     with Image.open(contents) as image:
         image.convert("RGB").quantize(128).save(path, optimize=True)
+
+
+def draw_dagger(path):
+    """Validation success over updates, with and without contacts."""
+    rows = columns("dagger_curves.csv")
+    reference = read(RESULTS / "baselines.json")[HARD]["go-to-goal"]
+    figure, axes = plt.subplots(1, 2, figsize=(7.6, 2.9), sharey=True, layout="constrained")
+    for panel, column, key in (
+        (axes[0], "success", "success_rate"),
+        (axes[1], "collision-free success", "collision_free_success_rate"),
+    ):
+        panel.axhline(reference[key], color="0.4", linestyle="--", linewidth=1, label="go-to-goal")
+        for encoder, colour in (("oracle", "tab:orange"), ("point_cloud", "tab:blue")):
+            for has_filter, style in (("yes", "-"), ("no", ":")):
+                own = [r for r in rows if r["encoder"] == f"`{encoder}`"]
+                own = [r for r in own if r["safety filter"] == has_filter]
+                updates = [int(r["updates"].replace(",", "")) / 1000 for r in own]
+                label = encoder if has_filter == "yes" else f"{encoder}, no filter"
+                values = [float(r[column]) for r in own]
+                panel.plot(updates, values, style, color=colour, linewidth=1.2, label=label)
+        panel.set_title(column, fontsize=9)
+        panel.set(ylim=(0, 1))
+        panel.grid(alpha=0.3)
+    axes[0].set_ylabel("validation")
+    figure.supxlabel("thousand updates", fontsize=10)
+    handles = axes[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside right center", fontsize=8)
+    save(figure, path)
+
+
+def draw_encoders(path):
+    """The validation error of each encoder over updates."""
+    rows = columns("encoder_curves.csv")
+    figure, axes = plt.subplots(1, 4, figsize=(10.5, 2.6), layout="constrained")
+    for panel, (name, measure) in zip(axes, ENCODER_MEASURES.items(), strict=True):
+        own = [row for row in rows if row["encoder"] == name]
+        updates = [int(row["updates"]) / 1000 for row in own]
+        panel.plot(updates, [float(row["value"]) for row in own], "tab:blue", linewidth=1.2)
+        panel.set_title(f"{NAMES[name]}:\n{measure}", fontsize=9)
+        panel.set_ylim(bottom=0)
+        panel.grid(alpha=0.3)
+    figure.supxlabel("thousand updates", fontsize=10)
+    save(figure, path)
 
 
 def draw_all():
@@ -266,6 +324,8 @@ def draw_all():
     draw(FIGURES / "curves_sac.png", sac, TASKS, steps)
     draw(FIGURES / "curves_td3.png", td3, [t for t in TASKS if "wide" not in t], steps)
     draw(FIGURES / "curves_bc.png", bc, TASKS, "batches")
+    draw_dagger(FIGURES / "curves_dagger.png")
+    draw_encoders(FIGURES / "curves_encoders.png")
 
 
 if __name__ == "__main__":
