@@ -1,8 +1,12 @@
 """The shapes of the arm and of a scene as the arrays that `kernels` takes."""
 
+import contextlib
 import functools
 import itertools
 import math
+import tempfile
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pybullet as p
@@ -93,12 +97,14 @@ def link_shapes(robot):
 def _shapes(client, robot, body, link):
     """The shapes of a link of a body: vertices (v, 3), m, in the link's frame, and rounding."""
     shapes = p.getCollisionShapeData(body, link, physicsClientId=client)
-    if len(shapes) > 1:  # PyBullet returns the vertices of all of them as one: one at a time
-        for collision in robot.collision_elements(_name(client, body, link)):
-            with temporary_urdf(_ONE_SHAPE.format(collision)) as urdf:
-                alone = p.loadURDF(urdf, physicsClientId=client)
-            yield from _shapes(client, robot, alone, -1)
-            p.removeBody(alone, physicsClientId=client)
+    if len(shapes) > 1 or any(len(_objects(shape[4].decode())) > 1 for shape in shapes):
+        # PyBullet returns the vertices of all hulls as one, so each is loaded alone.
+        for element in robot.collision_elements(_name(client, body, link)):
+            for one in _one_by_one(element):
+                with temporary_urdf(_ONE_SHAPE.format(one)) as urdf:
+                    alone = p.loadURDF(urdf, physicsClientId=client)
+                yield from _shapes(client, robot, alone, -1)
+                p.removeBody(alone, physicsClientId=client)
         return
     # PyBullet's positions are relative to the centre of mass.
     position, quaternion = p.getDynamicsInfo(body, link, physicsClientId=client)[3:5]
@@ -116,6 +122,45 @@ def _shapes(client, robot, body, link):
 
 _ONE_SHAPE = """<robot name="shape"><link name="shape"><inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>{}</link></robot>"""
+
+
+def _objects(file):
+    """The objects of an OBJ file, each as the text of a file; PyBullet makes a hull of each."""
+    if not file.lower().endswith(".obj"):
+        return [None]
+    vertices, objects = [], [[]]
+    for line in Path(file).read_text(errors="replace").splitlines():
+        word = line.split(maxsplit=1)[:1]
+        if word in (["o"], ["g"]):
+            objects.append([])
+        elif word == ["v"]:
+            vertices.append(line)
+        elif word == ["f"]:
+            # Only the vertices' numbers: those of textures and normals are not there.
+            numbers = [corner.partition("/")[0] for corner in line.split()[1:]]
+            objects[-1].append(f"f {' '.join(numbers)}")
+    return ["\n".join([*vertices, *faces]) for faces in objects if faces]
+
+
+@contextlib.contextmanager
+def _temporary_obj(text):
+    with tempfile.NamedTemporaryFile("w", suffix=".obj") as file:
+        file.write(text)
+        file.flush()
+        yield file.name
+
+
+def _one_by_one(element):
+    """A URDF's `collision` element, or one for each object of its OBJ file, as text."""
+    mesh = element.find("geometry/mesh")
+    objects = [] if mesh is None else _objects(mesh.get("filename"))
+    if len(objects) < 2:
+        yield ElementTree.tostring(element, "unicode")
+        return
+    for text in objects:
+        with _temporary_obj(text) as file:
+            mesh.set("filename", file)
+            yield ElementTree.tostring(element, "unicode")
 
 
 def _name(client, body, link):

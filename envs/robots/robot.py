@@ -135,6 +135,39 @@ class Robot:
         text = json.dumps(content, default=np.ndarray.tolist, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
+    @classmethod
+    def from_urdf(cls, path, **options):
+        """The arm that a URDF describes, as PyBullet loads it.
+
+        The kinematic chain, axes, limits and collision shapes are the URDF's. Joints that mimic
+        another one follow it.
+
+        Args:
+            path: of the URDF.
+            joints: names of the n actuated joints; by default all movable joints between the base
+                and the end effector.
+            end_effector: name of the link that has the end effector; by default the link at the end
+                of the longest chain of turning joints.
+            end_effector_position: m, (3,), in that link's frame.
+            fixed: dict from names of other joints, such as fingers, to where they are held (rad or
+                m); by default 0, or the limit that is nearest to it.
+            limits: dict from names of joints to (lower, upper), rad or m, where the URDF has none,
+                or others.
+            srdf: path of an SRDF, whose `disable_collisions` pairs of links do not collide. More
+                pairs are left out by sampling (`envs.robots.self_collisions`).
+            packages: dict from names of packages to folders, for `package://` paths of meshes.
+            name: of the robot; by default the URDF's.
+            base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
+            gain: of the position controllers; by default from a calibration
+                (`envs.robots.control`).
+
+        Raises:
+            RobotError: the file cannot be used; a ValueError that names it and the reason.
+        """
+        from roboarm_nmp.envs.robots.urdf import robot_from_urdf
+
+        return robot_from_urdf(path, **options)
+
     # --- Sizes and normalisation
 
     @property
@@ -278,9 +311,8 @@ class Robot:
         return root
 
     def collision_elements(self, link):
-        """The URDF's `collision` elements of a link, by its name, as text."""
-        found = self._parsed_urdf().findall(f"link[@name='{link}']/collision")
-        return [ElementTree.tostring(collision, "unicode") for collision in found]
+        """The URDF's `collision` elements of a link, by its name."""
+        return self._parsed_urdf().findall(f"link[@name='{link}']/collision")
 
     @contextlib.contextmanager
     def _readable_urdf(self):
