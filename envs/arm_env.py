@@ -10,14 +10,12 @@ import gymnasium as gym
 import numpy as np
 import pybullet as p
 
-from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import is_number
+from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
+from roboarm_nmp.envs.scenes.primitives import Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.world import (
     HOLD_STEPS,
     MAX_EDGE,
-    SUBSTEPS,
-    TIME_STEP,
     World,
     why_no_window,
 )
@@ -86,7 +84,6 @@ class RoboArmEnv(gym.Env):
             no visual shapes, which saves 50 MB: call `env.world.draw()` before you render
             `env.client` yourself.
         render_size: (width, height) of `rgb_array` images in pixels.
-        robot: the `Robot`, by default the Panda.
 
     Raises:
         ValueError: an argument is out of its range; the message gives the range.
@@ -114,7 +111,6 @@ class RoboArmEnv(gym.Env):
         velocities=False,
         render_mode=None,
         render_size=(480, 360),
-        robot=PANDA,
     ):
         _one_of("goal_type", goal_type, GOAL_TYPES)
         _one_of("action_mode", action_mode, ACTION_MODES)
@@ -174,7 +170,8 @@ class RoboArmEnv(gym.Env):
         self.render_mode = render_mode
         self.render_size = render_size
 
-        joints, size = robot.num_joints, goal_size(goal_type, robot.num_joints)
+        joints = (Scene() if scene is None else scene).robot.num_joints
+        size = goal_size(goal_type, joints)
         self._observation_size = joints * (2 if velocities else 1) + 3
         unbounded = [
             ("observation", self._observation_size),
@@ -190,7 +187,7 @@ class RoboArmEnv(gym.Env):
         if window and (problem := why_no_window()):
             gym.logger.warn(f"render_mode='human' needs a display ({problem}): no window")
             window = False
-        self.world = World(scene, window, drawn=render_mode is not None, robot=robot)
+        self.world = World(scene, window, drawn=render_mode is not None)
         """The simulated `World`. Change its scene by `set_scene` of the environment."""
         self.start_configuration = None
         """Start of this episode, float32 (n,), rad; None before the first reset."""
@@ -211,7 +208,7 @@ class RoboArmEnv(gym.Env):
 
     @property
     def robot(self):
-        """The `Robot`."""
+        """The scene's `Robot`."""
         return self.world.robot
 
     @property
@@ -225,7 +222,12 @@ class RoboArmEnv(gym.Env):
         return self.world.scene
 
     def set_scene(self, scene):
-        """Put the arm into another `Scene`. This ends the episode. An equal one does nothing."""
+        """Put the arm into another `Scene`. This ends the episode. An equal one does nothing.
+
+        Raises ValueError: the scene has another robot.
+        """
+        if isinstance(scene, Scene) and scene.robot != self.robot:
+            raise ValueError(f"the scene's robot is {scene.robot.name!r}, not {self.robot.name!r}")
         if self.world.set_scene(scene):
             self.start_configuration = None
 

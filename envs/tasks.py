@@ -3,11 +3,15 @@
 Paper: section 4. It names the tasks, but gives no dimensions. They are calibrated so that the
 go-to-goal policy reaches the paper's success rates (docs/guide/tasks.md). MotionBenchMaker's scenes
 are as published.
+
+Tasks are the Panda's. `TASK@ROBOT`, such as `random_boxes_hard@arms/iiwa.yaml`, is a task with
+another arm (`envs.robots.files`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
@@ -39,9 +43,20 @@ class Task:
 def get_task(task):
     """The `Task` of a name in `TASKS` or `TRAINING_SCENES`, or of the path of a scene file.
 
+    With `@` and a robot's file after it, the task is that robot's.
+
     Raises:
-        ValueError: an unknown name, or a malformed scene file.
+        ValueError: an unknown name, a malformed file, or a task that is the Panda's only.
     """
+    task, robot = split_robot(task)
+    if robot is not None:
+        found, robot = get_task(task), load_robot(robot)
+        if has_name(task) and not is_for_any_robot(task):
+            raise ValueError(
+                f"{task} is the Panda's: its obstacles and queries are. Any robot has scene files "
+                f"and {', '.join(name for name in (*TASKS, *TRAINING_SCENES) if is_for_any_robot(name))}"
+            )
+        return replace(found, scene=with_robot(found.scene, robot))
     if has_name(task):
         return TASKS[task] if task in TASKS else TRAINING_SCENES[task]
     if is_task(task):
@@ -53,8 +68,28 @@ def get_task(task):
     raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}, or a scene file (.yaml)")
 
 
+def split_robot(task):
+    """`TASK@ROBOT` as (task, robot); the robot is None without `@`."""
+    task, at, robot = str(task).partition("@")
+    return task, robot if at else None
+
+
+def with_robot(scene, robot):
+    """A `Scene`, or a distribution of scenes, with another robot."""
+    if isinstance(scene, Scene):
+        return replace(scene, robot=robot)
+    return replace(scene, base=replace(scene.base, robot=robot))
+
+
+def is_for_any_robot(name):
+    """Whether a task's obstacles are made for any robot: there are none, or they are random."""
+    scene = TASKS[name].scene if name in TASKS else TRAINING_SCENES[name].scene
+    return not isinstance(scene, Scene) or not scene.obstacles
+
+
 def is_task(task):
-    """Whether `task` is a name, or a path with the suffix of a scene file."""
+    """Whether `task` is a name, or a path with the suffix of a scene file; possibly with a robot."""
+    task, robot = split_robot(task)
     return has_name(task) or Path(task).suffix in SCENE_FILES
 
 
@@ -64,7 +99,9 @@ def has_name(task):
 
 
 def task_name(task):
-    """The name of a task in files: its own, or that of its scene file without suffix."""
+    """The name of a task in files: its own, or that of its files without suffix."""
+    if "@" in str(task):
+        return "@".join(Path(part).stem for part in split_robot(task))
     return task if task in TASKS else Path(task).stem
 
 

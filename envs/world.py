@@ -13,13 +13,9 @@ import sys
 import numpy as np
 import pybullet as p
 
-from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.scenes.primitives import FRICTION, Box, Cylinder, Scene, floor_box
 
-# One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
-# controller; docs/guide/environment.md has the measured tracking error.
-TIME_STEP = 1.0 / 120.0
-SUBSTEPS = 4
 # A configuration is "held" if the controller keeps the arm there without contact for this many
 # environment steps, and the arm drifts no further than this (normalised).
 HOLD_STEPS = 5
@@ -76,11 +72,10 @@ class World:
         drawn: give bodies visual shapes. They cost 50 MB of memory, and PyBullet takes up to six
             times as long to add a cylinder or a sphere. Otherwise obstacles are specks in images,
             until `draw`.
-        robot: the `Robot`, by default the Panda.
 
     Attributes:
         client: PyBullet's number of the engine; None once it is closed.
-        robot: the `Robot`.
+        robot: the scene's `Robot`.
         body: PyBullet's number of the arm's body.
         scene: the `Scene`; `set_scene` changes it.
         has_window: whether PyBullet's window is open.
@@ -90,8 +85,8 @@ class World:
         RuntimeError: of all methods but `close`: the world is closed.
     """
 
-    def __init__(self, scene=None, window=False, drawn=True, robot=PANDA):
-        self.client, self.robot = None, robot
+    def __init__(self, scene=None, window=False, drawn=True):
+        self.client = None
         self._drawn = drawn
         scene = Scene() if scene is None else scene
         _check_scene(scene)
@@ -113,6 +108,7 @@ class World:
             fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self.client
         )
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
+        self.robot = scene.robot
         self.body = self._load_robot()
         # PyBullet places a body by its centre of mass.
         self._in_place = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
@@ -193,7 +189,7 @@ class World:
         _check_scene(scene)
         if scene is self.scene or scene == self.scene:
             return False
-        if self._bodies_made > MAX_BODIES_MADE:
+        if self._bodies_made > MAX_BODIES_MADE or scene.robot != self.robot:
             self._make(scene)
             return True
         self._start, self._events = None, []

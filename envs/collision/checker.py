@@ -39,7 +39,6 @@ from roboarm_nmp.envs.collision.kernels import (
     motion_batch,
     signed_distances_batch,
 )
-from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, floor_box
 
 RESOLUTION = 0.021
@@ -82,11 +81,10 @@ class CollisionChecker:
     batch's shape, (...), and is empty for an empty batch. Safe to use from several threads.
 
     Args:
-        scene: a `Scene`.
+        scene: a `Scene`, whose robot has n joints.
         points: m, (n, 3), in the base's frame: the centres of additional balls, for example an
             observed point cloud.
         point_radius: m, of the balls, in [0, `MAX_MARGIN`).
-        robot: the arm, with n joints.
 
     Raises:
         TypeError: `scene` is not a `Scene`.
@@ -95,13 +93,13 @@ class CollisionChecker:
             outside the limits; a margin out of its range.
     """
 
-    def __init__(self, scene, points=(), point_radius=0.0, robot=PANDA):
+    def __init__(self, scene, points=(), point_radius=0.0):
         if not isinstance(scene, Scene):
             raise TypeError(
                 f"a scene must be a roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
             )
-        self.scene, self.robot = scene, robot
-        self._arm = arm_hulls(robot)
+        self.scene, self.robot = scene, scene.robot
+        self._arm = arm_hulls(scene.robot)
         shapes, geometries = list(scene.obstacles), list(range(len(scene.obstacles)))
         if scene.table is not None:
             shapes.append(scene.table)

@@ -82,6 +82,8 @@ class Robot:
         end_effector_frame: index of the frame that moves it.
         end_effector_position: m, (3,), the end effector's position in that frame.
         base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
+        mesh_digest: SHA-256 (hex) of the meshes of the links that may collide; empty for `PANDA`.
+        source: the file that names the robot, for scene files; empty for `PANDA`.
         xml: the URDF's text, with absolute paths of meshes; empty if PyBullet can read the file.
         gains: of the position controllers (n,).
         contact_free: a configuration without contacts (n,).
@@ -112,6 +114,8 @@ class Robot:
     contact_free: tuple
     base_position: tuple = (0.0, 0.0, 0.0)
     base_orientation: tuple = (0.0, 0.0, 0.0, 1.0)
+    mesh_digest: str = ""
+    source: str = ""
     xml: str = ""
 
     def __post_init__(self):
@@ -131,7 +135,8 @@ class Robot:
     def fingerprint(self):
         """SHA-256 (hex) of the description: all that simulation and kinematics depend on."""
         content = {f.name: getattr(self, f.name) for f in fields(self)}
-        content["urdf"], content["xml"] = Path(self.urdf).name, bool(self.xml)
+        for name in ("urdf", "source", "xml"):
+            content.pop(name)
         text = json.dumps(content, default=np.ndarray.tolist, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -184,6 +189,14 @@ class Robot:
     def link_distances_shape(self):
         """Of link distances: for each link, its signed distance (m) and the gradient of that."""
         return len(self.collision_links), 1 + self.num_joints
+
+    @functools.cached_property
+    def reach(self):
+        """m: the end effector's largest distance from the base, of 10,000 random configurations."""
+        rng = np.random.default_rng(0)
+        configurations = rng.uniform(self.lower, self.upper, (10_000, self.num_joints))
+        positions = self.forward_kinematics(configurations) - np.array(self.base_position)
+        return float(np.linalg.norm(positions, axis=1).max())
 
     @functools.cached_property
     def _mid_and_range(self):

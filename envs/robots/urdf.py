@@ -1,6 +1,7 @@
 """A `Robot` from a URDF, which is untrusted input: everything in it is checked first."""
 
 import dataclasses
+import hashlib
 import math
 from pathlib import Path
 from xml.etree import ElementTree
@@ -95,6 +96,7 @@ def robot_from_urdf(
         name=name or tree.root.get("name") or Path(path).stem,
         urdf=str(path),
         xml=xml,
+        mesh_digest=tree.mesh_digest,
         joint_names=tuple(joints),
         joint_indices=tuple(index[joint] for joint in joints),
         lower=bounds[:, 0],
@@ -142,6 +144,7 @@ class _Tree:
         links: names of the links, parents first.
         elements: a link's XML element.
         joints: a joint's XML element, parents first.
+        mesh_digest: SHA-256 (hex) of the collision meshes.
     """
 
     def __init__(self, path, packages):
@@ -222,6 +225,7 @@ class _Tree:
         # A URDF is often in a folder beside those of its meshes.
         folders = [self.path.absolute().parent.parent.resolve()]
         folders += [Path(folder).resolve() for folder in (packages or {}).values()]
+        digest = hashlib.sha256()
         for link in self.elements.values():
             for kind, limit in (("collision", MAX_COLLISION_MESH), ("visual", MAX_VISUAL_MESH)):
                 for mesh in link.findall(f"{kind}/geometry/mesh"):
@@ -239,6 +243,9 @@ class _Tree:
                     if file.stat().st_size > limit:
                         raise RobotError(f"{where} has more than {limit // 1_000_000} MB")
                     mesh.set("filename", str(file))
+                    if kind == "collision":
+                        digest.update(file.read_bytes())
+        self.mesh_digest = digest.hexdigest()
 
     def _axis(self, joint):
         axis = self.joints[joint].find("axis")
