@@ -52,9 +52,10 @@ def get_task(task):
     if robot is not None:
         found, robot = get_task(task), load_robot(robot)
         if has_name(task) and not is_for_any_robot(task):
+            names = [name for name in (*TASKS, *TRAINING_SCENES) if is_for_any_robot(name)]
             raise ValueError(
-                f"{task} is the Panda's: its obstacles and queries are. Any robot has scene files "
-                f"and {', '.join(name for name in (*TASKS, *TRAINING_SCENES) if is_for_any_robot(name))}"
+                f"{task} is the Panda's: its obstacles and queries are. Tasks of any robot are "
+                f"{', '.join(names)} and scene files"
             )
         return replace(found, scene=with_robot(found.scene, robot))
     if has_name(task):
@@ -88,7 +89,7 @@ def is_for_any_robot(name):
 
 
 def is_task(task):
-    """Whether `task` is a name, or a path with the suffix of a scene file; possibly with a robot."""
+    """Whether `task` is a name, or the path of a scene file; a robot may follow."""
     task, robot = split_robot(task)
     return has_name(task) or Path(task).suffix in SCENE_FILES
 

@@ -14,7 +14,7 @@ GAINS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 NUM_POSES, NUM_STEPS, STEP = 16, 12, 0.03  # of a calibration; length of a step (normalised)
 
 
-def calibrate(robot, seed=0):
+def calibrate(robot, gains=GAINS, seed=0):
     """Gains with which an arm executes commanded steps best, one for all joints.
 
     From random configurations, without contacts, the arm is
@@ -23,9 +23,9 @@ def calibrate(robot, seed=0):
     Returns:
         gain, and the share of the commanded displacement that was executed with it (1: all of it).
     """
-    shares = [_executed(robot, gain, np.random.default_rng(seed)) for gain in GAINS]
+    shares = [_executed(robot, gain, np.random.default_rng(seed)) for gain in gains]
     best = int(np.argmin(np.abs(np.array(shares) - 1.0)))
-    return GAINS[best], shares[best]
+    return gains[best], shares[best]
 
 
 def _executed(robot, gain, rng):

@@ -83,5 +83,6 @@ PANDA = Robot(
     end_effector_frame=6,
     end_effector_position=(0.0, 0.0, FLANGE_LENGTH + HAND_TO_GRASP),
     gains=(0.6,) * 7,
+    observed_pose=(0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8),
     contact_free=tuple((low + high) / 2 for low, high in zip(_LOWER, _UPPER, strict=True)),
 )

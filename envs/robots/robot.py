@@ -87,6 +87,8 @@ class Robot:
         xml: the URDF's text, with absolute paths of meshes; empty if PyBullet can read the file.
         gains: of the position controllers (n,).
         contact_free: a configuration without contacts (n,).
+        observed_pose: the configuration (n,) in which sensors observe a scene: always the same, so
+            that an encoded scene depends on the scene alone.
     """
 
     name: str
@@ -112,6 +114,7 @@ class Robot:
     end_effector_position: tuple
     gains: tuple
     contact_free: tuple
+    observed_pose: tuple
     base_position: tuple = (0.0, 0.0, 0.0)
     base_orientation: tuple = (0.0, 0.0, 0.0, 1.0)
     mesh_digest: str = ""

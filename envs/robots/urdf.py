@@ -121,6 +121,7 @@ def robot_from_urdf(
         end_effector_position=tuple(position + rotation @ np.array(end_effector_position)),
         gains=(gain or 0.6,) * len(joints),
         contact_free=tuple(bounds.mean(1)),
+        observed_pose=tuple(bounds.mean(1)),
         base_position=tuple(map(float, base_position)),
         base_orientation=tuple(map(float, base_orientation)),
     )
@@ -129,7 +130,12 @@ def robot_from_urdf(
     }
     disabled = adjacent | (disabled_pairs(srdf, link_index) if srdf else set())
     pairs, contact_free = sample_pairs(robot, disabled)
-    robot = dataclasses.replace(robot, self_collision_pairs=pairs, contact_free=contact_free)
+    robot = dataclasses.replace(
+        robot,
+        self_collision_pairs=pairs,
+        contact_free=contact_free,
+        observed_pose=contact_free,
+    )
     if gain is None:
         gain = calibrate(robot)[0]
         robot = dataclasses.replace(robot, gains=(gain,) * len(joints))
