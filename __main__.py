@@ -4,10 +4,12 @@ Each subcommand runs its script as `python -m` does. So a trainer stays a file t
 to bottom, and the processes that it spawns find it under its module's name.
 """
 
-import difflib
 import gc
 import runpy
 import sys
+
+from roboarm_nmp.envs.utils.names import suggest
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 TRAINERS = {
     "sac": ("clean_rl_scripts.sac_her_mp", "SAC with HER and demonstrations"),
@@ -22,7 +24,10 @@ TRAINERS = {
 COMMANDS = {
     "train": (None, "train a policy or a scene encoder: roboarm train --help"),
     "evaluate": ("clean_rl_scripts.evaluate", "evaluate a policy on the queries of a task"),
+    "policies": ("envs.policies", "list the pretrained policies and encoders"),
     "show": ("envs.show", "window, image or animation of a task and of a policy"),
+    "view": ("envs.viewer.app", "policies in the browser; move goal and obstacles"),
+    "demo": ("envs.viewer.demo", "a pretrained policy in the browser, without arguments"),
     "sweep": ("clean_rl_scripts.sweep", "search a trainer's flags with Optuna"),
     "queries": ("demo_generation.make_queries", "make a query file"),
     "collect": ("demo_generation.collect", "collect demonstrations"),
@@ -41,7 +46,10 @@ def _usage(prog, commands):
 
 
 def main(arguments=None):
-    """Run a subcommand. Returns the exit code: 0, or 2 for an unknown command."""
+    """Run a subcommand.
+
+    Returns the exit code: 0, 1 without a package that it needs, 2 for an unknown command.
+    """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     prog, commands = "roboarm", COMMANDS
     if arguments[:1] == ["train"]:
@@ -51,13 +59,25 @@ def main(arguments=None):
         return 0 if arguments else 2
     name = arguments[0]
     if name not in commands:
-        close = difflib.get_close_matches(name, commands, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(commands)}"
+        hint = suggest(name, commands)
         print(f"{prog}: unknown command {name!r}: {hint}", file=sys.stderr)
         return 2
     gc.set_threshold(50_000)  # PyTorch's import makes many objects: 0.2 s of collections
-    sys.argv = [f"{prog} {name}", *arguments[1:]]
-    runpy.run_module(f"roboarm_nmp.{commands[name][0]}", run_name="__main__", alter_sys=True)
+    sys.argv = [f"{prog} {name}", *arguments[1:]]  # its first is replaced by the script's path
+    end_with_one_line("nothing was written")  # until the script has better advice
+    try:
+        runpy.run_module(
+            f"roboarm_nmp.{commands[name][0]}",
+            init_globals={"PROGRAM": f"{prog} {name}"},  # for `envs.training.flags.program`
+            run_name="__main__",
+            alter_sys=True,
+        )
+    except ModuleNotFoundError as error:
+        if error.name != "ompl":
+            raise
+        needs = f"{prog} {name} needs OMPL, which has no packages for every Python"
+        print(f"{needs}: docs/install.md says for which", file=sys.stderr)
+        return 1
     return 0
 
 

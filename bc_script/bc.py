@@ -214,11 +214,7 @@ if __name__ == "__main__":
         torch.as_tensor(np.concatenate(arrays), device=device)
         for arrays in zip(*parts, strict=True)
     ]
-    latents = None  # the encoded scene of each demonstration
-    if args.encoder is not None:
-        encoded = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
-        latents = torch.as_tensor(np.concatenate(encoded), device=device)
-    del files, parts
+    del parts
 
     # ALGO LOGIC: network and optimiser
     observation_size = eval_envs[0].observation_space["observation"].shape[0]
@@ -228,6 +224,12 @@ if __name__ == "__main__":
     optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
     state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
+
+    latents = None  # the encoded scene of each demonstration; the first time takes minutes
+    if args.encoder is not None:
+        encoded = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
+        latents = torch.as_tensor(np.concatenate(encoded), device=device)
+    del files
     run.start(args.total_updates, "update")
 
     while run.step < args.total_updates:

@@ -23,7 +23,6 @@ import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-from tqdm import tqdm
 
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.arm_env import GOAL_SIZES
@@ -35,6 +34,7 @@ from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, gr
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training import flags, protocol, runs
+from roboarm_nmp.envs.utils.progress import progress_bar
 from roboarm_nmp.envs.utils.random_streams import Stream
 
 
@@ -232,6 +232,7 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         visited.append(observation["observation"][0, :7].cpu().numpy())
         return actor(**observation)
 
+    bar = progress_bar(None, "round", args.round_queries, unit="query", transient=True)
     while len(reached) < args.round_queries:
         number, first, last = examples.choose_paths(rng, 1)
         scene, ends = examples.paths.scenes[number], examples.paths.points[np.r_[first, last]]
@@ -249,6 +250,8 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         count = min(args.round_labels, len(states))
         states = states[rng.choice(len(states), count, False, weights / weights.sum())]
         parts.append(examples.label(number, states, np.repeat(ends[1:], count, axis=0), rng))
+        bar.update()
+    bar.close()
     return concat([on_device(part, device) for part in parts]), np.mean(reached)
 
 
@@ -326,7 +329,7 @@ if __name__ == "__main__":
 
     pool = [None] * num_draws
     numbers = range(run.step, run.step + num_draws)
-    for number in tqdm(numbers, desc="drawing examples", mininterval=2.0):
+    for number in progress_bar(numbers, "drawing examples", unit="batch"):
         pool[number % num_draws] = draw(number)
     pool = concat(pool)
     background = ThreadPoolExecutor(1)

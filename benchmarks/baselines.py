@@ -2,15 +2,16 @@
 
     python benchmarks/baselines.py --workers 2                  # 2 hours; what is done is skipped
     python benchmarks/baselines.py --only wall --workers 2
-    python benchmarks/baselines.py --table                      # only writes the table
+    python benchmarks/baselines.py --table                      # only writes the tables
 
 Each cell is a call of `clean_rl_scripts/evaluate.py` (goal `ee`): `go-to-goal` on all test queries,
 the others on the first `--num`. Results go to benchmarks/results/baselines.json at once, so an
-interrupted run goes on where it was; docs/benchmark/baselines.md is the table of what is there. The
+interrupted run goes on where it was; docs/benchmark/baselines.md has tables of what is there. The
 planner's numbers depend on the machine, so nothing else should run beside it. Times are per query.
 """
 
 import argparse
+import csv
 import datetime
 import json
 import os
@@ -21,14 +22,17 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numpy as np
+from markdown_tables import NOTHING, share, table, write
+
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.queries import load_queries, query_path
 from roboarm_nmp.envs.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks/results/baselines.json"
-TABLE = ROOT / "docs/benchmark/baselines.md"
 UNSEEN = ROOT / "benchmarks/results/unseen_obstacles.json"  # another benchmark's
+PAPER = ROOT / "benchmarks/results/paper_go_to_goal.csv"
 CELLS = {
     "go-to-goal": ["--policy", "go-to-goal"],
     "via-points, K = 16": ["--policy", "via-points", "--tries", "16"],
@@ -42,20 +46,13 @@ CELLS = {
     ],
 }
 REACTIVE = "go-to-goal, filter, point_cloud"  # which that one runs
-COLUMNS = ("go-to-goal", REACTIVE, *list(CELLS)[1:])
-# Success of go-to-goal in the paper, sections 5.2 to 5.4, which give none for the bookshelves.
-PAPER = {
-    "no_obstacles": 0.979,
-    "wall": 0.765,
-    "double_walls_wide_gap": 0.648,
-    "double_walls": 0.453,
-    "boxes": 0.806,
-    "random_boxes_easy": 0.491,
-    "random_boxes_medium": 0.370,
-    "random_boxes_hard": 0.289,
-    "three_shelves": 0.832,
-    "pole_shelves": 0.721,
-    "narrow_shelves": 0.539,
+PLANNERS = tuple(CELLS)[1:]
+COLUMNS = ("go-to-goal", REACTIVE, *PLANNERS)
+SHOWN = {REACTIVE: "go-to-goal with safety filter"}
+SOURCES = {
+    "go-to-goal": "none",
+    REACTIVE: "point cloud",
+    "plan from the point cloud, 5 s": "point cloud",
 }
 
 
@@ -79,80 +76,63 @@ def run(results, tasks, names, num, workers):
             write_atomically(RESULTS, (json.dumps(results, indent=1) + "\n").encode())
 
 
-def table(results, unseen):
-    """The page, in Markdown. `unseen`: results of benchmarks/unseen_obstacles.py."""
+def papers_go_to_goal():
+    """Dict of task -> success of go-to-goal in the paper, sections 5.2 to 5.4."""
+    with open(PAPER, newline="") as file:
+        return {row["task"]: float(row["success"]) for row in csv.DictReader(file)}
+
+
+def tables(results, unseen):
+    """Name -> Markdown. `unseen`: results of benchmarks/unseen_obstacles.py."""
     results = {task: dict(results.get(task, {})) for task in envs.TASKS}
     for task, found in unseen.items():
         if REACTIVE in found:
             results[task][REACTIVE] = found[REACTIVE]
-    lines = [
-        "# Non-learning baselines",
-        "",
-        "`python benchmarks/baselines.py` measures and writes this page (goal `ee`). The policies:",
-        "[tasks.md](tasks.md). In each cell: success, collision-free success [95 % interval of",
-        "success]. RRT-Connect and via-points use ground truth (privileged) unless the column says",
-        "otherwise.",
-        "LBKPIECE1 helps where RRT-Connect takes long ([demonstrations.md](demonstrations.md)).",
-        "The success within 0.05 s depends on the machine and its load.",
-        f"`{REACTIVE}` is `go-to-goal` with a [safety filter](safety_filter.md) on observed points",
-        "(goal `combined`; its version: [unseen_obstacles.md](unseen_obstacles.md)).",
-        "",
-        "| task | paper, `go-to-goal` | " + " | ".join(COLUMNS) + " |",
-        "|---" * (2 + len(COLUMNS)) + "|",
-    ]
+    papers = {task: share(value) for task, value in papers_go_to_goal().items()}
+    success = matrix(results, "success_rate", share)
+    for row, task in zip(success, envs.TASKS, strict=True):
+        row.insert(1, papers.get(task, NOTHING))
+    names = [SHOWN.get(name, name) for name in COLUMNS]
+    head = ["task", *names]
+    return {
+        "baselines-policies": policies(results),
+        "baselines-success": table(["task", "paper's go-to-goal", *names], success),
+        "baselines-collision-free": table(
+            head, matrix(results, "collision_free_success_rate", share)
+        ),
+        "baselines-path-length": table(head, matrix(results, "path_length", "{:.2f}".format)),
+        "baselines-planning-time": table(
+            ["task", *PLANNERS],
+            matrix(results, "planning_seconds", "{:.3f}".format, PLANNERS),
+        ),
+    }
+
+
+def matrix(results, key, form, names=None):
+    """Rows: a task each, and one quantity of each policy."""
+    rows = []
     for task in envs.TASKS:
-        row = [f"`{task}`", f"{PAPER[task]:.3f}" if task in PAPER else "none given"]
-        lines.append(
-            "| " + " | ".join(row + [_cell(results, task, name) for name in COLUMNS]) + " |"
-        )
-    lines += [
-        "",
-        "Path length (rad, mean over successes) and, of planners, mean planning time (s):",
-        "",
-        "| task | " + " | ".join(COLUMNS) + " |",
-        "|---" * (1 + len(COLUMNS)) + "|",
-    ]
-    for task in envs.TASKS:
-        row = [_means(results, task, name) for name in COLUMNS]
-        lines.append("| " + " | ".join([f"`{task}`", *row]) + " |")
-    lines += ["", *_conditions(results), ""]
-    return "\n".join(lines)
+        values = [results[task].get(name, {}).get(key) for name in names or COLUMNS]
+        shown = [NOTHING if value is None else form(value) for value in values]
+        rows.append([f"`{task}`", *shown])
+    return rows
 
 
-def _cell(results, task, name):
-    result = results.get(task, {}).get(name)
-    if result is None:
-        return "not run"
-    low, high = result["success_rate_interval"]
-    rates = f"{result['success_rate']:.3f}, {result['collision_free_success_rate']:.3f}"
-    return f"{rates} [{low:.3f}, {high:.3f}]"
-
-
-def _means(results, task, name):
-    result = results.get(task, {}).get(name)
-    if result is None:
-        return "not run"
-    length = "-" if result["path_length"] is None else f"{result['path_length']:.2f}"
-    seconds = result["planning_seconds"]
-    return length if seconds is None else f"{length}; {seconds:.3f}"
-
-
-def _conditions(results):
-    done = [(name, result) for cells in results.values() for name, result in cells.items()]
-    if not done:
-        return []
-    dates = sorted({result["date"] for _, result in done})
-    counts = {name: {r["num_queries"] for other, r in done if other == name} for name in COLUMNS}
-    said = [
-        f"{name}: {' or '.join(f'{n:,}' for n in sorted(numbers))}"
-        for name, numbers in counts.items()
-        if numbers
-    ]
-    measured = " to ".join(dict.fromkeys([dates[0], dates[-1]]))
-    return [
-        f"Test queries per task: {'; '.join(said)}. Measured {measured}, on the machine of "
-        "[benchmarks.md](benchmarks.md).",
-    ]
+def policies(results):
+    """Markdown: what each policy receives, and how exactly its success was measured."""
+    rows = []
+    for name in COLUMNS:
+        done = [cells[name] for cells in results.values() if name in cells]
+        if not done:
+            continue
+        counts = sorted({result["num_queries"] for result in done})
+        widths = [np.diff(result["success_rate_interval"])[0] / 2 for result in done]
+        dates = sorted({result["date"] for result in done})
+        row = [SHOWN.get(name, name), SOURCES.get(name, "ground truth (privileged)")]
+        row += ["yes" if name in PLANNERS else "no", " or ".join(f"{n:,}" for n in counts)]
+        rows.append([*row, share(max(widths)), dates[-1]])
+    head = ["policy", "geometry source", "search", "queries per task"]
+    return table([*head, "half of the widest 95 % interval", "measured until"], rows)
 
 
 def main():
@@ -169,8 +149,7 @@ def main():
         tasks = args.only or [task for task in envs.TASKS if query_path(task).exists()]
         run(results, tasks, args.policies, args.num, args.workers)
     unseen = json.loads(UNSEEN.read_text()) if UNSEEN.exists() else {}
-    write_atomically(TABLE, table(results, unseen).encode())
-    print(f"{TABLE} written")
+    write(tables(results, unseen))
 
 
 if __name__ == "__main__":

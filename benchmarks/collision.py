@@ -32,7 +32,6 @@ from functools import partial
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-import pybullet as p
 from tqdm import tqdm
 
 from roboarm_nmp import envs
@@ -40,6 +39,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 CONTACT_RANGE = 0.01  # m
 SCENES = 40  # of each distribution

@@ -40,7 +40,6 @@ import time
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-import pybullet as p
 import pybullet_data
 from ompl import base as ob
 from ompl import geometric as og
@@ -53,6 +52,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import RESOLUTION
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.utils.random_streams import Stream
 
 # The tasks for the plain way: those with a fixed scene, a table and a floor.

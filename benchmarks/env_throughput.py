@@ -28,11 +28,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import gymnasium
 import numpy as np
 import panda_gym  # noqa: F401  (registers PandaReachJoints-v3)
-import pybullet as p
 from tqdm import trange
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs import arm_env, panda
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 EPISODE = 100  # steps
 

@@ -3,16 +3,15 @@
     python benchmarks/paper_tables.py --list                        # the cells, and which are done
     python benchmarks/paper_tables.py --only 'bc-*-double_walls' --steps 150000
     python benchmarks/paper_tables.py --only sac-ee-wall-p1 --seeds 1 2 3 4
-    python benchmarks/paper_tables.py                               # only writes the page
+    python benchmarks/paper_tables.py                  # only writes the tables and figures
 
 A cell is a run: algorithm, goal type, task, p of the demo injection. It is trained with its script
 (flags that differ from the defaults: `RECIPES`) in `--runs-dir`, where one that was stopped goes
 on. Its best policy by validation goes to envs/policies/pretrained, in half precision, is
 evaluated on test queries as it is there, and gets its result beside it, in JSON: what has one is
 done, with the same flags and as many steps or more; on more queries than before the same policy is
-only evaluated again. (With `--no-keep-policies` the result stays alone.) The page,
-docs/benchmark/results.md,
-and its figures are made of those results, of the planners' and of `go-to-goal`'s
+only evaluated again. (With `--no-keep-policies` the result stays alone.) The tables and figures of
+docs/benchmark/results.md are made of those results, of the planners' and of `go-to-goal`'s
 (benchmarks/results/baselines.json), and of the paper's numbers (`paper_cells.csv`: sections 5.2 and
 5.3 and the tables of the appendix; means and standard deviations of four seeds).
 """
@@ -37,6 +36,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from baselines import papers_go_to_goal
+from markdown_tables import NOTHING, interval, share, table, write
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -51,14 +52,14 @@ CELLS = ROOT / "benchmarks/results/paper_cells.csv"
 POLICIES = ROOT / "envs" / "policies" / "pretrained"
 BASELINES = ROOT / "benchmarks/results/baselines.json"
 UNSEEN = ROOT / "benchmarks/results/unseen_obstacles.json"
-PAGE, FIGURES = ROOT / "docs/benchmark/results.md", ROOT / "docs" / "figures"
+FIGURES = ROOT / "docs" / "figures"
 SCRIPTS = {
     "bc": ROOT / "bc_script" / "bc.py",
     "sac": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
     "td3": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
 }
 STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
-# Settings for long runs (docs/algorithms/training.md).
+# Settings for long runs (docs/algorithms).
 RECIPES = {
     "bc": ["--eval-every", "25000"],
     "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3"],
@@ -69,24 +70,25 @@ ENCODERS = {
     "vae": "VAE",
     "vqvae": "VQ-VAE",
     "pointnet2": "PointNet++",
-    "oracle": "the ground-truth obstacles",
+    "oracle": "ground-truth obstacles",
 }
+# What a policy's scene input is computed from. Policies of the fixed scenes have none.
+SOURCES = ENCODERS | {"": "none", "oracle": "ground truth (privileged)"}
 LINES = {"bc": ":", "sac": "-", "td3": "--"}  # of the curves
+COLOURS = ("sac", "td3", "bc")
 FAR_BELOW = 0.05  # of the paper's mean: worth an explanation
 # In benchmarks/results/baselines.json; the second in `UNSEEN`.
 GO_TO_GOAL, REACTIVE = "go-to-goal", "go-to-goal, filter, point_cloud"
 RRT_CONNECT = "RRT-Connect, 5 s"
-PLAN_FROM_POINTS = "plan from the point cloud, 5 s"
-# Policies in `UNSEEN` beside the paper's encoders. All have a safety filter.
-IMITATED = {
-    "dagger, vae": "latent code (VAE), link distances from observed points",
-    "dagger, vqvae": "latent code (VQ-VAE), link distances from observed points",
-    "dagger, pointnet2": "latent code (PointNet++), link distances from observed points",
-    "dagger, field": "latent code (field) alone",
-    "dagger, decoded by field": "points decoded from the latent code (field)",
-    "dagger, point_cloud": "observed points",
-    "dagger, oracle": "the ground-truth obstacles",
+# Rows beside the policies: method, geometry source, whether it searches.
+REFERENCES = {
+    GO_TO_GOAL: ("*go-to-goal*", "none", "no"),
+    RRT_CONNECT: ("*RRT-Connect*", "ground truth (privileged)", "yes"),
 }
+HEAD = [
+    *("task", "method", "geometry source", "search", "success", "95 % interval"),
+    *("collision-free", "queries", "seeds", "training steps", "paper's success"),
+]
 LONG_RUN = 7_000_000  # steps of the paper's runs with encoders (section 5.3)
 
 
@@ -119,10 +121,6 @@ class Cell:
         if self.demo_prob:
             name += " (p = 0)" if self.demo_prob == "0" else f"-MP (p = {self.demo_prob})"
         return name
-
-    @property
-    def paper(self):
-        return "not in the paper" if self.mean is None else f"{self.mean:.3f} ± {self.std:.3f}"
 
     def flags(self):
         """Of the trainer, but for the seed and the number of steps."""
@@ -276,7 +274,7 @@ def curve(run):
     return sorted(points.items())
 
 
-# --- The page
+# --- The tables
 
 
 def load_results(folders):
@@ -290,14 +288,26 @@ def load_results(folders):
     return {name: sorted(found, key=lambda r: r["seed"]) for name, found in results.items()}
 
 
-def ours(found):
-    """Success over all seeds' queries, and its interval; ± the seeds' deviation."""
-    rates = [result["success_rate"] for result in found]
+def load_references():
+    """Baselines' results, and those in unseen scenes: dicts of task -> name -> result."""
+    baselines, unseen = (json.loads(path.read_text()) for path in (BASELINES, UNSEEN))
+    for task, found in unseen.items():
+        if REACTIVE in found:
+            baselines.setdefault(task, {})[REACTIVE] = found[REACTIVE]
+    return baselines, unseen
+
+
+def pooled(found):
+    """Success, its interval, collision-free success and number of queries, over all seeds.
+
+    Collision-free success is None where a result lacks it.
+    """
     counts = [result["num_queries"] for result in found]
+    free = [result["collision_free_success_rate"] for result in found]
+    rates = [result["success_rate"] for result in found]
     successes, count = round(np.dot(rates, counts)), sum(counts)
-    rate, (low, high) = successes / count, wilson_interval(successes, count)
-    deviation = f" ± {statistics.stdev(rates):.3f}" if len(rates) > 1 else ""
-    return f"{rate:.3f}{deviation} [{low:.3f}, {high:.3f}]"
+    free = None if None in free else np.dot(free, counts) / count
+    return successes / count, wilson_interval(successes, count), free, count
 
 
 def of_recipe(cell, results):
@@ -311,180 +321,123 @@ def mean_success(cell, results):
     return statistics.mean(result["success_rate"] for result in of_recipe(cell, results))
 
 
-def in_small(cell, found):
-    """How many steps and seeds a cell's results have, and whether they had other flags."""
-    steps = sorted({result["steps"] for result in found})
-    steps = " to ".join(f"{n:,}" for n in (steps[0], steps[-1])[: len(steps)])
-    others = "" if cell.is_recipe_of(found[0]["args"]) else ", other flags"
-    return f"<sub>{steps} steps, {_seeds(found)}{others}</sub>"
+def steps_of(found):
+    """How long a cell's results were trained."""
+    return " or ".join(f"{steps:,}" for steps in sorted({result["steps"] for result in found}))
 
 
-def _seeds(found):
-    return f"{len(found)} seed{'s' * (len(found) > 1)}"
+def method_of(cell):
+    return cell.label + (f" with {ENCODERS[cell.encoder]}" if cell.encoder else "")
 
 
-def imitated_rows(unseen, tasks):
-    """Of `IMITATED`: dict of a row's name -> dict of column's name -> text.
+def results_table(cells, results, baselines):
+    """Markdown: per task a row for each cell that was run, and for each of `REFERENCES`.
 
-    Other seeds of a policy are cells named like its own, with `, seed 2` and so on.
+    `baselines`: dict of task -> name -> result.
     """
-    rows = {}
-    for name, source in IMITATED.items():
-        texts = rows[f"DAgger with a safety filter: {source}"] = {}
-        for task in tasks:
-            cells = unseen.get(task, {})
-            found = [cells[key] for key in cells if key == name or key.startswith(f"{name}, seed ")]
-            if found:
-                number = sum(result["num_queries"] for result in found)
-                small = f"<sub>{number:,} queries, {_seeds(found)}</sub>"
-                texts[f"`{task}`"] = f"**{ours(found)}**<br>{small}"
-    return {name: texts for name, texts in rows.items() if texts}
+    rows = []
+    for task in dict.fromkeys(cell.task for cell in cells):
+        of_task = [cell for cell in cells if cell.task == task]
+        for cell in of_task:
+            if found := of_recipe(cell, results):
+                rows.append([f"`{task}`", method_of(cell), SOURCES[cell.encoder], "no"])
+                rows[-1] += _numbers(*pooled(found), len(found), steps_of(found), cell.mean)
+        best = max((c for c in of_task if c.encoder and c.mean is not None), default=None,
+                   key=lambda cell: cell.mean)  # fmt: skip
+        if best:
+            rows.append([f"`{task}`", f"paper's best: {method_of(best)}", SOURCES[best.encoder]])
+            rows[-1] += ["no", NOTHING, NOTHING, NOTHING, NOTHING, "4", f"{LONG_RUN:,}"]
+            rows[-1] += [share(best.mean)]
+        for name, (method, source, search) in REFERENCES.items():
+            if one := baselines.get(task, {}).get(name):
+                rows.append([f"`{task}`", method, source, search])
+                papers = papers_go_to_goal().get(task) if name == GO_TO_GOAL else None
+                rows[-1] += _numbers(*pooled([one]), NOTHING, NOTHING, papers)
+    return table(HEAD, rows)
 
 
-def table(cells, results, column, baselines, more=()):
-    """Markdown: a row per algorithm, a column per `column(cell)`; ours, and the paper's below.
+def _numbers(success, ends, free, count, seeds, steps, paper):
+    return [share(success), interval(ends), share(free), f"{count:,}", seeds, steps, share(paper)]
 
-    `more`: further rows, dict of name -> dict of column -> text.
-    Where the columns are tasks, `baselines` gives the last rows: each task's results of baselines.
-    """
-    rows, columns = {}, {}
+
+def hindsight_table(cells, results):
+    """Markdown: SAC on `no_obstacles`, goal `combined`, with and without hindsight."""
+    rows = []
     for cell in cells:
-        columns[column(cell)] = cell.task
-        found = of_recipe(cell, results)
-        text = f"**{ours(found)}**<br>{in_small(cell, found)}" if found else "not run"
-        label = cell.label + (f", {ENCODERS[cell.encoder]}" if cell.encoder else "")
-        rows.setdefault(label, {})[column(cell)] = f"{text}<br>{cell.paper}"
-    rows |= dict(more)
-    lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
-    for name, word in (
-        *((GO_TO_GOAL, "no learning"), (REACTIVE, "no learning")),
-        *((PLAN_FROM_POINTS, "search"), (RRT_CONNECT, "search, ground truth")),
-    ):
-        known = {text: baselines.get(task, {}).get(name) for text, task in columns.items()}
-        if len(set(columns.values())) == len(columns) and any(known.values()):
-            rates = {text: f"{one['success_rate']:.3f}" for text, one in known.items() if one}
-            rows[f"*{word}: {name}*"] = rates
-    for label, texts in rows.items():
-        lines.append("| " + " | ".join([label, *(texts.get(name, "") for name in columns)]) + " |")
-    return lines
+        if found := of_recipe(cell, results):
+            hindsight = "no" if cell.hindsight == "no" else "yes"
+            rows.append([cell.label, hindsight])
+            rows[-1] += _numbers(*pooled(found), len(found), steps_of(found), cell.mean)
+    return table(["method", "hindsight", *HEAD[4:]], rows)
 
 
-def long_runs(cells, results):
-    """A sentence: how long runs with encoders of as many steps as the paper's would take here."""
-    hours = {}
+def missing(cells, results):
+    """A sentence that names the paper's cells that were not run."""
+    tasks, absent = list(dict.fromkeys(cell.task for cell in cells)), {}
+    is_compared = any(cell.hindsight == "no" for cell in cells)
     for cell in cells:
-        for result in results.get(cell.name, []):
-            if cell.encoder and cell.algorithm != "bc":
-                rate = result["training_seconds"] / result["steps"]
-                hours.setdefault(cell.algorithm.upper(), []).append(LONG_RUN * rate / 3600)
-    if not hours:
-        return []
-    took = ", ".join(f"{name} {statistics.mean(found):.0f} h" for name, found in hours.items())
-    return ["", f"A run of {LONG_RUN:,} steps would take, as those that were begun did: {took}."]
+        if cell.mean is not None and cell.name not in results:
+            name = method_of(cell)
+            if is_compared:
+                name += " without hindsight" if cell.hindsight == "no" else " with hindsight"
+            absent.setdefault(name, []).append(cell.task)
+    if not absent:
+        return "All cells of the paper were run."
+    everywhere = [name for name, of in absent.items() if len(of) == len(tasks)]
+    parts = [", ".join(everywhere)] if everywhere else []
+    for name, of in absent.items():
+        if name not in everywhere:
+            parts.append(f"{name} on {', '.join(f'`{task}`' for task in of)}")
+    return f"Not run: {'; '.join(parts)}."
 
 
 def runs_table(cells, results):
     """Markdown: what was run, a row per policy."""
-    lines = [
-        "| policy | success [95 %] | collision-free | steps (best at) | test queries | training "
-        "| made |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for cell in cells:
         for result in results.get(cell.name, []):
-            minutes = result["training_seconds"] / 60
-            free = result["collision_free_success_rate"]
-            free = "not known" if free is None else f"{free:.3f}"
-            name = f"`{cell.name}-s{result['seed']}`" + ("" if result["kept"] else ", not kept")
-            if not cell.is_recipe_of(result["args"]):
-                name += ", other flags"
-            lines.append(
-                f"| {name} | {ours([result])} | {free} "
-                f"| {result['steps']:,} ({result['policy_step']:,}) | {result['num_queries']:,} "
-                f"| {minutes:.0f} min | {result['date']}, {result['commit']} |"
-            )
-    return lines
+            success, ends, free, count = pooled([result])
+            row = [f"`{cell.name}-s{result['seed']}`", share(success), interval(ends), share(free)]
+            row += [f"{count:,}", f"{result['steps']:,}", f"{result['policy_step']:,}"]
+            row += [f"{result['training_seconds'] / 60:.0f}", result["date"], result["commit"]]
+            row += ["yes" if result["kept"] else "no"]
+            rows.append([*row, "recipe" if cell.is_recipe_of(result["args"]) else "earlier"])
+    head = ["policy", *HEAD[4:8], "steps", "best at step", "training (min)", "date", "commit"]
+    return table([*head, "pretrained file", "flags"], rows)
 
 
-def page(cells, results, baselines, unseen):
-    """docs/benchmark/results.md."""
-    goals = [cell for cell in cells if not cell.encoder and cell.hindsight != "no"]
-    lines = [
-        "# Results",
-        "",
-        "![go-to-goal, paper, ours, RRT-Connect](figures/results_story.png)",
-        "",
-        "Success on test queries: in bold ours with its 95 % interval (of several seeds: over",
-        "all their queries, and the seeds' deviation), in small the steps (BC: batches) and seeds",
-        "([other flags](#the-runs): only where there is no run with today's);",
-        "below it the paper's, mean ± standard deviation of four seeds, after 1,000,000 steps",
-        f"({LONG_RUN:,} for random boxes). The last rows are non-learning baselines, which receive",
-        "a goal configuration (goal `ee`: [baselines.md](baselines.md)). `" + REACTIVE + "` is",
-        "`go-to-goal` with a [safety filter](safety_filter.md) on observed points (goal",
-        "`combined`, 200 test queries or more: [unseen_obstacles.md](unseen_obstacles.md)). With",
-        "p = 0,",
-        "queries are those of the demonstrations, which are not shown; the paper samples them.",
-        "`python benchmarks/paper_tables.py` runs cells and writes this page;",
-        "`clean_rl_scripts/evaluate.py --policy NAME` runs any policy below that was kept.",
-        "Minutes are of one core of an AMD EPYC or Intel Xeon, mostly beside other jobs.",
-        "Earlier runs: [lab notebook](../lab_notebook.md#the-first-long-runs).",
-        "The words: [glossary.md](glossary.md).",
-    ]
-    for goal_type, text in GOALS.items():
-        chosen = [cell for cell in goals if cell.goal_type == goal_type]
-        lines += ["", f"## Goal: {text} (`{goal_type}`)", ""]
-        lines += table(chosen, results, lambda cell: f"`{cell.task}`", baselines)
+def below_table(cells, results):
+    """Markdown: cells whose mean is far below the paper's."""
+    rows = []
+    for cell in cells:
+        if cell.mean is not None and cell.name in results:
+            mean = mean_success(cell, results)
+            if mean < cell.mean - FAR_BELOW:
+                rows.append([f"`{cell.name}`", share(mean), share(cell.mean)])
+    return table(["cell", "success", "paper's success"], rows)
+
+
+def tables(cells, results, baselines):
+    """Name -> Markdown of all tables of docs/benchmark/results.md that show the paper's cells."""
+    found = {}
+    for goal_type in GOALS:
+        chosen = [cell for cell in cells if not cell.encoder and cell.goal_type == goal_type]
+        chosen = [cell for cell in chosen if cell.hindsight != "no"]
+        found[f"paper-{goal_type}"] = results_table(chosen, results, baselines)
+        found[f"paper-{goal_type}"] += f"\n\n{missing(chosen, results)}"
     hindsight = [
         cell
         for cell in cells
         if (cell.algorithm, cell.goal_type, cell.task) == ("sac", "combined", "no_obstacles")
     ]
-    lines += ["", "## Hindsight: `no_obstacles`, goal `combined`", ""]
-    names = {"yes": "hindsight", "no": "no hindsight"}
-    lines += table(hindsight, results, lambda cell: names[cell.hindsight], {})
-    lines += ["", "How far learning without hindsight had come when ours stopped:"]
-    lines += ["[lab notebook](../lab_notebook.md#demonstrations)."]
-    lines += ["", "## Encoders: trained on `random_boxes_hard`, goal `combined`", ""]
+    found["paper-hindsight"] = hindsight_table(hindsight, results)
+    found["paper-hindsight"] += f"\n\n{missing(hindsight, results)}"
     encoded = [cell for cell in cells if cell.encoder]
-    imitated = imitated_rows(unseen, dict.fromkeys(cell.task for cell in encoded))
-    lines += table(encoded, results, lambda cell: f"`{cell.task}`", baselines, imitated)
-    if imitated:
-        lines += [
-            "",
-            "DAgger imitates a roadmap planner in other scenes of `random_boxes_hard`. Unlike the",
-            "paper's policies it has a safety filter, which enforces a minimum clearance.",
-            "Collision-free success, success without filter, versions of the filter:",
-            "[unseen_obstacles.md](unseen_obstacles.md).",
-        ]
-    lines += long_runs(cells, results)
-    lines += ["", "Why policies with a latent code fail to generalise to scenes of other kinds:"]
-    lines += ["[lab notebook](../lab_notebook.md#behavioural-cloning-in-scenes-of-other-kinds)."]
-    lines += ["", "## The runs", ""]
-    done = [cell for cell in cells if cell.name in results]
-    if not done:
-        return "\n".join([*lines, "None yet.", ""])
-    lines += runs_table(cells, results)
-    lines += ["", "Flags that are not the scripts' defaults, beside task, goal and p: "]
-    lines[-1] += "; ".join(
-        f"{name}: `{' '.join(flags)}`" for name, flags in RECIPES.items() if flags
-    )
-    lines[-1] += ". Each kept policy's JSON has all of its flags, also where it says `other flags`"
-    lines[-1] += ": TD3 with goal `ee` there is older than its penalty, others than goal minus"
-    lines[-1] += " configuration ([lab notebook](../lab_notebook.md#goal-minus-configuration))."
-    lines[-1] += " (The paper's networks have two hidden layers, with encoders four.)"
-    below = []
-    for cell in done:
-        mean = mean_success(cell, results)
-        if cell.mean is not None and mean < cell.mean - FAR_BELOW:
-            below.append(f"`{cell.name}` ({mean:.3f}, paper {cell.mean:.3f})")
-    lines += ["", f"Below the paper by more than {FAR_BELOW}: {', '.join(below) or 'none'}"]
-    lines[-1] += " of these runs."
-    if below:
-        lines[-1] += " What was found: [lab notebook](../lab_notebook.md#demonstrations);"
-        lines[-1] += " with encoders, see below their table."
-    lines += ["", "![success over steps](figures/results_curves.png)"]
-    lines += ["", "![success per task](figures/results_bars.png)", ""]
-    return "\n".join(lines)
+    found["paper-encoders"] = results_table(encoded, results, baselines)
+    found["paper-encoders"] += f"\n\n{missing(encoded, results)}"
+    found["paper-below"] = below_table(cells, results)
+    found["paper-runs"] = runs_table(cells, results)
+    return found
 
 
 def draw_story(cells, results, baselines, unseen, path):
@@ -524,45 +477,110 @@ def draw_story(cells, results, baselines, unseen, path):
     _save(figure, path)
 
 
-def draw_curves(cells, results, path):
-    """Validation success over steps: a panel per task, a line per run, a colour per cell."""
+def groups(cells):
+    """Row -> title -> cells: a row per goal and one for encoders, a title per task."""
+    rows = {f"goal {goal_type}": {} for goal_type in ("ee", "config", "combined")}
+    for cell in cells:
+        row = "scene encoders" if cell.encoder else f"goal {cell.goal_type}"
+        title = cell.task.replace("walls_", "walls_\n") + "\n(no hindsight)" * (
+            cell.hindsight == "no"
+        )
+        rows.setdefault(row, {}).setdefault(title, []).append(cell)
+    return {row: titles for row, titles in rows.items() if titles}
+
+
+def style_of(cell):
+    """One colour per method and encoder in all panels."""
+    colour = list(COLOURS).index(cell.algorithm) if cell.algorithm in COLOURS else 4
+    shade = {"0": 0.45, "1": 1.0, "vae": 1.0, "vqvae": 0.75, "pointnet2": 0.5, "oracle": 0.3}
+    return {
+        "color": (f"C{colour}", shade.get(cell.encoder or cell.demo_prob, 0.75)),
+        "linestyle": LINES.get(cell.algorithm, "-."),
+    }
+
+
+def draw_curves(cells, results, baselines, path):
+    """Validation success over steps of SAC and TD3 beside BC: a line per run."""
     done = [cell for cell in cells if cell.task == cell.trained_on and cell.name in results]
-    tasks = list(dict.fromkeys(cell.task for cell in done))
+    shown = [
+        (f"{title}, {row}".replace("_\n", "_").replace("\n", " "), chosen)
+        for row, titles in groups(done).items()
+        for title, chosen in titles.items()
+        if any(cell.algorithm != "bc" for cell in chosen)
+    ]
+    columns = 3
+    lines = -(-len(shown) // columns)
     figure, all_axes = plt.subplots(
-        len(tasks), figsize=(9, 2.4 * len(tasks)), squeeze=False, sharex=True, layout="constrained"
+        *(lines, columns), figsize=(10, 2.7 * lines), squeeze=False, layout="constrained"
     )
-    for task, axes in zip(tasks, all_axes[:, 0], strict=True):
-        for i, cell in enumerate(cell for cell in done if cell.task == task):
-            style = {"marker": ".", "linestyle": LINES.get(cell.algorithm, "-."), "color": f"C{i}"}
+    for axes in all_axes.flat[len(shown) :]:
+        axes.set_visible(False)
+    labels = {}
+    for (title, chosen), axes in zip(shown, all_axes.flat, strict=False):
+        floor = baselines.get(chosen[0].task, {}).get(GO_TO_GOAL)
+        if floor:
+            line = axes.axhline(floor["success_rate"], color="0.6", linewidth=1)
+            labels["go-to-goal"] = line
+        for cell in chosen:
             for result in of_recipe(cell, results):
-                (line,) = axes.plot(*zip(*result["curve"], strict=True), **style)
-            line.set_label(_label(cell))  # once for all seeds
-        axes.set(title=task, ylabel="validation success", ylim=(0, 1))
+                steps, success = zip(*result["curve"], strict=True)
+                (line,) = axes.plot(np.divide(steps, 1000), success, **style_of(cell))
+            labels[method_of(cell)] = line
+        axes.set_title(title, fontsize="small")
+        axes.set(ylim=(0, 1.02), xlim=(0, None))
         axes.grid(alpha=0.3)
-        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
-    all_axes[-1, 0].set_xlabel("environment steps (BC: batches)")
+    for axes in all_axes[:, 0]:
+        axes.set_ylabel("validation success")
+    all_axes[-1, 0].set_xlabel("training steps, thousands (BC: batches)")
+    figure.legend(labels.values(), labels, loc="outside lower center", ncols=4, fontsize="small")
     _save(figure, path)
 
 
-def draw_bars(cells, results, path):
-    """Test success per task: ours and the paper's, for all cells that were run."""
-    done = [cell for cell in cells if cell.name in results]
-    tasks = list(dict.fromkeys(cell.task for cell in done))
+def draw_success(cells, results, baselines, path):
+    """Test success with its 95 % interval, ours beside the paper's: a panel per task and goal."""
+    rows = groups([cell for cell in cells if cell.name in results])
+    methods = {
+        row: list(dict.fromkeys(method_of(cell) for chosen in titles.values() for cell in chosen))
+        for row, titles in rows.items()
+    }
+    columns = max(map(len, rows.values()))
+    heights = [1.6 + len(names) for names in methods.values()]
     figure, all_axes = plt.subplots(
-        len(tasks), figsize=(9, 1 + 0.45 * len(done)), squeeze=False, layout="constrained",
-        height_ratios=[sum(cell.task == task for cell in done) for task in tasks],
+        *(len(rows), columns), figsize=(11, 1 + 0.34 * sum(heights)), squeeze=False,
+        height_ratios=heights, sharex=True, sharey="row", layout="constrained",
     )  # fmt: skip
-    for task, axes in zip(tasks, all_axes[:, 0], strict=True):
-        chosen = [cell for cell in done if cell.task == task][::-1]
-        for i, cell in enumerate(chosen):
-            mean = mean_success(cell, results)
-            axes.barh(i + 0.2, mean, 0.4, color="tab:blue", label="ours")
-            if cell.mean is not None:
-                axes.barh(i - 0.2, cell.mean, 0.4, xerr=cell.std, color="tab:gray", label="paper")
-        axes.set_yticks(range(len(chosen)), [_label(cell) for cell in chosen])
-        axes.set(title=task, xlim=(0, 1))
-    handles, labels = all_axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles[:2], labels[:2], loc="outside lower center", ncols=2)
+    labels = {}
+    for (row, titles), line in zip(rows.items(), all_axes, strict=True):
+        for axes in line[len(titles) :]:
+            axes.set_visible(False)
+        names = methods[row]
+        line[0].set_yticks(range(len(names)), names, fontsize=8)
+        line[0].set_ylim(len(names) - 0.4, -0.6)
+        line[0].set_ylabel(row)
+        for (title, chosen), axes in zip(titles.items(), line, strict=False):
+            floor = baselines.get(chosen[0].task, {}).get(GO_TO_GOAL)
+            if floor:
+                rule = axes.axvline(floor["success_rate"], color="0.6", linewidth=1)
+                labels["go-to-goal"] = rule
+            for cell in chosen:
+                y = names.index(method_of(cell))
+                success, (low, high), _, _ = pooled(of_recipe(cell, results))
+                ends = [[max(success - low, 0)], [max(high - success, 0)]]
+                style = {"fmt": "o", "markersize": 4, "capsize": 2}
+                labels["ours, 95 % interval"] = axes.errorbar(
+                    success, y - 0.15, xerr=ends, color="C0", **style
+                )
+                if cell.mean is not None:
+                    style |= {"fmt": "D", "color": "C1"}
+                    labels["paper, standard deviation of four seeds"] = axes.errorbar(
+                        cell.mean, y + 0.15, xerr=cell.std, **style
+                    )
+            axes.set_title(title, fontsize="small")
+            axes.set_xlim(-0.02, 1.04)
+            axes.grid(alpha=0.3, axis="x")
+            axes.tick_params(labelbottom=True)
+    all_axes[-1, 0].set_xlabel("success on test queries")
+    figure.legend(labels.values(), labels, loc="outside lower center", ncols=3, fontsize="small")
     _save(figure, path)
 
 
@@ -573,11 +591,6 @@ def _save(figure, path):
     with Image.open(path) as image:
         image = image.convert("RGB").quantize(128)
     image.save(path, optimize=True)
-
-
-def _label(cell):
-    encoder = f", {ENCODERS[cell.encoder]}" if cell.encoder else ""
-    return f"{cell.label}, {cell.goal_type}{encoder}" + ", no hindsight" * (cell.hindsight == "no")
 
 
 @dataclass
@@ -629,7 +642,8 @@ def main():
         results = load_results(folders)
         for cell in cells:
             found = of_recipe(cell, results)
-            print(f"{cell.name:60} {cell.paper}   {ours(found) if found else 'not run'}")
+            reached = f"ours {pooled(found)[0]:.3f}" if found else "not run"
+            print(f"{cell.name:60} paper {share(cell.mean)}   {reached}")
         return
     # `kill` ends the trainer too: `subprocess.run` does that for whatever is raised.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("killed; the same command goes on"))
@@ -642,16 +656,12 @@ def main():
             except KeyboardInterrupt:
                 sys.exit("interrupted; the same command goes on from the last checkpoint")
     results = load_results(folders)
-    baselines, unseen = (json.loads(path.read_text()) for path in (BASELINES, UNSEEN))
-    for task, found in unseen.items():
-        if REACTIVE in found:
-            baselines.setdefault(task, {})[REACTIVE] = found[REACTIVE]
+    baselines, unseen = load_references()
     if results:
         draw_story(cells, results, baselines, unseen, FIGURES / "results_story.png")
-        draw_curves(cells, results, FIGURES / "results_curves.png")
-        draw_bars(cells, results, FIGURES / "results_bars.png")
-    write_atomically(PAGE, page(cells, results, baselines, unseen).encode())
-    print(f"{PAGE} written")
+        draw_curves(cells, results, baselines, FIGURES / "results_curves.png")
+        draw_success(cells, results, baselines, FIGURES / "results_success.png")
+    write(tables(cells, results, baselines))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,6 @@ from dataclasses import replace
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-import pybullet as p
 from ompl import base as ob
 from tqdm import tqdm
 
@@ -38,6 +37,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import RESOLUTION
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 
 class PyBulletValidity:

@@ -6,9 +6,9 @@
     python benchmarks/unseen_obstacles.py --table                 # only writes the tables
 
 Each cell is a call of `clean_rl_scripts/evaluate.py` on the first `--num` test queries, goal
-`combined`. Results go to benchmarks/results/unseen_obstacles.json at once; the tables in
-docs/benchmark/unseen_obstacles.md, between its marks, show these results. Nothing may be chosen by
-them: use `evaluate.py --split validation` for that.
+`combined`. Results go to benchmarks/results/unseen_obstacles.json at once; the tables of
+docs/benchmark/unseen_obstacles.md show these results. Nothing may be chosen by them: use
+`evaluate.py --split validation` for that.
 """
 
 import argparse
@@ -17,13 +17,14 @@ import datetime
 import hashlib
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from markdown_tables import NOTHING, interval, share, table, write
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
@@ -35,7 +36,6 @@ from roboarm_nmp.envs.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks/results/unseen_obstacles.json"
-PAGE = ROOT / "docs/benchmark/unseen_obstacles.md"
 BASELINES = ROOT / "benchmarks/results/baselines.json"
 PAPER_CELLS = ROOT / "benchmarks/results/paper_cells.csv"
 POLICIES = ROOT / "envs" / "policies" / "pretrained"
@@ -86,46 +86,53 @@ for _name, _policy, _filter, _source in (
         f"{_name}, no escape": [*_flags, *_filter, "--no-escape"],
         _name: _flags,  # its own filter
     }
-VARIANTS = ("no filter", "with the filter", "filter and escape")
 # Decoded points are less exact than observed ones.
 CELLS[DECODED] = [*CELLS[DECODED], "--safety-margin", "0.015"]
-PRIVILEGED = ("ground truth (privileged)",) * 2
-# Rows of the first table: policy, what it receives of the scene, its filter's source, its cell.
+PRIVILEGED = "ground truth (privileged)"
+# Rows of the first tables: method, source of its observation and of its link distances, its cell.
 ROWS = (
-    ("`go-to-goal`", "nothing", "point cloud", "go-to-goal, filter, point_cloud"),
-    ("`go-to-goal`", "nothing", "ground truth (privileged)", "go-to-goal, filter, ground_truth"),
-    ("`bc.py`", "latent code (VAE)", "point cloud", "bc, vae"),
-    ("`bc.py`", "latent code (VQ-VAE)", "point cloud", "bc, vqvae"),
-    ("`bc.py`", "latent code (PointNet++)", "point cloud", "bc, pointnet2"),
-    ("`bc.py`", *PRIVILEGED, "bc, oracle"),
-    ("`dagger.py`", "latent code (VAE), link distances", "point cloud", "dagger, vae"),
-    ("`dagger.py`", "latent code (VQ-VAE), link distances", "point cloud", "dagger, vqvae"),
-    (
-        *("`dagger.py`", "latent code (PointNet++), link distances", "point cloud"),
-        "dagger, pointnet2",
-    ),
-    (
-        *("`dagger.py`", "latent code (field), link distances", "decoded from it"),
-        "dagger, field",
-    ),
-    (
-        *("`dagger.py`, with points", "points decoded from the latent code (field)"),
-        *("decoded from it", DECODED),
-    ),
-    ("`dagger.py`", "point cloud", "point cloud", OBSERVED),
-    ("`dagger.py`, mixed scenes", "point cloud", "point cloud", f"{OBSERVED}, mixed scenes"),
-    ("`dagger.py`", *PRIVILEGED, "dagger, oracle"),
+    ("go-to-goal", "none", "point cloud", "go-to-goal, filter, point_cloud"),
+    ("go-to-goal", "none", PRIVILEGED, "go-to-goal, filter, ground_truth"),
+    ("BC", "latent code (VAE)", "point cloud", "bc, vae"),
+    ("BC", "latent code (VQ-VAE)", "point cloud", "bc, vqvae"),
+    ("BC", "latent code (PointNet++)", "point cloud", "bc, pointnet2"),
+    ("BC", PRIVILEGED, PRIVILEGED, "bc, oracle"),
+    ("DAgger", "latent code (VAE)", "point cloud", "dagger, vae"),
+    ("DAgger", "latent code (VQ-VAE)", "point cloud", "dagger, vqvae"),
+    ("DAgger", "latent code (PointNet++)", "point cloud", "dagger, pointnet2"),
+    ("DAgger", "latent code (field)", "latent code (field)", "dagger, field"),
+    ("DAgger, trained with points", "decoded points (field)", "latent code (field)", DECODED),
+    ("DAgger", "point cloud", "point cloud", OBSERVED),
+    ("DAgger, mixed scenes", "point cloud", "point cloud", f"{OBSERVED}, mixed scenes"),
+    ("DAgger", PRIVILEGED, PRIVILEGED, "dagger, oracle"),
 )
-# Columns of the second table, for every task.
+SEARCHING = (
+    ("plan from the decoded cloud", "latent code (field)", "plan from the decoded cloud, field"),
+    ("plan from the point cloud", "point cloud", "plan from the point cloud"),
+    ("RRT-Connect", PRIVILEGED, "RRT-Connect"),
+)
+# Columns of the tables of every task.
 EVERYWHERE = (
     *("go-to-goal, filter, point_cloud", OBSERVED, f"{OBSERVED}, mixed scenes", "dagger, oracle"),
     "plan from the point cloud",
 )
-# Columns of the third table, for tasks with scenes of other kinds, and the random boxes.
+# Columns of the tables of tasks with scenes of other kinds, and the random boxes.
 WITH_ENCODERS = (
     *("dagger, vae", "dagger, vqvae", "dagger, pointnet2", "dagger, field"),
     *(DECODED, OBSERVED, "dagger, oracle"),
 )
+# How the columns are called in the tables.
+SHOWN = {
+    "go-to-goal, filter, point_cloud": "go-to-goal with safety filter",
+    "dagger, vae": "VAE",
+    "dagger, vqvae": "VQ-VAE",
+    "dagger, pointnet2": "PointNet++",
+    "dagger, field": "field",
+    DECODED: "decoded points (field)",
+    OBSERVED: "DAgger, point cloud",
+    f"{OBSERVED}, mixed scenes": "DAgger, mixed scenes",
+    "dagger, oracle": "DAgger, privileged",
+}
 UNSEEN = [
     name for name, task in envs.TASKS.items() if name.startswith("random") or not task.trainable
 ]
@@ -149,11 +156,10 @@ KEPT = (
 FILTER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the safety filter that a result had
 ENCODER_MARK = "†"
 MARKS = {
-    FILTER_MARKS[1]: "with the escape as it was before 2026-11-24, without virtual obstacles",
-    FILTER_MARKS[2]: "with a safety filter that took slow arrivals for local minima",
-    ENCODER_MARK: "with an encoder that has been replaced since",
+    FILTER_MARKS[1]: "measured with version 1 of the safety filter",
+    FILTER_MARKS[2]: "measured with version 2 of the safety filter",
+    ENCODER_MARK: "measured with an encoder that has been replaced",
 }
-BEGIN, END = "<!-- written by benchmarks/unseen_obstacles.py -->\n", "<!-- until here -->\n"
 
 
 def keep(run):
@@ -213,6 +219,20 @@ def run(tasks, names, num, workers):
             results = load_results()  # again: another run of this may have added to it
             results.setdefault(task, {})[name] = result
             write_results(results)
+            write_card(task, result)
+
+
+def write_card(task, result):
+    """Put a policy's result on its own task, with its own filter, into its model card's file."""
+    path = POLICIES / f"{result['flags'][1]}.json"
+    if len(result["flags"]) > 2 or not path.exists():
+        return
+    card = json.loads(path.read_text())
+    if card["args"]["task"] == task:
+        keys = ("success_rate", "success_rate_interval")
+        keys += ("collision_free_success_rate", "num_queries")
+        card |= {key: result[key] for key in keys}
+        write_atomically(path, (json.dumps(card, indent=1) + "\n").encode())
 
 
 def is_done(result, name, num):
@@ -278,71 +298,98 @@ def others_results(baselines):
 
 
 def tables(results, others):
-    """In Markdown. `others` are the results of `others_results`."""
+    """Name -> Markdown. `others` are the results of `others_results`."""
     results = {task: others.get(task, {}) | results.get(task, {}) for task in envs.TASKS}
-    hard, best = results[HARD], papers_best()
-    head = "policy", "receives", "source of its filter", *VARIANTS, "ms per action"
-    lines = _row(*head, is_head=True)
-    for policy, receives, source, name in ROWS:
-        unfiltered = "go-to-goal" if name.startswith("go-to-goal") else f"{name}, no filter"
-        cells = [_cell(hard.get(cell)) for cell in (unfiltered, f"{name}, no escape", name)]
-        milliseconds = hard.get(name, {}).get("ms_per_action")
-        shown = "not measured" if milliseconds is None else f"{milliseconds:.1f}"
-        lines += _row(policy, receives, source, *cells, shown)
-    for policy, receives, name in (
-        (
-            "plan from the decoded cloud",
-            "latent code (field)",
-            "plan from the decoded cloud, field",
-        ),
-        ("plan from the point cloud", "point cloud", "plan from the point cloud"),
-        ("RRT-Connect", PRIVILEGED[0], "RRT-Connect"),
+    hard = results[HARD]
+    found = {
+        "unseen-policies": policies_table(hard),
+        "unseen-filter": filter_table(hard),
+        "unseen-seeds": seeds_table(hard),
+    }
+    for name, columns, tasks in (
+        ("unseen-tasks", ("go-to-goal", *EVERYWHERE), list(envs.TASKS)),
+        ("unseen-encoders", WITH_ENCODERS, UNSEEN),
     ):
-        seconds = f"searches {hard[name]['planning_seconds']:.3f} s" if name in hard else "not run"
-        lines += _row(policy, receives, "no filter", _cell(hard.get(name)), "", "", seconds)
-    for names, tasks in (("go-to-goal", *EVERYWHERE), envs.TASKS), (WITH_ENCODERS, UNSEEN):
-        lines += ["", *_row("task", "paper's best policy", *names, is_head=True)]
-        for task in tasks:
-            paper = f"{best[task]:.3f}" if task in best else "none given"
-            lines += _row(f"`{task}`", paper, *(_cell(results[task].get(name)) for name in names))
-    if any(name in hard for name in SEEDS):
-        lines += ["", _of_seeds([hard[name] for name in (OBSERVED, *SEEDS) if name in hard])]
-    dates = sorted({result["date"] for cells in results.values() for result in cells.values()})
-    lines += ["", f"In brackets, test queries and the 95 % interval of success. To {dates[-1]}."]
-    shown = "".join(lines)
-    lines += [f"{mark}: {meaning}." for mark, meaning in MARKS.items() if mark in shown]
-    return "\n".join(lines) + "\n"
+        found[f"{name}-success"] = matrix(results, "success_rate", columns, tasks, papers_best())
+        free = "collision_free_success_rate"
+        found[f"{name}-collision-free"] = matrix(results, free, columns, tasks)
+    return {name: with_footnotes(text) for name, text in found.items()}
 
 
-def _of_seeds(results):
-    """A sentence: success of policies with point clouds over seeds of the training."""
-    text = f"`dagger.py` with point clouds, {len(results)} seeds, `{HARD}`:"
-    for words, key in (
-        ("success", "success_rate"),
-        ("collision-free", "collision_free_success_rate"),
-    ):
-        rates = [result[key] for result in results]
-        each = ", ".join(f"{rate:.3f}" for rate in rates)
-        text += f" {words} {each}, so {statistics.mean(rates):.3f}"
-        text += f" ± {statistics.stdev(rates):.3f};"
-    counts = ", ".join(f"{result['num_queries']:,}" for result in results)
-    return f"{text} of {counts} test queries."
+def policies_table(hard):
+    """Markdown: policies with their filters, and methods that search."""
+    rows = []
+    for method, observation, source, cell in ROWS:
+        if cell in hard:
+            one = hard[cell]
+            rows.append([method, observation, source, "no", *_numbers(one)])
+            rows[-1] += [f"{one['ms_per_action']:.1f}", NOTHING]
+    for method, source, cell in SEARCHING:
+        if cell in hard:
+            one = hard[cell]
+            rows.append([method, source, NOTHING, "yes", *_numbers(one)])
+            rows[-1] += [NOTHING, f"{one['planning_seconds']:.3f}"]
+    head = ["method", "observation", "source of link distances", "search", "success"]
+    head += ["95 % interval", "collision-free", "queries", "ms per action", "planning time (s)"]
+    return table(head, rows)
 
 
-def _row(*cells, is_head=False):
-    """Lines of a table."""
-    return [f"| {' | '.join(cells)} |", *["|---" * len(cells) + "|"] * is_head]
+def filter_table(hard):
+    """Markdown: policies without a filter, with it, and with the escape from local minima."""
+    rows = []
+    for method, observation, source, name in ROWS:
+        unfiltered = "go-to-goal" if name == "go-to-goal, filter, point_cloud" else None
+        unfiltered = unfiltered or f"{name}, no filter"
+        for variant, cell in (
+            ("none", unfiltered),
+            ("filter", f"{name}, no escape"),
+            ("filter and escape", name),
+        ):
+            if cell in hard:
+                shown = NOTHING if variant == "none" else source
+                rows.append([method, observation, variant, shown, *_numbers(hard[cell])])
+    head = ["method", "observation", "safety filter", "source of its link distances", "success"]
+    return table([*head, "95 % interval", "collision-free", "queries"], rows)
 
 
-def _cell(result):
-    if result is None:
-        return "not run"
-    low, high = result["success_rate_interval"]
-    rates = f"{result['success_rate']:.3f}, {result['collision_free_success_rate']:.3f}"
-    mark = FILTER_MARKS.get(version_of_filter(result), "") + ENCODER_MARK * had_other_encoder(
-        result
-    )
-    return f"{rates}{mark} [{result['num_queries']:,}: {low:.3f}, {high:.3f}]"
+def seeds_table(hard):
+    """Markdown: policies with point clouds of several seeds."""
+    rows = []
+    for seed, name in enumerate((OBSERVED, *SEEDS), 1):
+        if name in hard:
+            rows.append([seed, *_numbers(hard[name])])
+    return table(["seed", "success", "95 % interval", "collision-free", "queries"], rows)
+
+
+def matrix(results, key, columns, tasks, papers=None):
+    """Markdown: a row per task, and one quantity of each policy that was evaluated there."""
+    rows = []
+    for task in tasks:
+        found = [results[task].get(name) for name in columns]
+        shown = [share(one[key]) + _mark(one) if one else NOTHING for one in found]
+        paper = [share(papers.get(task))] if papers else []
+        rows.append([f"`{task}`", *paper, *shown])
+    names = [SHOWN.get(name, name) for name in columns]
+    return table(["task", *["paper's best"] * bool(papers), *names], rows)
+
+
+def with_footnotes(text):
+    notes = [f"{mark}: {meaning}." for mark, meaning in MARKS.items() if mark in text]
+    return "\n\n".join([text, *notes])
+
+
+def _numbers(result):
+    """Cells: success, its interval, collision-free success, queries."""
+    success = share(result["success_rate"]) + _mark(result)
+    free = share(result["collision_free_success_rate"])
+    count = f"{result['num_queries']:,}"
+    return [success, interval(result["success_rate_interval"]), free, count]
+
+
+def _mark(result):
+    """Says that a result was measured with an earlier safety filter or encoder."""
+    mark = FILTER_MARKS.get(version_of_filter(result), "")
+    return mark + ENCODER_MARK * had_other_encoder(result)
 
 
 def main():
@@ -364,12 +411,8 @@ def main():
         if args.cells is None:
             unseen = [task for task in others if task in UNSEEN]
             run(unseen, WITH_ENCODERS, args.num, args.workers)
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
     others = others_results(json.loads(BASELINES.read_text()))
-    page = before + BEGIN + tables(load_results(), others) + END + after
-    write_atomically(PAGE, page.encode())
-    print(f"{PAGE} written")
+    write(tables(load_results(), others))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """Evaluate a policy on the queries of a task: how often it reaches the goal, and how well.
 
-    python clean_rl_scripts/evaluate.py --policy go-to-goal --task double_walls --workers 2
-    python clean_rl_scripts/evaluate.py --policy runs/my_run --task wall --json result.json
+    roboarm evaluate --policy go-to-goal --task double_walls
+    roboarm evaluate --policy sac-ee-wall-p1-s1                  # on the task it was trained on
+    roboarm evaluate --policy runs/my_run --task wall --json result.json
+    python clean_rl_scripts/evaluate.py --policy random --task boxes    # the same script
 
 An episode is one query, in the query's scene, under the task's standard rules: goal tolerances,
 horizon and longest step of `RoboArmEnv`'s defaults, contacts allowed. The same arguments give the
@@ -57,13 +59,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import tyro
 from PIL import Image
 
 from roboarm_nmp.envs.arm_env import STANDARD_RULES
 from roboarm_nmp.envs.policies.baselines import TIME_LIMIT, TRIES
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
+    CORES,
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
@@ -71,15 +73,17 @@ from roboarm_nmp.envs.training.flags import (
     Workers,
 )
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 
 @dataclass
 class Args:
     policy: str
     """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy network, a run's folder
-    with a `policy.pt` in it, or the name of a pretrained policy (docs/benchmark/results.md)"""
-    task: str
-    """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml)"""
+    with a `policy.pt` in it, or the name of a pretrained policy (`roboarm policies`)"""
+    task: str | None = None
+    """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); by default the one that the
+    policy was trained on"""
     goal_type: Literal["ee", "config", "combined"] | None = None
     """what the goal is; by default the policy's own, otherwise `ee`"""
     split: Literal["test", "validation", "original"] = "test"
@@ -88,8 +92,8 @@ class Args:
     """a query file to use instead of the task's own"""
     num_queries: PositiveInt | None = None
     """only the first so many queries of the split"""
-    workers: Workers = 1
-    """processes; each uses one core"""
+    workers: Workers = CORES
+    """processes, one core each; by default as many as there are cores"""
     stop_on_collision: bool = False
     """end an episode at the first contact"""
     geometry_source: str | None = None
@@ -115,15 +119,15 @@ class Args:
 
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 for arguments that cannot be used."""
-    args = tyro.cli(Args, args=arguments, description=__doc__)
-    # Here, so that --help need not wait for PyTorch.
-    from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
-
+    args = flags.parse(Args, arguments)
     try:
         flags.check(args)
         for path in (args.json, args.image):
             if path is not None:
                 check_writable(path)
+        # Here, so that neither --help nor these errors wait for PyTorch.
+        from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
+
         options = vars(args) | {"safety_filter": _safety_filter(args)}
         for name in ("safety_margin", "escape", "json", "image"):
             del options[name]
@@ -131,7 +135,7 @@ def main(arguments=None):
     except ValueError as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
-    print(_table(result))
+    print(_table(result | {"policy": args.policy}), flush=True)  # before JSON on /dev/stdout
     try:
         if args.json is not None:
             write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())
@@ -160,6 +164,31 @@ def _safety_filter(args):
     return replace(own, escape=False)
 
 
+def _settings(result):
+    """What distinguishes this evaluation from others, in words; None where a policy lacks it."""
+    from roboarm_nmp.envs.perception.point_clouds import NUM_POINTS
+
+    env, safety_filter = result["env"], result["safety_filter"]
+    encoder, margin = env.get("encoder") or "none", "none"
+    if encoder == "point_cloud":
+        encoder += f", {env.get('num_points', NUM_POINTS)} points"
+    if safety_filter is not None:
+        escape = "escapes local minima" if safety_filter["escape"] else "no escape"
+        margin = f"margin {safety_filter['margin']:g} m, {escape}"
+    limit = result["time_limit"]
+    return {
+        "queries": result["queries"],
+        "goal type": result["goal_type"],
+        "encoder": encoder,
+        "geometry source": result["geometry_source"] or "none",
+        "privileged": "yes" if result["privileged"] else None,
+        "safety filter": margin,
+        "time limit": None if limit is None else f"{limit:g} s per query",
+        "tries": result["tries"],
+        "seed": result["seed"],
+    }
+
+
 def _table(result):
     """The text that is printed of a result."""
 
@@ -168,16 +197,10 @@ def _table(result):
         between = f"[{interval[0]:.4f}, {interval[1]:.4f}]" if interval else unit
         return f"  {name:<24}{number:>9}  {between}"
 
-    count, split = result["num_queries"], result["split"]
-    header = [f"{result['policy']} on {result['task']}: {count} {split} queries"]
-    header.append(f"goal type {result['goal_type']}")
-    if result["env"].get("encoder"):
-        header.append(f"encoder {result['env']['encoder']}")
-    if result["geometry_source"]:
-        header.append(f"geometry source {result['geometry_source']}")
-    if result["privileged"]:
-        header.append("privileged")
-    lines = [", ".join(header)]
+    count, split = f"{result['num_queries']:,}", result["split"]
+    lines = [f"{result['policy']} on {result['task']}: {count} {split} queries"]
+    settings = _settings(result)
+    lines += [f"  {name:<24}{value}" for name, value in settings.items() if value is not None]
     lines += [
         f"  not comparable: {name} is {value}, not {STANDARD_RULES[name]}"
         for name, value in result["deviations"].items()
@@ -205,4 +228,5 @@ def _table(result):
 
 
 if __name__ == "__main__":
+    end_with_one_line("nothing was written; the same command starts again")
     sys.exit(main())

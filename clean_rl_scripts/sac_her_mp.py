@@ -191,8 +191,7 @@ class Actor(nn.Module):
         noise = torch.randn_like(mean)
         x_t = mean + log_std.exp() * noise
         log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
-        # log(1 - tanh(x_t)^2) without cancellation
-        log_prob = log_prob - 2 * (math.log(2) - x_t - F.softplus(-2 * x_t))
+        log_prob = log_prob - 2 * (math.log(2) - x_t - F.softplus(-2 * x_t))  # log(1 - tanh(x_t)^2)
         return self.action_scale * torch.tanh(x_t), log_prob.sum(1)
 
     def forward(self, observation, achieved_goal, desired_goal, **_):
@@ -376,6 +375,7 @@ if __name__ == "__main__":
     counts, losses = {"updates": 0, "demos_injected": 0}, {}
     state = agent.checkpoint_state() | {"buffer": rb, "rng": rng, "counts": counts}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
+    protocol.encode_demos(envs)
     run.start(args.total_timesteps, "step")
     obs = protocol.begin_episodes(envs, args.seed, run.step)
     episodes, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes

@@ -4,14 +4,15 @@
         --folder sweeps/td3 --trials 20 --search policy-lr=1e-6..5e-3:log q-lr=1e-6..5e-3:log \\
         -- --task double_walls_wide_gap --total-timesteps 100000
 
-(Or `python clean_rl_scripts/sweep.py ...`.) The search space: `NAME=LOW..HIGH` (integers if both
+The search space: `NAME=LOW..HIGH` (integers if both
 are; `:log` for a logarithmic scale) or `NAME=a,b,c` (`NAME=true,false` for boolean flags). Every
 trial receives the flags after `--`, too. A trial's value is the trainer's best validation success.
 
 The folder contains each trial's run, the search itself (`study.log`) and `trials.csv`; `tensorboard
 --logdir FOLDER` shows curves and, under HPARAMS, the comparison. The same command continues an
-interrupted search; trials that were running continue from their checkpoints. (An uninterrupted
-search with one worker is reproducible; otherwise samples depend on the order in which trials end.)
+interrupted search; trials that were running continue from their checkpoints. An uninterrupted
+search with `--workers 1` is reproducible. Otherwise, samples depend on the order in which trials
+end.
 
 (Paper, appendix "Parameter sweeps": learning rates from 1e-6 to 5e-3; for SAC, with and without
 entropy tuning, `target-entropy=-7,None`, and alpha from 1e-5 to 10.)
@@ -31,9 +32,10 @@ from pathlib import Path
 
 import tyro
 
-from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers, check
+from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers, check, parse
+from roboarm_nmp.envs.utils import names
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
-from roboarm_nmp.envs.utils.signals import Terminated, exit_interrupted
+from roboarm_nmp.envs.utils.signals import Terminated, end_with_one_line, exit_interrupted
 from roboarm_nmp.envs.utils.workers import check_ray
 
 try:
@@ -42,8 +44,8 @@ try:
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
     from optuna.trial import TrialState
-except ImportError:
-    sys.exit('sweep.py needs the extra `sweep`: pip install -c constraints.txt -e ".[sweep]"')
+except ImportError:  # --help needs no Optuna
+    optuna = None
 
 METRIC = "validation_success_rate"
 RUNNING = set()  # processes of trainers
@@ -61,8 +63,8 @@ class Args:
     """Folder of the search."""
     seed: Seed = 0
     """Seed of the search."""
-    workers: Workers = 1
-    """Trials at a time, one core each."""
+    workers: Workers = CORES
+    """Trials at a time, one core each; by default as many as there are cores."""
     ray_address: str | None = None
     """Search on the Ray cluster at this address (`auto`, `HOST:PORT`)."""
 
@@ -312,7 +314,9 @@ def _check(args, flags):
     """The search space, as for `sweep`. Raises ValueError: an argument is not valid."""
     check(args)
     if not args.trainer.is_file():
-        raise ValueError(f"no such trainer: {args.trainer}")
+        scripts = [str(path) for path in args.trainer.parent.glob("*.py")]
+        hint = names.suggest(args.trainer, scripts, "expected the path of a trainer's script")
+        raise ValueError(f"no such trainer: {args.trainer}: {hint}")
     search = dict(parse_search(text) for text in args.search)
     check_folder(args.folder)
     check_ray(args.ray_address)
@@ -325,7 +329,8 @@ def _check(args, flags):
     given = [flag.partition("=")[0] for flag in flags if flag.startswith("--")]
     for flag in (*(f"--{name}" for name in search), *given):
         if flag.replace("_", "-") not in known:
-            raise ValueError(f"{args.trainer} has no flag {flag}")
+            hint = names.suggest(flag, sorted(known), "--help lists them")
+            raise ValueError(f"{args.trainer} has no flag {flag}: {hint}")
     return search
 
 
@@ -333,7 +338,9 @@ def main(arguments=None):
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     cut = arguments.index("--") if "--" in arguments else len(arguments)
     flags = arguments[cut + 1 :]
-    args = tyro.cli(Args, args=arguments[:cut], prog="sweep.py", description=__doc__)
+    args = parse(Args, arguments[:cut], others="search")
+    if optuna is None:
+        sys.exit('this needs the extra `sweep`: pip install -c constraints.txt -e ".[sweep]"')
     signal.signal(signal.SIGTERM, _on_sigterm)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
@@ -360,4 +367,5 @@ def main(arguments=None):
 
 
 if __name__ == "__main__":
+    end_with_one_line("nothing was written")
     main()

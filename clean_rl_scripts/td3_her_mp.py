@@ -373,6 +373,7 @@ if __name__ == "__main__":
     counts, losses = {"updates": 0, "demos_injected": 0}, {}
     state = agent.checkpoint_state() | {"buffer": rb, "rng": rng, "counts": counts}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
+    protocol.encode_demos(envs)
     run.start(args.total_timesteps, "step")
     obs = protocol.begin_episodes(envs, args.seed, run.step)
     episodes, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes

@@ -17,8 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
-from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.following import follow
@@ -29,6 +27,7 @@ from roboarm_nmp.envs.datasets.queries import query_path, validate
 from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
+    CORES,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveInt,
@@ -37,8 +36,9 @@ from roboarm_nmp.envs.training.flags import (
 )
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.files import check_writable
+from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 MAX_QUERIES = 100  # tried for one demonstration
 REASONS = ("no_plan", "missed", "collided", "too_long")
@@ -52,8 +52,8 @@ class Args:
     """Number of demonstrations."""
     seed: Seed = 0
     """Seed of queries and plans. (The pretrained files have 0, and plans of an earlier version.)"""
-    workers: Workers = 2
-    """Number of processes. The file does not depend on it."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores. The file does not depend on it."""
     planner: str = "RRTConnect"
     """One of OMPL's planners, by name."""
     max_checks: PositiveInt = 30_000
@@ -205,16 +205,15 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
     """
     with contextlib.closing(Journal(journal_of(path), options)) as journal:
         missing = [index for index in range(num) if index not in journal.entries]
-        bar = tqdm(
-            desc=options["task"],
+        bar = progress_bar(
+            description=options["task"],
             total=num,
             initial=num - len(missing),
-            unit=" demos",
-            mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+            unit="demo",
             disable=not progress,
         )
         if ray_address is None:
-            results = workers.run(Collector, (options,), missing, num_workers, warn=bar.write)
+            results = workers.run(Collector, (options,), missing, num_workers, warn=write_line)
         else:
             results = workers.run_on_ray(ray_address, Collector, (options,), missing)
         with bar, contextlib.closing(results):
@@ -255,15 +254,15 @@ def _check(args):
     demo_path(args.task)  # rejects an unknown task, also with --output
     if not envs.get_task(args.task).trainable:
         raise ValueError(f"{args.task} is for testing only: training on it is not allowed")
-    with contextlib.closing(envs.make(args.task)) as env:
-        # Rejects what a planner rejects, before any work is done.
-        make_planner(env, vars(args))
     check_writable(path)
-    if query_path(args.task).exists():
-        validate(query_path(args.task), args.task)  # demonstrations must not be of its queries
     if path.exists() and not args.overwrite:
         raise ValueError(f"{path} exists; --overwrite replaces it")
     workers.check_ray(args.ray_address)
+    if query_path(args.task).exists():
+        validate(query_path(args.task), args.task)  # demonstrations must not be of its queries
+    with contextlib.closing(envs.make(args.task)) as env:
+        # Rejects what a planner rejects. Last, because it may compile the collision checks.
+        make_planner(env, vars(args))
     return path
 
 
@@ -272,8 +271,6 @@ def main(args):
         path = _check(args)
         options = {name: getattr(args, name) for name in OPTIONS}
         counts = collect(path, args.num, options, args.workers, args.ray_address)
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command continues from here")
     except OSError as error:
         sys.exit(
             f"error: {error}\nwhat was collected is safe; the same command continues from here"
@@ -289,5 +286,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    raise_on_sigterm()
-    main(tyro.cli(Args, prog="roboarm collect", description=__doc__))
+    end_with_one_line("the same command continues from here")
+    main(flags.parse(Args, others="planner"))

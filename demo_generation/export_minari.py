@@ -28,14 +28,15 @@ from typing import Literal
 
 import gymnasium
 import numpy as np
-import tyro
-from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_episode
 from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
+from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 PREFIX = ".exporting-"  # of incomplete folders; Minari ignores hidden ones
 
@@ -174,13 +175,7 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
         raise ValueError(f"the dataset {dataset_id} exists ({path}); --overwrite replaces it")
     planner = demos.parameters.get("options", {}).get("planner", "a planner")
     env = gymnasium.make(envs.gymnasium_id(demos.task), goal_type=goal_type)
-    bar = tqdm(
-        range(len(demos)),
-        desc=dataset_id,
-        unit=" episodes",
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
-        disable=not progress,
-    )
+    bar = progress_bar(range(len(demos)), dataset_id, unit="episode", disable=not progress)
     root = get_dataset_path().resolve()
     _clear_leftovers(root)
     with (
@@ -227,4 +222,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, prog="roboarm minari", description=__doc__))
+    end_with_one_line("no dataset was written")
+    main(flags.parse(Args, others="dataset"))

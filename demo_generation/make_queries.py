@@ -2,10 +2,16 @@
 
     roboarm queries --task wall
     roboarm queries --task random_boxes_hard --solvable
+    roboarm queries --task three_shelves --goal-region 0.4 0.65 -0.4 0.4 0.24 0.46 \\
+        --num-test 200 --num-validation 20 --output in_the_shelf.h5
 
 With `--solvable`, a query is accepted only if the planner solves it. That means: one of
 `SOLVE_ATTEMPTS` plans, of at most `SOLVE_CHECKS` collision checks each, reaches the goal in the
 simulator without contact.
+
+With `--goal-region`, the end effector of every goal is in a box. The goals are random feasible
+configurations as always, of which those elsewhere are left out. In scenes that vary, the box must
+have room in every scene.
 
 Where scenes vary, `--queries-per-scene` queries in a row share a scene, which makes smaller files.
 
@@ -19,25 +25,27 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
 from roboarm_nmp.demo_generation.motionbenchmaker import read_problems
 from roboarm_nmp.demo_generation.planning import Planner
+from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.format import ORIGINAL
 from roboarm_nmp.envs.datasets.journal import Journal, journal_of
 from roboarm_nmp.envs.datasets.queries import query_path, write_queries
 from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
+from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.files import check_writable
+from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
@@ -45,6 +53,11 @@ HOLD_STEPS = 24
 STREAMS = {"test": Stream.TEST_QUERIES, "validation": Stream.VALIDATION_QUERIES}
 SCENES = 1  # a fourth number, for the scenes of a split
 SOLVE_ATTEMPTS, SOLVE_CHECKS = 3, 30_000
+# Random configurations for a goal in a region: as many at a time, and at most for one goal.
+GOALS, MAX_GOALS = 1_000, 1_000_000
+
+
+Region = Annotated[tuple[float, ...], tyro.conf.arg(metavar="XMIN XMAX YMIN YMAX ZMIN ZMAX")]
 
 
 @dataclass
@@ -55,26 +68,31 @@ class Args:
     """Accept only queries that the planner solves."""
     queries_per_scene: PositiveInt = 1
     """Queries in each scene, where scenes vary."""
+    goal_region: Region = ()
+    """Box (m) for the goals' end-effector positions, in the world's frame: its origin is the arm's
+    base, x points to the front, y to the left, z up. By default they are anywhere."""
     seed: Seed = 0
     """Seed of the queries. (The files of this project have seed 0.)"""
     num_test: PositiveInt = 10_000
     """Number of test queries."""
     num_validation: PositiveInt = 200
     """Number of validation queries."""
-    workers: Workers = 2
-    """Number of processes. The file does not depend on it."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores. The file does not depend on it."""
     original: Path | None = None
     """JSON file of MotionBenchMaker problems to add as the split `original`; goes with one task."""
     output: Path | None = None
-    """File to write or replace; goes with one task. The default is `envs/data/<task>.h5`, or, for a
-    scene file, `<name>_queries.h5` beside it."""
+    """File to write; goes with one task. The default is `envs/data/<task>.h5`, or, for a scene
+    file, `<name>_queries.h5` beside it."""
+    overwrite: bool = False
+    """Replace files that exist."""
 
 
 class Sampler:
     """Samples queries of a task; a job is (seed, split, number)."""
 
-    def __init__(self, task, solvable, queries_per_scene=1):
-        self.queries_per_scene = queries_per_scene
+    def __init__(self, task, solvable, queries_per_scene=1, goal_region=None):
+        self.queries_per_scene, self.goal_region = queries_per_scene, goal_region
         self.env = envs.make(task)
         self.planner = None
         if solvable:
@@ -92,7 +110,7 @@ class Sampler:
         rng = np.random.default_rng([seed, STREAMS[split], number])
         rejected = Counter()
         for _ in range(MAX_QUERIES):
-            start, goal = self.env.sample_query(rng)
+            start, goal = self._sample_query(rng)
             if not all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal)):
                 rejected["unheld"] += 1
             elif self.planner and not demonstrate(self.planner, start, goal, rng, SOLVE_ATTEMPTS):
@@ -107,6 +125,29 @@ class Sampler:
                 }
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
 
+    def _sample_query(self, rng):
+        """As `env.sample_query`, with the goal's end effector in the goal region, if there is one.
+
+        Raises RuntimeError: no goal in it was found.
+        """
+        if self.goal_region is None:
+            return self.env.sample_query(rng)
+        start, inside = self.env.sample_feasible(rng), 0
+        low, high = np.reshape(self.goal_region, (3, 2)).T
+        for _ in range(MAX_GOALS // GOALS):
+            goals = rng.uniform(panda.LOWER, panda.UPPER, (GOALS, 7)).astype(np.float32)
+            positions = panda.forward_kinematics(goals)
+            for i in np.flatnonzero(((low <= positions) & (positions <= high)).all(axis=1)):
+                distance = np.linalg.norm(positions[i] - panda.forward_kinematics(start))
+                inside += 1
+                if distance > self.env.ee_tolerance and self.env.is_feasible(goals[i]):
+                    return start, goals[i]
+        raise RuntimeError(
+            f"--goal-region: of {MAX_GOALS:,} random configurations, {inside:,} "
+            f"({inside / MAX_GOALS:.2%}) have their end effector in this box, and 0 of these are "
+            f"feasible goals"
+        )
+
 
 def make_queries(
     path,
@@ -119,6 +160,7 @@ def make_queries(
     original=None,
     num_workers=1,
     progress=True,
+    goal_region=None,
 ):
     """Sample the queries of a task and write its file.
 
@@ -132,13 +174,16 @@ def make_queries(
         original: path of a JSON file of MotionBenchMaker problems for the split `original`.
         num_workers: number of processes.
         progress: show a progress bar.
+        goal_region: (xmin, xmax, ymin, ymax, zmin, zmax), m, of the goals' end-effector positions
+            in the world's frame; None for anywhere.
 
     Returns:
         A Counter of the samples rejected: `unheld`, `unsolved`.
 
     Raises:
         ValueError: unknown task; the journal belongs to other queries, or is in use.
-        RuntimeError: no query can be found, or workers keep dying.
+        RuntimeError: no query can be found, also because the goal region has no room; or workers
+            keep dying.
         DatasetError, OSError: as `envs.datasets.queries.write_queries` does.
         Whatever is raised, what is in the journal is safe.
     """
@@ -147,20 +192,20 @@ def make_queries(
     path, distribution, base = Path(path), envs.get_task(task).scene, envs.get_task(task).base_scene
     options = {"task": str(task), "seed": seed, "solvable": solvable}
     options |= {"queries_per_scene": queries_per_scene}
+    options["goal_region"] = None if goal_region is None else list(goal_region)
     with contextlib.closing(Journal(journal_of(path), options)) as journal:
         jobs = [(seed, "test", number) for number in range(num_test)]
         jobs += [(seed, "validation", number) for number in range(num_validation)]
         missing = [job for job in jobs if f"{job[1]}/{job[2]}" not in journal.entries]
-        bar = tqdm(
-            desc=task,
+        bar = progress_bar(
+            description=str(task),
             total=len(jobs),
             initial=len(jobs) - len(missing),
-            unit=" queries",
-            mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+            unit="query",
             disable=not progress,
         )
-        arguments = (task, solvable, queries_per_scene)
-        results = workers.run(Sampler, arguments, missing, num_workers, warn=bar.write)
+        arguments = (task, solvable, queries_per_scene, goal_region)
+        results = workers.run(Sampler, arguments, missing, num_workers, warn=write_line)
         with bar, contextlib.closing(results):
             for query in results:
                 journal.append(query)
@@ -187,11 +232,15 @@ def make_queries(
         if solvable:
             parameters |= {"unsolved": rejected["unsolved"], "solve_checks": SOLVE_CHECKS}
             parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
+        if goal_region is not None:
+            parameters["goal_region"] = list(goal_region)
         made_by = f"roboarm queries --task {task} --seed {seed} "
         made_by += f"--num-test {num_test} --num-validation {num_validation}"
         made_by += " --solvable" * solvable
         if queries_per_scene > 1:
             made_by += f" --queries-per-scene {queries_per_scene}"
+        if goal_region is not None:
+            made_by += f" --goal-region {' '.join(map(str, goal_region))}"
         if original is not None:
             made_by += f" --original {Path(original).name}"
         write_queries(path, task, seed, splits, made_by, parameters)
@@ -209,10 +258,22 @@ def _check(args):
         raise ValueError("--output and --original are one file: they go with one task")
     if args.original is not None:
         read_problems(args.original)
+    if args.goal_region:
+        region = np.array(args.goal_region)
+        if region.shape != (6,) or not (
+            np.isfinite(region).all() and (region[::2] < region[1::2]).all()
+        ):
+            given = " ".join(map(str, args.goal_region))
+            raise ValueError(
+                f"--goal-region takes XMIN XMAX YMIN YMAX ZMIN ZMAX, each minimum below its "
+                f"maximum, got {given}"
+            )
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
         query_path(task)  # rejects an unknown task, also with --output
         check_writable(path)
+        if path.exists() and not args.overwrite:
+            raise ValueError(f"{path} exists; --overwrite replaces it")
     return pairs
 
 
@@ -233,6 +294,7 @@ def main(args):
                 args.queries_per_scene,
                 args.original,
                 args.workers,
+                goal_region=args.goal_region or None,
             )
             text = f"{path}: written; {rejected['unheld']} samples rejected by the long hold check"
             if args.solvable:
@@ -243,10 +305,8 @@ def main(args):
             print(text)
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command continues from here")
 
 
 if __name__ == "__main__":
-    raise_on_sigterm()
-    main(tyro.cli(Args, prog="roboarm queries", description=__doc__))
+    end_with_one_line("the same command continues from here")
+    main(flags.parse(Args, others="query"))

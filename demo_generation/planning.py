@@ -23,6 +23,7 @@ from ompl import util as ou
 
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.envs.utils.names import suggest
 
 # OMPL writes to the console. What concerns a user is raised here.
 ou.setLogLevel(ou.LogLevel.LOG_NONE)
@@ -203,7 +204,7 @@ class Planner:
         max_checks=None,
     ):
         if not callable(planner) and planner not in PLANNERS:
-            raise ValueError(f"unknown planner {planner!r}: one of {', '.join(PLANNERS)}")
+            raise ValueError(f"unknown planner {planner!r}: {suggest(planner, PLANNERS)}")
         if not 0 <= clearance < 0.5:
             raise ValueError(f"clearance must be in [0, 0.5) m, got {clearance!r}")
         if not 0 <= planner_range < math.inf:

@@ -31,7 +31,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -41,9 +40,9 @@ from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Seed, Workers
+from roboarm_nmp.envs.training.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 # L2, normalised, between checked states of a motion before a path wants to take it.
 COARSE = 8 * RESOLUTION
@@ -472,8 +471,8 @@ class Args:
     """Scenes in each file."""
     seed: Seed = 0
     """Seed of scenes and roadmaps."""
-    workers: Workers = 2
-    """Number of processes. The files do not depend on it."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores. The files do not depend on it."""
     ray_address: str | None = None
     """Address of a Ray cluster (`auto`, `HOST:PORT`) to use instead of local processes."""
 
@@ -546,7 +545,7 @@ def collect(args, progress=True):
         made_by,
         open_shard,
         counted="path_count",
-        unit="paths",
+        unit="path",
         per_scene=args.paths_per_scene,
         progress=progress,
     )
@@ -556,8 +555,6 @@ def collect(args, progress=True):
 def main(args):
     try:
         made = collect(args)
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command continues from here")
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
@@ -566,5 +563,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    raise_on_sigterm()
-    main(tyro.cli(Args, prog="roboarm roadmaps", description=__doc__))
+    end_with_one_line("the same command continues from here")
+    main(flags.parse(Args, others="roadmap"))

@@ -7,6 +7,7 @@ is good if following its plan repeats the stored execution exactly, reaches the 
 contact (unless the file was collected with --allow-collisions). The exit code is 1 if any is not.
 """
 
+import contextlib
 import sys
 from collections import Counter
 from dataclasses import dataclass
@@ -14,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from roboarm_nmp.demo_generation.collect import demonstrate, make_planner
 from roboarm_nmp.demo_generation.following import follow
@@ -23,9 +23,10 @@ from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos, writ
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.tasks import is_task
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import Workers
+from roboarm_nmp.envs.training.flags import CORES, Workers
 from roboarm_nmp.envs.utils import workers
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.progress import progress_bar, write_line
+from roboarm_nmp.envs.utils.signals import end_with_one_line, exit_interrupted
 
 VERDICTS = ("good", "changed", "missed", "collided", "refused")
 REPAIR_ATTEMPTS = 10
@@ -35,8 +36,8 @@ REPAIR_ATTEMPTS = 10
 class Args:
     files: tyro.conf.Positional[tuple[str, ...]]
     """Demonstration files, or tasks (names or scene files)."""
-    workers: Workers = 2
-    """Number of processes."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores."""
     repair: bool = False
     """Plan failed demonstrations anew, on the same queries, and replace the file."""
 
@@ -118,18 +119,12 @@ def verify(task_or_path, num_workers=1, repair=False, progress=True):
     if "options" not in demos.parameters:
         raise DatasetError(f"{path}: has no record of the options it was collected with")
     counts, kept = Counter(), {}
-    results = workers.run(Verifier, (path, repair), range(len(demos)), num_workers)
-    bar = tqdm(
-        results,
-        desc=path.name,
-        total=len(demos),
-        unit=" demos",
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
-        disable=not progress,
-    )
-    for index, verdict, demo in bar:
-        counts[verdict] += 1
-        kept[index] = demo
+    results = workers.run(Verifier, (path, repair), range(len(demos)), num_workers, write_line)
+    bar = progress_bar(results, path.name, len(demos), unit="demo", disable=not progress)
+    with contextlib.closing(results):
+        for index, verdict, demo in bar:
+            counts[verdict] += 1
+            kept[index] = demo
     bad = len(demos) - counts["good"]
     removed = 0
     if repair and bad:
@@ -182,5 +177,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    raise_on_sigterm()
-    main(tyro.cli(Args, prog="roboarm verify", description=__doc__))
+    end_with_one_line("nothing has changed")
+    main(flags.parse(Args))

@@ -10,7 +10,6 @@ demonstrations, from light (start) to dark (goal). `task_gallery.png` shows all 
 from pathlib import Path
 
 import numpy as np
-import pybullet as p
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
@@ -20,6 +19,7 @@ from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.show import render_query
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls
@@ -64,7 +64,7 @@ def save_gallery(tiles):
 def main():
     gallery = {}
     for task in tqdm([*envs.TASKS, "mixed_scenes"], unit="task"):
-        env = envs.make(task, render_mode="rgb_array")
+        env = envs.make(task, render_mode="rgb_array", goal_type="combined")
         if not isinstance(envs.get_task(task).scene, Scene):
             pixels, rng = [], np.random.default_rng(0)
             for _ in range(ROWS * COLUMNS):

@@ -10,7 +10,6 @@ Classes: robot red, table and floor orange, obstacles yellow (as in the paper's 
 from pathlib import Path
 
 import numpy as np
-import pybullet as p
 from PIL import Image
 
 from roboarm_nmp import envs
@@ -23,6 +22,7 @@ from roboarm_nmp.envs.perception.sensors import (
     SensorWorld,
     cardinal,
 )
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 FOLDER = Path(__file__).parent / "figures"
 COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [255, 255, 255]], np.uint8)

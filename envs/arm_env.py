@@ -8,15 +8,16 @@ import time
 
 import gymnasium as gym
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.scenes.primitives import Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import (
     HOLD_STEPS,
     MAX_EDGE,
     World,
+    image_array,
     why_no_window,
 )
 
@@ -479,7 +480,7 @@ class RoboArmEnv(gym.Env):
             renderer=p.ER_TINY_RENDERER,
             physicsClientId=self.client,
         )
-        return np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
+        return image_array(pixels, width, height)
 
     def close(self):
         """Disconnect from PyBullet. Closing twice is allowed."""

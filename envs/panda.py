@@ -8,8 +8,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import pybullet as p
 import pybullet_data
+
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 NUM_JOINTS = 7
 # Joint limits (rad) and torque limits (N m) as in pybullet_data's franka_panda/panda.urdf.

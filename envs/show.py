@@ -1,14 +1,19 @@
 """Show a task in PyBullet's window, as an image, or as an animation of a policy.
 
-    python -m roboarm_nmp.envs.show double_walls
-    python -m roboarm_nmp.envs.show double_walls --output image.png
-    python -m roboarm_nmp.envs.show my_scene.yaml --output images.png --draws 9
-    python -m roboarm_nmp.envs.show wall --output episode.gif --policy runs/my_run
-    python -m roboarm_nmp.envs.show double_walls --output episode.gif --policy planner
+    roboarm show double_walls
+    roboarm show double_walls --output image.png
+    roboarm show my_scene.yaml --output images.png --draws 9
+    roboarm show wall --output episode.gif --policy runs/my_run
+    roboarm show double_walls --output episode.gif --policy planner
+    roboarm show wall --output image.png --camera top
+    roboarm show wall --output episode.gif --camera 2.5 90 -20
+    roboarm show wall --policy planner --save-trajectory episode.csv
+    roboarm show wall --output episode.gif --trajectory episode.csv
 
-The arm is white; at the goal it is transparent green. The green ball is the goal position of the
-end effector. An image shows the start. The window shows the policy's episodes one after another, in
-real time, until it is closed, or Escape or Ctrl-C is pressed.
+The arm is white. The green ball is the goal position of the end effector. Where the goal is a
+configuration, the arm at the goal is shown in transparent green; the goal type `ee` has no such
+configuration. An image shows the start. The window shows the policy's episodes one after another,
+in real time, until it is closed, or Escape or Ctrl-C is pressed.
 """
 
 import io
@@ -22,26 +27,38 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import pybullet as p
 import tyro
 from PIL import Image
-from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.datasets.demonstrations import Demos, demo_path, load_demos
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.envs.datasets.format import OutOfDateError
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
+from roboarm_nmp.envs.datasets.trajectories import (
+    STEP_SECONDS,
+    check_ending,
+    load_joint_path,
+    save_trajectory,
+)
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
-from roboarm_nmp.envs.scenes.primitives import to_array
+from roboarm_nmp.envs.scenes.primitives import Scene, to_array
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeInt, Pixels, PositiveInt, Seed
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
-from roboarm_nmp.envs.world import why_no_window
+from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.envs.utils.signals import end_with_one_line
+from roboarm_nmp.envs.world import image_array, why_no_window
 
 SIZE = (640, 480)
 OVERSAMPLING = 2  # the software renderer has jagged edges
 FIELD_OF_VIEW, PITCH, MARGIN = 40.0, -28.0, 0.05  # degrees, degrees, share of the image
+# Yaw and pitch in degrees, as PyBullet counts them.
+VIEWS = {"front": (90.0, -15.0), "side": (0.0, -15.0), "top": (-90.0, -90.0)}
+MAX_DISTANCE = 15.0  # m, of the camera
+MAX_SECONDS = 3600  # of a trajectory from a file
 # From the front right, as long as the obstacles do not hide more of the arm's surroundings from
 # there than from one of the other corners.
 YAWS = (55.0, 125.0, -55.0, -125.0)
@@ -69,6 +86,9 @@ class Args:
     network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy
     (docs/benchmark/results.md). `demo` replays the task's demonstrations; --query is then the
     number of a demonstration."""
+    goal_type: Literal["ee", "config", "combined"] | None = None
+    """What the goal is; by default the policy's own, otherwise `combined`. For `ee`, the goal is a
+    position: there is no ghost of the arm."""
     query: NonNegativeInt = 0
     """Number of the (first) query to show, from 0."""
     split: Literal["test", "validation", "original"] = "test"
@@ -78,6 +98,19 @@ class Args:
     query has its own."""
     size: tuple[Pixels, Pixels] = SIZE
     """Width and height of one image in pixels."""
+    camera: Literal["front", "side", "top"] | tuple[float, float, float] | None = None
+    """Point of view: `front`, `side` (from the arm's right) or `top`, as near as the whole scene
+    allows; or DISTANCE YAW PITCH: m from the middle of the scene, degrees, degrees. Yaw 0 is the
+    arm's right, 90 its front, 180 its left; pitch -90 looks straight down, 0 horizontally. By
+    default from a corner that obstacles do not hide."""
+    trajectory: Path | None = None
+    """Play this file (.csv or .npz) instead of a policy's episode: one of --save-trajectory, or of
+    one's own. A .csv needs columns `q1` to `q7` (rad), and may have `time` (s); a .npz an array
+    `configurations` (n, 7), and perhaps `times`. The arm is moved without physics, in the scene of
+    --query; the ghost is the end."""
+    save_trajectory: Path | None = None
+    """Write the shown episode to this file (.csv or .npz): configurations, actions, contacts,
+    times. Without --output there is no window then."""
     seed: Seed = 0
     """Of random queries, and of `random`, `via-points` and `planner`."""
 
@@ -93,6 +126,7 @@ class _Camera(NamedTuple):
     """Where PyBullet's camera is: `distance` m from `target`, a point (3,), m."""
 
     yaw: float
+    pitch: float
     distance: float
     target: np.ndarray
 
@@ -105,17 +139,19 @@ class _Shot(NamedTuple):
     arm: np.ndarray
 
 
-def render_query(env, query, size=SIZE, points=()):
+def render_query(env, query, size=SIZE, points=(), camera=None):
     """An image of a query: the arm at the start, and a transparent ghost of it at the goal.
 
-    The camera stands where the whole scene and the arm are visible, and with them bodies that were
-    added to `env.client`. It moves the arm: reset the environment afterwards.
+    With the goal type `ee` the goal is a position, and there is no ghost. It moves the arm: reset
+    the environment afterwards.
 
     Args:
         env: a `RoboArmEnv`, with `render_mode="rgb_array"` to have the goal marked by a ball.
-        query: an `envs.datasets.queries.Query`; a goal that is a position (3,) has no ghost.
+        query: an `envs.datasets.queries.Query`.
         size: (width, height) in pixels.
         points: (n, 3), m: further positions that must be in the image.
+        camera: one of `VIEWS`, or (distance, yaw, pitch) in m and degrees, as for `--camera`. By
+            default, it stands where the whole scene and the arm are visible.
 
     Returns:
         uint8 (height, width, 3).
@@ -123,28 +159,32 @@ def render_query(env, query, size=SIZE, points=()):
     Raises:
         ValueError: the environment refuses the query.
     """
-    return next(render_configurations(env, query, [query.start], size, points))
+    return next(render_configurations(env, query, [query.start], size, points, camera))
 
 
-def render_configurations(env, query, configurations, size=SIZE, points=()):
+def render_configurations(env, query, configurations, size=SIZE, points=(), camera=None):
     """Images as of `render_query`, from one point of view, with the arm in each configuration.
 
     Args:
         configurations: (n, 7), joint angles in rad, e.g. of a `Trajectory`.
-        env, query, size, points: see `render_query`.
+        env, query, size, points, camera: see `render_query`.
 
     Yields:
         n images, uint8 (height, width, 3).
     """
     env.world.draw()
     env.reset_specific(*query)
-    has_ghost = len(query.goal) == panda.NUM_JOINTS
-    poses = [*configurations, *[query.goal] * has_ghost]
-    points = np.concatenate([_extent(env, poses), np.reshape(points, (-1, 3))])
+    yield from _render(env, query.goal, configurations, size, points, camera)
+
+
+def _render(env, goal, configurations, size, points, view):
+    """`render_configurations` in the present scene, whose goal is marked."""
+    has_ghost = env.goal_type != "ee"
+    points = np.concatenate([_visible(env, goal, configurations), np.reshape(points, (-1, 3))])
     slope = math.tan(math.radians(FIELD_OF_VIEW / 2))
-    camera = _camera(env, points, (slope * size[0] / size[1], slope))
+    camera = _camera(env, points, (slope * size[0] / size[1], slope), view)
     if has_ghost:
-        panda.set_configuration(env.client, env.robot, query.goal)
+        panda.set_configuration(env.client, env.robot, goal)
         ghost = _shoot(env, camera, size)
         tinted = ghost.colour.mean(-1, keepdims=True) * GHOST_COLOUR
     for configuration in configurations:
@@ -156,6 +196,15 @@ def render_configurations(env, query, configurations, size=SIZE, points=()):
             mixed = (1 - GHOST_OPACITY) * pixels + GHOST_OPACITY * tinted
             pixels = np.where(visible[..., None], mixed, pixels)
         yield np.asarray(Image.fromarray(pixels.astype(np.uint8)).reduce(OVERSAMPLING))
+
+
+def _visible(env, goal, configurations):
+    """Points (n, 3), m, that must be visible: as `_extent`, and at the goal the arm or a point."""
+    if env.goal_type != "ee":
+        return _extent(env, [*configurations, goal])
+    if len(goal) == panda.NUM_JOINTS:
+        goal = panda.forward_kinematics(goal)
+    return np.concatenate([_extent(env, configurations), [goal]])
 
 
 def _extent(env, configurations):
@@ -176,15 +225,21 @@ def _extent(env, configurations):
     return np.concatenate([np.asarray(box)[choices, [0, 1, 2]] for box in boxes])
 
 
-def _camera(env, points, slopes):
+def _camera(env, points, slopes, view=None):
     """The nearest camera with all points (n, 3), m, in its image. Moves the arm.
 
-    `slopes` are those of the right and upper edge of its field of view.
+    `slopes` are those of the right and upper edge of its field of view; `view` is as `--camera`.
     """
-    # So that all queries of a scene are rendered from the same side, whatever the arm hides.
-    panda.set_configuration(env.client, env.robot, (panda.LOWER + panda.UPPER) / 2)
-    yaw = min(YAWS, key=lambda yaw: _hidden(env, yaw))
-    rotation = _rotation(yaw)
+    distance = None
+    if view is None:
+        # So that all queries of a scene are rendered from the same side, whatever the arm hides.
+        panda.set_configuration(env.client, env.robot, (panda.LOWER + panda.UPPER) / 2)
+        yaw, pitch = min(YAWS, key=lambda yaw: _hidden(env, yaw)), PITCH
+    elif view in VIEWS:
+        yaw, pitch = VIEWS[view]
+    else:
+        distance, yaw, pitch = view
+    rotation = _rotation(yaw, pitch)
     points = points @ rotation.T  # right, up, towards the camera
     # A point is inside if |x - eye_x| <= slope * (eye_z - z). So eye_z is at least
     # (max(x + slope * z) + max(-x + slope * z)) / (2 * slope), and the same for y.
@@ -195,14 +250,15 @@ def _camera(env, points, slopes):
         left = np.max(-points[:, axis] + slope * points[:, 2])
         eye[axis] = (right - left) / 2
         nearest.append((right + left) / (2 * slope))
-    eye[2] = max(nearest)
-    distance = eye[2] - points[:, 2].mean()
-    return _Camera(yaw, distance, rotation.T @ (eye - [0, 0, distance]))
+    middle = points[:, 2].mean()
+    distance = max(nearest) - middle if distance is None else distance
+    eye[2] = middle
+    return _Camera(yaw, pitch, distance, rotation.T @ eye)
 
 
-def _rotation(yaw):
+def _rotation(yaw, pitch=PITCH):
     """The matrix (3, 3) from the world to the camera's axes: right, up, and towards it."""
-    view = p.computeViewMatrixFromYawPitchRoll((0, 0, 0), 1.0, yaw, PITCH, 0, 2)
+    view = p.computeViewMatrixFromYawPitchRoll((0, 0, 0), 1.0, yaw, pitch, 0, 2)
     return np.reshape(view, (4, 4)).T[:3, :3]
 
 
@@ -221,7 +277,7 @@ def _shoot(env, camera, size):
         width,
         height,
         p.computeViewMatrixFromYawPitchRoll(
-            camera.target.tolist(), camera.distance, camera.yaw, PITCH, 0, 2
+            camera.target.tolist(), camera.distance, camera.yaw, camera.pitch, 0, 2
         ),
         p.computeProjectionMatrixFOV(FIELD_OF_VIEW, width / height, 0.1, 20.0),
         lightDirection=(1.4 * math.cos(light), 1.4 * math.sin(light), 2.5),
@@ -232,7 +288,7 @@ def _shoot(env, camera, size):
         physicsClientId=env.client,
     )
     return _Shot(
-        np.reshape(pixels, (height, width, 4))[..., :3].astype(np.float32),
+        image_array(pixels, width, height).astype(np.float32),
         np.reshape(depth, (height, width)),
         np.reshape(bodies, (height, width)) == env.robot,
     )
@@ -249,16 +305,19 @@ class _Queries:
         get: function from a number to a `Query`.
         count: the number of queries; None for random ones without end.
         name: of one of them, in messages.
-        demos: the `Demos` of these queries, or None.
+        replay: function from a number to configurations (n, 7), rad, one per `STEP_SECONDS`, to
+            show instead of a policy's episode; or None.
     """
 
     get: Callable
     count: int | None
     name: str
-    demos: Demos | None = None
+    replay: Callable | None = None
 
 
 def _find_queries(args):
+    if args.trajectory is not None:
+        return _file_queries(args)
     if args.policy == "demo":
         path = demo_path(args.task)
         if not path.exists():
@@ -269,11 +328,23 @@ def _find_queries(args):
             demo = demos[number]
             return Query(demo.start, demo.goal, demo.scene)
 
-        return _Queries(get, len(demos), "demonstration", demos)
+        def replay(number):
+            return demos[number].configurations
+
+        return _Queries(get, len(demos), "demonstration", replay)
+    return _task_queries(args)
+
+
+def _task_queries(args):
+    """The task's queries; random ones where it has none that fit its scene."""
+    reason = "no query file"
     if query_path(args.task).exists():
-        queries = load_queries(args.task, args.split)
-        return _Queries(queries.__getitem__, len(queries), f"{args.split} query")
-    print(f"{args.task} has no query file: random queries of seed {args.seed}")
+        try:
+            queries = load_queries(args.task, args.split)
+            return _Queries(queries.__getitem__, len(queries), f"{args.split} query")
+        except OutOfDateError:
+            reason = "its queries are out of date and left out"
+    print(f"{args.task}: {reason}: random queries of seed {args.seed}")
     env = envs.make(args.task)
 
     def draw(number):
@@ -287,6 +358,25 @@ def _find_queries(args):
     return _Queries(draw, None, "random query")
 
 
+def _file_queries(args):
+    """From the start to the end of --trajectory, in the scene of a query where scenes vary."""
+    times, path = load_joint_path(args.trajectory)
+    steps = round((times[-1] - times[0]) / STEP_SECONDS)
+    if steps * STEP_SECONDS > MAX_SECONDS:
+        raise ShowError(f"{args.trajectory}: it is longer than {MAX_SECONDS} s")
+    shown = np.clip(times[0] + np.arange(steps + 1) * STEP_SECONDS, None, times[-1])
+    configurations = np.stack([np.interp(shown, times, joint) for joint in path.T], axis=1)
+    configurations[-1] = path[-1]
+    scene = envs.get_task(args.task).scene
+    scenes = None if isinstance(scene, Scene) else _task_queries(args)
+
+    def get(number):
+        return Query(path[0], path[-1], scenes.get(number).scene if scenes else scene)
+
+    count, name = (scenes.count, scenes.name) if scenes else (None, "query")
+    return _Queries(get, count, name, lambda number: configurations)
+
+
 def _check(args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
@@ -297,7 +387,26 @@ def _check(args):
         check_writable(args.output)
     if args.draws > 1 and (args.output is None or args.output.suffix.lower() != ".png"):
         raise ShowError("--draws goes with --output FILE.png")
-    if args.output is None and (problem := why_no_window()):
+    if isinstance(args.camera, tuple):
+        distance, yaw, pitch = args.camera
+        if not (0 < distance <= MAX_DISTANCE and math.isfinite(yaw) and -90 <= pitch <= 90):
+            raise ShowError(
+                f"--camera DISTANCE YAW PITCH: at most {MAX_DISTANCE:.0f} m, any angle, -90 to 90 "
+                f"degrees, got {distance:g} {yaw:g} {pitch:g}"
+            )
+    if args.trajectory is not None:
+        if args.policy != Args.policy:
+            raise ShowError("--trajectory plays a file, --policy runs a policy: give one of them")
+        if args.draws > 1:
+            raise ShowError("--draws goes with queries, not with --trajectory")
+    if args.save_trajectory is not None:
+        check_ending(args.save_trajectory)
+        check_writable(args.save_trajectory)
+        if args.trajectory is not None or args.policy == "demo":
+            raise ShowError("--save-trajectory goes with a policy: a file need not be saved again")
+        if args.output is not None and args.output.suffix.lower() == ".png":
+            raise ShowError("--save-trajectory goes with --output FILE.gif, or without --output")
+    elif args.output is None and (problem := why_no_window()):
         raise ShowError(
             f"a window needs a display ({problem}); "
             f"--output FILE.png or --output FILE.gif writes a file instead"
@@ -306,31 +415,49 @@ def _check(args):
 
 def _show(args):
     _check(args)
-    suffix = None if args.output is None else args.output.suffix.lower()
-    arguments, policy, begin = {}, None, None
-    if suffix != ".png" and args.policy != "demo":
+    if args.output is not None:
+        kind = args.output.suffix.lower()
+    else:
+        kind = "window" if args.save_trajectory is None else "file"
+    policy, arguments, begin = None, {}, None
+    if args.policy != "demo" and args.trajectory is None:
         policy, arguments = find_policy(args.policy)
+    own = arguments.get("goal_type")
+    if None not in (own, args.goal_type) and own != args.goal_type:
+        raise ShowError(
+            f"{args.policy} was trained with the goal type {own!r}, it cannot be shown with "
+            f"{args.goal_type!r}"
+        )
+    goal_type = own or args.goal_type or "combined"
+    # An image of the start needs nothing else of the policy.
+    arguments = {} if kind == ".png" else arguments
     queries = _find_queries(args)
     last = args.query + args.draws - 1
     if queries.count is not None and last >= queries.count:
         raise ShowError(f"no {queries.name} {last}: the numbers are 0 to {queries.count - 1}")
     try:
-        mode = "human" if suffix is None else "rgb_array"
-        env = envs.make(args.task, render_mode=mode, **arguments)
+        mode = {"window": "human", "file": None}.get(kind, "rgb_array")
+        env = envs.make(args.task, render_mode=mode, **arguments | {"goal_type": goal_type})
     except (TypeError, ValueError) as error:
         raise ShowError(f"{args.policy}: its environment cannot be made: {error}") from error
     try:
-        if policy is not None:
+        if policy is not None and kind != ".png":
             begin = make_policy(policy, env, args.seed)
-        {None: _window, ".png": _draw, ".gif": _animate}[suffix](args, env, queries, begin)
+        command = {"window": _window, "file": _record, ".png": _draw, ".gif": _animate}[kind]
+        command(args, env, queries, begin)
     finally:
         if p.isConnected(env.client):  # not after Escape
             env.close()
 
 
 def _draw(args, env, queries, begin):
-    bar = tqdm(range(args.query, args.query + args.draws), "drawing", disable=None)
-    images = [render_query(env, queries.get(number), args.size) for number in bar]
+    bar = progress_bar(
+        range(args.query, args.query + args.draws), "drawing", unit="image", transient=True
+    )
+    images = []
+    for number in bar:
+        query = queries.get(number)
+        images += _images(args, env, queries, query, [query.start])
     columns = math.ceil(math.sqrt(args.draws))
     blank = [np.full_like(images[0], 255)] * (-args.draws % columns)
     grid = np.stack(images + blank)
@@ -342,17 +469,35 @@ def _draw(args, env, queries, begin):
     print(f"{args.output}: written, {args.task}, {queries.name} {args.query}{until}")
 
 
+def _images(args, env, queries, query, configurations):
+    """Images of configurations (n, 7), rad, in the scene of a query, with its goal."""
+    if queries.replay is None:
+        yield from render_configurations(env, query, configurations, args.size, (), args.camera)
+        return
+    _place(env, query)
+    yield from _render(env, query.goal, configurations, args.size, (), args.camera)
+
+
+def _place(env, query):
+    """Show a query's scene and goal, without a reset: the ends of a file may be in collision."""
+    env.world.draw()
+    env.set_scene(query.scene)
+    env.world.mark_goal(panda.forward_kinematics(query.goal), env.ee_tolerance)
+
+
 def _animate(args, env, queries, begin):
     query, trajectory = queries.get(args.query), None
-    if queries.demos is None:
+    if queries.replay is None:
         trajectory = rollout(env, query, begin(args.query, query).act)
         configurations = trajectory.configurations
     else:
-        configurations = panda.denormalise(queries.demos[args.query].states)
+        configurations = queries.replay(args.query)
+    text = _outcome(args, env, queries, args.query, query, configurations, trajectory)
     last = len(configurations) - 1
     steps = [*range(0, last, max(1, math.ceil(last / MAX_FRAMES))), last]
-    frames = render_configurations(env, query, configurations[steps], args.size)
-    frames = [Image.fromarray(frame) for frame in tqdm(frames, "drawing", len(steps), disable=None)]
+    frames = _images(args, env, queries, query, configurations[steps])
+    bar = progress_bar(frames, "drawing", len(steps), unit="frame", transient=True)
+    frames = [Image.fromarray(frame) for frame in bar]
     # One palette and no dithering: still parts of the scene have the same pixels in all frames.
     # This method keeps the green of the small ball.
     palette = frames[0].quantize(COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=3)
@@ -367,45 +512,70 @@ def _animate(args, env, queries, begin):
         duration=[round(1000 * one) for one in seconds],
         loop=0,
     )
-    text = _outcome(args, queries, args.query, last, trajectory)
     print(f"{args.output}: written, {args.task}, {text}")
+    if args.save_trajectory is not None:
+        save_trajectory(args.save_trajectory, trajectory)
+        print(f"{args.save_trajectory}: written, the trajectory")
+
+
+def _record(args, env, queries, begin):
+    query = queries.get(args.query)
+    trajectory = rollout(env, query, begin(args.query, query).act)
+    save_trajectory(args.save_trajectory, trajectory)
+    configurations = trajectory.configurations
+    text = _outcome(args, env, queries, args.query, query, configurations, trajectory)
+    print(f"{args.save_trajectory}: written, {args.task}, {text}")
 
 
 def _window(args, env, queries, begin):
     print("Ctrl-C ends, and so does Escape in the window", flush=True)
     client = env.client
     p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0, physicsClientId=client)  # no side panels
-    numbers = itertools.count() if queries.count is None else itertools.cycle(range(queries.count))
+    if args.trajectory is not None:
+        numbers = itertools.repeat(args.query)
+    elif queries.count is None:
+        numbers = itertools.count(args.query)
+    else:
+        numbers = itertools.islice(itertools.cycle(range(queries.count)), args.query, None)
     try:
-        for number in itertools.islice(numbers, args.query, None):
+        for number in numbers:
             query, trajectory = queries.get(number), None
-            env.reset_specific(*query)
+            if queries.replay is None:
+                env.reset_specific(*query)
+            else:
+                _place(env, query)
             projection = p.getDebugVisualizerCamera(physicsClientId=client)[3]
             slopes = (1 / projection[0], 1 / projection[5])
-            camera = _camera(env, _extent(env, [query.start, query.goal]), slopes)
+            visible = _visible(env, query.goal, [query.start])
+            camera = _camera(env, visible, slopes, args.camera)
             p.resetDebugVisualizerCamera(
-                camera.distance, camera.yaw, PITCH, camera.target, physicsClientId=client
+                camera.distance, camera.yaw, camera.pitch, camera.target, physicsClientId=client
             )
-            if queries.demos is None:
+            if queries.replay is None:
                 trajectory = rollout(env, query, begin(number, query).act)
                 configurations = trajectory.configurations
             else:
-                configurations = panda.denormalise(queries.demos[number].states)
+                configurations = queries.replay(number)
                 for configuration in configurations:
                     panda.set_configuration(client, env.robot, configuration)
                     time.sleep(1 / env.metadata["render_fps"])
-            text = _outcome(args, queries, number, len(configurations) - 1, trajectory)
+            text = _outcome(args, env, queries, number, query, configurations, trajectory)
             print(text, flush=True)
             time.sleep(PAUSE)
-    except KeyboardInterrupt:
-        pass
     except p.error:
         if p.isConnected(client):
             raise  # otherwise Escape was pressed
 
 
-def _outcome(args, queries, number, steps, trajectory):
-    """The result of an episode in words; `trajectory` is None for a demonstration."""
+def _outcome(args, env, queries, number, query, configurations, trajectory):
+    """The result of an episode in words; `trajectory` is None where none was simulated."""
+    steps = len(configurations) - 1
+    if args.trajectory is not None:
+        env.set_scene(query.scene)
+        colliding = sum(map(env.in_collision, configurations))
+        contact = f"in collision in {colliding} of {steps + 1} configurations"
+        contact = contact if colliding else "collision-free"
+        return f"{args.trajectory}: {steps * STEP_SECONDS:.1f} s, {contact}"
     if trajectory is None:
         return f"{queries.name} {number}: {steps} steps"
     reached = "reached the goal" if trajectory.success else "did not reach the goal"
@@ -421,19 +591,15 @@ def _save(image, path, kind, **options):
 
 def main(arguments=None):
     """The command. Returns the exit code: 0, or 2 where nothing can be shown."""
-    args = tyro.cli(
-        Args, args=arguments, prog="python -m roboarm_nmp.envs.show", description=__doc__
-    )
+    args = flags.parse(Args, arguments, others="image")
     try:
         _show(args)
     except (OSError, ValueError) as error:
         print(f"error: {error}".replace("\n", " "), file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("interrupted: nothing was written", file=sys.stderr)
-        return 130
     return 0
 
 
 if __name__ == "__main__":
+    end_with_one_line("nothing was written")
     sys.exit(main())

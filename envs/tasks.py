@@ -16,6 +16,7 @@ from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
+from roboarm_nmp.envs.utils.names import suggest
 
 SCENE_FILES = (".yaml", ".yml")
 
@@ -66,7 +67,7 @@ def get_task(task):
         return Task(load_scene(task), f"the scene in {task}")
     if Path(task).suffix or Path(task).name != str(task):
         raise ValueError(f"scene files are .yaml or .yml (docs/customise/scene.md), got {task}")
-    raise ValueError(f"unknown task {task!r}: one of {', '.join(TASKS)}, or a scene file (.yaml)")
+    raise ValueError(f"unknown task {task!r}: {suggest(task, TASKS)} (or a scene file, .yaml)")
 
 
 def split_robot(task):

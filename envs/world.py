@@ -11,10 +11,10 @@ import subprocess
 import sys
 
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.scenes.primitives import FRICTION, Box, Cylinder, Scene, floor_box
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 # A configuration is "held" if the controller keeps the arm there without contact for this many
 # environment steps, and the arm drifts no further than this (normalised).
@@ -56,6 +56,15 @@ def why_no_window():
     except subprocess.TimeoutExpired:
         return f"DISPLAY is {display}, which does not answer"
     return None if answer.returncode == 0 else f"DISPLAY is {display}, which cannot be opened"
+
+
+def image_array(pixels, width, height):
+    """The colours that `getCameraImage` returns, as uint8 (height, width, 3).
+
+    A PyBullet built without NumPy returns a tuple of integers, which `bytes` converts six times as
+    fast as NumPy does.
+    """
+    return np.frombuffer(bytes(pixels), np.uint8).reshape(height, width, 4)[..., :3].copy()
 
 
 class World:

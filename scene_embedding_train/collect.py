@@ -16,16 +16,15 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import tyro
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers
+from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 
 @dataclass
@@ -44,8 +43,8 @@ class Args:
     """Scenes in each file."""
     seed: Seed = 0
     """Seed of scenes and configurations."""
-    workers: Workers = 2
-    """Number of processes. The files do not depend on it."""
+    workers: Workers = CORES
+    """Number of processes, by default that of the cores. The files do not depend on it."""
     output: Path = Path("observations")
     """Folder to write to."""
     ray_address: str | None = None
@@ -107,7 +106,7 @@ def collect(args, progress=True):
         made_by,
         open_shard,
         counted="configuration",
-        unit="scenes",
+        unit="scene",
         progress=progress,
     )
     return Observations(args.output)
@@ -116,8 +115,6 @@ def collect(args, progress=True):
 def main(args):
     try:
         made = collect(args)
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command continues from here")
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
@@ -125,5 +122,5 @@ def main(args):
 
 
 if __name__ == "__main__":
-    raise_on_sigterm()
-    main(tyro.cli(Args, prog="roboarm observations", description=__doc__))
+    end_with_one_line("the same command continues from here")
+    main(flags.parse(Args, others="sensor"))

@@ -12,7 +12,7 @@ however thin; the others are anywhere.
 Obstacles stand all around the robot, so each of eight sectors has an eighth of z_E. No weight
 depends on the direction, so scenes are rotated and mirrored at random. (Convolutions over a grid
 seen from above, and one layer to all of z_E, had twice the error after as many updates:
-docs/guide/perception.md.)
+docs/lab_notebook.md, "Encoders".)
 
 What is saved: `encoder.pt`, an exported network from the clouds to z_E, and `encoder.decoder.pt`,
 one from z_E and points to distances. To make an encoder of your own, copy this file and change the
@@ -349,7 +349,7 @@ if __name__ == "__main__":
             points, valid, obstacles = batch_of(data, validation[:1], device)
             field = functools.partial(model, points, valid)
             run.log_image("eval/slices", comparison(obstacles, field, REACH))
-            run.show(near=f"{result['error_near']:.4f}")
+            run.show(validation_error_near=f"{result['error_near']:.4f}")
             if run.is_best(-result["error_near"], result):
                 encoder = ExportedEncoder(model, tuple(names), args.num_points)
                 details = metadata | {"step": step} | result

@@ -284,7 +284,8 @@ if __name__ == "__main__":
                 points = batch_of(clouds, validation[:1], device)[0][0]
                 predicted = model.decoders[0](model.encoders[0](points[:, 1]), shown).argmax(2)
             run.log_image("eval/classification", comparison(shown[0], classes, predicted[0]))
-            run.show(iou=f"{result['iou_obstacle']:.3f}", absent=f"{result['absent']:.3f}")
+            iou, absent = f"{result['iou_obstacle']:.3f}", f"{result['absent']:.3f}"
+            run.show(validation_iou=iou, validation_absent=absent)
             error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
             if run.is_best(-error, result):
                 encoder = ExportedEncoder(model, tuple(clouds.sensors))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.observations import Observations
@@ -19,6 +18,7 @@ from roboarm_nmp.envs.perception.sensors import sensors_to_json
 from roboarm_nmp.envs.training.flags import PositiveInt, Share
 from roboarm_nmp.envs.training.runs import RunFlags
 from roboarm_nmp.envs.utils.files import new_contents
+from roboarm_nmp.envs.utils.progress import progress_bar
 
 
 @dataclass
@@ -111,7 +111,8 @@ def unpack(observations, name, arrays, shards):
             }
             spans = zip(observations.offsets, observations.offsets[1:], strict=False)
             total = len(observations.offsets) - 1
-            bar = tqdm(zip(spans, shards, strict=True), f"unpacking {name}", total, unit="shard")
+            spans = zip(spans, shards, strict=True)
+            bar = progress_bar(spans, f"unpacking {name}", total, unit="shard")
             for (begin, end), rows in bar:
                 for one, array in whole.items():
                     array[begin:end] = rows[one]

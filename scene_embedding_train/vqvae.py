@@ -275,7 +275,7 @@ if __name__ == "__main__":
             run.log({f"eval/{name}": value for name, value in result.items()})
             figure = comparison(model, batch_of(images, validation[:1], device))
             run.log_image("eval/reconstruction", figure)
-            run.show(error=f"{result['error_foreground']:.4f}")
+            run.show(validation_error=f"{result['error_foreground']:.4f}")
             if run.is_best(-result["error_foreground"], result):
                 encoder = ExportedEncoder(model, tuple(cameras), size)
                 details = metadata | {"step": step} | result

@@ -1,6 +1,8 @@
 import contextlib
+import importlib.util
 import random
 import signal
+import sys
 
 import meta_device
 import numpy as np
@@ -14,8 +16,21 @@ from roboarm_nmp.envs.training import protocol
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+class _SkipWithoutOmpl:
+    """Importing OMPL skips the test or module that does it, where OMPL has no packages."""
+
+    def find_spec(self, name, path=None, target=None):
+        if name == "ompl":
+            pytest.skip("OMPL has no packages for this Python", allow_module_level=True)
+
+
+if importlib.util.find_spec("ompl") is None:
+    sys.meta_path.append(_SkipWithoutOmpl())
+
+
 # Files that take a minute and more. They begin first, so that no process is left alone with one.
 LONG = (
+    "test_browser",
     *("test_trainers", "test_encoder_policies", "test_encoder_trainers", "test_devices"),
     *("test_td3_her_mp", "test_dagger", "test_bc", "test_collect", "test_own_algorithm"),
     *("test_evaluation", "test_paper_tables", "test_own_scene", "test_sac_her_mp", "test_learning"),

@@ -1,16 +1,23 @@
 """The command `roboarm`: its subcommands, their help, and its errors."""
 
+import argparse
+import os
+import re
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+import tyro
+from paths import ROOT
 
 from roboarm_nmp import __main__ as command
 
 NAMES = [*(name for name in command.COMMANDS if name != "train")]
 NAMES += [f"train {name}" for name in command.TRAINERS]
+WITHOUT_GROUPS = ("data", "policies")  # which have few flags
 
 
 def run(*arguments):
@@ -19,11 +26,35 @@ def run(*arguments):
     )
 
 
+@pytest.mark.parametrize("name", ["collect", "queries"])
+def test_planning_without_ompl_is_refused_in_one_line(name, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    monkeypatch.delitem(sys.modules, "roboarm_nmp.demo_generation.planning", raising=False)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    assert command.main([name, "--task", "wall"]) == 1
+    message = capsys.readouterr().err
+    assert f"roboarm {name} needs OMPL" in message and message.count("\n") == 1
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_every_subcommand_has_help(name):
+def test_every_subcommand_has_help_with_an_example_and_groups(name):
     done = run(*name.split(), "--help")
     assert done.returncode == 0, done.stderr
-    assert "usage:" in done.stdout and "--help" in done.stdout
+    assert f"usage: roboarm {name} [-h]" in done.stdout
+    examples = [line for line in done.stdout.splitlines() if "usage:" not in line]
+    assert any(f"roboarm {name} " in f"{line} " for line in examples)
+    if name not in WITHOUT_GROUPS:
+        groups = re.findall(r"[a-z-]+ options ─", done.stdout)
+        assert groups and len(set(groups)) == len(groups)
+        assert ("algorithm options ─" in groups) == name.startswith("train ")
+    if name.startswith("train "):
+        assert {"evaluation options ─", "run options ─"} <= {*groups}
+
+
+def test_help_of_a_script_has_the_scripts_name():
+    script = ROOT / "clean_rl_scripts" / "evaluate.py"
+    done = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True)
+    assert "usage: evaluate.py [-h]" in done.stdout, done.stderr
 
 
 def test_help_is_quick_and_lists_all_subcommands():
@@ -33,6 +64,55 @@ def test_help_is_quick_and_lists_all_subcommands():
     assert all(name in done.stdout for name in command.COMMANDS)
     trainers = run("train", "--help")
     assert all(name in trainers.stdout for name in command.TRAINERS)
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules")
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "term")]
+)
+@pytest.mark.parametrize("name", NAMES)
+def test_signal_ends_every_subcommand_with_one_line(name, number, code, word, monkeypatch, capsys):
+    def parse(*_, **__):  # the first thing that a script does
+        os.kill(os.getpid(), number)
+        time.sleep(60)
+
+    monkeypatch.setattr(tyro, "cli", parse)
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(KeyboardInterrupt) as interrupt:
+            command.main(name.split())
+        with pytest.raises(SystemExit) as end:
+            sys.excepthook(interrupt.type, interrupt.value, interrupt.tb)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert end.value.code == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(word) and "; " in line
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "line"),
+    [
+        (signal.SIGINT, 130, "interrupted; nothing was written; the same command starts again"),
+        (signal.SIGTERM, 143, "terminated; nothing was written; the same command starts again"),
+    ],
+)
+def test_signal_while_workers_start_ends_an_evaluation_with_one_line(number, code, line):
+    arguments = ["--policy", "random", "--task", "no_obstacles", "--workers", "2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "roboarm_nmp", "evaluate", *arguments],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    began = process.stderr.readline()
+    os.killpg(process.pid, number)  # from a terminal, to the workers too
+    _, error = process.communicate(timeout=100)
+    assert began.startswith("0%, 0/10000, ") and process.returncode == code
+    assert [one for one in error.splitlines() if not one.startswith("0%, ")] == [line]
 
 
 @pytest.mark.parametrize(

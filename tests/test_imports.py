@@ -19,6 +19,7 @@ LEVELS = [
     ("envs.datasets", "envs.policies"),
     ("envs.training",),
     ("envs.show",),
+    ("envs.viewer",),
     ("demo_generation",),
     ("clean_rl_scripts", "bc_script", "scene_embedding_train"),
 ]

@@ -1,14 +1,18 @@
-"""The package is found under its own name, whatever else has a name like its folders."""
+"""Installing: under any Python, and found under its own name beside folders of the same names."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import textwrap
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from paths import ROOT
 
+PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 OWN_FOLDERS = ("envs", "tests", "benchmarks", "demo_generation")
 USE = """
     import multiprocessing
@@ -50,6 +54,40 @@ def run(*command, cwd, **variables):
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def test_every_later_python_is_accepted():
+    """Without an upper bound: pip would refuse a Python that nobody has tried yet."""
+    project = (ROOT / "pyproject.toml").read_text()
+    accepted = SpecifierSet(re.search(r'^requires-python = "(.*)"', project, re.MULTILINE)[1])
+    assert all(version in accepted for version in (*PYTHONS, "3.15", "4.0"))
+    assert "3.9" not in accepted
+    assert set(re.findall(r"Python :: (3\.\d+)", project)) == set(PYTHONS)
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+def test_constraints_pin_each_package_once_within_the_declared_range(python):
+    def applies(requirement):
+        return not requirement.marker or requirement.marker.evaluate({"python_version": python})
+
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [Requirement(line) for line in lines if not line.startswith("#")]
+    pins = [pin for pin in pins if applies(pin)]
+    versions = {pin.name.lower(): re.fullmatch("==(.+)", str(pin.specifier))[1] for pin in pins}
+    assert len(versions) == len(pins)
+    project = (ROOT / "pyproject.toml").read_text()
+    needed = re.search(r"^dependencies = \[(.*?)^\]", project, re.MULTILINE | re.DOTALL)[1]
+    for requirement in map(Requirement, re.findall(r'^ +"(.+?)"', needed, re.MULTILINE)):
+        assert versions[requirement.name] in requirement.specifier, requirement
+
+
+def test_install_page_lists_every_extra():
+    project = (ROOT / "pyproject.toml").read_text()
+    extras = re.search(r"optional-dependencies\]\n(.*?)^\[", project, re.MULTILINE | re.DOTALL)[1]
+    page = (ROOT / "docs" / "install.md").read_text()
+    assert re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE) == re.findall(
+        r"^(\w+) = ", extras, re.MULTILINE
+    )
 
 
 def test_package_works_beside_folders_of_the_same_names(project):

@@ -9,7 +9,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs.collision.kernels import (
     BODY_COLUMNS,
@@ -23,6 +22,7 @@ from roboarm_nmp.envs.collision.kernels import (
 )
 from roboarm_nmp.envs.robots.robot import matrix, temporary_urdf
 from roboarm_nmp.envs.scenes.primitives import Cylinder, Sphere, to_array
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 MAX_MARGIN = 0.5
 """m. Margins and radii of points must be smaller."""

@@ -1,27 +1,52 @@
 """The decorator `compiled`: Numba's `njit` with a cache on disk that survives damaged files.
 
+The cache is in the user's cache folder (`envs.utils.files.cache_folder`), or in `NUMBA_CACHE_DIR`.
 Numba trusts its cache. A truncated file raises `EOFError` in every process from then on, and a
 file with a few wrong bytes can crash the process. Here each entry has a checksum. A damaged file is
 named on stderr, ignored, and replaced by a new compilation.
 """
 
 import contextlib
+import fcntl
+import functools
 import hashlib
 import pickle
 import sys
+from pathlib import Path
 
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.serialize import dumps
 
+from roboarm_nmp.envs.utils.files import cache_folder
+from roboarm_nmp.envs.utils.progress import write_line
+
 
 def compiled(function):
     """Numba's `njit`, cached on disk where a folder for that can be written to."""
     dispatcher = numba.njit(nogil=True, error_model="numpy")(function)
-    # (RuntimeError: neither the folder of the source nor the user's cache folder can be.)
-    with contextlib.suppress(RuntimeError):
-        dispatcher._cache = _CheckedCache(function)
+    given = numba.config.CACHE_DIR
+    # (RuntimeError: no folder can be written to. OSError: there is no home folder.)
+    with contextlib.suppress(RuntimeError, OSError):
+        try:  # Numba's own setting, for this function only
+            numba.config.CACHE_DIR = given or str(cache_folder() / "numba")
+            dispatcher._cache = _CheckedCache(function)
+        finally:
+            numba.config.CACHE_DIR = given
     return dispatcher
+
+
+@functools.cache
+def _announce_compilation(folder):
+    """Print a line when this process compiles first, unless another is compiling.
+
+    The lock on a file in the cache's folder is held to the end of this process.
+    """
+    global _lock
+    with contextlib.suppress(OSError):
+        _lock = open(Path(folder, "compiling"), "wb")  # noqa: SIM115
+        fcntl.flock(_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        write_line("compiling collision checks (once, about 30 s)")
 
 
 class _CheckedResult(CompileResultCacheImpl):
@@ -45,7 +70,10 @@ class _CheckedCache(FunctionCache):
 
     def load_overload(self, sig, target_context):
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
+            if found is None:
+                _announce_compilation(self.cache_path)
+            return found
         except Exception:  # unpickling wrong bytes raises exceptions of many types
             path = self._damaged_path(sig, target_context)
             print(f"{path}: damaged, the function is compiled again", file=sys.stderr)

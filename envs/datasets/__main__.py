@@ -10,13 +10,16 @@ import sys
 from roboarm_nmp.envs.datasets.demonstrations import describe, load_demos
 from roboarm_nmp.envs.datasets.format import locate
 from roboarm_nmp.envs.datasets.queries import query_path, validate
-from roboarm_nmp.envs.tasks import TASKS
+from roboarm_nmp.envs.tasks import get_task
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 
 def main(arguments=None):
     """Run the command. Returns the exit code: 0, or 1 if a file is bad."""
     parser = argparse.ArgumentParser(
-        prog="roboarm data", description="Files of the tasks: queries and demonstrations."
+        prog="roboarm data",
+        description="Files of the tasks: queries and demonstrations.",
+        epilog="examples: roboarm data validate wall --simulate; roboarm data describe wall boxes",
     )
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser(
@@ -27,7 +30,7 @@ def main(arguments=None):
         "roboarm verify.)",
     )
     command.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
-    command.add_argument("--task", choices=list(TASKS), help="the task the files must be for")
+    command.add_argument("--task", help="the task the files must be for")
     command.add_argument(
         "--simulate",
         action="store_true",
@@ -45,6 +48,12 @@ def main(arguments=None):
 
 
 def _validate(options):
+    if options.task is not None:
+        try:
+            get_task(options.task)
+        except ValueError as error:
+            print(f"error: --task: {error}", file=sys.stderr)
+            return 1
     bad = False
     for file in options.files:
         try:
@@ -74,4 +83,5 @@ def _describe(options):
 
 
 if __name__ == "__main__":
+    end_with_one_line("no file has changed")
     sys.exit(main())

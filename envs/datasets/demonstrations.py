@@ -1,14 +1,16 @@
 """Demonstrations: a task's files of them, read, written, described.
 
     demos = load_demos("wall")
-    demos[0].states, demos[0].actions
+    demos[0].configurations  # rad
+    demos[0].states, demos[0].actions  # normalised, as in observations and actions
+    demos[-1], demos[:10]  # as with queries
 
 The format of the files: `envs.datasets.format`.
 """
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +44,9 @@ QUANTUM, QUANTUM_IN_SCENES = 2e-4, 4e-4
 class Demo:
     """One demonstration.
 
+    `start`, `goal`, `plan` and `configurations` are joint angles in rad, as in queries; `states`
+    and `actions` are normalised, as the environment observes and receives them.
+
     Attributes:
         start, goal: float32 (7,), rad.
         scene: the `Scene`.
@@ -60,10 +65,18 @@ class Demo:
     actions: np.ndarray
     digest: int
 
+    @property
+    def configurations(self):
+        """The executed configurations: float64 (m, 7), rad."""
+        return panda.denormalise(self.states)
+
 
 @dataclass(frozen=True, eq=False)
 class Demos:
-    """The demonstrations of a file, flat. `demos[i]` is a `Demo`.
+    """Demonstrations, flat. `demos[i]` is a `Demo`; a slice or index array, fewer demonstrations.
+
+    An index beyond the last one raises IndexError; -1 is the last one. In `made_by`, `parameters`
+    and `seed`, fewer demonstrations are those of the whole file.
 
     Attributes:
         task: name of the task they are for.
@@ -107,9 +120,13 @@ class Demos:
     def __len__(self):
         return len(self.start)
 
-    def __getitem__(self, i):
-        if not 0 <= i < len(self):
-            raise IndexError(f"demonstration {i} of {len(self)}")
+    def __getitem__(self, index):
+        try:
+            i = np.arange(len(self))[index]
+        except IndexError as error:
+            raise IndexError(f"demonstration {index} of {len(self)}") from error
+        if i.ndim:
+            return self._take(i)
         rows = slice(self.offsets[i], self.offsets[i + 1])
         return Demo(
             self.start[i],
@@ -120,6 +137,29 @@ class Demos:
             self.actions[rows][:-1],
             int(self.digest[i]),
         )
+
+    def _take(self, chosen):
+        """The demonstrations with these numbers, int64 (k,)."""
+        rows, offsets = _rows(self.offsets, chosen)
+        plan_rows, plan_offsets = _rows(self.plan_offsets, chosen)
+        columns = ("start", "goal", "plan_seed", "digest", "collided")
+        return replace(
+            self,
+            **{name: getattr(self, name)[chosen] for name in columns},
+            scenes=self.scenes.take(chosen),
+            states=self.states[rows],
+            actions=self.actions[rows],
+            offsets=offsets,
+            plan=self.plan[plan_rows],
+            plan_offsets=plan_offsets,
+        )
+
+
+def _rows(offsets, chosen):
+    """The rows of the chosen demonstrations in a flat array, and their offsets among these."""
+    lengths = np.diff(offsets)[chosen]
+    new = np.concatenate([[0], np.cumsum(lengths)])
+    return np.arange(new[-1]) + np.repeat(offsets[chosen] - new[:-1], lengths), new
 
 
 def demo_path(task):

@@ -110,6 +110,10 @@ class DatasetError(ValueError):
     """A file that cannot be used. The message names the file and the error."""
 
 
+class OutOfDateError(DatasetError):
+    """A file that was made for another version of its task's scene."""
+
+
 class QueryScenes:
     """The scenes of n queries: `scenes[i]` is the `Scene` of query i, made on access.
 
@@ -363,7 +367,7 @@ def _read_open(path, file, schema, task):
     wanted = scene_to_json(get_task(task).base_scene) if task else attributes["scene"]
     if not _same_scene(attributes["scene"], wanted):
         replacing = " --overwrite" * (schema == DEMO_SCHEMA)
-        raise DatasetError(
+        raise OutOfDateError(
             f"{path}: out of date: made for another version of the scene of {made_for!r}; "
             f"make it again with: {attributes['made_by']}{replacing}"
         )

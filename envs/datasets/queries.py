@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.format import (
@@ -33,6 +32,8 @@ from roboarm_nmp.envs.datasets.format import (
 )
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task
+from roboarm_nmp.envs.utils.names import suggest
+from roboarm_nmp.envs.utils.progress import progress_bar
 from roboarm_nmp.envs.world import HOLD_STEPS, World
 
 # Positions may differ by a rounding error between machines.
@@ -104,8 +105,7 @@ def load_queries(task_or_path, split="test"):
         ValueError: unknown split; a malformed scene file.
     """
     if split not in (*SPLITS, ORIGINAL):
-        known = ", ".join((*SPLITS, ORIGINAL))
-        raise ValueError(f"split must be one of {known}, got {split!r}")
+        raise ValueError(f"unknown split {split!r}: {suggest(split, (*SPLITS, ORIGINAL))}")
     path, task = locate(task_or_path, query_path)
     queries = _read_queries(path, task)[0]
     if split not in queries:
@@ -217,7 +217,7 @@ def _simulate(path, queries, hold_steps, progress):
     total = sum(len(queries[split]) for split in queries)
     with (
         contextlib.closing(world),
-        tqdm(total=total, unit=" queries", desc=Path(path).name, disable=not progress) as bar,
+        progress_bar(None, Path(path).name, total, "query", disable=not progress) as bar,
     ):
         for split in queries:
             for row, (start, goal, scene) in enumerate(queries[split]):

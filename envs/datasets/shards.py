@@ -6,17 +6,16 @@ shards of a folder, whatever their contents.
 
 import contextlib
 import re
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
-from tqdm import tqdm
 
 from roboarm_nmp.envs.datasets.format import DatasetError, attribute, check_plain
 from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
+from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 
 _SHARD = re.compile(r"shard_(\d{5})\.h5")
 
@@ -132,16 +131,15 @@ def collect(
 
     missing = [job for job in jobs if not exists(job)]
     done = num_scenes - sum(end - first for _, first, end in missing)
-    bar = tqdm(
-        desc=str(args.task),
+    bar = progress_bar(
+        description=str(args.task),
         total=num_scenes * per_scene,
         initial=done * per_scene,
-        unit=f" {unit}",
-        mininterval=0.2 if sys.stderr.isatty() else 30,  # seconds
+        unit=unit,
         disable=not progress,
     )
     if args.ray_address is None:
-        results = workers.run(collector, arguments, missing, args.workers, warn=bar.write)
+        results = workers.run(collector, arguments, missing, args.workers, warn=write_line)
     else:
         results = workers.run_on_ray(args.ray_address, collector, arguments, missing)
     with bar, contextlib.closing(results):

@@ -40,8 +40,10 @@ import contextlib
 import copy
 import io
 import json
+import logging
 import operator
 import pickle
+import re
 import warnings
 import zipfile
 from pathlib import Path
@@ -71,6 +73,7 @@ _EXTRA = (
 _BATCH_SIZES = (1, 2, 32)
 # So many shapes of inputs are remembered as checked.
 _MAX_CHECKED = 1_000
+MAX_REASON = 300  # characters of PyTorch's reason in an error
 
 
 def save_network(path, module, example_inputs, metadata):
@@ -102,10 +105,12 @@ def save_network(path, module, example_inputs, metadata):
         content = {"format": FORMAT, "version": VERSION, "metadata": metadata}
         with torch.no_grad(), _float32_by_default(), torch.device("cpu"), warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # torch's, about itself
-            content |= _export(module, inputs)
+            with _without_graph():
+                content |= _export(module, inputs)
             _compare(ExportedNetwork(content), module, inputs)
     except Exception as error:  # torch.export raises many kinds
-        raise NetworkError(f"{path}: this network cannot be saved: {error}") from error
+        reason = _reason(error)
+        raise NetworkError(f"{path}: this network cannot be saved: {reason}") from error
     buffer = io.BytesIO()
     torch.save(content, buffer)
     write_atomically(path, buffer.getbuffer())
@@ -310,6 +315,30 @@ def _float32_by_default():
 
 
 # --- Graph -> data
+
+
+@contextlib.contextmanager
+def _without_graph():
+    """PyTorch prints the graph of a module that it cannot export: pages, without a reason."""
+    logger = logging.getLogger("torch.fx.experimental.symbolic_shapes")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _reason(error):
+    """Why a network cannot be saved, in one line. PyTorch's messages have many, and graphs."""
+    text = str(error).strip() or type(error).__name__
+    place = re.search(r'File "[^"]*?([^"/]+)", line (\d+), in (\w+)', text)
+    where = f" ({place[1]}, line {place[2]}, in {place[3]})" if place else ""
+    if type(error).__name__ == "GuardOnDataDependentSymNode":  # to import it takes a second
+        return f"its forward branches on a value{where}, which a list of operations cannot do"
+    line = text.splitlines()[0]
+    return (line if len(line) <= MAX_REASON else f"{line[:MAX_REASON]} ...") + where
 
 
 class _ByName(torch.nn.Module):

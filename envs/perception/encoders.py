@@ -10,18 +10,15 @@
 Paper: sections 5.1 and 5.3. `envs.wrappers.SceneEncodingWrapper` appends z_E to observations.
 """
 
-import contextlib
 import functools
 import hashlib
 import io
 import os
-import sys
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from roboarm_nmp.envs.networks.exported_networks import NetworkError, load_network
 from roboarm_nmp.envs.perception.point_clouds import (
@@ -33,7 +30,9 @@ from roboarm_nmp.envs.perception.point_clouds import (
 )
 from roboarm_nmp.envs.perception.sensors import PointCloud, observe_scene, sensors_from_json
 from roboarm_nmp.envs.scenes.primitives import ROW, Scene, padded_rows
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.envs.utils.files import cache_folder, write_atomically
+from roboarm_nmp.envs.utils.names import suggest
+from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 
 ORACLE = "oracle"
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -78,9 +77,10 @@ def make_encoder(name, num_points=NUM_POINTS, geometry_source=None):
         return _shared(NetworkEncoder, PRETRAINED / f"{name}.pt", name)
     path = Path(name).absolute()  # a relative path is another file in another folder
     if not os.path.exists(path):
+        known = [ORACLE, POINT_CLOUD, *pretrained_encoders()]
         raise NetworkError(
-            f"no such encoder: {name} (expected {ORACLE}, {POINT_CLOUD}, the path of an encoder's "
-            f"network file, or a pretrained encoder: {', '.join(pretrained_encoders())})"
+            f"no such encoder: {name}: {suggest(name, known)} (or the path of an encoder's network "
+            f"file)"
         )
     return _shared(NetworkEncoder, path, name)
 
@@ -260,19 +260,27 @@ class NetworkEncoder(SceneEncoder):
         return self.encode(self.observe(scene))
 
     def _encode_all(self, scenes, task):
-        """Latents are stored beside the network, in `<encoder>.<task>.npz`, where that is possible.
+        """Latents are kept in the user's cache folder, where that is possible.
 
-        The file counts only for the same network and the same scenes.
+        A file there counts only for the same network and the same scenes.
         """
-        path = self.path.with_suffix(f".{task}.npz")
         key = hashlib.sha256(self.path.read_bytes() + repr(scenes).encode()).hexdigest()
+        try:
+            path = cache_folder() / "encodings" / f"{self.path.stem}.{key[:16]}.npz"
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            write_line(f"encoding {task} with {self.name}, not kept: {error}")
+            return super()._encode_all(scenes, task)
         latents = _read_latents(path, key)
         if latents is None:
+            write_line(f"encoding {task} with {self.name}, once; kept in {path}")
             latents = super()._encode_all(scenes, task)
             file = io.BytesIO()
             np.savez(file, key=key, latents=latents)
-            with contextlib.suppress(OSError):
+            try:
                 write_atomically(path, file.getvalue())
+            except OSError as error:
+                write_line(f"not kept: {error}")
         return latents
 
     # --- The decoder: from z_E back to geometry
@@ -308,8 +316,7 @@ class NetworkEncoder(SceneEncoder):
 
 def _progress(scenes, description):
     """The different ones of some scenes, with a progress bar."""
-    quiet = 0.2 if sys.stderr.isatty() else 30  # seconds
-    return tqdm(dict.fromkeys(scenes), description, unit="scene", mininterval=quiet)
+    return progress_bar(dict.fromkeys(scenes), description, unit="scene")
 
 
 def _read_latents(path, key):

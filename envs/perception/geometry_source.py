@@ -15,6 +15,7 @@ from dataclasses import replace
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, POINT_RADIUS, observed_points
+from roboarm_nmp.envs.utils.names import suggest
 
 GROUND_TRUTH = "ground_truth"
 CACHED_CHECKERS = 64  # about 60 kB each
@@ -42,7 +43,7 @@ def find_geometry_source(name):
     except ValueError as error:
         raise ValueError(
             f"a geometry source is {GROUND_TRUTH}, {POINT_CLOUD} or an encoder with a decoder: "
-            f"{error}"
+            f"{suggest(name, [GROUND_TRUTH, POINT_CLOUD], str(error))}"
         ) from error
     return functools.partial(decoded_checker, encoder=encoder)
 

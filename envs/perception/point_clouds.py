@@ -43,6 +43,14 @@ def remember_points(scene):
 def _observe(scene):
     clouds = observe_scene(scene, cardinal(PointCloud)).values()
     points = np.concatenate([one["points"][one["labels"] == OBSTACLE] for one in clouds])
+    return one_per_cell(points)
+
+
+def one_per_cell(points):
+    """The first of the points (n, 3), m, in each cube with edges of `CELL`, in their order.
+
+    Use it with points of your own: the pretrained policies were trained with such clouds.
+    """
     _, first = np.unique(np.floor(points / CELL).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(first)]
 

@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 
 import gymnasium as gym
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
-from roboarm_nmp.envs.world import MAX_EDGE, World
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
 
 # Classes (paper, appendix "Training and verifying the encoders").
 ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
@@ -252,7 +252,7 @@ class SensorWorld(World):
             renderer=p.ER_TINY_RENDERER,
             physicsClientId=self.client,
         )
-        rgb = np.reshape(rgb, (height, width, 4))[..., :3].astype(np.uint8)
+        rgb = image_array(rgb, width, height)
         # From OpenGL's depth in [0, 1] to m.
         depth = np.reshape(depth, (height, width)).astype(np.float64)
         depth = sensor.far * sensor.near / (sensor.far - (sensor.far - sensor.near) * depth)

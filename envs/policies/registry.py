@@ -23,6 +23,7 @@ from roboarm_nmp.envs.policies.baselines import (
     import_planning,
     make_baseline,
 )
+from roboarm_nmp.envs.utils.names import suggest
 
 # The arguments of an environment that a policy's metadata may contain. Tolerances and horizon are
 # not among them: they define what a success is.
@@ -55,10 +56,10 @@ def policy_file(name):
         return path
     pretrained = pretrained_policies()
     if str(name) not in pretrained:
-        raise PolicyError(
-            f"no such policy: {path} (expected {', '.join(BASELINES)}, a policy network, a folder "
-            f"with a policy.pt in it, or a name: {', '.join(pretrained) or 'there are none'})"
-        )
+        otherwise = f"expected {', '.join(BASELINES)}, a policy network, a folder with a policy.pt "
+        otherwise += "in it, or a name that `roboarm policies` lists"
+        hint = suggest(name, [*BASELINES, *pretrained], otherwise)
+        raise PolicyError(f"no such policy: {path}: {hint}")
     return pretrained[str(name)]
 
 
@@ -88,6 +89,17 @@ def own_safety_filter(policy):
     `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
     """
     return None if callable(policy) or policy in BASELINES else _load(policy)[2]
+
+
+def own_task(policy):
+    """The task that a trained policy was trained on, a name or path; None for other policies.
+
+    `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
+    """
+    if callable(policy) or policy in BASELINES:
+        return None
+    task = _load(policy)[0].metadata.get("task")
+    return task if isinstance(task, str) else None
 
 
 def recurrent_size(policy):

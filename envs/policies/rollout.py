@@ -57,7 +57,7 @@ class Episode:
         query: an `envs.datasets.queries.Query`.
 
     Attributes:
-        observation: the last one.
+        observation, info: the last ones.
         ended: whether the episode is over, possibly at its start.
 
     Raises:
@@ -66,8 +66,8 @@ class Episode:
 
     def __init__(self, env, query):
         self.env = env
-        self.observation, info = env.reset_specific(*query)
-        self.ended = self._success = info["is_success"]
+        self.observation, self.info = env.reset_specific(*query)
+        self.ended = self._success = self.info["is_success"]
         self._states, self._actions = [self.observation["observation"][:7]], []
         self._contacts, self._times = [], []
         self._observed = time.perf_counter()
@@ -75,11 +75,11 @@ class Episode:
     def step(self, action):
         """One step of the environment. Raises ValueError: it refuses the action."""
         seconds = time.perf_counter() - self._observed
-        self.observation, _, terminated, truncated, info = self.env.step(action)
-        self.ended, self._success = terminated or truncated, info["is_success"]
+        self.observation, _, terminated, truncated, self.info = self.env.step(action)
+        self.ended, self._success = terminated or truncated, self.info["is_success"]
         self._states.append(self.observation["observation"][:7])
         self._actions.append(np.array(action, dtype=np.float64))
-        self._contacts.append(info["collision"])
+        self._contacts.append(self.info["collision"])
         self._times.append(seconds)
         self._observed = time.perf_counter()
 

@@ -8,6 +8,7 @@ horizon and longest step of `RoboArmEnv`'s defaults, contacts allowed. The same 
 same numbers, times excepted, whatever the number of workers.
 """
 
+import contextlib
 import math
 import platform
 import time
@@ -19,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.arm_env import deviations
@@ -29,12 +29,18 @@ from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
 from roboarm_nmp.envs.policies.baselines import PLANNERS, TIME_LIMIT, TRIES
-from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
+from roboarm_nmp.envs.policies.registry import (
+    find_policy,
+    make_policy,
+    own_safety_filter,
+    own_task,
+)
 from roboarm_nmp.envs.policies.rollout import render_strip, rollout
 from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.envs.utils import workers
+from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 
 CHUNK = 10  # queries a worker takes at a time
 
@@ -96,7 +102,7 @@ class EvaluationOptions:
             )
 
 
-def evaluate(policy, task, *, progress=False, **options):
+def evaluate(policy, task=None, *, progress=False, **options):
     """Run a policy on a task's queries.
 
     Args:
@@ -104,7 +110,8 @@ def evaluate(policy, task, *, progress=False, **options):
             a folder with a `policy.pt`, the name of a pretrained policy, or a function from an
             observation (dict of `RoboArmEnv`) to an action (7,); with several workers, one that can
             be pickled.
-        task: name of the task, or path of a scene file.
+        task: name of the task, or path of a scene file; None for the task that the policy was
+            trained on.
         progress: show a progress bar, with the success rate so far.
         options: the fields of `EvaluationOptions`.
 
@@ -118,8 +125,9 @@ def evaluate(policy, task, *, progress=False, **options):
         - `ms_per_action`: of the policy alone, without the simulator and without planning;
         - `planning_seconds`, `planning_seconds_solved`: means over all queries, and over those with
           a motion found; `free_motion_rate`, only of `via-points`;
-        - `policy`, `task`, `goal_type`, `split`, `num_queries`, `env`, `deviations` (from the
-          standard rules), `safety_filter`, `seed`, `tries`, `time_limit`, `versions`;
+        - `policy`, `task`, `goal_type`, `split`, `queries` (the file, if it is not the task's own),
+          `num_queries`, `env`, `deviations` (from the standard rules), `safety_filter`, `seed`,
+          `tries`, `time_limit`, `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles.
 
@@ -130,7 +138,7 @@ def evaluate(policy, task, *, progress=False, **options):
     return _summary(job, _run(job, progress))
 
 
-def first_episode_image(policy, task, frames=8, **options):
+def first_episode_image(policy, task=None, frames=8, **options):
     """The first query's episode as an image strip, uint8 (height, frames * width, 3).
 
     Arguments and errors as for `evaluate`. Short episodes have fewer frames.
@@ -191,7 +199,8 @@ class _Job:
     """An evaluation whose arguments were checked, for the workers.
 
     `options` are those in use: `env` has all arguments of `envs.make`, `geometry_source` is None
-    where nothing takes obstacles from one. `start`, `goal` and `scenes` stand for its `queries`.
+    where nothing takes obstacles from one, `queries` is the name of a file or None. Instead of it
+    there are `start`, `goal` and `scenes`.
     """
 
     policy: str | Path | Callable
@@ -215,18 +224,24 @@ class _Job:
 def _prepare(policy, task, options):
     """The `_Job` of an evaluation, once all of its arguments have been checked."""
     try:
-        get_task(task)  # or it raises
+        if task is not None:
+            get_task(task)  # or it raises
         if not callable(policy):
             policy, trained = find_policy(policy)
+            task = own_task(policy) if task is None else task
             if trained and options.goal_type not in (None, trained["goal_type"]):
                 raise EvaluationError(
                     f"{policy} was trained with the goal type {trained['goal_type']!r}, it cannot "
                     f"be evaluated with {options.goal_type!r}"
                 )
             options = replace(options, env=trained or options.env)
+        if task is None:
+            name = getattr(policy, "__name__", policy)
+            raise EvaluationError(f"{name} has no task of its own: choose one (--task)")
         queries, scenes = _queries(task, options)
+        file = str(options.queries) if isinstance(options.queries, (str, Path)) else None
         options = replace(
-            _in_use(policy, options), queries=None, split=getattr(queries, "split", None)
+            _in_use(policy, options), queries=file, split=getattr(queries, "split", None)
         )
         start, goal = queries.start[: options.num_queries], queries.goal[: options.num_queries]
         job = _Job(policy, str(task), options, start, goal, scenes)
@@ -345,27 +360,28 @@ def _run(job, progress):
     count = len(job.start)
     chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
     outcomes, successes = [None] * count, 0
-    bar = tqdm(total=count, unit="query", disable=None if progress else True)
+    bar = progress_bar(total=count, unit="query", disable=not progress)
     threads = torch.get_num_threads()
     try:
-        with bar:
-            for indices, chunk in _results(job, chunks, bar.write):
+        with bar, contextlib.closing(_results(job, chunks)) as results:
+            for indices, chunk in results:
                 outcomes[indices.start : indices.stop] = chunk
                 successes += sum(outcome.success for outcome in chunk)
                 bar.update(len(chunk))
-                if bar.n:  # 0 as long as no bar is shown
+                if bar.n:  # 0 if no bar is shown
                     bar.set_postfix(success=f"{successes / bar.n:.3f}")
     finally:
         torch.set_num_threads(threads)
     return outcomes
 
 
-def _results(job, chunks, warn):
-    """The chunks and their outcomes, in any order."""
-    count = job.options.workers
+def _results(job, chunks):
+    """Yield the chunks and their outcomes, in any order."""
+    count = min(job.options.workers, len(chunks))
     if count == 1:
-        return map(_Worker(job), chunks)
-    return workers.run(_Worker, (job,), chunks, min(count, len(chunks)), warn)
+        yield from map(_Worker(job), chunks)
+    else:
+        yield from workers.run(_Worker, (job,), chunks, count, write_line)
 
 
 # --- The result
@@ -399,6 +415,7 @@ def _summary(job, outcomes):
         "task": job.task,
         "goal_type": options.env["goal_type"],
         "split": options.split,
+        "queries": options.queries,
         "num_queries": count,
         **share("success_rate", reached),
         **share("collision_free_success_rate", reached & ~columns.collision),

@@ -1,22 +1,56 @@
-"""Ranges of a script's flags, as part of their types, and the check of all of them at once.
+"""The flags of a script: parsing, a grouped `--help`, ranges as part of their types.
 
     @dataclass
     class Args:
         num_envs: PositiveInt = 4
         gamma: Share = 0.95
 
+    args = parse(Args)
     check(args)   # or ValueError: "--gamma must be in [0, 1], got 2.0"
 
 `--help` shows the ranges, too.
 """
 
+import ast
 import dataclasses
+import inspect
+import itertools
 import math
+import os
+import re
+import shutil
 import sys
+import textwrap
 import typing
+from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+# The groups of `--help`, in its order, and the flags in each. Flags of other names are in OTHERS.
+OTHERS = "algorithm"
+GROUPS = {
+    "policy": ("policy", "tries", "time_limit"),
+    "task": (
+        *("task", "goal_type", "split", "queries", "num_queries", "query", "num"),
+        *("action_mode", "max_step", "horizon", "stop_on_collision"),
+    ),
+    "observation": (*("encoder", "num_points", "velocities", "geometry_source", "link_distances"),),
+    "safety_filter": ("safety_margin", "escape"),
+    "data": ("demo_prob", "demos", "num_demos", "paths", "observations", "validation_share"),
+    OTHERS: (),
+    "evaluation": (
+        *("eval_every", "eval_queries", "test_queries", "stop_at_success", "eval_scenes"),
+    ),
+    "run": (
+        *("exp_name", "seed", "runs_dir", "resume", "device", "bf16", "track", "workers"),
+        *("ray_address",),
+    ),
+    "output": ("output", "overwrite", "repair", "shard_size", "json", "image"),
+}
+
+# The cores that this process may use: the default of --workers.
+CORES = min(len(os.sched_getaffinity(0)), 256)
 
 
 class Range(typing.NamedTuple):
@@ -46,6 +80,90 @@ PositiveShare = _number(float, sys.float_info.min, 1.0, "above 0, and at most 1"
 PositiveFloat = _number(float, sys.float_info.min, LARGEST, "above 0, and finite", "> 0")
 NonNegativeFloat = _number(float, 0.0, LARGEST, "at least 0, and finite", ">= 0")
 FiniteFloat = _number(float, -LARGEST, LARGEST, "finite", "")
+
+
+def program():
+    """The name of the running program, for messages: `roboarm evaluate`, or a script's name."""
+    main = sys.modules["__main__"]
+    return getattr(main, "PROGRAM", Path(sys.argv[0]).name)  # `roboarm` sets it
+
+
+def parse(Args, arguments=None, default=None, others=OTHERS):
+    """The flags of the command line as an instance of a dataclass.
+
+    `--help` shows the docstring of the dataclass's module, and the flags in their `GROUPS`, each
+    with the docstring under it.
+
+    Args:
+        Args: the dataclass, all fields with types that tyro parses.
+        arguments: list of strings; None for those of the process.
+        default: an instance with other defaults.
+        others: the group of the flags that are not in `GROUPS`.
+
+    Raises:
+        SystemExit: after `--help`, or for flags that cannot be parsed.
+    """
+    kinds, docs = typing.get_type_hints(Args, include_extras=True), _docs(Args)
+    group_of = {name: group for group, names in GROUPS.items() for name in names}
+    groups = {others if group == OTHERS else group: [] for group in GROUPS}
+    for field in dataclasses.fields(Args):
+        kind = Annotated[kinds[field.name], tyro.conf.arg(help=docs.get(field.name))]
+        one = dataclasses.field(default=field.default, default_factory=field.default_factory)
+        if default is not None:
+            one = dataclasses.field(default=getattr(default, field.name))
+        groups[group_of.get(field.name, others)].append((field.name, kind, one))
+    made = [
+        (group, tyro.conf.OmitArgPrefixes[_dataclass(group, fields)])
+        for group, fields in groups.items()
+        if fields
+    ]
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & set(arguments):  # tyro would not wrap its lines
+        description = getattr(sys.modules.get(Args.__module__), "__doc__", None) or ""
+        print(_wrapped(description, min(100, shutil.get_terminal_size().columns)), end="\n\n")
+    parsed = tyro.cli(_dataclass("Flags", made), prog=program(), args=arguments, description="")
+    values = (vars(getattr(parsed, group)) for group, _ in made)
+    return Args(**{name: value for group in values for name, value in group.items()})
+
+
+def _dataclass(name, fields):
+    made = dataclasses.make_dataclass(name, fields, kw_only=True)
+    made.__doc__ = None  # otherwise its signature, which `--help` would show
+    return made
+
+
+def _wrapped(text, width):
+    """A docstring with its paragraphs and list items wrapped. Indented lines stay as they are."""
+    blocks = []
+    for block in text.strip().split("\n\n"):
+        if not block.startswith(" "):
+            items = [" ".join(item.split()) for item in re.split(r"\n(?=- )", block)]
+            block = "\n".join(
+                textwrap.fill(
+                    item,
+                    width,
+                    subsequent_indent="  " * item.startswith("- "),
+                    break_long_words=False,
+                    break_on_hyphens=False,
+                )
+                for item in items
+            )
+        blocks.append(block)
+    return "\n\n".join(blocks)
+
+
+def _docs(Args):
+    """The docstrings under a dataclass's fields, and under those of its base classes, by name."""
+    docs = {}
+    for one in reversed(Args.__mro__[:-1]):
+        try:
+            source = inspect.getsource(one)
+        except (OSError, TypeError):  # a class of an interactive session has none
+            continue
+        for field, text in itertools.pairwise(ast.parse(textwrap.dedent(source)).body[0].body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                docs[field.target.id] = " ".join(ast.literal_eval(text.value).split())
+    return docs
 
 
 def check(args):

@@ -25,8 +25,9 @@ from roboarm_nmp.envs.policies.registry import recurrent_size
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
-from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt
+from roboarm_nmp.envs.training.flags import NonNegativeInt, PositiveFloat, PositiveInt
 from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite
+from roboarm_nmp.envs.utils.progress import progress_bar
 
 NUM_ENVS = 8  # at most, that an evaluation runs together; the first of them renders
 IMAGE_SIZE = (240, 180)
@@ -42,8 +43,8 @@ class PolicyFlags(RunFlags):
     """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
     eval_queries: PositiveInt = 200
     """validation queries per evaluation"""
-    test_queries: PositiveInt = 1_000
-    """test queries for the best policy at the end"""
+    test_queries: NonNegativeInt = 1_000
+    """test queries for the best policy at the end (0: no test)"""
 
 
 @dataclass
@@ -150,9 +151,16 @@ def make_training_envs(args, demo_prob=None, demos=None):
         demos = load_demos_for(made[0], demos or args.task, args.task)
     except ValueError as error:
         sys.exit(f"--demo-prob: {error}")
-    if args.encoder is not None:
-        made[0].encoder.encode_demos(demos)  # once, not in the loop
     return [DemoQueriesWrapper(env, demos) for env in made]
+
+
+def encode_demos(envs):
+    """Encode the scenes of training environments' demonstrations, if they have both.
+
+    It may take minutes, once; without it, scenes are encoded at their resets.
+    """
+    if isinstance(envs[0], DemoQueriesWrapper) and hasattr(envs[0].env, "encoder"):
+        envs[0].env.encoder.encode_demos(envs[0].demos)
 
 
 def begin_episodes(envs, seed, step):
@@ -173,7 +181,7 @@ def stack(observations, device):
     }
 
 
-def evaluate(policy, envs, queries, device, safety_filter=None, seed=0):
+def evaluate(policy, envs, queries, device, safety_filter=None, seed=0, description=None):
     """Run a deterministic policy on every query, each env one at a time; mean results.
 
     Args:
@@ -185,6 +193,7 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0):
         device: of the policy.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy, or None.
         seed: of the filter's escapes from local minima, >= 0.
+        description: of a progress bar that disappears at the end; None for no bar.
 
     Returns:
         A dict of floats: `success_rate`, `collision_free_success_rate`, `collision_rate`, and
@@ -193,9 +202,11 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0):
     Raises:
         FloatingPointError: the policy's actions or its recurrent state are not finite.
     """
+    rollouts = _rollouts(policy, envs, queries, device, safety_filter, seed)
+    bar = {"unit": "query", "transient": True, "disable": description is None}
     results = [
         (trajectory.success, trajectory.collides, len(trajectory))
-        for trajectory in _rollouts(policy, envs, queries, device, safety_filter, seed)
+        for trajectory in progress_bar(rollouts, description, len(queries), **bar)
     ]
     success, collides, steps = np.array(results, dtype=np.float64).T
     return {
@@ -329,21 +340,24 @@ class PolicyRun(Run):
             evaluation.
         """
         queries, envs, device = self.validation, self.eval_envs, self.device
+        bar = {"description": "validation"}
         if self.interrupted:
             return False
         try:
             with self.interruptible():
-                result = evaluate(policy, envs, queries, device, self.safety_filter)
+                result = evaluate(policy, envs, queries, device, self.safety_filter, **bar)
                 self.log({f"eval/{name}": value for name, value in result.items()})
                 if self.safety_filter is not None:
-                    bare = evaluate(policy, envs, queries, device)
+                    bar = {"description": "validation without filter"}
+                    bare = evaluate(policy, envs, queries, device, **bar)
                     self.log({f"eval/{name}_without_filter": v for name, v in bare.items()})
                 image = rollout_image(policy, envs[0], queries[0], device, self.safety_filter)
                 self.log_image("eval/rollout", image)
         except KeyboardInterrupt:
             return False
         is_best = self.is_best(result["success_rate"])
-        self.show(eval=result["success_rate"], best=self.best_score)
+        values = {"validation success": result["success_rate"], "best": self.best_score}
+        self.show(**{name: f"{value:.3f}" for name, value in values.items()})
         return is_best
 
     def save_policy(self, policy):
@@ -372,39 +386,49 @@ class PolicyRun(Run):
         Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed,
         for comparable results. File and line contain the rules of the training, if they are others,
         the step length, if it is not the standard one (`deviations`), and whether the policy
-        observes ground-truth obstacles (`privileged`).
+        observes ground-truth obstacles (`privileged`). Without queries there is no test, and file
+        and line have no results of one.
         """
+        self.close()
+        args = self.args
+        result, text = self._test(queries) if len(queries) else ({}, "no test, --test-queries 0")
+        result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
+        result |= {"policy": str(self.folder / "policy.pt"), "policy_step": self.best_step}
+        result |= {"validation_success_rate": self.best_score, "steps": self.step}
+        self.write_result(result | {"seconds": round(self.seconds)})
+        print(
+            f"{args.task}, goal {args.goal_type}, {text}; validation success {self.best_score:.3f} "
+            f"at {self.best_step}; {self.step} steps in {self.seconds:.0f} s. "
+            f"{self.folder / 'result.json'}"
+        )
+
+    def _test(self, queries):
+        """The results of a test as a dict, and the most important ones in words."""
         # Here, because Numba takes a while to import, which --help would wait for.
         from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
         from roboarm_nmp.envs.training.evaluation import is_privileged
 
-        self.close()
-        args = self.args
         policy = load_network(self.folder / "policy.pt").to(self.device)
         own = {name: value for name, value in self.env_arguments.items() if name not in RULES}
-        test_envs = make_eval_envs(args.task, len(queries), **own)
+        test_envs = make_eval_envs(self.args.task, len(queries), **own)
         safety_filter = SafetyFilter.from_metadata(policy.metadata)
-        result = evaluate(policy, test_envs, queries, self.device, safety_filter)
+        bar = {"description": "test"}
+        result = evaluate(policy, test_envs, queries, self.device, safety_filter, **bar)
+        success, collision_free = result["success_rate"], result["collision_free_success_rate"]
         rules = {name: getattr(test_envs[0], name) for name in RULES}
         trained = rules | {n: self.env_arguments[n] for n in RULES if n in self.env_arguments}
         result |= {"rules": rules, "rules_in_training": trained, "deviations": deviations(own)}
-        result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
-        result |= {"policy": str(self.folder / "policy.pt"), "policy_step": self.best_step}
-        result |= {"validation_success_rate": self.best_score, "steps": self.step}
         result |= {"privileged": is_privileged(own)}
-        self.write_result(result | {"seconds": round(self.seconds)})
         if rules != trained:
             print(
                 f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:"
             )
         for name, value in result["deviations"].items():
             print(f"not comparable: {name} is {value}, not {STANDARD_RULES[name]}")
-        success, collision_free = result["success_rate"], result["collision_free_success_rate"]
         privileged = ", privileged" if result["privileged"] else ""
-        print(
-            f"{args.task}, goal {args.goal_type}, {len(queries)} test queries{privileged}: success "
-            f"{success:.3f}, collision-free success {collision_free:.3f}; {self.step} steps in "
-            f"{self.seconds:.0f} s. {self.folder / 'result.json'}"
+        return result, (
+            f"{len(queries)} test queries{privileged}: success {success:.3f}, collision-free "
+            f"success {collision_free:.3f}"
         )
 
 

@@ -42,8 +42,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
-from tqdm import tqdm
 
 from roboarm_nmp.envs.tasks import SCENE_FILES
 from roboarm_nmp.envs.training import flags
@@ -55,7 +53,8 @@ from roboarm_nmp.envs.utils.files import (
     new_contents,
     write_atomically,
 )
-from roboarm_nmp.envs.utils.signals import Terminated, exit_interrupted, raise_on_sigterm
+from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.envs.utils.signals import Terminated, end_with_one_line, exit_interrupted
 
 
 @dataclass
@@ -91,8 +90,8 @@ def parse_args(Args, may_change=()):
     Raises:
         SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
     """
-    raise_on_sigterm()
-    args = tyro.cli(Args)
+    end_with_one_line("nothing was written")
+    args = flags.parse(Args)
     if args.resume is not None:
         args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
     try:
@@ -130,7 +129,7 @@ def _args_of_run(Args, run, may_change):
     begun_in = Path(saved.get("begun_in", "."))
     defaults = Args(**{name: _from_json(saved[name], kinds[name], begun_in) for name in known})
     defaults.resume = run
-    args = tyro.cli(Args, default=defaults)
+    args = flags.parse(Args, default=defaults)
     had, given = (json.loads(_to_json(asdict(one))) for one in (defaults, args))
     contradicted = [
         f"--{name.replace('_', '-')} is {given[name]!r} now, the run had {had[name]!r}"
@@ -195,7 +194,7 @@ def _say_plainly(run, kind, error, trace):
         checkpoint = f"--resume {run} continues from the last checkpoint"
     if isinstance(error, KeyboardInterrupt):
         print(file=sys.stderr)  # ends the line of a progress bar
-        exit_interrupted(error, checkpoint or f"{run} has no checkpoint yet")
+        exit_interrupted(error, checkpoint or f"no checkpoint yet; --resume {run} starts again")
     if isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
         text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()
     elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
@@ -344,7 +343,7 @@ class Run:
     """
 
     def __init__(self, args, name, state, device):
-        """Make the run's folder. With --resume, give `state` its contents in the checkpoint.
+        """Make and print the run's folder. With --resume, restore `state` from its checkpoint.
 
         Args:
             args: the flags.
@@ -354,6 +353,7 @@ class Run:
         """
         self.args, self.device = args, device
         self.folder = run_folder(args, name)
+        print(f"run folder: {self.folder}", flush=True)
         self._progress = {"step": 0, "seconds": 0.0}
         self._progress |= {"best_step": 0, "best_score": -math.inf, "best_result": {}}
         self._state = state | {"progress": self._progress}
@@ -368,12 +368,11 @@ class Run:
     interrupted = property(lambda self: self._interrupt is not None)
 
     def start(self, total, unit):
-        """Open TensorBoard's writer and a progress bar of `total` steps, called `unit`."""
+        """Open TensorBoard's writer and a progress bar of `total` steps; `unit` names one."""
         self.writer = summary_writer(self.folder, self.args, self.step)
         self._seconds_before = self.seconds
-        interval = 0.2 if sys.stderr.isatty() else 30  # s: a log file needs fewer lines
-        options = {"unit": unit, "smoothing": 0.05, "mininterval": interval}
-        self._bar = tqdm(total=total, initial=self.step, **options)
+        self._unit, options = unit, {"unit": unit, "smoothing": 0.05}
+        self._bar = progress_bar(None, "training", total, initial=self.step, **options)
         self._may_raise = False
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -423,7 +422,7 @@ class Run:
 
     def show(self, **values):
         """Show values at the end of the progress bar."""
-        self._bar.set_postfix(**values)
+        self._bar.set_postfix(values)  # in their order
 
     def reached(self, score):
         """Whether the best evaluation so far has this score; False for None."""
@@ -452,11 +451,9 @@ class Run:
         self._progress["seconds"] = self._seconds_before + self._bar.format_dict["elapsed"]
         save_checkpoint(self.folder, self._state, self.device)
         if self.interrupted:
-            unit = f"{self._bar.unit} {self.step:,}"
             self.close()
-            exit_interrupted(
-                self._interrupt, f"checkpoint at {unit}; --resume {self.folder} continues there"
-            )
+            where = f"checkpoint at {self._unit} {self.step:,}"
+            exit_interrupted(self._interrupt, f"{where}; --resume {self.folder} continues there")
 
     def write_result(self, result):
         """Write `result.json`: a dict, and the flags."""

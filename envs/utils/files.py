@@ -10,6 +10,23 @@ import zipfile
 from pathlib import Path
 
 
+def cache_folder():
+    """The folder for files that can be made again. It may not exist yet.
+
+    `$ROBOARM_NMP_CACHE`, by default `roboarm-nmp` in `$XDG_CACHE_HOME`, by default `~/.cache`.
+    Raises OSError: there is no home folder.
+    """
+    own, base = os.environ.get("ROBOARM_NMP_CACHE"), os.environ.get("XDG_CACHE_HOME", "")
+    if own:
+        return Path(own).absolute()
+    if os.path.isabs(base):  # a relative path counts as none (XDG Base Directory Specification)
+        return Path(base, "roboarm-nmp")
+    try:
+        return Path.home() / ".cache" / "roboarm-nmp"
+    except RuntimeError as error:
+        raise OSError(f"{error}; ROBOARM_NMP_CACHE may name a cache folder") from error
+
+
 def write_atomically(path, contents):
     """Write bytes: at every moment, whatever happens, `path` is the old file or the whole new one.
 

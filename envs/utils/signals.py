@@ -1,9 +1,8 @@
-"""SIGTERM (`kill`, `timeout`, cluster schedulers) ends a command like Ctrl-C.
+"""Ctrl-C and SIGTERM (`kill`, `timeout`, cluster schedulers) end a command with one line.
 
-A command calls `raise_on_sigterm` first. Where it handles Ctrl-C, it handles SIGTERM too:
+A command calls `end_with_one_line` first, and again as soon as another advice holds:
 
-    except KeyboardInterrupt as interrupt:
-        exit_interrupted(interrupt, "the same command continues")
+    end_with_one_line("the same command continues")
 """
 
 import signal
@@ -14,13 +13,25 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM arrived. Raised in the main thread, like the KeyboardInterrupt of Ctrl-C."""
 
 
-def raise_on_sigterm():
-    """From now on, SIGTERM raises `Terminated`. Call it in the main thread of a command."""
+def end_with_one_line(advice):
+    """From now on, Ctrl-C and SIGTERM unwind the program and end it as `exit_interrupted` does.
 
-    def handle(number, frame):
+    Call it in the main thread of a command, not in a library: it replaces `sys.excepthook`.
+
+    Args:
+        advice: how to continue, or what was kept.
+    """
+
+    def terminate(number, frame):
         raise Terminated
 
-    signal.signal(signal.SIGTERM, handle)
+    def hook(kind, error, trace):
+        if isinstance(error, KeyboardInterrupt):
+            exit_interrupted(error, advice)
+        sys.__excepthook__(kind, error, trace)
+
+    signal.signal(signal.SIGTERM, terminate)
+    sys.excepthook = hook
 
 
 def exit_interrupted(interrupt, advice):

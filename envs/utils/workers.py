@@ -6,6 +6,7 @@ returns the function that does jobs; it has an importable, top-level name.
 
 import collections
 import concurrent.futures
+import contextlib
 import importlib.util
 import multiprocessing
 import os
@@ -30,14 +31,16 @@ def run(make_worker, arguments, jobs, workers, warn=print):
     """
     waiting, deaths = collections.deque(jobs), 0
     while waiting:
-        executor = concurrent.futures.ProcessPoolExecutor(
-            workers, multiprocessing.get_context("spawn"), _start, (make_worker, arguments)
-        )
+        with _starting_processes():
+            executor = concurrent.futures.ProcessPoolExecutor(
+                workers, multiprocessing.get_context("spawn"), _start, (make_worker, arguments)
+            )
         running = {}
         try:
             while waiting or running:
                 while waiting and len(running) < 2 * workers:
-                    running[executor.submit(_work, waiting[0])] = waiting[0]
+                    with _starting_processes():  # at the first job
+                        running[executor.submit(_work, waiting[0])] = waiting[0]
                     waiting.popleft()
                 done, _ = concurrent.futures.wait(
                     running, return_when=concurrent.futures.FIRST_COMPLETED
@@ -62,9 +65,33 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             executor.shutdown(cancel_futures=True)
 
 
+@contextlib.contextmanager
+def _starting_processes():
+    """A context for starting processes: SIGINT and SIGTERM, also of a terminal, wait for its end.
+
+    Neither this process is interrupted between two of its steps, nor a new one killed while this
+    one writes to it, which would wait for ever. New processes begin with both signals blocked.
+    """
+    numbers, arrived, handlers = {signal.SIGINT, signal.SIGTERM}, [], {}
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:  # not only blocked: another thread may receive them
+            if callable(signal.getsignal(number)):
+                handlers[number] = signal.signal(number, lambda one, frame: arrived.append(one))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in arrived:
+            signal.raise_signal(number)
+
+
 def _start(make_worker, arguments):
     global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    # SIGINT stays blocked: a terminal sends Ctrl-C to this process, too, but the parent handles it.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     threading.Thread(target=_follow_parent, daemon=True).start()
     _worker = make_worker(*arguments)
 

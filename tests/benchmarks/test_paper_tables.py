@@ -1,15 +1,15 @@
 """The results page: from the paper's cells and a folder of results, and from a run."""
 
+import contextlib
 import functools
-import importlib.util
 import json
 import re
-import statistics
 import subprocess
 import sys
 import time
 from dataclasses import replace
 
+import paper_tables
 import psutil
 import pytest
 from paths import ROOT
@@ -17,12 +17,6 @@ from PIL import Image
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.networks.exported_networks import load_network
-
-spec = importlib.util.spec_from_file_location(
-    "paper_tables", ROOT / "benchmarks" / "paper_tables.py"
-)
-paper_tables = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(paper_tables)
 
 CELLS = {cell.name: cell for cell in paper_tables.read_cells()}
 
@@ -52,7 +46,15 @@ def args_of(name):
     return {f[2:].replace("-", "_"): v for f, v in zip(given[::2], given[1::2], strict=True)}
 
 
-BASELINES = {"wall": {"go-to-goal": {"success_rate": 0.7}, "RRT-Connect, 5 s": {"success_rate": 1}}}
+def baseline(success):
+    return {
+        "success_rate": success,
+        "collision_free_success_rate": success / 2,
+        "num_queries": 1000,
+    }
+
+
+BASELINES = {"wall": {"go-to-goal": baseline(0.7), "RRT-Connect, 5 s": baseline(1.0)}}
 
 
 @pytest.fixture
@@ -108,78 +110,69 @@ def test_runs_from_before_goal_minus_configuration_are_others():
         assert cell.is_recipe_of(args | {"relative_configuration": False}) is fits
 
 
-def test_the_page_shows_what_was_run_and_what_was_not(results):
-    page = paper_tables.page(list(CELLS.values()), results, BASELINES, {})
-    in_small = "<sub>300,000 steps, 1 seed</sub><br>0.971 ± 0.003"
-    assert f"**0.950 [0.946, 0.954]**<br>{in_small}" in page
-    deviation = statistics.stdev([0.981, 0.982, 0.983])  # the interval is that of 30,000 queries
-    in_small = "<sub>300,000 steps, 3 seeds, other flags</sub><br>0.986 ± 0.002"
-    assert f"**0.982 ± {deviation:.3f} [0.980, 0.983]**<br>{in_small}" in page
-    assert "not run<br>0.848 ± 0.027" in page
-    # The `combined` cells on `no_obstacles` with p stand in two tables.
-    assert page.count("<br>") - page.count("<sub>") == len(CELLS) + 4
-    assert page.count("not run<br>") == len(CELLS) + 4 - page.count("<sub>")
-    assert page.count("<sub>") == 4
-    assert page.count("| *no learning: go-to-goal* |  | 0.700 |") == 3
-    assert page.count("| *search, ground truth: RRT-Connect, 5 s* |  | 1.000 |") == 3
-    below = "`sac-ee-double_walls-p1` (0.830, paper 0.916) of these runs. What was found: "
-    assert f"Below the paper by more than 0.05: {below}" in page
-    assert (
-        "| `bc-combined-no_obstacles-s2`, not kept, other flags | 0.982 [0.979, 0.984] | 0.491 |"
-        in page
-    )
-    assert "300,000 (275,000) | 10,000 | 10 min | 2026-01-02, abc1234 |" in page
-    for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
-        assert len({line.count("|") for line in table.splitlines()}) == 1
+def test_tables_list_what_was_run_and_name_what_was_not(results):
+    tables = paper_tables.tables(list(CELLS.values()), results, BASELINES)
+    assert tables["paper-ee"].splitlines()[2:6] == [
+        "| `wall` | SAC-MP (p = 1) | none | no | 0.950 | [0.946,\u00a00.954] | 0.475 | 10,000 | 1 "
+        "| 300,000 | 0.971 |",
+        "| `wall` | *go-to-goal* | none | no | 0.700 | [0.671,\u00a00.728] | 0.350 | 1,000 | – | – "
+        "| 0.765 |",
+        "| `wall` | *RRT-Connect* | ground truth (privileged) | yes | 1.000 | [0.996,\u00a01.000] "
+        "| 0.500 | 1,000 | – | – | – |",
+        "| `double_walls` | SAC-MP (p = 1) | none | no | 0.830 | [0.823,\u00a00.837] | 0.415 "
+        "| 10,000 | 1 | 300,000 | 0.916 |",
+    ]
+    assert tables["paper-ee"].splitlines()[7].startswith("Not run: BC, SAC (p = 0), SAC-MP")
+    last = tables["paper-ee"].rpartition("; ")[2]
+    assert last == "SAC-MP (p = 1) on `no_obstacles`, `double_walls_wide_gap`, `boxes`."
+    # Three seeds: the interval is that of 30,000 queries.
+    three = "0.982 | [0.980,\u00a00.983] | 0.491 | 30,000 | 3 | 300,000 | 0.986 |"
+    assert f"| `no_obstacles` | BC | none | no | {three}" in tables["paper-combined"]
+    hindsight = tables["paper-hindsight"].splitlines()
+    assert hindsight[2].startswith("| SAC (p = 0) | no | 0.002 |") and len(hindsight) == 5
+    assert "SAC (p = 0) with hindsight" in hindsight[4]
+    assert tables["paper-below"].splitlines()[2:] == [
+        "| `sac-ee-double_walls-p1` | 0.830 | 0.916 |"
+    ]
+    runs = tables["paper-runs"].splitlines()[2:]
+    assert len(runs) == 6
+    assert runs[-2].startswith("| `bc-combined-no_obstacles-s3` | 0.983 |")
+    end = "300,000 | 275,000 | 10 | 2026-01-02 | abc1234 | no | earlier |"
+    assert runs[-2].endswith(end)
+    for text in tables.values():
+        rows = [line for line in text.splitlines() if line.startswith("|")]
+        assert len({line.count("|") for line in rows}) == 1
 
 
 def test_runs_with_other_flags_do_not_count_beside_the_cells_own(results):
     name = "sac-ee-double_walls-p1"  # so far with other flags, and far below the paper
     results[name] += [result(name, 2, 0.9, args=args_of(name), kept=False)]
-    page = paper_tables.page(list(CELLS.values()), results, BASELINES, {})
-    assert "**0.900 [0.894, 0.906]**<br><sub>300,000 steps, 1 seed</sub><br>0.916" in page
-    assert "Below the paper by more than 0.05: none" in page
-    assert f"| `{name}-s1`, not kept, other flags | 0.830" in page
-    assert f"| `{name}-s2`, not kept | 0.900" in page
+    tables = paper_tables.tables(list(CELLS.values()), results, BASELINES)
+    assert "| `double_walls` | SAC-MP (p = 1) | none | no | 0.900 |" in tables["paper-ee"]
+    assert len(tables["paper-below"].splitlines()) == 2
+    runs = [line for line in tables["paper-runs"].splitlines() if f"`{name}-s" in line]
+    assert ["0.830" in runs[0], runs[0].endswith("| earlier |")] == [True, True]
+    assert ["0.900" in runs[1], runs[1].endswith("| recipe |")] == [True, True]
 
 
-def test_an_algorithm_of_ones_own(results, tmp_path):
+def test_own_algorithm_stands_in_the_tables(results, tmp_path):
     header, *rows = paper_tables.CELLS.read_text().splitlines()
     (tmp_path / "cells.csv").write_text("\n".join([header, *rows, "mine,ee,wall,wall,1,yes,,,"]))
     cells = paper_tables.read_cells(tmp_path / "cells.csv")
     results["mine-ee-wall-p1"] = [result("mine-ee-wall-p1", 1, 0.5, kept=True)]
-    page = paper_tables.page(cells, results, {}, {})
-    found = "**0.500 [0.490, 0.510]**<br><sub>300,000 steps, 1 seed</sub>"
-    assert f"| MINE-MP (p = 1) |  | {found}<br>not in the paper |" in page
-    assert "`mine-ee-wall-p1` (" not in page
-    paper_tables.draw_bars(cells, results, tmp_path / "bars.png")
-
-
-def test_imitation_stands_beside_the_papers_encoders(results):
-    found = {"success_rate": 0.9, "num_queries": 1000}
-    more = {"success_rate": 0.8, "num_queries": 1000}
-    observed = "dagger, point_cloud"
-    seeds = {observed: found, f"{observed}, seed 2": more, f"{observed}, no filter": more}
-    unseen = {"narrow_shelves": {"dagger, point_cloud": found}, "wall": {"dagger, oracle": found}}
-    unseen["pole_shelves"] = seeds
-    page = paper_tables.page(list(CELLS.values()), results, BASELINES, unseen)
-    (row,) = (line for line in page.splitlines() if line.startswith("| DAgger"))
-    assert row.startswith("| DAgger with a safety filter: observed points |  |  |")
-    assert row.endswith("| **0.900 [0.880, 0.917]**<br><sub>1,000 queries, 1 seed</sub> |")
-    assert "| **0.850 ± 0.071 [0.834, 0.865]**<br><sub>2,000 queries, 2 seeds</sub> |" in row
-    for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
-        assert len({line.count("|") for line in table.splitlines()}) == 1
-
-
-def test_the_page_without_any_result():
-    page = paper_tables.page(list(CELLS.values()), {}, {}, {})
-    assert "**" not in page and page.rstrip().endswith("None yet.")
+    tables = paper_tables.tables(cells, results, {})
+    row = "| `wall` | MINE-MP (p = 1) | none | no | 0.500 | [0.490,\u00a00.510] | 0.250 "
+    assert f"{row}| 10,000 | 1 | 300,000 | – |" in tables["paper-ee"]
+    assert "mine" not in tables["paper-below"]
+    paper_tables.draw_success(cells, results, {}, tmp_path / "success.png")
 
 
 def test_figures_are_drawn(results, tmp_path):
     unseen = {"wall": {"dagger, point_cloud": {"success_rate": 0.99}}}
     story = functools.partial(paper_tables.draw_story, baselines=BASELINES, unseen=unseen)
-    for draw in (paper_tables.draw_curves, paper_tables.draw_bars, story):
+    curves = functools.partial(paper_tables.draw_curves, baselines=BASELINES)
+    success = functools.partial(paper_tables.draw_success, baselines=BASELINES)
+    for draw in (curves, success, story):
         draw(list(CELLS.values()), results, path=tmp_path / "figure.png")
         with Image.open(tmp_path / "figure.png") as image:
             assert len(image.convert("RGB").getcolors(1_000_000)) > 10
@@ -197,15 +190,23 @@ def test_figure_of_tasks_shows_means_over_seeds(results, monkeypatch):
 def test_a_trainer_does_not_outlive_the_command(tmp_path):
     script = ROOT / "benchmarks" / "paper_tables.py"
     flags = ["--only", "bc-ee-boxes", "--steps", "1000000", "--runs-dir", str(tmp_path)]
-    process = subprocess.Popen([sys.executable, str(script), *flags], stderr=subprocess.PIPE)
-    until = time.time() + 60
-    while not list(tmp_path.glob("*/*/args.json")):
-        assert time.time() < until
-        time.sleep(0.05)
-    (trainer,) = psutil.Process(process.pid).children()
-    process.terminate()
-    assert b"killed" in process.communicate(timeout=20)[1] and process.returncode == 1
-    assert not trainer.is_running()
+    process = psutil.Popen([sys.executable, str(script), *flags], stderr=subprocess.PIPE)
+    trainers = []
+    try:
+        until = time.time() + 120
+        while not list(tmp_path.glob("*/*/args.json")):
+            assert time.time() < until
+            time.sleep(0.05)
+        trainers = process.children()
+        process.terminate()
+        assert b"killed" in process.communicate(timeout=20)[1] and process.returncode == 1
+        assert len(trainers) == 1 and not trainers[0].is_running()
+    finally:  # also where the assertions fail
+        with contextlib.suppress(psutil.NoSuchProcess):
+            trainers += process.children()
+        for one in (*trainers, process):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                one.kill()
 
 
 def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):

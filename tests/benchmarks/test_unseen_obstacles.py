@@ -1,24 +1,17 @@
 """The tables of unseen scenes, from results, and a run's policy by name."""
 
-import importlib.util
 import json
 import sys
 
 import numpy as np
 import torch
-from paths import ROOT
+import unseen_obstacles as unseen
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.roadmap_paths import shard_bytes
 from roboarm_nmp.envs.datasets.shards import shard_path
 from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
 from roboarm_nmp.envs.policies.safety_filter import VERSION
-
-spec = importlib.util.spec_from_file_location(
-    "unseen_obstacles", ROOT / "benchmarks" / "unseen_obstacles.py"
-)
-unseen = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(unseen)
 
 
 def result(success, collision_free, number=200):
@@ -33,41 +26,29 @@ def result(success, collision_free, number=200):
     }
 
 
-def test_tables_between_the_marks_show_the_results(tmp_path, monkeypatch):
-    page, results = tmp_path / "page.md", tmp_path / "results.json"
-    page.write_text(f"# Before\n\n{unseen.BEGIN}outdated\n{unseen.END}\nAfter\n")
+def test_tables_list_what_was_run_with_one_quantity_per_column():
     hard = {unseen.OBSERVED: result(0.93, 0.91, 3000)}
     hard[f"{unseen.OBSERVED}, no filter"] = result(0.7, 0.4)
+    hard[f"{unseen.OBSERVED}, seed 3"] = result(0.91, 0.85)
     found = {unseen.HARD: hard, "wall": {unseen.OBSERVED: result(0.8, 0.75)}}
     found["wall"]["dagger, oracle"] = result(0.7, 0.6) | {"safety_filter": {"escape": True}}
-    found["boxes"] = {"dagger, oracle": result(0.7, 0.6) | {"safety_filter": {"escape": False}}}
-    results.write_text(json.dumps(found))
-    monkeypatch.setattr(unseen, "PAGE", page)
-    monkeypatch.setattr(unseen, "RESULTS", results)
-    monkeypatch.setattr(sys, "argv", ["unseen_obstacles.py", "--table"])
-    unseen.main()
-    text = page.read_text()
-    assert text.startswith("# Before\n\n") and text.endswith("\nAfter\n") and "outdated" not in text
-    (row,) = [line for line in text.splitlines() if line.startswith("| `dagger.py` | point cloud")]
-    assert "| 0.700, 0.400 [200: 0.670, 0.730] | not run | 0.930, 0.910 [3,000: 0.9" in row
-    assert row.endswith("| 1.2 |")
-    (wall,) = [line for line in text.splitlines() if line.startswith("| `wall` |")]
-    assert "0.800, 0.750 [200" in wall and wall.count("not run") == 2
-    assert "| 0.700, 0.600\\* [200" in wall  # an older escape
-    assert text.count("\\*") == 2 and "\\*: with the escape" in text and "†" not in text
-    assert all(f"| `{task}` |" in text for task in envs.TASKS)
-    assert "seeds" not in text
-    # Again, the same.
-    unseen.main()
-    assert page.read_text() == text
-    # With another seed.
-    hard[f"{unseen.OBSERVED}, seed 3"] = result(0.91, 0.85)
-    results.write_text(json.dumps(found))
-    unseen.main()
-    sentence = "`dagger.py` with point clouds, 2 seeds, `random_boxes_hard`: success 0.930, 0.910, "
-    sentence += "so 0.920 ± 0.014; collision-free 0.910, 0.850, so 0.880 ± 0.042; of 3,000, 200 "
-    sentence += "test queries."
-    assert sentence in page.read_text().splitlines()
+    tables = unseen.tables(found, {unseen.HARD: {}})
+    _, _, row = tables["unseen-policies"].splitlines()
+    numbers = "0.930 | [0.900,\u00a00.960] | 0.910 | 3,000 | 1.2 | – |"
+    assert row == f"| DAgger | point cloud | point cloud | no | {numbers}"
+    _, _, without, with_filter = tables["unseen-filter"].splitlines()
+    assert "| none | – | 0.700 |" in without
+    assert "| filter and escape | point cloud | 0.930 |" in with_filter
+    assert [row[:12] for row in tables["unseen-seeds"].splitlines()[2:]] == [
+        "| 1 | 0.930 ",
+        "| 3 | 0.910 ",
+    ]
+    success, free = (tables[f"unseen-tasks-{key}"] for key in ("success", "collision-free"))
+    (wall,) = [line for line in success.splitlines() if line.startswith("| `wall` |")]
+    assert wall == "| `wall` | 0.971 | – | – | 0.800 | – | 0.700\\* | – |"
+    assert success.endswith("\\*: measured with version 1 of the safety filter.")
+    assert "| `wall` | – | – | 0.750 | – | 0.600\\* | – |" in free
+    assert all(f"| `{task}` |" in success for task in envs.TASKS)
 
 
 def test_results_of_other_flags_files_or_fewer_queries_are_run_again():
@@ -88,12 +69,11 @@ def test_results_of_other_flags_files_or_fewer_queries_are_run_again():
     assert unseen.digests(with_field).keys() == {"field"}
     assert unseen.is_done(with_field | {"encoders": unseen.digests(with_field)}, name, 200)
     replaced = with_field | {"encoders": {"field": "0123456789ab"}}
-    assert not unseen.is_done(replaced, name, 200) and "0.800† [" in unseen._cell(replaced)
+    assert not unseen.is_done(replaced, name, 200) and unseen._mark(replaced) == "†"
     # The first version and the second differ in the escape only.
     first, second = ({"margin": 0.01, "escape": False, "version": version} for version in (1, 2))
-    marked = [unseen._cell(done | {"safety_filter": one}) for one in (first, second)]
-    assert marked[0] == marked[1] and "0.800‡ [" in marked[0]
-    assert "0.800\\* [" in unseen._cell(done | {"safety_filter": first | {"escape": True}})
+    assert {unseen._mark(done | {"safety_filter": one}) for one in (first, second)} == {"‡"}
+    assert unseen._mark(done | {"safety_filter": first | {"escape": True}}) == "\\*"
     assert not unseen.is_done(done | {"safety_filter": second}, name, 200)
 
 
@@ -118,11 +98,3 @@ def test_policy_of_a_run_is_kept_by_name_with_its_flags(tmp_path, monkeypatch):
     text = path.with_suffix(".json").read_text()
     assert str(tmp_path) not in text and json.loads(text)["args"] == args
     assert json.loads(text)["policy_step"] == 6
-
-
-def test_page_is_up_to_date_with_the_results():
-    begin, end = (unseen.PAGE.read_text().index(mark) for mark in (unseen.BEGIN, unseen.END))
-    others = unseen.others_results(json.loads(unseen.BASELINES.read_text()))
-    shown = unseen.PAGE.read_text()[begin + len(unseen.BEGIN) : end]
-    assert shown == unseen.tables(unseen.load_results(), others)
-    assert others[unseen.HARD]["bc, vae, no filter"]["num_queries"] == 1000

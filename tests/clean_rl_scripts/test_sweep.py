@@ -56,7 +56,8 @@ def trainer(tmp_path):
 
 def arguments(trainer, *more):
     folder = trainer.parent / "sweep"
-    return [str(a) for a in (trainer, "--folder", folder, "--search", "lr=0.0..1.0", *more)]
+    flags = ["--folder", folder, *(["--workers", 1] if "--workers" not in more else [])]
+    return [str(a) for a in (trainer, *flags, "--search", "lr=0.0..1.0", *more)]
 
 
 def rows(trainer):
@@ -127,6 +128,25 @@ def test_search_is_reproducible_and_continues(trainer, tmp_path, capsys):
         sweep.main(arguments(trainer, "--trials", "8", "--", "--other", "1"))
     with pytest.raises(SystemExit, match="has no flag --seconds"):
         sweep.main(arguments(trainer, "--trials", "8", "--", "--seconds", "1"))
+    with pytest.raises(SystemExit, match="has no flag --othr: did you mean --other?"):
+        sweep.main(arguments(trainer, "--trials", "8", "--", "--othr", "1"))
+    with pytest.raises(
+        SystemExit, match="no such trainer: .*trainr.py: did you mean .*trainer.py?"
+    ):
+        sweep.main(arguments(trainer.with_name("trainr.py"), "--trials", "8"))
+
+
+def test_help_needs_no_optuna_and_a_search_says_how_to_install_it(trainer):
+    code = "import runpy, sys; sys.modules['optuna'] = None; sys.argv[0] = 'sweep.py'; "
+    code += f"runpy.run_path({str(SCRIPT)!r}, run_name='__main__')"
+    done, search = (
+        subprocess.run([sys.executable, "-c", code, *flags], capture_output=True, text=True)
+        for flags in (["--help"], arguments(trainer))
+    )
+    assert done.returncode == 0 and "usage: sweep.py [-h]" in done.stdout, done.stderr
+    assert search.returncode == 1 and not (trainer.parent / "sweep").exists()
+    (line,) = [line for line in search.stderr.splitlines() if "pybullet" not in line]
+    assert line.startswith("this needs the extra `sweep`: pip install")
 
 
 def start(trainer, seconds):

@@ -16,6 +16,7 @@ from trainers import GPU, PATHS, TRAINERS, command, load, refusal, run_here, run
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.demonstrations import demo_path
 from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.perception.encoders import SceneEncoder
 from roboarm_nmp.envs.training import protocol, runs
 
 
@@ -107,7 +108,8 @@ def test_running_average_of_the_policy_is_saved(tmp_path, trainer, short_episode
     module = load(trainer)
     length = "--total-updates" if trainer == "bc" else "--total-timesteps"
     flags = [length, "600", "--policy-average", "0.01", "--goal-type", "ee"]
-    run = run_script(trainer, tmp_path, *flags)
+    run = run_script(trainer, tmp_path, *flags, "--test-queries", "0")
+    assert "success_rate" not in json.loads((run / "result.json").read_text())
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     args = module.Args(hidden_size=16, bf16=False, goal_type="ee")
     actor, average = (module.Actor(args, 10).eval() for _ in range(2))
@@ -208,7 +210,7 @@ def test_signal_between_evaluations_ends_in_a_checkpoint(
 
 
 def test_signal_during_an_evaluation_ends_it_at_once(tmp_path, monkeypatch, capsys, trainer):
-    def evaluate(*_):
+    def evaluate(*_, **__):
         os.kill(os.getpid(), signal.SIGTERM)
         raise AssertionError("the evaluation went on")
 
@@ -224,7 +226,7 @@ def test_signal_during_an_evaluation_ends_it_at_once(tmp_path, monkeypatch, caps
 @pytest.mark.parametrize("stop, steps", [(None, 1200), (1.0, 600)])
 def test_run_stops_at_a_success_rate_only_on_request(tmp_path, monkeypatch, stop, steps):
     success = {"success_rate": 1.0, "collision_free_success_rate": 1.0}
-    monkeypatch.setattr(protocol, "evaluate", lambda *_: success)
+    monkeypatch.setattr(protocol, "evaluate", lambda *_, **__: success)
     flags = command("sac_her_mp", tmp_path)[1:] + ["--updates-per-step", "0"]
     if stop is not None:
         flags += ["--stop-at-success", stop]
@@ -233,13 +235,26 @@ def test_run_stops_at_a_success_rate_only_on_request(tmp_path, monkeypatch, stop
     assert json.loads(result.read_text())["steps"] == steps
 
 
+def test_run_folder_is_printed_before_demonstrations_are_encoded(
+    tmp_path, monkeypatch, capsys, trainer
+):
+    def encode_demos(*_):
+        assert capsys.readouterr().out.startswith(f"run folder: {tmp_path}/no_obstacles__")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SceneEncoder, "encode_demos", encode_demos)
+    flags = ["--encoder", "oracle"] + ["--demo-prob", "1"] * (trainer != "bc")
+    with pytest.raises(KeyboardInterrupt):
+        run_here(*command(trainer, tmp_path, *flags)[1:])
+
+
 # --- Bad input
 
 
 @pytest.mark.parametrize(
     "flags, message",
     [
-        (["--task", "walls"], "unknown task 'walls': one of no_obstacles, wall"),
+        (["--task", "walls"], "unknown task 'walls': did you mean wall?"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
         (["--resume", "nowhere"], "nowhere is no run's folder"),
         (["--goal-type", "pose"], "goal-type"),

@@ -86,11 +86,12 @@ def wait_for(condition, seconds=60):
 
 
 def worker_processes(process):
-    return [
-        child
-        for child in psutil.Process(process.pid).children(recursive=True)
-        if "spawn_main" in " ".join(child.cmdline())
-    ]
+    workers = []
+    for child in psutil.Process(process.pid).children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):  # it has ended since
+            if "spawn_main" in " ".join(child.cmdline()):
+                workers.append(child)
+    return workers
 
 
 def has_ended(process):
@@ -122,7 +123,7 @@ def finish(output, whole, *flags):
     assert result.returncode == 0, result.stderr
     assert output.read_bytes() == whole.read_bytes()
     assert list(output.parent.iterdir()) == [output]
-    return int(re.search(rf"(\d+)/{NUM} ", result.stderr).group(1))
+    return int(re.search(rf"(\d+)/{NUM}, ", result.stderr).group(1))
 
 
 # --- The same file
@@ -299,7 +300,7 @@ def test_flipped_bit_drops_its_entry_and_is_reported(whole, journal, output):
     result = run(output)
     assert result.returncode == 0 and output.read_bytes() == whole.read_bytes()
     assert f"{collect.journal_of(output)}: damaged, " in result.stderr
-    begun = int(re.search(rf"(\d+)/{NUM} ", result.stderr).group(1))
+    begun = int(re.search(rf"(\d+)/{NUM}, ", result.stderr).group(1))
     assert NUM - 2 <= begun < NUM  # two of them, if it was the end of a line
 
 
@@ -384,8 +385,8 @@ def rejection(args):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ({"task": "double_wals"}, "unknown task 'double_wals': one of no_obstacles, wall"),
-        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': one of"),
+        ({"task": "double_wals"}, "unknown task 'double_wals': did you mean double_walls"),
+        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': did you mean RRTConnect"),
         ({"num": 0}, "--num must be at least 1"),
         ({"workers": 0}, r"--workers must be in \[1, 256\], got 0"),
         ({"seed": -1}, r"--seed must be in \[0, 2\^32\)"),
@@ -689,7 +690,7 @@ def test_terminated_verify_leaves_the_file_unchanged(damaged):
     wait_for(lambda: worker_processes(process) or process.poll() is not None)
     process.terminate()
     _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 143 and "Traceback" not in stderr
+    assert process.returncode == 143 and "Traceback" not in stderr, stderr
     last = stderr.splitlines()[-1]
     assert last == f"terminated; {path} is unchanged: the same command verifies it again"
     assert path.read_bytes() == before

@@ -10,7 +10,6 @@ import zlib
 
 import numpy as np
 import psutil
-import pybullet as p
 import pytest
 from paths import ROOT
 
@@ -28,6 +27,7 @@ from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 # Configurations on `wall`: two without contact, and three in collision.
 READY = np.array([1.0, -0.5, 0.0, -1.8, 0.0, 1.5, 0.0], np.float32)
@@ -338,7 +338,7 @@ def test_seed_of_several_numbers_gives_a_path_of_its_own(worlds):
 
 
 def test_other_planner_solves_a_query_that_rrt_connect_alone_does_not(monkeypatch):
-    """This query takes RRT-Connect half a million checks or more: docs/benchmark/performance.md."""
+    """This query takes RRT-Connect half a million checks or more: docs/lab_notebook.md."""
     env = envs.make("benchmaker_bookshelf_thin")
     query, planner = load_queries("benchmaker_bookshelf_thin", "original")[88], Planner(env)
     planner.plan(*query, seed=4, time_limit=60.0)
@@ -502,7 +502,7 @@ def test_query_nearer_than_the_clearance_is_planned(box):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': one of .*RRTConnect"),
+        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': did you mean RRTConnect"),
         ({"planner": "PRM"}, "unknown planner 'PRM'"),
         ({"planner": None}, "unknown planner None"),
         ({"max_checks": 0}, "max_checks must be positive or None, got 0"),

@@ -9,7 +9,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import psutil
-import pybullet as p
 import pytest
 import stable_baselines3
 import torch
@@ -20,6 +19,7 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, from_array, to_array
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 HOME = np.array([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], dtype=np.float32)
 NEAR_HOME = HOME + np.float32(0.1)
@@ -742,7 +742,7 @@ def test_bad_argument_is_rejected_with_its_range(arguments, message):
 
 
 def test_unknown_task_missing_reset_and_wrong_scene_are_rejected():
-    with pytest.raises(ValueError, match="unknown task 'walls': one of no_obstacles, wall"):
+    with pytest.raises(ValueError, match="unknown task 'walls': did you mean wall?"):
         envs.make("walls")
     with pytest.raises(RuntimeError, match="call reset"):
         envs.make("no_obstacles").step(np.zeros(7))

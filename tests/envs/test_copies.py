@@ -8,13 +8,13 @@ import sys
 
 import gymnasium as gym
 import numpy as np
-import pybullet as p
 import pytest
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.envs.perception.sensors import POSE, Camera, PointCloud, SensorWorld
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.envs.wrappers import SensorWrapper
 

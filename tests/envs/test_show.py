@@ -1,15 +1,16 @@
 """envs.show: its images and animations, the policy in them, and its errors."""
 
 import os
+import re
 import socket
 import subprocess
 import sys
 import time
 
 import numpy as np
-import pybullet as p
 import pytest
 import torch
+from paths import ROOT
 from PIL import Image
 from torch import nn
 
@@ -17,9 +18,14 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs import panda, show
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, write_queries
+from roboarm_nmp.envs.datasets.trajectories import load_joint_path
 from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.policies.registry import find_policy, make_policy
+from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import TASKS, Task
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.envs.viewer import demo
 
 SMALL = (96, 72)
 SIZE = ["--size", "96", "72"]
@@ -29,13 +35,13 @@ AT_THE_SIDE = np.array([1.5, 0.6, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
 
 @pytest.fixture(scope="module")
 def env():
-    env = envs.make("no_obstacles", render_mode="rgb_array")
+    env = env_of("no_obstacles")
     yield env
     env.close()
 
 
-def env_of(task):
-    return envs.make(task, render_mode="rgb_array")
+def env_of(task, goal_type="combined"):
+    return envs.make(task, render_mode="rgb_array", goal_type=goal_type)
 
 
 def green(pixels):
@@ -65,7 +71,7 @@ def frames_of(path):
 def test_environment_without_render_mode_is_drawn_for_images():
     scene = Scene((Sphere((0.5, 0.3, 0.4), 0.1), Cylinder((0.5, -0.3, 0.3), 0.05, 0.3)))
     query, task = Query(BENT, BENT + 0.1, scene), "random_boxes_hard"
-    plain, drawn = envs.make(task), env_of(task)
+    plain, drawn = envs.make(task, goal_type="combined"), env_of(task)
     expected = show.render_query(drawn, query, SMALL)
     assert not np.array_equal(expected, show.render_query(drawn, Query(BENT, BENT, Scene()), SMALL))
     plain.reset_specific(*query)
@@ -77,10 +83,14 @@ def test_environment_without_render_mode_is_drawn_for_images():
     drawn.close()
 
 
-def test_image_shows_the_goal_as_a_ball_and_as_a_ghost(env):
+def test_image_shows_the_goal_as_a_ball_and_a_goal_configuration_as_a_ghost_too(env):
     ball = panda.forward_kinematics(AT_THE_SIDE).astype(np.float32)
     with_ghost = show.render_query(env, Query(BENT, AT_THE_SIDE, Scene()), (160, 120))
-    ball_only = show.render_query(env, Query(BENT, ball, Scene()), (160, 120))
+    position = env_of("no_obstacles", "ee")
+    ball_only = show.render_query(position, Query(BENT, ball, Scene()), (160, 120))
+    same = show.render_query(position, Query(BENT, AT_THE_SIDE, Scene()), (160, 120))
+    np.testing.assert_array_equal(ball_only, same)
+    position.close()
     assert with_ghost.shape == ball_only.shape == (120, 160, 3)
     assert with_ghost.dtype == ball_only.dtype == np.uint8
     assert 5 < green(ball_only).sum() < 60
@@ -113,7 +123,7 @@ def test_camera_is_as_near_as_the_whole_scene_allows(env):
     for slopes in ((0.5, 0.4), (0.2, 0.6)):
         camera = show._camera(env, show._extent(env, [BENT, AT_THE_SIDE]), slopes)
         view = p.computeViewMatrixFromYawPitchRoll(
-            camera.target.tolist(), camera.distance, camera.yaw, show.PITCH, 0, 2
+            camera.target.tolist(), camera.distance, camera.yaw, camera.pitch, 0, 2
         )
         for configuration in (BENT, AT_THE_SIDE):
             points.append(panda.forward_kinematics(configuration))
@@ -122,6 +132,33 @@ def test_camera_is_as_near_as_the_whole_scene_allows(env):
         projected = projected[:, :2] / -projected[:, 2:3] / slopes
         assert 0.8 < np.abs(projected).max() < 1
     env.set_scene(Scene())
+
+
+def test_camera_is_where_it_is_told_to_be(env):
+    query = Query(BENT, AT_THE_SIDE, Scene())
+
+    def ball(camera):
+        """Row and column of the goal's ball in an image of 192 x 144 pixels; its pixels."""
+        goal = panda.forward_kinematics(AT_THE_SIDE).astype(np.float32)
+        image = show.render_query(position, Query(BENT, goal, Scene()), (192, 144), (), camera)
+        places = np.argwhere(green(image))
+        return places.mean(0), len(places)
+
+    position = env_of("no_obstacles", "ee")
+    # The goal is to the arm's left (+y), in front of it (+x) only a little.
+    x, y, z = panda.forward_kinematics(AT_THE_SIDE)
+    assert y > 0.3 > x > -0.1
+    (_, front), _ = ball("front")
+    (_, side), _ = ball("side")
+    (top_row, top), near = ball("top")
+    assert front > 110 and abs(side - 96) < 40 and top < 80 and abs(top_row - 72) < 40
+    # Numbers: yaw 90 is the front; twice as far away, the ball is smaller and nearer to the middle.
+    (_, close), large = ball((2.0, 90.0, -15.0))
+    (_, far), small = ball((4.0, 90.0, -15.0))
+    assert close > far > 96 and large > 1.5 * small
+    position.close()
+    images = [show.render_query(env, query, SMALL, (), view) for view in (None, "front", "top")]
+    assert not np.array_equal(images[0], images[1]) and not np.array_equal(*images[1:])
 
 
 def test_camera_is_where_obstacles_do_not_hide_the_arm(env):
@@ -245,6 +282,26 @@ def test_animation_of_a_policy_with_a_safety_filter(tmp_path, capsys, monkeypatc
     assert f"{policy}: reached the goal in " in text and "collision-free" in text
 
 
+def test_first_animation_of_the_quickstart_is_collision_free(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+    monkeypatch.chdir(tmp_path)
+    commands = re.findall(
+        r"^roboarm show (.* --output \S+\.gif)", (ROOT / "docs/quickstart.md").read_text(), re.M
+    )
+    assert run(*commands[0].split(), *SIZE) == 0
+    text = capsys.readouterr().out
+    assert "reached the goal" in text and "collision-free" in text
+
+
+def test_policy_in_the_animation_of_the_readme_is_collision_free():
+    """docs/make_hero.py shows the query of `roboarm demo`."""
+    policy, arguments = find_policy(demo.POLICY)
+    env, query = envs.make(demo.TASK, **arguments), load_queries(demo.TASK)[demo.QUERY]
+    trajectory = rollout(env, query, make_policy(policy, env)(demo.QUERY, query).act)
+    assert trajectory.success and not trajectory.collides
+    env.close()
+
+
 def test_demonstration_is_shown(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 3)
     demo = load_demos("wall")[7]
@@ -257,6 +314,89 @@ def test_demonstration_is_shown(tmp_path, capsys, monkeypatch):
     assert run("wall", "--output", tmp_path / "a.png", *arguments) == 0
     image = show.render_query(env_of("wall"), Query(demo.start, demo.goal, demo.scene), SMALL)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), image)
+
+
+def test_ghost_is_left_out_where_the_goal_is_a_position(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+
+    def greens(*flags):
+        suffix = ".gif" if "--gif" in flags else ".png"
+        arguments = [flag for flag in flags if flag != "--gif"]
+        assert run("wall", "--output", tmp_path / f"a{suffix}", *arguments, *SIZE) == 0
+        return green(np.asarray(Image.open(tmp_path / f"a{suffix}").convert("RGB"))).sum()
+
+    assert greens("--goal-type", "ee") < 40 < 150 < greens() == greens("--goal-type", "config")
+    # A trained policy has a goal type of its own.
+    assert greens("--policy", "sac-ee-wall-p1-s1") < 40
+    assert greens("--policy", "sac-ee-wall-p1-s1", "--gif") < 40
+    wrong = ["--policy", "sac-ee-wall-p1-s1", "--goal-type", "config"]
+    assert run("wall", "--output", tmp_path / "b.gif", *wrong) == 2
+    assert "was trained with the goal type 'ee'" in capsys.readouterr().err
+
+
+# --- The camera
+
+
+def test_camera_flag_takes_a_name_or_three_numbers(tmp_path):
+    images = []
+    for name, camera in (("a", ["top"]), ("b", [2.5, 90, -15]), ("c", [2.5, -90, -15]), ("d", [])):
+        flags = ["--camera", *camera] if camera else []
+        assert run("wall", "--output", tmp_path / f"{name}.png", *SIZE, *flags) == 0
+        images.append(np.asarray(Image.open(tmp_path / f"{name}.png")))
+    query = load_queries("wall")[0]
+    env = env_of("wall")
+    for image, view in zip(images, ("top", (2.5, 90, -15), (2.5, -90, -15), None), strict=True):
+        np.testing.assert_array_equal(image, show.render_query(env, query, SMALL, (), view))
+    env.close()
+    assert len({image.tobytes() for image in images}) == 4
+
+
+# --- Trajectories
+
+
+def test_saved_trajectory_plays_as_the_episode(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 4)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    for ending in (".csv", ".npz"):
+        file = tmp_path / f"episode{ending}"
+        arguments = ["--query", 2, "--save-trajectory", file]
+        assert run("wall", *arguments, "--output", tmp_path / "a.gif", *SIZE) == 0
+        episode = file.read_bytes()
+        assert run("wall", *arguments) == 0  # without a window
+        output = capsys.readouterr().out
+        assert f"{file}: written, wall, test query 2, go-to-goal: reached the goal in " in output
+        assert len(file.read_bytes()) == pytest.approx(len(episode), rel=0.1)
+        assert run("wall", "--trajectory", file, "--output", tmp_path / "b.gif", *SIZE) == 0
+        steps = int(output.split(" steps")[0].split()[-1])
+        assert f"{file}: {steps / 30:.1f} s, collision-free" in capsys.readouterr().out
+        (played, durations), (shown, before) = (frames_of(tmp_path / f"{n}.gif") for n in "ba")
+        assert durations == before
+        # The same arm; the ghost stands at the end of the file, a little off the goal.
+        assert np.mean(np.abs(played.astype(int) - shown.astype(int)).max(-1) > 20) < 0.02
+        times, configurations = load_joint_path(file)
+        query = load_queries("wall")[2]
+        np.testing.assert_allclose(configurations[0], query.start, atol=1e-6)
+        np.testing.assert_allclose(times, np.arange(steps + 1) / 30)
+
+
+def test_path_of_ones_own_is_played_with_its_collisions(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(show, "MAX_FRAMES", 2)
+    file, gif = tmp_path / "mine.csv", ["--output", tmp_path / "a.gif"]
+    inside = np.array([0.0, 1.2, 0.0, -1.0, 0.0, 1.6, 0.0])  # in the wall
+    np.savetxt(file, [BENT, inside], delimiter=",", header="q1,q2,q3,q4,q5,q6,q7", comments="")
+    assert run("wall", "--trajectory", file, *gif, *SIZE) == 0
+    text = capsys.readouterr().out
+    assert f"{file}: " in text and "in collision in " in text
+    assert run("no_obstacles", "--trajectory", file, "--output", tmp_path / "a.png", *SIZE) == 0
+    # With times, as long as they say: from 2 s to 3.5 s.
+    rows = np.column_stack([[2.0, 3.5], [BENT, AT_THE_SIDE]])
+    header = "time,q1,q2,q3,q4,q5,q6,q7"
+    np.savetxt(file, rows, delimiter=",", header=header, comments="")
+    assert run("no_obstacles", "--trajectory", file, *gif, *SIZE) == 0
+    assert f"{file}: 1.5 s, collision-free" in capsys.readouterr().out
+    # Where scenes vary, in that of a query.
+    other = ["--query", 6, "--split", "validation"]
+    assert run("random_boxes_hard", "--trajectory", file, *gif, *SIZE, *other) == 0
 
 
 # --- Where the queries come from
@@ -284,6 +424,20 @@ def test_queries_are_random_without_a_query_file(tmp_path, capsys):
     env = env_of(str(task))
     expected = show.render_query(env, Query(AT_THE_SIDE, BENT, env.scene), SMALL)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "d.png")), expected)
+
+
+def test_scene_is_shown_without_queries_that_are_out_of_date(tmp_path, capsys):
+    task = tmp_path / "mine.yaml"
+    task.write_text("{}")
+    write_two_queries(task)
+    task.write_text("obstacles: [sphere: {position: [0.3, 0.5, 0.5], radius: 0.2}]")
+    assert run(task, "--output", tmp_path / "a.png", *SIZE) == 0
+    line, written = capsys.readouterr().out.splitlines()
+    left_out = "its queries are out of date and left out: random queries of seed 0"
+    assert line == f"{task}: {left_out}"
+    assert "random query 0" in written
+    pixels = np.asarray(Image.open(tmp_path / "a.png")).astype(int)
+    assert (pixels[..., 2] > 30 + pixels[..., 0]).sum() > 100  # the sphere is blue
 
 
 class OneSphere:
@@ -336,7 +490,8 @@ def test_window_continues_until_ctrl_c(window, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show.time, "sleep", sleep)
     (tmp_path / "mine.yaml").write_text("{}")
     write_two_queries(tmp_path / "mine.yaml")
-    assert run(tmp_path / "mine.yaml", "--query", 1) == 0
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "mine.yaml", "--query", 1)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("Ctrl-C ends")
     assert [line.split(",")[0] for line in lines[1:]] == [f"test query {i}" for i in (1, 0, 1)]
@@ -413,6 +568,16 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
         (["wall", *gif, "--policy", no_action], "no_action.pt: its output is not float32"),
         (["wall", *gif, "--policy", strange], "goal_type must be one of"),
         (["benchmaker_bookshelf_tall", *gif, "--policy", "demo"], "has no demonstrations"),
+        (["wall", *png, "--camera", 0, 90, -15], "--camera DISTANCE YAW PITCH: at most 15 m"),
+        (["wall", *png, "--camera", 2, 90, -95], "-90 to 90 degrees, got 2 90 -95"),
+        (["wall", *gif, "--trajectory", tmp_path / "none.csv"], "none.csv: No such file"),
+        (["wall", *gif, "--trajectory", policy], "a trajectory's file must end in .csv or .npz"),
+        (["wall", *gif, "--trajectory", "a.csv", "--policy", "planner"], "give one of them"),
+        (["wall", *png, "--trajectory", "a.csv", "--draws", 2], "not with --trajectory"),
+        (["wall", *gif, "--save-trajectory", tmp_path / "a.txt"], "must end in .csv or .npz"),
+        (["wall", *png, "--save-trajectory", tmp_path / "a.csv"], "--output FILE.gif, or without"),
+        (["wall", "--save-trajectory", tmp_path / "none" / "a.csv"], "cannot write"),
+        (["wall", "--policy", "demo", "--save-trajectory", tmp_path / "a.csv"], "with a policy"),
     ]
     for arguments, message in cases:
         assert run(*arguments) == 2, arguments
@@ -440,13 +605,14 @@ def test_old_image_stays_until_the_new_one_is_whole(tmp_path, capsys, monkeypatc
     assert path.read_bytes().startswith(b"\x89PNG") and os.listdir(tmp_path) == ["a.png"]
 
 
-def test_interrupt_writes_nothing(tmp_path, capsys, monkeypatch):
+def test_interrupt_writes_nothing(tmp_path, monkeypatch):
     def interrupt(*arguments):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(show, "_shoot", interrupt)
-    assert run("wall", "--output", tmp_path / "a.png", *SIZE) == 130
-    assert "nothing was written" in capsys.readouterr().err and os.listdir(tmp_path) == []
+    with pytest.raises(KeyboardInterrupt):
+        run("wall", "--output", tmp_path / "a.png", *SIZE)
+    assert os.listdir(tmp_path) == []
 
 
 def test_images_of_tasks_do_not_import_torch(tmp_path):

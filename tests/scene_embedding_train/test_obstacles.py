@@ -1,10 +1,10 @@
 """Ground-truth obstacles for the trainers: distances against PyBullet's."""
 
 import numpy as np
-import pybullet as p
 import torch
 from encoder_trainers import OBSTACLES, obstacle_rows
 
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.scene_embedding_train import obstacles
 
 

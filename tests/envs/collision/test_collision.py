@@ -10,7 +10,6 @@ import textwrap
 from dataclasses import replace
 
 import numpy as np
-import pybullet as p
 import pytest
 from paths import ROOT
 
@@ -29,6 +28,7 @@ from roboarm_nmp.envs.collision.kernels import BULLET_MARGIN
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.panda import COLLISION_LINKS
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 # Stretched out, upwards and to the front, and far from itself.
 STATE = panda.normalise([0.3, 0.4, 0.2, -0.9, 0.3, 1.2, 0.4])

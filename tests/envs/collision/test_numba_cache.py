@@ -104,6 +104,40 @@ def test_folder_in_the_place_of_a_file_is_named_and_ignored(compiled_once, cache
     assert result == "12.0 12" and any(path.name in line for line in lines)
 
 
+def begin(folder, **variables):
+    """A process that imports the module `small` of a folder."""
+    env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    return subprocess.Popen(
+        [sys.executable, "-c", "import small"],
+        cwd=folder,
+        env=env | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_cache_is_in_the_user_folder_and_the_first_compilation_is_announced_once(tmp_path):
+    (tmp_path / "small.py").write_text(MODULE)
+    cache = tmp_path / "cache"
+    variables = {"ROBOARM_NMP_CACHE": str(cache)}
+    at_once = [begin(tmp_path, **variables) for _ in range(2)]
+    outputs = [process.communicate() for process in at_once]
+    assert [process.returncode for process in at_once] == [0, 0], outputs
+    said = "".join(error for _, error in outputs).splitlines()
+    assert said == ["compiling collision checks (once, about 30 s)"]
+    assert begin(tmp_path, **variables).communicate() == ("12.0 12\n", "")
+    assert list(cache.glob("numba/*/small.quadruple*.nbc"))
+    assert not [path for path in tmp_path.rglob("*.nb?") if cache not in path.parents]
+
+
+def test_compilation_without_any_cache_folder_works(tmp_path):
+    (tmp_path / "small.py").write_text(MODULE)
+    (tmp_path / "file").write_bytes(b"")
+    output, _ = begin(tmp_path, ROBOARM_NMP_CACHE=str(tmp_path / "file")).communicate()
+    assert output == "12.0 12\n"
+
+
 def test_collision_checks_survive_a_damaged_cache(tmp_path):
     first = run(CHECKER, ROOT, tmp_path)
     assert 0 < int(first[0]) < 1000 and first[1] == []

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -10,7 +11,6 @@ import time
 
 import h5py
 import numpy as np
-import pybullet as p
 import pybullet_data
 import pytest
 from paths import ROOT
@@ -28,6 +28,7 @@ from roboarm_nmp.envs.datasets.queries import (
     write_queries,
 )
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 
 def random_splits(seed=0, test=30, validation=10):
@@ -187,7 +188,7 @@ def test_bad_arguments_are_rejected(path):
         write(path, task="wal")
     with pytest.raises(ValueError, match="unknown task 'wal'"):
         query_path("wal")
-    with pytest.raises(ValueError, match="split must be one of test, validation"):
+    with pytest.raises(ValueError, match="unknown split 'train': one of test, validation"):
         load_queries(path, "train")
 
 
@@ -521,9 +522,54 @@ def test_make_queries_command_repeats_itself(tmp_path):
         assert json.loads(file.attrs["parameters"].decode())["hold_steps"] == 24
     first = path.read_bytes()
     again = ["roboarm_nmp", *made_by.split()[1:], "--output", path, "--workers", 1]
-    assert command(*again).returncode == 0
+    refused = command(*again)
+    assert refused.returncode == 1 and path.read_bytes() == first
+    assert refused.stderr.splitlines()[-1] == f"error: {path} exists; --overwrite replaces it"
+    path.write_bytes(b"old")
+    assert command(*again, "--overwrite").returncode == 0
     assert path.read_bytes() == first
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path):
+    path, region = tmp_path / "in_the_shelf.h5", (0.4, 0.65, -0.4, 0.4, 0.24, 0.46)
+    make_queries.make_queries(path, "three_shelves", 0, 6, 2, progress=False, goal_region=region)
+    splits = validate(path, "three_shelves", simulate=True)
+    low, high = np.array(region[::2]), np.array(region[1::2])
+    for queries in splits.values():
+        goals = panda.forward_kinematics(queries.goal)
+        assert (low <= goals).all() and (goals <= high).all()
+        starts = panda.forward_kinematics(queries.start)
+        assert not ((low <= starts) & (starts <= high)).all()  # only goals are restricted
+    with h5py.File(path) as file:
+        assert json.loads(file.attrs["parameters"])["goal_region"] == list(region)
+        assert "--goal-region 0.4 0.65 -0.4 0.4 0.24 0.46" in file.attrs["made_by"].decode()
+
+
+def test_goal_region_without_room_is_an_error_that_counts(tmp_path, monkeypatch):
+    monkeypatch.setattr(make_queries, "MAX_GOALS", 20_000)
+    inside_a_wall = (0.3, 0.9, -0.015, 0.015, 0.1, 0.7)
+    args = make_queries.Args(
+        ("wall",), goal_region=inside_a_wall, output=tmp_path / "no.h5", workers=1
+    )
+    sampler = make_queries.Sampler("wall", False, goal_region=inside_a_wall)
+    goals = np.random.default_rng(1).uniform(panda.LOWER, panda.UPPER, (20_000, 7))
+    positions = panda.forward_kinematics(goals)
+    inside = (np.abs(positions - (0.6, 0, 0.4)) <= (0.3, 0.015, 0.3)).all(axis=1).sum()
+    with pytest.raises(RuntimeError) as error:
+        sampler((0, "test", 0))
+    text = str(error.value)
+    counted = re.search(r"of 20,000 random configurations, (\d+) \(", text)
+    assert inside > 20 and int(counted[1]) == pytest.approx(inside, rel=0.5)
+    assert text.endswith("0 of these are feasible goals")
+
+    def in_this_process(make_worker, arguments, jobs, *_, **__):
+        yield from map(make_worker(*arguments), jobs)
+
+    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
+    with pytest.raises(SystemExit, match="error: --goal-region: of 20,000"):
+        make_queries.main(args)
+    assert not list(tmp_path.iterdir())
 
 
 def test_terminated_make_queries_command_continues(made, tmp_path):
@@ -558,6 +604,12 @@ def test_terminated_make_queries_command_continues(made, tmp_path):
         (["--task", "all", "--output", "some.h5"], "one task"),
         (["--task", "wall", "--workers", "0"], "--workers must be in [1, 256]"),
         (["--task", "wall", "--seed", "-1"], "--seed must be in [0, 2^32)"),
+        (["--task", "wall"], "wall.h5 exists; --overwrite replaces it"),
+        (["--task", "wall", "--goal-region", "1", "2", "3"], "--goal-region takes XMIN XMAX YMIN"),
+        (
+            ["--task", "wall", "--goal-region", "1", "0", "0", "1", "0", "1"],
+            "each minimum below its maximum, got 1.0 0.0 0.0",
+        ),
     ],
 )
 def test_make_queries_rejects_bad_flags_before_any_work(arguments, complaint):

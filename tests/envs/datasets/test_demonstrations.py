@@ -127,11 +127,33 @@ def test_executions_far_from_their_plans_are_stored(tmp_path):
     assert demos.collided.tolist() == [False, True, False]
 
 
-def test_index_beyond_the_last_demonstration_is_an_error(path):
-    demos = load_demos(path)
-    for i in (5, -1):
-        with pytest.raises(IndexError, match=f"demonstration {i} of 5"):
-            demos[i]
+def test_demonstrations_are_indexed_like_queries(path):
+    demos, queries = load_demos(path), load_queries("wall")
+    assert queries[-1].start.tolist() == queries[len(queries) - 1].start.tolist()
+    assert demos[-1].digest == demos[4].digest and demos[np.int64(1)].digest == demos[1].digest
+    for index in (slice(1, 4), slice(None, None, -2), [4, 0], np.arange(5) > 2, slice(0, 0)):
+        chosen = np.arange(5)[index]
+        fewer = demos[index]
+        assert len(fewer) == len(queries[: len(chosen)]) == len(chosen)
+        for one, i in zip(fewer, chosen, strict=True):
+            for name in ("start", "goal", "plan", "states", "actions", "digest"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(demos[i], name))
+            assert one.scene == demos[i].scene
+    assert describe(demos[:2])["steps"] == np.mean([len(demos[i].actions) for i in (0, 1)])
+    for data, number in ((demos, 5), (demos, -6), (queries, len(queries))):
+        with pytest.raises(IndexError):
+            data[number]
+    with pytest.raises(IndexError, match="demonstration 5 of 5"):
+        demos[5]
+
+
+def test_configurations_of_a_demonstration_are_radians_like_those_of_queries(path):
+    demo = load_demos(path)[0]
+    middle, half = (panda.UPPER + panda.LOWER) / 2, (panda.UPPER - panda.LOWER) / 2
+    np.testing.assert_allclose(demo.configurations, middle + half * demo.states, atol=1e-6)
+    # As start and goal, up to the resolution of the stored states and the arrival's tolerance.
+    np.testing.assert_allclose(demo.configurations[0], demo.start, atol=1e-3)
+    np.testing.assert_allclose(demo.configurations[-1], demo.goal, atol=0.1)
 
 
 def naive_subgoals(plan):

@@ -261,6 +261,20 @@ def test_module_that_cannot_be_exported_is_rejected_and_the_old_file_stays(make,
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["net.pt"]
 
 
+@pytest.mark.parametrize("kind", [_Branches, _Random])
+def test_module_that_cannot_be_exported_gives_one_line_and_prints_no_graph(kind, tmp_path, capfd):
+    with pytest.raises(NetworkError) as caught:
+        save_network(tmp_path / "net.pt", kind(), {"x": torch.ones(2, 3)}, {})
+    reason = {
+        _Branches: "its forward branches on a value (test_exported_networks.py, line ",
+        _Random: "the operation 'aten.randn_like.default' is not allowed",
+    }[kind]
+    message = str(caught.value)
+    assert reason in message and "\n" not in message and len(message) < 500
+    output = "".join(capfd.readouterr())
+    assert "torch.ops" not in output and "Unable to find" not in output
+
+
 def test_metadata_must_be_json(tmp_path):
     with pytest.raises(NetworkError, match="JSON"):
         save_network(tmp_path / "net.pt", nn.ReLU(), {"input": torch.ones(1, 3)}, {"a": object()})

@@ -12,6 +12,7 @@ from paths import ROOT
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.perception.sensors import (
+    CARDINAL,
     NOTHING,
     OBSTACLE,
     OUTPUTS,
@@ -25,8 +26,8 @@ from roboarm_nmp.envs.perception.sensors import (
     sensors_to_json,
 )
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.wrappers import SensorWrapper
-from roboarm_nmp.scene_embedding_train import collect
 
 HOME = np.array([0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8])
 BALL = Sphere((0.4, 0.5, 0.9), 0.1)
@@ -42,6 +43,23 @@ def world():
     world = SensorWorld()
     yield world
     world.close()
+
+
+def test_images_do_not_depend_on_how_pybullet_was_built(world, monkeypatch):
+    """Without NumPy it returns tuples of numbers in place of arrays."""
+
+    def get_camera_image(*arguments, **options):
+        width, height, *images = camera_image(*arguments, **options)
+        return width, height, *(tuple(np.ravel(image).tolist()) for image in images)
+
+    world.show(Scene((BALL,)), HOME)
+    camera = Camera((2.0, 0.2, 0.7), size=(40, 30), outputs=OUTPUTS)
+    as_built, camera_image = camera.observe(world), p.getCameraImage
+    monkeypatch.setattr(p, "getCameraImage", get_camera_image)
+    of_tuples = camera.observe(world)
+    for name in OUTPUTS:
+        np.testing.assert_array_equal(of_tuples[name], as_built[name])
+        assert as_built[name] in camera.space[name] and of_tuples[name] in camera.space[name]
 
 
 @pytest.mark.parametrize(("size", "fov"), [((224, 224), 60.0), ((160, 120), 40.0)])
@@ -187,23 +205,19 @@ def test_sensors_observe_once_per_episode_or_in_every_step():
         env.close()
 
 
-def test_code_of_the_docs_runs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    collect.collect(
-        collect.Args(num=80, sensors="images", image_size=16, shard_size=50, workers=1), False
-    )
+def test_code_of_perception_page_runs():
     page = (ROOT / "docs/guide/perception.md").read_text()
     names = {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(block, names)
-    heights = names["env"].reset(seed=0)[0]["sensors"]["heights"]["heights"]
-    assert heights.shape == (20, 20) and 0.25 < heights.max() < 1.6
-    assert names["env"].observation_space["sensors"]["heights"]["heights"].contains(heights)
-    z = names["z"]
-    assert z.shape == (64,) and np.isfinite(z).all() and z.std() > 0
-    principal = names["PrincipalComponents"](names["pictures"])(**names["pictures"])
-    np.testing.assert_allclose(principal.mean(0), 0, atol=1e-3)
-    np.testing.assert_allclose(principal.std(0), 1, atol=0.05)
+    assert names["image"].shape == (224, 224, 3) and set(names["sensors"]) == {*CARDINAL, "above"}
+    assert names["z"].shape == (64,) and np.isfinite(names["z"]).all() and names["z"].std() > 0
+    assert names["observation"]["goal_link_distances"].shape == (10, 8)
+    assert names["tokens"].shape == (32, 3)
+    assert names["distances"].shape == names["points"].shape[:1]
+    assert names["distances"].max() < 0.0151
+    observed = names["env"].reset(seed=0)[0]["observation"]
+    assert observed.shape == (10 + 3 * 32,)
 
 
 def test_observing_changes_no_episode():

@@ -33,9 +33,14 @@ def test_pretrained_policies_are_found_from_anywhere(tmp_path, monkeypatch):
     assert path.samefile(files["sac-ee-wall-p1-s1"]) and arguments["goal_type"] == "ee"
     # A file or folder of that name takes precedence.
     (tmp_path / "sac-ee-wall-p1-s1").mkdir()
-    names = ", ".join(sorted(files))
-    with pytest.raises(PolicyError, match=f"no such policy.*or a name: {names}"):
+    with pytest.raises(
+        PolicyError, match="no such policy: sac-ee-wall-p1-s2: did you mean sac-ee-w"
+    ):
         policy_file("sac-ee-wall-p1-s2")
+    with pytest.raises(
+        PolicyError, match="no such policy: x: expected go-to-goal, .*`roboarm polic"
+    ):
+        policy_file("x")
     (tmp_path / "sac-ee-wall-p1-s1" / "policy.pt").write_bytes(b"")
     assert policy_file("sac-ee-wall-p1-s1") == Path("sac-ee-wall-p1-s1/policy.pt")
 

@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pybullet as p
 import pytest
 
 from roboarm_nmp import envs
@@ -29,6 +28,7 @@ from roboarm_nmp.envs.scenes.primitives import (
 )
 from roboarm_nmp.envs.scenes.random_boxes import GRID, KEEP_CLEAR, SHOULDER
 from roboarm_nmp.envs.tasks import TASKS
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 HARD = "random_boxes_hard"
 

@@ -1,7 +1,9 @@
 """Evaluation: metrics, baselines, safety filters, ground truth, the command and its errors."""
 
+import itertools
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -77,6 +79,14 @@ def _numbers(result):
     """The numbers that must not depend on how an evaluation is run."""
     times = ("ms_per_action", "planning_seconds", "planning_seconds_solved")
     return {name: value for name, value in result.items() if name not in times}
+
+
+def header_of(result):
+    """Rows of the command's header: dict of name -> text."""
+    rows = itertools.takewhile(
+        lambda line: not line.startswith("  success"), command._table(result).splitlines()[1:]
+    )
+    return dict(re.split(" {2,}", row.strip(), maxsplit=1) for row in rows)
 
 
 # --- Metrics
@@ -356,10 +366,49 @@ FILTER = SafetyFilter(margin=0.01)
 def test_result_and_header_say_whether_ground_truth_was_used(policy, options, source, privileged):
     result = evaluate(policy, "wall", num_queries=1, **options)
     assert (result["geometry_source"], result["privileged"]) == (source, privileged)
-    header = command._table(result).splitlines()[0]
-    assert ("geometry source" in header) == (source is not None)
-    assert source is None or f"geometry source {source}" in header
-    assert header.endswith(", privileged") == privileged
+    header = header_of(result)
+    assert header["geometry source"] == (source or "none")
+    assert header.get("privileged", "no") == ("yes" if privileged else "no")
+
+
+def test_headers_of_different_evaluations_differ():
+    cases = [
+        ("go-to-goal", {}),
+        ("go-to-goal", {"goal_type": "config"}),
+        ("go-to-goal", {"safety_filter": FILTER}),
+        ("go-to-goal", {"safety_filter": SafetyFilter(FILTER.margin / 2)}),
+        ("go-to-goal", {"safety_filter": SafetyFilter(FILTER.margin, escape=False)}),
+        ("go-to-goal", {"safety_filter": FILTER, "geometry_source": "point_cloud"}),
+        ("random", {"seed": 1}),
+        ("random", {"seed": 2}),
+        ("via-points", {"tries": 1}),
+        ("via-points", {"tries": 2}),
+        ("planner", {"time_limit": 1.0}),
+        ("planner", {"time_limit": 2.5}),
+        (POLICY, {}),
+        (POLICY, {"safety_filter": False}),
+    ]
+    headers = [
+        (policy, header_of(evaluate(policy, "wall", num_queries=1, **options)))
+        for policy, options in cases
+    ]
+    assert all(headers.count(header) == 1 for header in headers)
+    (policy, last) = headers[-2]
+    assert last["encoder"] == "point_cloud, 32 points"
+    assert last["safety filter"] == "margin 0.01 m, escapes local minima"
+    assert headers[0][1]["encoder"] == headers[0][1]["safety filter"] == "none"
+    assert headers[-3][1]["time limit"] == "2.5 s per query"
+
+
+def test_task_defaults_to_that_of_the_policy(tmp_path):
+    (tmp_path / "run").mkdir()
+    path = _save(tmp_path / "run" / "policy.pt", task="boxes")
+    for policy, task in (("sac-ee-wall-p1-s1", "wall"), (path, "boxes"), (path.parent, "boxes")):
+        assert evaluate(str(policy), num_queries=1)["task"] == task
+    assert evaluate(str(path), "wall", num_queries=1)["task"] == "wall"
+    for policy in ("go-to-goal", _no_motion):
+        with pytest.raises(EvaluationError, match="has no task of its own"):
+            evaluate(policy)
 
 
 def test_points_without_link_distances_are_not_privileged():
@@ -512,7 +561,9 @@ def test_errors_of_the_command_are_one_line_before_any_work(
     unfit = str(_save(tmp_path / "unfit.pt", env={"goal_type": "ee"}))
     (tmp_path / "empty").mkdir()
     cases = [
-        ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol"),
+        ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol: did you mean go-to-goal?"),
+        ({"policy": "sac-ee-wal-p1"}, "did you mean sac-ee-wall-p1-s1?"),
+        ({"task": "wal"}, "unknown task 'wal': did you mean wall?"),
         ({"policy": str(tmp_path / "empty")}, "no such policy"),
         ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
         ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
@@ -554,6 +605,8 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         output = capsys.readouterr()
         assert output.out == "" and message in output.err
         assert output.err.startswith("evaluate.py: ") and output.err.count("\n") == 1
+    assert command.main(["--policy", "go-to-goal"]) == 2
+    assert "go-to-goal has no task of its own: choose one (--task)" in capsys.readouterr().err
     with pytest.raises(SystemExit) as stop:
         command.main(["--policy", "random", "--task", "wall", "--goal-type", "pose"])
     assert stop.value.code == 2
@@ -561,7 +614,9 @@ def test_errors_of_the_command_are_one_line_before_any_work(
 
 def test_device_files_are_written_to_and_never_replaced(query_file, tmp_path):
     flags = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", str(query_file)]
-    run = [sys.executable, SCRIPT, *flags, "--num-queries", "1", "--json"]
+    # With buffered output, as by default.
+    run = ["env", "-u", "PYTHONUNBUFFERED", sys.executable, SCRIPT, *flags]
+    run += ["--num-queries", "1", "--json"]
     shown = subprocess.run([*run, "/dev/stdout"], capture_output=True, text=True, check=True)
     assert json.loads(shown.stdout[shown.stdout.index("{") :])["num_queries"] == 1
     with open(tmp_path / "out.txt", "w") as file:  # the table, and the JSON after it

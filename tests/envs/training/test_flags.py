@@ -1,13 +1,20 @@
-"""envs/training/flags.py: a flag out of its range ends a trainer before it writes a file."""
+"""envs/training/flags.py: parsing, groups, and ranges: a bad flag ends a trainer at once."""
 
+import dataclasses
 import json
+import os
+import re
 import sys
+from pathlib import Path
 
 import pytest
 from paths import ROOT
 from trainers import PATHS, load
 
-from roboarm_nmp.envs.training import runs
+from roboarm_nmp.clean_rl_scripts import evaluate, sweep
+from roboarm_nmp.demo_generation import collect, make_queries, roadmaps, verify
+from roboarm_nmp.envs.training import flags, runs
+from roboarm_nmp.scene_embedding_train import collect as observations
 
 ENCODERS = ("vae", "vqvae", "pointnet2", "field")
 PATHS |= {name: ROOT / "scene_embedding_train" / f"{name}.py" for name in ENCODERS}
@@ -39,7 +46,8 @@ OF_REINFORCEMENT = (
 CASES = [
     *((script, *case) for script in (*POLICIES, *ENCODERS) for case in OF_ALL),
     *((script, *case) for script in REINFORCEMENT for case in OF_REINFORCEMENT),
-    *((script, f"--{name}-queries", "0") for script in POLICIES for name in ("eval", "test")),
+    *((script, "--eval-queries", "0") for script in POLICIES),
+    *((script, "--test-queries", "-1") for script in POLICIES),
     ("sac_her_mp", "--alpha", "0"),
     ("sac_her_mp", "--tau", "0"),
     ("sac_her_mp", "--target-entropy", "-inf"),
@@ -99,3 +107,59 @@ def test_runs_of_the_same_second_have_their_own_folders(args_of, monkeypatch, tm
         "_3",
     ]
     assert all(json.loads((folder / "args.json").read_text())["seed"] == 1 for folder in folders)
+
+
+@dataclasses.dataclass
+class Base:
+    seed: flags.Seed = 1
+    """seed of all
+    random numbers"""
+    output: Path | None = None
+    """where to write"""
+
+
+@dataclasses.dataclass
+class Own(Base):
+    my_rate: flags.PositiveFloat = 0.5
+    """a rate of mine"""
+    sizes: tuple[flags.PositiveInt, ...] = (1, 2)
+    """some sizes"""
+    on: bool = False
+    """switch it on"""
+    output: Path | None = Path("here")
+    """where this one writes"""
+
+
+def test_flags_are_parsed_into_their_dataclass():
+    assert flags.parse(Own, []) == Own()
+    given = flags.parse(
+        Own, ["--seed", "3", "--my_rate", "2", "--sizes", "4", "--on", "--output", "None"]
+    )
+    assert given == Own(3, None, 2.0, (4,), True)
+    assert flags.parse(Own, ["--no-on"], default=given) == Own(3, None, 2.0, (4,), False)
+
+
+def test_help_has_groups_docstrings_and_defaults(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "argv", ["/some/where/own.py"])
+    with pytest.raises(SystemExit):
+        flags.parse(Own, ["--help"], default=Own(seed=7))
+    text = capsys.readouterr().out
+    assert text.startswith("envs/training/flags.py: parsing, groups, and ranges")
+    assert "usage: own.py [-h]" in text
+    options = " ".join(re.sub(r"[|│]", " ", text.partition("show this help")[2]).split())
+    expected = [
+        *("algorithm options", "--my-rate FLOAT > 0 a rate of mine (default: 0.5)"),
+        *("some sizes (default: 1 2)", "--on, --no-on switch it on (default: False)"),
+        *("run options", "--seed INT IN [0, 2^32) seed of all random numbers (default: 7)"),
+        *("output options", "where this one writes (default: here)"),
+    ]
+    places = [options.find(words) for words in expected]
+    assert -1 not in places and places == sorted(places), options
+
+
+def test_workers_default_to_the_cores_that_may_be_used():
+    assert min(len(os.sched_getaffinity(0)), 256) == flags.CORES
+    for command in (make_queries, collect, verify, roadmaps, observations, evaluate, sweep):
+        (field,) = (one for one in dataclasses.fields(command.Args) if one.name == "workers")
+        assert field.default == flags.CORES, command

@@ -15,8 +15,9 @@ from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
 from roboarm_nmp.envs.policies.registry import PolicyError, make_policy
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
-from roboarm_nmp.envs.training import protocol
+from roboarm_nmp.envs.training import flags, protocol
 from roboarm_nmp.envs.training.evaluation import evaluate
+from roboarm_nmp.envs.utils import progress
 
 HARD = "random_boxes_hard"
 DISTANCES = {"link_distances": True, "geometry_source": "ground_truth"}
@@ -216,8 +217,9 @@ def test_image_strip_shows_the_episode_from_start_to_end():
 
 
 def test_latest_of_equally_good_policies_is_the_best(tmp_path, monkeypatch):
-    rates = iter([0.5, 0.7, 0.6, 0.7, 0.2])
-    monkeypatch.setattr(protocol, "evaluate", lambda *_: {"success_rate": next(rates)})
+    rates = 0.5, 0.7, 0.6, 0.7, 0.2
+    results = ({"success_rate": rate} for rate in rates)
+    monkeypatch.setattr(protocol, "evaluate", lambda *_, **__: next(results))
     monkeypatch.setattr(protocol, "rollout_image", lambda *_: np.zeros((2, 2, 3), np.uint8))
     run = a_run(tmp_path, {}, [None], validation=[None])
     run.start(5, "step")
@@ -236,7 +238,7 @@ def test_latest_of_equally_good_policies_is_the_best(tmp_path, monkeypatch):
     ]
 
 
-def result_of(tmp_path, capsys, **env_arguments):
+def result_of(tmp_path, capsys, num_queries=3, **env_arguments):
     """`result.json` and the printed lines for a policy that needs more than 50 steps."""
     env_arguments |= {"goal_type": "config"}
     made = protocol.make_eval_envs("no_obstacles", 3, **env_arguments)
@@ -248,7 +250,7 @@ def result_of(tmp_path, capsys, **env_arguments):
     run.advance(3)
     run._bar.start_t -= 1000.0  # as if training had taken so long
     run.checkpoint()
-    run.final_test(load_queries("no_obstacles", "test")[:3])
+    run.final_test(load_queries("no_obstacles", "test")[:num_queries])
     return json.loads((run.folder / "result.json").read_text()), capsys.readouterr().out
 
 
@@ -269,6 +271,37 @@ def test_final_test_is_run_under_the_standard_rules(tmp_path, capsys):
         assert result["success_rate"] == standard["success_rate"]
         assert result["episode_length"] == standard["episode_length"]
         assert "tested under the standard rules, 400 steps, contacts allowed:" in lines
+
+
+def test_run_without_test_queries_has_no_figures_of_a_test(tmp_path, capsys):
+    flags.check(Flags(test_queries=0))
+    result, lines = result_of(tmp_path, capsys, num_queries=0)
+    assert result["num_queries"] == 0 and not any("collision" in name for name in result)
+    assert "success_rate" not in result and result["validation_success_rate"] == 0.5
+    assert "no test, --test-queries 0; validation success 0.500 at 7" in lines
+
+
+def test_validations_and_the_final_test_show_their_progress(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "LOG_INTERVAL", 0)
+    queries = load_queries("no_obstacles", "validation")[:2]
+    envs_ = protocol.make_eval_envs("no_obstacles", 2, goal_type="config")
+    run = a_run(tmp_path, {"goal_type": "config"}, envs_, validation=queries)
+    run.start(10, "step")
+    run.safety_filter = SafetyFilter(0.0)
+    monkeypatch.setattr(protocol, "rollout_image", lambda *_: np.zeros((2, 2, 3), np.uint8))
+    policy, evaluate = Toward(0.03), protocol.evaluate
+
+    def without_filter(policy, envs, queries, device, safety_filter=None, **bar):
+        return evaluate(policy, envs, queries, device, **bar)
+
+    monkeypatch.setattr(protocol, "evaluate", without_filter)
+    assert run.validate(policy)
+    run.safety_filter = None
+    run.save_policy(policy)
+    run.final_test(queries)
+    lines = capsys.readouterr().err.splitlines()
+    for name in ("validation", "validation without filter", "test"):
+        assert any(line.startswith(f"{name}: 100%, 2/2, ") for line in lines), name
 
 
 def test_result_with_other_step_lengths_is_marked_as_not_comparable(tmp_path, capsys):

@@ -309,7 +309,8 @@ def test_second_signal_ends_a_run_at_once(tmp_path):
     ended, _ = script(tmp_path, LOOP % "os.kill(os.getpid(), signal.SIGTERM)")
     run = sorted(tmp_path.iterdir())[-1]
     assert ended.returncode == 143
-    assert ended.stderr.splitlines()[-1] == f"terminated; {run} has no checkpoint yet"
+    line = f"terminated; no checkpoint yet; --resume {run} starts again"
+    assert ended.stderr.splitlines()[-1] == line
     assert not (run / "checkpoint.pt").exists()
 
 
@@ -398,6 +399,21 @@ def test_run_continues_with_step_time_and_best_evaluation(parse, tmp_path, monke
     resumed.checkpoint()
     assert 100 < resumed.seconds < 115
     resumed.close()
+
+
+def test_run_prints_its_folder_before_anything_else(parse, tmp_path, capsys):
+    run, _ = begin(parse, tmp_path)
+    assert capsys.readouterr().out == f"run folder: {run.folder}\n"
+
+
+def test_bar_shows_labelled_values_in_their_order(parse, tmp_path, capsys):
+    run, _ = begin(parse, tmp_path)
+    run.start(10, "update")
+    run.show(**{"validation success": "0.620", "best": "0.710"})
+    run.close()
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("training: 0%, 0/10, ")
+    assert line.endswith("validation success=0.620, best=0.710")
 
 
 def test_equal_score_is_the_best_and_nan_never(parse, tmp_path):

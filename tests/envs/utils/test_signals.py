@@ -8,13 +8,12 @@ import pytest
 
 COMMAND = """
 import time
-from roboarm_nmp.envs.utils.signals import exit_interrupted, raise_on_sigterm
-raise_on_sigterm()
+from roboarm_nmp.envs.utils.signals import end_with_one_line
+end_with_one_line("nothing has begun")
+end_with_one_line("start again")
 try:
     print("ready", flush=True)
     time.sleep(60)
-except KeyboardInterrupt as interrupt:
-    exit_interrupted(interrupt, "start again")
 finally:
     print("cleaned up")
 """
@@ -35,4 +34,44 @@ def test_signal_unwinds_the_command_and_sets_its_exit_code(number, code, line):
     process.send_signal(number)
     stdout, stderr = process.communicate(timeout=30)
     assert (process.returncode, stdout) == (code, "cleaned up\n")
-    assert stderr.splitlines()[-1] == line and "Traceback" not in stderr
+    assert stderr.splitlines() == [line]
+
+
+def test_other_errors_keep_their_traceback():
+    code = COMMAND.replace("time.sleep(60)", "1 / 0")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 1 and "ZeroDivisionError" in ended.stderr
+
+
+WORKERS = """
+import concurrent.futures.process as pool
+import os
+import sys
+from roboarm_nmp.envs.utils import workers
+from roboarm_nmp.envs.utils.signals import end_with_one_line
+
+def make_worker():
+    return abs
+
+if __name__ == "__main__":
+    end_with_one_line("start again")
+    start = pool._ExecutorManagerThread.start
+
+    def signal_and_start(thread):
+        os.kill(os.getpid(), int(sys.argv[1]))
+        start(thread)
+
+    pool._ExecutorManagerThread.start = signal_and_start
+    list(workers.run(make_worker, (), [1, 2], 2))
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [(signal.SIGTERM, 143, "terminated"), (signal.SIGINT, 130, "inter")]
+)
+def test_signal_while_workers_are_started_ends_in_one_line(number, code, word, tmp_path):
+    (tmp_path / "script.py").write_text(WORKERS)
+    command = [sys.executable, tmp_path / "script.py", str(int(number))]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    (line,) = ended.stderr.splitlines()
+    assert ended.returncode == code and line.startswith(word)

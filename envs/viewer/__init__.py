@@ -1,0 +1,1 @@
+"""The browser viewer: `roboarm view` and `roboarm demo` (extra `viewer`)."""

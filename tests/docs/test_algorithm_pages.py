@@ -1,0 +1,37 @@
+"""docs/algorithms: its tables are of docs/make_algorithm_pages.py, its defaults of the flags."""
+
+import importlib
+import importlib.util
+import re
+
+import pytest
+from paths import ROOT
+
+from roboarm_nmp.__main__ import TRAINERS
+
+PAGES = ROOT / "docs" / "algorithms"
+
+
+def load(name):
+    """A script in docs as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["sac", "td3", "bc", "dagger", "encoders"])
+def test_tables_show_the_results_in_the_data_files(name):
+    text = (PAGES / f"{name}.md").read_text()
+    assert "<!-- table: " in text
+    assert load("make_algorithm_pages").with_tables(text) == text
+
+
+@pytest.mark.parametrize("name", ["sac", "td3", "bc", "dagger"])
+def test_flag_tables_show_the_defaults(name):
+    Args = importlib.import_module(f"roboarm_nmp.{TRAINERS[name][0]}").Args
+    words, defaults = load("make_command_line").words, vars(Args())
+    rows = re.findall(r"^\| `--([\w-]+)` \| (.*?) \|", (PAGES / f"{name}.md").read_text(), re.M)
+    assert len(rows) >= 7
+    for flag, shown in rows:
+        assert shown.strip() == words(defaults[flag.replace("-", "_")]), flag

@@ -1,0 +1,158 @@
+"""docs/reference/api.md: its snippets run from top to bottom, and its references exist."""
+
+import importlib
+import re
+
+import numpy as np
+import pytest
+import torch
+from paths import ROOT
+
+import roboarm_nmp
+from roboarm_nmp.clean_rl_scripts import evaluate
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.policies.export import save_policy
+from roboarm_nmp.envs.policies.registry import PolicyError
+from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+
+PAGE = (ROOT / "docs/reference/api.md").read_text()
+SNIPPETS = re.findall(r"^```python\n(.*?)^```", PAGE, re.S | re.M)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """The folder and the names after all snippets were run, in their order."""
+    folder, names = tmp_path_factory.mktemp("page"), {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for number, snippet in enumerate(SNIPPETS):
+            exec(compile(snippet, f"snippet {number}", "exec"), names)
+    return folder, names
+
+
+def test_snippets_of_the_page_run(page):
+    folder, names = page
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("back.h5", "episode.npz", "my_scene.yaml", "path.csv", "policy.pt")
+    ]
+    assert names["filtered"]["safety_filter"]["margin"] == 0.01
+    assert len(names["demos"][:10]) == 10
+
+
+def test_every_reference_of_the_page_exists():
+    references = re.findall(r"^::: (\S+)", PAGE, re.M)
+    assert len(references) > 25
+    for name in references:
+        parts = name.split(".")
+        for depth in range(len(parts), 0, -1):
+            try:
+                found = importlib.import_module(".".join(parts[:depth]))
+            except ModuleNotFoundError:
+                continue
+            for part in parts[depth:]:
+                found = getattr(found, part)
+            assert found.__doc__, name
+            break
+    for script in re.findall(r"`(examples/\w+\.py)`", PAGE):
+        assert (ROOT / script).exists(), script
+
+
+def test_stable_baselines3_policy_of_the_page_acts_as_its_model(page, capsys):
+    folder, names = page
+    arguments = ["--policy", str(folder / "policy.pt"), "--task", "wall", "--num-queries", "2"]
+    assert evaluate.main([*arguments, "--workers", "1"]) == 0
+    assert "on wall: 2 test queries" in capsys.readouterr().out
+    model, network = names["model"], load_network(folder / "policy.pt")
+    env = roboarm_nmp.make("wall", goal_type="ee")
+    for seed in range(5):
+        observation, _ = env.reset(seed=seed)
+        inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
+        expected = model.predict(observation, deterministic=True)[0]
+        np.testing.assert_allclose(network.predict_one(inputs), expected, atol=1e-5)
+    env.close()
+
+
+def test_stable_baselines3_policy_that_cannot_be_saved_gives_one_line(page, tmp_path, capfd):
+    class Distribution(torch.nn.Module):
+        def __init__(self, actor):
+            super().__init__()
+            self.actor = actor
+
+        def forward(self, **observation):
+            return self.actor(observation, deterministic=True)
+
+    with pytest.raises(PolicyError, match="its forward branches on a value .distributions.py") as e:
+        save_policy(tmp_path / "a.pt", Distribution(page[1]["model"].actor), "wall")
+    assert "\n" not in str(e.value) and "torch.ops" not in "".join(capfd.readouterr())
+    assert not list(tmp_path.iterdir())
+
+
+def test_td3_policy_is_saved_as_the_page_says(tmp_path):
+    from stable_baselines3 import TD3
+
+    class Actor(torch.nn.Module):
+        def __init__(self, actor):
+            super().__init__()
+            self.actor = actor
+
+        def forward(self, **observation):
+            return self.actor(observation)
+
+    arguments = {"goal_type": "combined", "geometry_source": "ground_truth", "link_distances": True}
+    env = roboarm_nmp.make("wall", **arguments)
+    model = TD3("MultiInputPolicy", env, buffer_size=10)
+    safety_filter = SafetyFilter(0.02)
+    save_policy(tmp_path / "a.pt", Actor(model.actor), "wall", safety_filter, **arguments)
+    metadata = load_network(tmp_path / "a.pt").metadata
+    assert metadata == {
+        "kind": "policy",
+        "task": "wall",
+        "env": arguments,
+        "safety_filter": {"margin": 0.02, "escape": True},
+    }
+    observation, _ = env.reset(seed=0)
+    inputs = {name: torch.from_numpy(value)[None] for name, value in observation.items()}
+    np.testing.assert_allclose(
+        load_network(tmp_path / "a.pt").predict_one(inputs),
+        model.predict(observation, deterministic=True)[0],
+        atol=1e-5,
+    )
+    env.close()
+
+
+def test_policy_with_other_actions_or_arguments_is_rejected(tmp_path):
+    class Goal(torch.nn.Module):
+        def forward(self, observation, achieved_goal, desired_goal):
+            return desired_goal
+
+    with pytest.raises(PolicyError, match=r"must be \(2, 7\), got \(2, 3\)"):
+        save_policy(tmp_path / "a.pt", Goal(), "wall", goal_type="ee")
+    with pytest.raises(PolicyError, match="horizon: not among the arguments that a policy stores"):
+        save_policy(tmp_path / "a.pt", Goal(), "wall", goal_type="config", horizon=10)
+    assert not list(tmp_path.iterdir())
+    save_policy(tmp_path / "a.pt", Goal(), "wall", goal_type="config")
+    assert load_network(tmp_path / "a.pt").metadata["env"] == {"goal_type": "config"}
+
+
+def test_end_effector_is_where_the_page_says():
+    """0.105 m from the hand's frame, and 0.212 m from the flange of joint 7, along its axis."""
+    configuration = np.array([0.2, -0.3, 0.1, -1.8, 0.4, 1.6, 0.8])
+    *_, (position, axes) = panda.joint_frames(configuration)
+    hand = position + 0.107 * axes[:, 2]  # panda_link8 and panda_hand share this origin
+    np.testing.assert_allclose(
+        panda.forward_kinematics(configuration), hand + 0.105 * axes[:, 2], atol=1e-12
+    )
+    env = roboarm_nmp.make("no_obstacles")
+    env.reset_specific(configuration.astype(np.float32), configuration.astype(np.float32) + 0.2)
+    links = {
+        p.getJointInfo(env.robot, i, physicsClientId=env.client)[12].decode(): p.getLinkState(
+            env.robot, i, computeForwardKinematics=1, physicsClientId=env.client
+        )[4]
+        for i in range(p.getNumJoints(env.robot, physicsClientId=env.client))
+    }
+    env.close()
+    np.testing.assert_allclose(links["panda_hand"], hand, atol=1e-5)
+    apart = np.subtract(links["panda_grasptarget"], links["panda_hand"])
+    assert np.linalg.norm(apart) == pytest.approx(0.105, abs=1e-5)

@@ -1,0 +1,88 @@
+"""docs/customise/{sensor,encoder,reward}.md: their code is executed."""
+
+import re
+
+import numpy as np
+import pytest
+from paths import ROOT
+from trainers import PATHS, load
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.scene_embedding_train import collect
+
+
+def blocks(name):
+    """The Python code of a page, block by block."""
+    page = (ROOT / f"docs/customise/{name}.md").read_text()
+    return re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+
+
+def executed(code):
+    """The names that blocks of code define."""
+    names = {}
+    for block in code:
+        exec(block, names)
+    return names
+
+
+def test_sensor_of_the_page_observes_heights_of_obstacles():
+    names = executed(blocks("sensor"))
+    heights, space = names["heights"], names["env"].observation_space["sensors"]["heights"]
+    assert heights.shape == (20, 20) and 0.25 < heights.max() < 1.6
+    assert space["heights"].contains(heights)
+
+
+def test_encoder_of_the_page_encodes_scenes_with_unit_variance(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    collect.collect(
+        collect.Args(num=80, sensors="images", image_size=16, shard_size=50, workers=1), False
+    )
+    names = executed(blocks("encoder"))
+    z = names["z"]
+    assert z.shape == (64,) and np.isfinite(z).all() and z.std() > 0
+    encoded = names["PrincipalComponents"](names["images"])(**names["images"])
+    np.testing.assert_allclose(encoded.mean(0), 0, atol=1e-3)
+    np.testing.assert_allclose(encoded.std(0), 1, atol=0.05)
+
+
+def test_reward_of_the_page_charges_contacts_in_steps_and_in_batches():
+    env = executed(blocks("reward")[:1])["env"]
+    transitions = []
+    for query in load_queries("double_walls", "validation")[:4]:
+        observation, _ = env.reset_specific(*query)
+        ended = False
+        while not ended:
+            action = panda.normalise(query.goal) - observation["observation"][:7]
+            observation, reward, *ends, info = env.step(action)
+            goals = observation["achieved_goal"], observation["desired_goal"]
+            transitions.append((*goals, reward, info))
+            ended = any(ends)
+    achieved, desired, rewards, infos = zip(*transitions, strict=True)
+    collision = np.array([info["collision"] for info in infos])
+    success = np.array([info["is_success"] for info in infos])
+    assert 0 < collision.sum() < len(collision)
+    expected = np.where(success, 0.0, -1.0) - 0.5 * collision
+    np.testing.assert_array_equal(rewards, expected)
+    for info in (infos, {"collision": collision}):
+        batch = env.compute_reward(np.array(achieved), np.array(desired), info)
+        np.testing.assert_array_equal(batch, expected)
+
+
+@pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
+def test_changed_replay_buffer_charges_contacts(trainer, tmp_path, monkeypatch):
+    _, before, after = blocks("reward")
+    source = PATHS[trainer].read_text()
+    assert source.count(before) == 1
+    script = tmp_path / "changed.py"
+    script.write_text(source.replace(before, after))
+    monkeypatch.setitem(PATHS, "changed", script)
+    env = envs.make("no_obstacles")
+    buffer = load("changed").HerReplayBuffer(env, 100, 0.0, np.random.default_rng(0))
+    step = {name: np.zeros(10) for name in ("observation", "next_observation")}
+    step |= {"action": np.zeros(7), "next_achieved_goal": np.zeros(3)}
+    step["desired_goal"] = np.ones(3)
+    buffer.add_episode([step | {"collision": number < 3} for number in range(10)])
+    assert set(buffer.sample(200)["reward"].tolist()) == {-1.0, -1.5}
+    env.close()

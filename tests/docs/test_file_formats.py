@@ -1,0 +1,65 @@
+"""docs/reference/file_formats.md: arrays, results and limits are those of the code."""
+
+import re
+
+import numpy as np
+from paths import ROOT
+
+import roboarm_nmp
+from roboarm_nmp.envs.datasets.format import DEMO_ARRAYS, QUERY_ARRAYS, SCENE_ARRAYS
+from roboarm_nmp.envs.networks import operations
+from roboarm_nmp.envs.scenes.files import load_scene
+
+PAGE = (ROOT / "docs/reference/file_formats.md").read_text()
+
+
+def section(title):
+    """The text below a heading, up to the next one of its level."""
+    return PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+
+
+def code(title, language):
+    return re.search(rf"```{language}\n(.*?)```", section(title), re.DOTALL)[1]
+
+
+def test_arrays_are_listed_with_their_dtypes():
+    for title, arrays in (
+        ("Queries", QUERY_ARRAYS | SCENE_ARRAYS),
+        ("Demonstrations", DEMO_ARRAYS),
+    ):
+        rows = re.findall(r"^\| (`.*?) \| (\w+) \((.*?)\)", section(title), re.M)
+        listed = {name: row for row in rows for name in re.findall(r"`(\w+)`", row[0])}
+        assert listed.keys() == arrays.keys()
+        for name, (dtype, width, _) in arrays.items():
+            _, shown, shape = listed[name]
+            assert np.dtype(shown) == np.dtype(dtype), name
+            assert shape.partition(",")[2].strip() == ("" if width is None else str(width)), name
+
+
+def test_code_about_queries_and_demonstrations_runs():
+    names = {}
+    exec(code("Queries", "python"), names)
+    exec(code("Demonstrations", "python"), names)
+    assert names["queries"].goal_position.shape == (len(names["queries"]), 3)
+    assert len(names["demo"].actions) == len(names["demo"].states) - 1
+
+
+def test_scene_of_the_page_is_read(tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_text(code("Scenes", "yaml"))
+    assert len(load_scene(path).obstacles) == 4
+
+
+def test_keys_of_an_evaluation_are_listed():
+    result = roboarm_nmp.evaluate("go-to-goal", "no_obstacles", num_queries=1)
+    listed = set(re.findall(r"`(\w+)`", section("Results")))
+    assert {key for key in result if not key.endswith("_interval")} <= listed
+
+
+def test_limits_of_networks_are_those_of_the_code():
+    text = section("Networks")
+    assert f"| operations in a network | {operations.MAX_NODES:,} |" in text
+    assert f"arguments and metadata included | {operations.MAX_VALUES:,} |" in text
+    assert f"| nested lists or dicts | {operations.MAX_DEPTH} |" in text
+    assert (operations.MAX_ELEMENTS, operations.MAX_COMPUTED) == (2**26, 2**28)
+    assert "stored or computed | 2²⁶ |" in text and "in all computed tensors | 2²⁸ |" in text

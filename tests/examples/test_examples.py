@@ -1,0 +1,62 @@
+"""The scripts in examples/ run as their docstrings say, and print what these say."""
+
+import ast
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from roboarm_nmp.envs import show
+from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.datasets.trajectories import load_joint_path
+
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+def run(name, folder, *arguments):
+    command = [sys.executable, ROOT / "examples" / name, *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
+def test_example_is_short_and_says_how_to_run_it(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= 80
+    docstring = ast.get_docstring(ast.parse(text))
+    assert f"python examples/{path.name}" in docstring and "rints" in docstring
+
+
+def test_demonstrations_train_a_network_of_ones_own(tmp_path):
+    few = ["--demos", 100, "--epochs", 3, "--queries", 5]
+    output = run("own_pytorch_loop.py", tmp_path, *few)
+    losses = [float(loss) for loss in re.findall(r"epoch \d: loss (\S+)", output)]
+    assert len(losses) == 3 and losses[2] < 0.9 * losses[0]
+    assert re.search(r"success \d\.\d\d of 5 validation queries", output)
+
+
+@pytest.mark.parametrize("file", ["path.csv", "path.npz"])
+def test_planned_path_is_checked_exported_and_can_be_shown(file, tmp_path, capsys, monkeypatch):
+    output = run("plan_check_export.py", tmp_path, "--query", 2, "--output", file)
+    free, motions = re.search(r"(\d+) of (\d+) motions are free", output).groups()
+    assert free == motions and "goal reached" in output and "collision-free" in output
+    times, configurations = load_joint_path(tmp_path / file)
+    query = load_queries("double_walls")[2]
+    np.testing.assert_allclose(configurations[[0, -1]], [query.start, query.goal], atol=1e-6)
+    np.testing.assert_allclose(np.diff(times), 1 / 30)
+    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+    shown = ["--trajectory", tmp_path / file, "--output", tmp_path / "a.gif", "--size", 80, 60]
+    assert show.main(["double_walls", *map(str, shown)]) == 0
+    assert "collision-free" in capsys.readouterr().out
+
+
+def test_own_points_lead_to_actions_that_avoid_them(tmp_path):
+    output = run("point_cloud_to_action.py", tmp_path)
+    assert "the straight motion to the goal is blocked" in output and "goal reached" in output
+    assert float(re.search(r"smallest distance from a point: (\S+) mm", output)[1]) > 0
+    # Points of one's own, far from the arm.
+    np.save(tmp_path / "cloud.npy", np.full((10, 3), 3.0))
+    output = run("point_cloud_to_action.py", tmp_path, "--points", "cloud.npy")
+    assert "1 points; the straight motion to the goal is free" in output
