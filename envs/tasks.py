@@ -76,6 +76,18 @@ def split_robot(task):
     return task, robot if at else None
 
 
+def task_with_robot(task, robot):
+    """`TASK@ROBOT`, of the flags `--task` and `--robot`; the task itself if the robot is None.
+
+    Raises ValueError: the task names a robot, too.
+    """
+    if robot is None:
+        return task
+    if split_robot(task)[1] is not None:
+        raise ValueError(f"--robot {robot}: the task names a robot already, {task}")
+    return f"{task}@{robot}"
+
+
 def with_robot(scene, robot):
     """A `Scene`, or a distribution of scenes, with another robot."""
     if isinstance(scene, Scene):
