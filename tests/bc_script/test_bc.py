@@ -10,9 +10,9 @@ from torch.distributions import Categorical, Independent, MixtureSameFamily, Nor
 from trainers import PATHS, load, refusal, run_here, run_script
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training.protocol import stack
 
 bc = load("bc")
@@ -53,12 +53,12 @@ def test_transitions_of_demonstrations_by_hand(goal_type):
     expected = []
     for i in range(3):
         demo = demos[i]
-        goal_position, goal_state = panda.forward_kinematics(demo.goal), panda.normalise(demo.goal)
+        goal_position, goal_state = PANDA.forward_kinematics(demo.goal), PANDA.normalise(demo.goal)
         goal = {"ee": [goal_position], "config": [goal_state]}.get(
             goal_type, [goal_state, goal_position]
         )
         for state, action in zip(demo.states[:-1], demo.actions, strict=True):
-            position = panda.forward_kinematics(panda.denormalise(state))
+            position = PANDA.forward_kinematics(PANDA.denormalise(state))
             expected.append(np.concatenate([state, position, *goal, action / 0.03]))
     found = np.hstack([observations, goals, actions])
     np.testing.assert_allclose(found, np.array(expected), atol=1e-5)

@@ -5,9 +5,9 @@ import pytest
 from trainers import load, run_script
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import protocol
 
 READY = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)  # rad
@@ -21,8 +21,8 @@ OF_SAC = " --alpha 0.02 --target-entropy -14"
 
 def query(_, rng):
     """From `READY`, a goal about ten steps away in any direction."""
-    goal = panda.normalise(READY) + rng.uniform(-0.3, 0.3, 7)
-    return READY, panda.denormalise(goal).astype(np.float32)
+    goal = PANDA.normalise(READY) + rng.uniform(-0.3, 0.3, 7)
+    return READY, PANDA.denormalise(goal).astype(np.float32)
 
 
 @pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])

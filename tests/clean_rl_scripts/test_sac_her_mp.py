@@ -10,10 +10,10 @@ from trainers import load, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import collect
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import Demos, load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_transitions
 from roboarm_nmp.envs.datasets.format import QueryScenes
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import protocol
 from roboarm_nmp.envs.training.protocol import stack
 
@@ -52,8 +52,8 @@ def test_log_probability_is_that_of_a_squashed_gaussian():
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
 def test_network_inputs(goal_type):
     rng = np.random.default_rng(0)
-    c = rng.uniform(panda.LOWER, panda.UPPER, (5, 7))
-    state, goal_state = panda.normalise(c), rng.uniform(-1, 1, (5, 7))
+    c = rng.uniform(PANDA.lower, PANDA.upper, (5, 7))
+    state, goal_state = PANDA.normalise(c), rng.uniform(-1, 1, (5, 7))
     position, goal_position = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
     goal = {"ee": goal_position, "config": goal_state}.get(
         goal_type, np.hstack([goal_state, goal_position])
@@ -236,7 +236,7 @@ def hand_made_demos(number=3, steps=12, task="no_obstacles"):
     states = first[:, None] + np.arange(steps + 1)[:, None] * direction[:, None]
     actions = np.repeat(direction[:, None], steps + 1, axis=1)
     actions[:, -1] = 0.0
-    ends = panda.denormalise(states[:, [0, -1]]).astype(np.float32)
+    ends = PANDA.denormalise(states[:, [0, -1]]).astype(np.float32)
     return Demos(
         task=task,
         seed=0,
@@ -261,11 +261,11 @@ def test_demonstration_as_transitions_by_hand(goal_type):
     demo = hand_made_demos()[1]
     env = envs.make("no_obstacles", goal_type=goal_type)
     episode = demo_transitions(demo, env)
-    angles = panda.denormalise(demo.states.astype(np.float64))
-    positions = panda.forward_kinematics(angles)
-    goal_position = panda.forward_kinematics(demo.goal)
+    angles = PANDA.denormalise(demo.states.astype(np.float64))
+    positions = PANDA.forward_kinematics(angles)
+    goal_position = PANDA.forward_kinematics(demo.goal)
     if goal_type == "config":
-        reached = np.linalg.norm(demo.states - panda.normalise(demo.goal), axis=1) <= 0.05
+        reached = np.linalg.norm(demo.states - PANDA.normalise(demo.goal), axis=1) <= 0.05
     else:
         reached = np.linalg.norm(positions - goal_position, axis=1) <= 0.02
     assert len(episode) == np.argmax(reached) < len(demo.actions)  # cut where the goal is reached
@@ -278,8 +278,8 @@ def test_demonstration_as_transitions_by_hand(goal_type):
         assert not transition["collision"]
         goal = {
             "ee": goal_position,
-            "config": panda.normalise(demo.goal),
-            "combined": np.concatenate([panda.normalise(demo.goal), goal_position]),
+            "config": PANDA.normalise(demo.goal),
+            "combined": np.concatenate([PANDA.normalise(demo.goal), goal_position]),
         }[goal_type]
         np.testing.assert_allclose(transition["desired_goal"], goal, atol=1e-6)
     env.action_mode = "subgoal"
@@ -331,10 +331,10 @@ def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, de
     arrays, events = demo_run(tmp_path, demo_file, prob)
     first = np.concatenate([[True], arrays["remaining"][:-1] == 0])
     observation, goal = arrays["observation"][first], arrays["desired_goal"][first]
-    starts = panda.normalise(demos.start)
+    starts = PANDA.normalise(demos.start)
     query = np.array([np.abs(starts - row[:7]).max(1).argmin() for row in observation])
     assert np.abs(starts[query] - observation[:, :7]).max() < 1e-3  # all on the demos' queries
-    np.testing.assert_allclose(goal, panda.forward_kinematics(demos.goal)[query], atol=1e-6)
+    np.testing.assert_allclose(goal, PANDA.forward_kinematics(demos.goal)[query], atol=1e-6)
     injected = [
         np.abs(action - demos[q].actions[0]).max() < 1e-6
         for q, action in zip(query, arrays["action"][first], strict=True)

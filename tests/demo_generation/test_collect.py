@@ -24,10 +24,10 @@ from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.demo_generation.verify import VERDICTS, Verifier, verify
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.journal import VERSION, line_of
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json
 from roboarm_nmp.envs.utils import workers
 
@@ -526,7 +526,7 @@ def colliding():
     rng = np.random.default_rng(0)
     with contextlib.closing(envs.make(TASK)) as env:
         while True:
-            configuration = rng.uniform(0.9 * panda.LOWER, 0.9 * panda.UPPER).astype(np.float32)
+            configuration = rng.uniform(0.9 * PANDA.lower, 0.9 * PANDA.upper).astype(np.float32)
             if env.in_collision(configuration):
                 return configuration
 
