@@ -14,6 +14,7 @@ are feasible. Planning happens in the normalised configuration space [-1, 1]^n.
 """
 
 import math
+import operator
 import time
 
 import numpy as np
@@ -143,10 +144,10 @@ class _States(ob.StateValidityChecker):
 
     def __init__(self, space, is_valid):
         super().__init__(space)
-        self._is_valid = is_valid
+        self._is_valid, self._values = is_valid, _values_of(space)
 
     def isValid(self, state):  # noqa: N802 (OMPL's name)
-        state = _values(state)
+        state = self._values(state)
         return self._is_valid.motion_free(state, state)
 
 
@@ -155,14 +156,18 @@ class _Motions(ob.MotionValidator):
 
     def __init__(self, space, is_valid):
         super().__init__(space)
-        self._is_valid = is_valid
+        self._is_valid, self._values = is_valid, _values_of(space)
 
     def checkMotion(self, start, end):  # noqa: N802
-        return self._is_valid.motion_free(_values(start), _values(end))
+        return self._is_valid.motion_free(self._values(start), self._values(end))
 
 
-def _values(state):
-    return state[0], state[1], state[2], state[3], state[4], state[5], state[6]
+def _values_of(space):
+    """A function from a state of OMPL's `SpaceInformation` to a tuple of its numbers."""
+    joints = space.getStateDimension()
+    if joints == 1:
+        return lambda state: (state[0],)
+    return operator.itemgetter(*range(joints))  # in C: planners ask for millions of states
 
 
 class Planner:

@@ -27,7 +27,7 @@ interruption the same command continues; a finished collection is extended by a 
 
 import copy
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,7 @@ from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
@@ -457,6 +458,8 @@ class Args:
     task: str = "random_boxes_hard"
     """Name of a task, `mixed_scenes`, or path of a scene file. Each scene has a roadmap of its own,
     also where scenes do not vary."""
+    robot: Path | None = None
+    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
     scenes: PositiveInt = 6000
     """Number of scenes."""
     paths_per_scene: PositiveInt = 300
@@ -524,6 +527,7 @@ def collect(args, progress=True):
         OSError: the folder cannot be written. Finished shards are kept.
     """
     flags.check(args)
+    args = replace(args, task=task_with_robot(args.task, args.robot), robot=None)
     if args.num_nodes <= max(args.num_neighbours, JOINED):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
     if not args.margin >= NODE_MARGIN:
@@ -549,7 +553,7 @@ def collect(args, progress=True):
         per_scene=args.paths_per_scene,
         progress=progress,
     )
-    return load_roadmap_paths(args.output)
+    return load_roadmap_paths(args.output, envs.get_task(args.task).base_scene.robot)
 
 
 def main(args):

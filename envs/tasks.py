@@ -11,7 +11,8 @@ another arm (`envs.robots.files`).
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.robots.files import ROBOT_FILES, load_robot
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
@@ -44,7 +45,7 @@ class Task:
 def get_task(task):
     """The `Task` of a name in `TASKS` or `TRAINING_SCENES`, or of the path of a scene file.
 
-    With `@` and a robot's file after it, the task is that robot's.
+    With `@` and a robot's file after it, the task is that robot's (`envs.robots.files`).
 
     Raises:
         ValueError: an unknown name, a malformed file, or a task that is the Panda's only.
@@ -71,9 +72,20 @@ def get_task(task):
 
 
 def split_robot(task):
-    """`TASK@ROBOT` as (task, robot); the robot is None without `@`."""
-    task, at, robot = str(task).partition("@")
-    return task, robot if at else None
+    """`TASK@ROBOT` as (task, robot); the robot is None without `@`, and for a name's `@panda`.
+
+    The `@` follows a name or a scene file: folders and other files may have one in their names.
+    """
+    text = str(task)
+    for at in (i for i, letter in enumerate(text) if letter == "@"):
+        task, robot = text[:at], text[at + 1 :]
+        if Path(task).suffix in SCENE_FILES or Path(task).name == task and _is_robot(robot):
+            return task, None if robot == PANDA.name and has_name(task) else robot
+    return text, None
+
+
+def _is_robot(robot):
+    return robot == PANDA.name or Path(robot).suffix in ROBOT_FILES
 
 
 def task_with_robot(task, robot):
@@ -103,7 +115,7 @@ def is_for_any_robot(name):
 
 def is_task(task):
     """Whether `task` is a name, or the path of a scene file; a robot may follow."""
-    task, robot = split_robot(task)
+    task, _ = split_robot(task)
     return has_name(task) or Path(task).suffix in SCENE_FILES
 
 
@@ -114,9 +126,7 @@ def has_name(task):
 
 def task_name(task):
     """The name of a task in files: its own, or that of its files without suffix."""
-    if "@" in str(task):
-        return "@".join(Path(part).stem for part in split_robot(task))
-    return task if task in TASKS else Path(task).stem
+    return "@".join(Path(part).stem for part in split_robot(task) if part is not None)
 
 
 def _two_walls(gap):

@@ -134,6 +134,9 @@ class Robot:
     def __hash__(self):
         return hash(self.fingerprint)
 
+    def __repr__(self):
+        return f"Robot({self.name!r}, {self.fingerprint[:12]})"
+
     @functools.cached_property
     def fingerprint(self):
         """SHA-256 (hex) of the description: all that simulation and kinematics depend on."""
@@ -300,7 +303,7 @@ class Robot:
 
         `colour`: (red, green, blue, alpha) in [0, 1].
         """
-        root = self._parsed_urdf()
+        root = self.parsed_urdf()
         for link in root.iter("link"):
             for visual in link.findall("visual"):
                 link.remove(visual)
@@ -320,7 +323,8 @@ class Robot:
             p.changeVisualShape(body, link, rgbaColor=colour, physicsClientId=client)
         return body
 
-    def _parsed_urdf(self):
+    def parsed_urdf(self):
+        """The URDF's XML element, with absolute paths of meshes."""
         root = ElementTree.fromstring(self.xml or Path(self.urdf).read_text())
         for mesh in root.iter("mesh"):
             mesh.set("filename", resolve(mesh.get("filename"), self.urdf))
@@ -328,7 +332,7 @@ class Robot:
 
     def collision_elements(self, link):
         """The URDF's `collision` elements of a link, by its name."""
-        return self._parsed_urdf().findall(f"link[@name='{link}']/collision")
+        return self.parsed_urdf().findall(f"link[@name='{link}']/collision")
 
     @contextlib.contextmanager
     def _readable_urdf(self):
