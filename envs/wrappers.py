@@ -15,14 +15,14 @@ class SensorWrapper(gym.Wrapper):
     Args:
         env: a `RoboArmEnv`, possibly wrapped.
         sensors: dict of name -> sensor: an `envs.perception.sensors.Camera` or `PointCloud`, or
-            any object with their `space` and `observe`; by default four cameras (`cardinal()`).
+            any object with their `space` and `observe`; by default four cameras (`cardinal`).
         every_step: observe in every step; otherwise once per episode, at its start, with the arm in
             the start configuration (paper, appendix "Prediction times investigation").
     """
 
     def __init__(self, env, sensors=None, every_step=False):
         super().__init__(env)
-        self.sensors = cardinal() if sensors is None else dict(sensors)
+        self.sensors = cardinal(robot=env.unwrapped.robot) if sensors is None else dict(sensors)
         self.every_step = every_step
         spaces = {name: sensor.space for name, sensor in self.sensors.items()}
         self.observation_space = gym.spaces.Dict(
@@ -125,9 +125,10 @@ class LinkDistancesWrapper(_ObservingWrapper):
 
     float32, the robot's `link_distances_shape`, a row per link that may collide: the distance from
     the nearest obstacle, table or floor in m, clipped to
-    `envs.collision.checker.LINK_DISTANCE_RANGE`, and its gradient, m per unit of normalised configuration (zeros beyond the range). With goals
-    that are configurations, `goal_link_distances` are the same at the goal. All attributes of the
-    wrapped environment are available.
+    `envs.collision.checker.LINK_DISTANCE_RANGE`, and its gradient, m per unit of normalised
+    configuration (zeros beyond the range). With goals that are configurations,
+    `goal_link_distances` are the same at the goal. All attributes of the wrapped environment are
+    available.
 
     Hindsight relabelling replaces goals, and must replace `goal_link_distances`, too: see
     docs/guide/environment.md, "Hindsight relabelling".

@@ -13,7 +13,9 @@ from dataclasses import asdict, dataclass
 import gymnasium as gym
 import numpy as np
 
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
+from roboarm_nmp.envs.scenes.random_boxes import scale_of
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
 
@@ -25,7 +27,9 @@ OUTPUTS = ("rgb", "depth", "segmentation")
 MIN_NEAR = 0.001  # m, of `near`: far below it, depths have no resolution left
 # Cardinal directions as seen by the robot: x is forward, y left.
 CARDINAL = {"front": (1, 0), "left": (0, 1), "back": (-1, 0), "right": (0, -1)}
-DISTANCE, HEIGHT = 1.6, 0.8  # of the default sensors' places, m
+# Of the default sensors around the Panda: their distance and height, the height they look at, the
+# farthest visible distance (m). For another arm they are scaled with its reach.
+DISTANCE, HEIGHT, TARGET, FAR = 1.6, 0.8, 0.4, 5.0
 
 
 @dataclass(frozen=True)
@@ -159,13 +163,15 @@ class PointCloud:
         return self.points(**self.camera.observe(world))
 
 
-def cardinal(kind=Camera, **options):
-    """Four sensors of a kind around the robot, looking at it: a dict of name -> sensor.
+def cardinal(kind=Camera, robot=PANDA, **options):
+    """Four sensors of a kind around a `Robot`, looking at it: a dict of name -> sensor.
 
     (Paper, section 4: "four sensors located in cardinal directions".) `options` go to each.
     """
+    scale = scale_of(robot)
+    options = {"target": (0.0, 0.0, scale * TARGET), "far": scale * FAR} | options
     return {
-        name: kind(eye=(DISTANCE * x, DISTANCE * y, HEIGHT), **options)
+        name: kind(eye=(scale * DISTANCE * x, scale * DISTANCE * y, scale * HEIGHT), **options)
         for name, (x, y) in CARDINAL.items()
     }
 

@@ -65,7 +65,7 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
     # Here, because Numba takes a while to import.
     from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 
-    source = find_geometry_source(geometry_source)
+    source = find_geometry_source(geometry_source, robot)
     if name == "via-points":
         return _via_points(robot, seed, tries, source)
     return _planner(env, seed, time_limit, source)
