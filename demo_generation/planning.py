@@ -407,7 +407,7 @@ def _simplify(space, path, rounds):
         simplifier.reduceVertices(geometric, 0, 0)
         simplifier.partialShortcutPath(geometric, SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS)
     simplifier.collapseCloseVertices(geometric)
-    return _to_array(geometric, space.getDimension())
+    return _to_array(geometric, len(path[0]))
 
 
 def _to_array(path, num_joints):
