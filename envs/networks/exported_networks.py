@@ -135,8 +135,8 @@ def check_robot(path, metadata, robot):
 
 
 def _words(robot):
-    name, fingerprint = robot if isinstance(robot, list) and len(robot) == 2 else (robot, "")
-    return f"{name!r} (hash {str(fingerprint)[:8]})"
+    name, fingerprint = robot if isinstance(robot, list) and len(robot) == 2 else (robot, "?")
+    return f"{name!r} ({str(fingerprint)[:12]})"
 
 
 def to_float16(path, output):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
-from trainers import PATHS, load, refusal, run_here, run_script
+from trainers import PATHS, load, panda_env, refusal, run_here, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
@@ -21,7 +21,7 @@ bc = load("bc")
 @pytest.mark.parametrize("num_modes", [1, 3])
 def test_log_likelihood_is_that_of_torch_distributions(num_modes):
     torch.manual_seed(0)
-    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=num_modes), 10).eval()
+    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=num_modes), panda_env()).eval()
     observation, goal, action = torch.randn(32, 10), torch.randn(32, 3), torch.randn(32, 7)
     outputs = actor.mlp(actor.features(observation, goal)).reshape(32, num_modes, 15).double()
     std = (-5 + 3.5 * (torch.tanh(outputs[..., 7:14]) + 1)).exp()
@@ -37,7 +37,7 @@ def test_log_likelihood_is_that_of_torch_distributions(num_modes):
 
 def test_action_is_the_most_likely_modes_mean():
     torch.manual_seed(0)
-    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=3), 10).eval()
+    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=3), panda_env()).eval()
     observation, goal = torch.randn(64, 10), torch.randn(64, 3)
     mean, _, log_weight = actor.modes(observation, goal)
     chosen = [mean[i, int(log_weight[i].argmax())] for i in range(64)]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from trainers import load, run_script
+from trainers import load, panda_env, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.queries import Query
@@ -38,7 +38,7 @@ def test_trainer_learns_to_reach_near_goals(trainer, tmp_path, monkeypatch):
     queries = [Query(*query(None, rng), scene) for _ in range(60)]
     made = protocol.make_envs("no_obstacles", 4, horizon=30)
     module = load(trainer)
-    untrained = module.Actor(module.Args(hidden_size=64, bf16=False), 10).eval()
+    untrained = module.Actor(module.Args(hidden_size=64, bf16=False), panda_env()).eval()
     before, after = (
         protocol.evaluate(policy, made, queries, "cpu")["success_rate"]
         for policy in (untrained, load_network(run / "policy.pt"))

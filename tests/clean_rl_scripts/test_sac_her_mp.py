@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import load, run_script
+from trainers import load, panda_env, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import collect
@@ -34,7 +34,7 @@ def test_polyak_update_by_hand():
 
 def test_log_probability_is_that_of_a_squashed_gaussian():
     torch.manual_seed(0)
-    actor = sac.Actor(sac.Args(bf16=False), 10).eval()
+    actor = sac.Actor(sac.Args(bf16=False), panda_env()).eval()
     observation, goal = torch.randn(64, 10), torch.randn(64, 3)
     action, log_prob = actor.get_action(actor.features(observation, goal))
     mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
@@ -62,12 +62,12 @@ def test_network_inputs(goal_type):
     expected += [5 * (goal_position - position)] * (goal_type != "config")
     expected += [5 * (goal_state - state)] * (goal_type != "ee")
     observation = np.hstack([state, position])
-    features = sac.Features(sac.Args(goal_type=goal_type), 10)
+    features = sac.Features(sac.Args(goal_type=goal_type), panda_env(goal_type))
     tensors = torch.tensor(observation).float(), torch.tensor(goal).float()
     inputs = features(*tensors).numpy()
     assert inputs.shape == (5, features.size)
     np.testing.assert_allclose(inputs, np.hstack(expected), atol=1e-5)
-    plain = sac.Features(sac.Args(goal_type=goal_type, plain_networks=True), 10)
+    plain = sac.Features(sac.Args(goal_type=goal_type, plain_networks=True), panda_env(goal_type))
     np.testing.assert_array_equal(plain(*tensors), torch.cat(tensors, dim=1))
 
 
@@ -80,14 +80,14 @@ def test_networks_fit_every_observation(goal_type, velocities, link_distances):
     args = sac.Args(**shared, num_hidden_layers=4)
     env = envs.make("wall", **shared, append_link_distances=link_distances)
     batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
-    actor = sac.Actor(args, env.observation_space["observation"].shape[0])
+    actor = sac.Actor(args, env)
     if link_distances:  # distances, ten times as large, are the last inputs
         features = actor.features(batch["observation"], batch["desired_goal"])
         torch.testing.assert_close(features[:, -10:], 10.0 * batch["link_distances"][..., 0])
     action = actor(**batch)
     assert action.shape == (2, 7)
     features = actor.features(batch["observation"], batch["desired_goal"])
-    assert sac.Critics(args, actor.features.size)(features, action).shape == (2, 2)
+    assert sac.Critics(args, actor.features)(features, action).shape == (2, 2)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_networks_fit_every_observation(goal_type, velocities, link_distances):
 def test_actions_are_within_twice_the_longest_step(flags, scale):
     args = sac.Args(**flags, bf16=False)
     assert sac.action_scale(args) == scale
-    actor = sac.Actor(args, 10)
+    actor = sac.Actor(args, panda_env())
     with torch.no_grad():
         actor.mlp[-1].bias.fill_(100.0)  # saturated
         action = actor(torch.zeros(1, 10), None, torch.zeros(1, 3))
@@ -111,7 +111,8 @@ def test_actions_are_within_twice_the_longest_step(flags, scale):
 
 def test_plain_critics_have_no_layer_norm():
     for plain in (False, True):
-        modules = sac.Critics(sac.Args(plain_networks=plain), 30).modules()
+        args = sac.Args(plain_networks=plain)
+        modules = sac.Critics(args, sac.Features(args, panda_env())).modules()
         assert any(isinstance(one, torch.nn.LayerNorm) for one in modules) is not plain
 
 
@@ -196,8 +197,9 @@ def test_million_transitions_fit_into_400_mb():
 def test_bfloat16_products_stay_close_to_float32():
     torch.manual_seed(0)
     args = sac.Args(bf16=True)
-    critics = sac.Critics(args, 30)
-    inputs = torch.randn(256, 30), torch.rand(256, 7) * 0.06
+    features = sac.Features(args, panda_env())
+    critics = sac.Critics(args, features)
+    inputs = torch.randn(256, features.size), torch.rand(256, 7) * 0.06
     in_training, exact = critics.train()(*inputs), critics.eval()(*inputs)
     assert 0 < (in_training - exact).abs().max() < 0.02
     assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
