@@ -11,7 +11,7 @@ another arm (`envs.robots.files`).
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from roboarm_nmp.envs.robots.files import ROBOT_FILES, load_robot
+from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
@@ -74,18 +74,17 @@ def get_task(task):
 def split_robot(task):
     """`TASK@ROBOT` as (task, robot); the robot is None without `@`, and for a name's `@panda`.
 
-    The `@` follows a name or a scene file: folders and other files may have one in their names.
+    The `@` follows a name or a scene file: folders may have one in their names, and so do a task's
+    data files (`.h5`).
     """
     text = str(task)
     for at in (i for i, letter in enumerate(text) if letter == "@"):
         task, robot = text[:at], text[at + 1 :]
-        if Path(task).suffix in SCENE_FILES or Path(task).name == task and _is_robot(robot):
-            return task, None if robot == PANDA.name and has_name(task) else robot
+        if has_name(task) and robot == PANDA.name:
+            return task, None
+        if (has_name(task) or Path(task).suffix in SCENE_FILES) and Path(robot).suffix != ".h5":
+            return task, robot
     return text, None
-
-
-def _is_robot(robot):
-    return robot == PANDA.name or Path(robot).suffix in ROBOT_FILES
 
 
 def task_with_robot(task, robot):

@@ -190,7 +190,7 @@ def test_actions_lead_to_the_next_subgoal_and_are_clipped(path):
 def test_subgoals_are_close_and_contain_the_waypoints(made):
     plans, executions, _ = made
     for plan in plans:
-        points = subgoals(plan)
+        points = subgoals(plan, PANDA)
         assert points.dtype == np.float64
         np.testing.assert_allclose(points, naive_subgoals(plan), rtol=0, atol=1e-12)
         assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() <= SUBGOAL_SPACING + 1e-12
@@ -199,7 +199,7 @@ def test_subgoals_are_close_and_contain_the_waypoints(made):
             assert np.abs(points - waypoint).max(1).min() < 1e-12
         np.testing.assert_allclose(points[[0, -1]], waypoints[[0, -1]], rtol=0, atol=1e-12)
     assert SUBGOAL_SPACING < MAX_STEP == 0.03
-    assert subgoals(plans[0][[0, 0]]).shape == (2, 7)  # standing still
+    assert subgoals(plans[0][[0, 0]], PANDA).shape == (2, 7)  # standing still
 
 
 def test_same_contents_same_bytes(path, made, tmp_path):

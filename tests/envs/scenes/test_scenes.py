@@ -364,7 +364,7 @@ def test_missing_split_is_reported(tmp_path, scenes):
 def test_damaged_scenes_are_rejected(tmp_path, scenes):
     write(tmp_path / "queries.h5", scenes)
     path = tmp_path / "queries.h5"
-    attributes, arrays = dataset_format.read_file(path, dataset_format.QUERY_SCHEMA, HARD)
+    _, arrays, base = dataset_format.read_file(path, dataset_format.QUERY_SCHEMA, HARD)
     for name, change, complaint in [
         ("test/scene", lambda a: a + 1, "does not fit"),
         ("test/obstacle_count", lambda a: a + 1, "does not fit"),
@@ -373,7 +373,7 @@ def test_damaged_scenes_are_rejected(tmp_path, scenes):
     ]:
         damaged = arrays | {name: change(arrays[name]).astype(arrays[name].dtype)}
         with pytest.raises(DatasetError, match=complaint):
-            dataset_format.read_scenes(path, attributes, damaged, "test/")
+            dataset_format.read_scenes(path, base, damaged, "test/")
 
 
 def test_obstacle_arrays_round_trip():
