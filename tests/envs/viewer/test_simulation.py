@@ -278,10 +278,10 @@ def test_task_without_query_file_has_random_queries_of_a_seed(tmp_path):
 def test_inverse_kinematics_stays_within_limits_and_near_the_goal():
     for query in [load_queries("no_obstacles")[i] for i in range(20)]:
         here = PANDA.forward_kinematics(query.goal)
-        near = inverse_kinematics(here, query.goal)
+        near = inverse_kinematics(PANDA, here, query.goal)
         assert np.allclose(near, query.goal)
-        moved = inverse_kinematics(0.9 * here, query.goal)
+        moved = inverse_kinematics(PANDA, 0.9 * here, query.goal)
         assert np.all(moved >= PANDA.lower) and np.all(moved <= PANDA.upper)
         assert np.abs(PANDA.forward_kinematics(moved) - 0.9 * here).max() < 1e-3
-        beyond = inverse_kinematics([0.0, 0.0, 3.0], query.goal)
+        beyond = inverse_kinematics(PANDA, [0.0, 0.0, 3.0], query.goal)
         assert np.isfinite(beyond).all() and np.all(np.abs(PANDA.normalise(beyond)) <= 1 + 1e-9)
