@@ -1,11 +1,14 @@
 """Describe a robot, and verify its description against PyBullet.
 
     roboarm robot check ur5.yaml
-    roboarm robot check ur5.yaml --images folder
+    roboarm robot check ur5.yaml --image ur5.png
 
 Prints joints, limits, links and the pairs of links that may collide. Then it compares forward
 kinematics and compiled collision checks with PyBullet, and measures how well the arm follows
 commands and holds configurations. The exit code is 1 if one of them is out of its tolerance.
+
+The image has three random feasible configurations, end-effector positions behind the arm (orange),
+and the table of the pairs of links that may collide.
 """
 
 import sys
@@ -14,16 +17,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pybullet as p
 import tyro
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.robots.control import calibrate
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.show import render_configurations
 from roboarm_nmp.envs.tasks import get_task, with_robot
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, check
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.envs.utils.files import check_writable
 from roboarm_nmp.envs.world import World
 
 SCENES_TASK = "random_boxes_hard"  # of the collision checks that are compared
@@ -33,7 +39,9 @@ HELD_POSES = 200
 MAX_POSITION_ERROR = 1e-4  # m
 MAX_DISAGREEMENT, MAX_DEPTH = 0.001, 0.002  # share of configurations; m
 MIN_EXECUTED, MIN_HELD = 0.7, 0.9  # shares
-IMAGE_SIZE, NUM_POSES, NUM_POSITIONS = (360, 300), 3, 3_000
+POSE_SIZE, WORKSPACE_SIZE, NUM_POSES, NUM_POSITIONS = (360, 300), (540, 450), 3, 6_000
+BEAD = 0.006  # share of the reach: half the edge of a position's cube
+MAY_COLLIDE, NEVER = (235, 120, 40), (232, 232, 232)
 
 
 @dataclass
@@ -42,8 +50,8 @@ class Args:
     """`panda`, or a robot's file (.urdf, .yaml)"""
     configurations: PositiveInt = 10_000
     """configurations at which collision checks are compared"""
-    images: Path | None = None
-    """folder for images: poses.png, workspace.png"""
+    image: Path | None = None
+    """file of the image (.png); by default the name of the robot's file and _check.png"""
     seed: Seed = 0
     """of the configurations"""
 
@@ -128,15 +136,17 @@ def describe(robot):
         fastest = "unknown" if fastest is None else f"{fastest:.2f}"
         lines.append(f"{name:<28}{low:>9.3f}{high:>9.3f}{fastest:>10}{effort:>9.0f}")
     names = link_names(robot)
-    pairs = ", ".join(f"{names[a]}-{names[b]}" for a, b in robot.self_collision_pairs) or "none"
     still = [names[link.index] for link in robot.links if link.frame < 0]
     offset = ", ".join(f"{x:g}" for x in robot.end_effector_offset)
     lines += [
         f"links that move and may collide: {', '.join(names[i] for i in robot.collision_links)}",
         f"links that do not move: {', '.join(still) or 'none'}",
-        f"pairs that may collide ({len(robot.self_collision_pairs)}): {pairs}",
         f"end effector: ({offset}) m in {names[robot.end_effector_link]}",
+        f"pairs of links that may collide ({len(robot.self_collision_pairs)}):",
     ]
+    for a in sorted({pair[0] for pair in robot.self_collision_pairs}):
+        others = [names[pair[1]] for pair in robot.self_collision_pairs if pair[0] == a]
+        lines.append(f"  {names[a]:<26}{', '.join(others)}")
     return "\n".join(lines)
 
 
@@ -153,41 +163,62 @@ def link_names(robot):
     return {-1: base} | {info[0]: info[12].decode() for info in infos}
 
 
-def draw_poses(robot, rng):
-    """An image of the robot in feasible configurations, side by side: uint8 (height, width, 3)."""
-    env = RoboArmEnv(Scene(robot=robot), render_mode="rgb_array", render_size=IMAGE_SIZE)
-    images = []
-    for _ in range(NUM_POSES):
-        env.reset_specific(*env.sample_query(rng))
-        images.append(env.render())
-    env.close()
-    return np.concatenate(images, axis=1)
-
-
-def draw_workspace(robot, rng):
-    """An image of the robot among end-effector positions of random configurations."""
-    env = RoboArmEnv(Scene(robot=robot), render_mode="rgb_array", render_size=(600, 500))
-    env.reset_specific(*env.sample_query(rng))
-    configurations = rng.uniform(robot.lower, robot.upper, (NUM_POSITIONS, robot.num_joints))
+def draw(robot, rng):
+    """An image of the robot: configurations, workspace, and pairs of links that may collide."""
+    env = RoboArmEnv(Scene(robot=robot))
+    poses = [env.sample_feasible(rng) for _ in range(NUM_POSES)]
+    query = Query(poses[0], poses[1], env.scene)
+    images = list(render_configurations(env, query, poses, POSE_SIZE))
+    around = _behind(robot, rng)
     bead = p.createVisualShape(
         p.GEOM_BOX,
-        halfExtents=[0.006] * 3,
+        halfExtents=[BEAD * robot.reach] * 3,
         rgbaColor=(0.9, 0.4, 0.1, 1),
         physicsClientId=env.client,
     )
     p.createMultiBody(
-        baseVisualShapeIndex=bead,
-        batchPositions=robot.forward_kinematics(configurations).tolist(),
-        physicsClientId=env.client,
+        baseVisualShapeIndex=bead, batchPositions=around.tolist(), physicsClientId=env.client
     )
-    image = env.render()
+    images += render_configurations(env, query, poses[:1], WORKSPACE_SIZE, around, "side")
     env.close()
-    return image
+    images.append(draw_pairs(robot, WORKSPACE_SIZE))
+    rows = np.concatenate(images[:NUM_POSES], axis=1), np.concatenate(images[NUM_POSES:], axis=1)
+    return Image.fromarray(np.concatenate(rows))
+
+
+def _behind(robot, rng):
+    """End-effector positions (m) of random configurations, those on the arm's left."""
+    configurations = rng.uniform(robot.lower, robot.upper, (NUM_POSITIONS, robot.num_joints))
+    positions = robot.forward_kinematics(configurations)
+    return positions[positions[:, 1] > robot.base_position[1]]
+
+
+def draw_pairs(robot, size):
+    """An image of the links as rows and columns: uint8 (height, width, 3)."""
+    names = link_names(robot)
+    links = sorted(link.index for link in robot.links)
+    image, font = Image.new("RGB", size, "white"), ImageFont.load_default(12)
+    painter, left = ImageDraw.Draw(image), size[0] // 3
+    cell = min((size[0] - left) // len(links), (size[1] - 40) // len(links))
+    painter.text((10, 8), "pairs of links that may collide (orange)", "black", font)
+    for row, a in enumerate(links):
+        top = 32 + row * cell
+        painter.text((left - 6, top + cell // 2), names[a][-30:], "black", font, anchor="rm")
+        for column, b in enumerate(links):
+            corner = left + column * cell, top
+            pair = tuple(sorted((a, b)))
+            colour = MAY_COLLIDE if pair in robot.self_collision_pairs else NEVER
+            painter.rectangle((*corner, corner[0] + cell - 2, top + cell - 2), colour)
+    return np.asarray(image)
 
 
 def main(args):
     """Print the description and the verification. Returns whether all is within tolerance."""
     robot = load_robot(args.robot)
+    image = args.image or Path(f"{Path(args.robot).stem}_check.png")
+    if image.suffix.lower() != ".png":
+        raise ValueError(f"--image must end in .png, got {image}")
+    check_writable(image)
     print(describe(robot))
     rng = np.random.default_rng(args.seed)
     error = position_error(robot, rng)
@@ -207,11 +238,8 @@ def main(args):
     ]  # fmt: skip
     for text, is_good in results:
         print(f"{'ok ' if is_good else 'BAD'} {text}")
-    if args.images is not None:
-        args.images.mkdir(parents=True, exist_ok=True)
-        for name, image in (("poses", draw_poses), ("workspace", draw_workspace)):
-            Image.fromarray(image(robot, rng)).save(args.images / f"{name}.png")
-        print(f"{args.images / 'poses.png'}, {args.images / 'workspace.png'}")
+    draw(robot, rng).save(image)
+    print(f"{image}: written, poses, workspace and pairs of links")
     return all(is_good for _, is_good in results)
 
 
@@ -222,5 +250,6 @@ if __name__ == "__main__":
     try:
         check(args)
         sys.exit(0 if main(args) else 1)
-    except ValueError as error:
-        sys.exit(str(error))
+    except (OSError, RuntimeError, ValueError) as error:
+        print(f"error: {error}".replace("\n", " "), file=sys.stderr)
+        sys.exit(2)

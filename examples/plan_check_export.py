@@ -38,7 +38,7 @@ def main():
     checker = CollisionChecker(scene)
     waypoints = np.clip(env.robot.normalise(path), -1.0, 1.0)
     free = checker.is_motion_free(waypoints[:-1], waypoints[1:])
-    times, configurations = timed(path)  # at the environment's speed
+    times, configurations = timed(path, env.robot)  # at the environment's speed
     states = np.clip(env.robot.normalise(configurations), -1.0, 1.0)
     near = checker.signed_distances(states, self_collisions=False).distance.min()
     print(f"{free.sum()} of {len(free)} motions are free, smallest distance {1000 * near:.1f} mm")

@@ -374,7 +374,7 @@ def test_saved_trajectory_plays_as_the_episode(tmp_path, capsys, monkeypatch):
         assert durations == before
         # The same arm; the ghost stands at the end of the file, a little off the goal.
         assert np.mean(np.abs(played.astype(int) - shown.astype(int)).max(-1) > 20) < 0.02
-        times, configurations = load_joint_path(file)
+        times, configurations = load_joint_path(file, PANDA)
         query = load_queries("wall")[2]
         np.testing.assert_allclose(configurations[0], query.start, atol=1e-6)
         np.testing.assert_allclose(times, np.arange(steps + 1) / 30)
