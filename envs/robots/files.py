@@ -70,22 +70,22 @@ def _load(path, _):
     if "srdf" in options:
         options["srdf"] = _located(path, options["srdf"])
     if "packages" in options:
+        if not all(isinstance(f, str) for f in options["packages"].values()):
+            raise RobotError(f"{path}: packages must name folders, got {options['packages']}")
         options["packages"] = {n: _located(path, f) for n, f in options["packages"].items()}
     return robot_from_urdf(urdf, **{"name": path.stem} | options)
 
 
 def _read(path):
+    if not path.is_file() or path.stat().st_size > MAX_FILE:
+        raise RobotError(f"{path}: no file, or more than {MAX_FILE // 1000} kB")
+    text = path.read_bytes()
+    if b"&" in text or b"*" in text:  # they expand without limit
+        raise RobotError(f"{path}: anchors and aliases (& and *) are not allowed")
     try:
-        text = path.read_text(encoding="utf-8")
-        if len(text) > MAX_FILE:
-            raise RobotError(f"{path}: more than {MAX_FILE // 1000} kB")
-        if "&" in text or "*" in text:  # they expand without limit
-            raise RobotError(f"{path}: anchors and aliases (& and *) are not allowed")
-        options = yaml.safe_load(text)
-    except OSError as error:
-        raise RobotError(f"{path}: {error.strerror}") from error
-    except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
-        raise RobotError(f"{path}: no YAML: {error}") from error
+        options = yaml.safe_load(text.decode())
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise RobotError(f"{path}: no YAML: {error}".replace("\n", " ")) from error
     if not isinstance(options, dict):
         raise RobotError(f"{path}: must be a mapping with the key `urdf`")
     for key, value in options.items():
@@ -101,7 +101,7 @@ def _located(path, file):
     """The path of a file that a robot's file names."""
     if file.startswith("package:"):  # of an installed Python package
         package, _, rest = file.removeprefix("package:").partition("/")
-        found = importlib.util.find_spec(package)
+        found = importlib.util.find_spec(package) if package.isidentifier() else None
         if found is None or not found.submodule_search_locations:
             raise RobotError(f"{path}: the Python package {package!r} is not installed")
         return Path(found.submodule_search_locations[0], rest)

@@ -9,6 +9,7 @@ import contextlib
 import copy
 import functools
 import hashlib
+import importlib
 import json
 import tempfile
 from dataclasses import dataclass, fields
@@ -17,7 +18,8 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-import pybullet as p
+
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -175,9 +177,9 @@ class Robot:
         Raises:
             RobotError: the file cannot be used; a ValueError that names it and the reason.
         """
-        from roboarm_nmp.envs.robots.urdf import robot_from_urdf
-
-        return robot_from_urdf(path, **options)
+        # By name, because that module is built on this one.
+        urdf = importlib.import_module("roboarm_nmp.envs.robots.urdf")
+        return urdf.robot_from_urdf(path, **options)
 
     # --- Sizes and normalisation
 
@@ -332,7 +334,8 @@ class Robot:
 
     def collision_elements(self, link):
         """The URDF's `collision` elements of a link, by its name."""
-        return self.parsed_urdf().findall(f"link[@name='{link}']/collision")
+        links = self.parsed_urdf().findall("link")
+        return next(one for one in links if one.get("name") == link).findall("collision")
 
     @contextlib.contextmanager
     def _readable_urdf(self):

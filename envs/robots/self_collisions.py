@@ -7,10 +7,11 @@ shapes overlap by design), or that never do.
 import dataclasses
 import itertools
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
-import pybullet as p
+
+from roboarm_nmp.envs.robots.untrusted import RobotError, read_xml
+from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 SAMPLES = 20_000
 # Of the samples: a pair that collides in more of them always collides.
@@ -25,22 +26,15 @@ def disabled_pairs(srdf, link_index):
         link_index: dict from names of links to indices.
 
     Raises:
-        ValueError: the file cannot be read, or names a link that is not there.
+        RobotError: the file cannot be read, or names a link that is not there.
     """
     path = Path(srdf)
-    try:
-        text = path.read_text(encoding="utf-8")
-        if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise ValueError(f"{path}: has a document type or entities")
-        root = ElementTree.fromstring(text)
-    except (OSError, UnicodeDecodeError, ElementTree.ParseError) as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from error
     pairs = set()
-    for element in root.iter("disable_collisions"):
+    for element in read_xml(path).iter("disable_collisions"):
         names = element.get("link1"), element.get("link2")
         for name in names:
             if name not in link_index:
-                raise ValueError(f"{path}: disable_collisions: the URDF has no link {name!r}")
+                raise RobotError(f"{path}: disable_collisions: the URDF has no link {name!r}")
         pairs.add(tuple(sorted(link_index[name] for name in names)))
     return pairs
 
@@ -59,7 +53,7 @@ def sample_pairs(robot, disabled, samples=SAMPLES, seed=0):
         nothing collides there.
 
     Raises:
-        ValueError: no configuration is without contacts.
+        RobotError: no configuration is without contacts.
     """
     moved = {link.index: link.frame for link in robot.links}
     candidates = tuple(
@@ -90,4 +84,4 @@ def sample_pairs(robot, disabled, samples=SAMPLES, seed=0):
     for configuration, found in zip(configurations, colliding, strict=True):
         if not found - always:
             return pairs, tuple(configuration.tolist())
-    raise ValueError(f"{robot.name}: collides with itself in each of {samples} configurations")
+    raise RobotError(f"{robot.urdf}: collides with itself in each of {samples} configurations")

@@ -7,24 +7,27 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-import pybullet as p
 
 from roboarm_nmp.envs.robots.control import calibrate
-from roboarm_nmp.envs.robots.robot import Frame, Link, Robot, resolve, temporary_urdf
+from roboarm_nmp.envs.robots.robot import Frame, Link, Robot, resolve
 from roboarm_nmp.envs.robots.self_collisions import disabled_pairs, sample_pairs
+from roboarm_nmp.envs.robots.untrusted import RobotError, bullet_indices, read_xml
 
-MAX_URDF, MAX_DEPTH, MAX_LINKS = 5_000_000, 30, 200  # bytes, nested elements, links
-MAX_COLLISION_MESH, MAX_VISUAL_MESH = 20_000_000, 100_000_000  # bytes
+MAX_LINKS = 200
+MAX_NAME = 200  # letters
+# Bytes of all meshes, and shapes for collisions.
+MAX_MESHES = {"collision": 50_000_000, "visual": 200_000_000}
+MAX_SHAPES = 500
+MAX_MESH = {"collision": 20_000_000, "visual": 50_000_000}  # bytes of one
 MESH_ENDINGS = (".obj", ".stl", ".dae")
 MOVABLE = ("revolute", "continuous", "prismatic")
 DEFAULT_EFFORT = 1_000.0  # N m or N, where a URDF has none
-MAX_NUMBER = 1e6
+LIGHT = "0.001", "0.000001"  # kg, kg m^2: of frames, such as a tool's
+MAX_NUMBER, MAX_NORM_ERROR = 1e6, 0.01
 NUMBERS = ("xyz", "rpy", "size", "radius", "length", "scale", "value", "ixx", "iyy", "izz")
 NUMBERS += ("lower", "upper", "effort", "velocity", "multiplier", "offset", "ixy", "ixz", "iyz")
-
-
-class RobotError(ValueError):
-    """A robot's description cannot be used; the message names the file and the reason."""
+VECTORS = {"xyz": (3,), "rpy": (3,), "size": (3,), "scale": (1, 3)}  # how many numbers
+POSITIVE = ("size", "radius", "length")
 
 
 def robot_from_urdf(
@@ -42,6 +45,16 @@ def robot_from_urdf(
     gain=None,
 ):
     """See `Robot.from_urdf`."""
+    _check_options(
+        path,
+        joints=joints or (),
+        fixed=fixed or {},
+        limits=limits or {},
+        end_effector_position=end_effector_position,
+        base_position=base_position,
+        base_orientation=base_orientation,
+        gain=gain,
+    )
     tree = _Tree(Path(path), packages)
     movable = [joint for joint in tree.joints if tree.is_movable(joint)]
     if not movable:
@@ -81,8 +94,14 @@ def robot_from_urdf(
         else:
             raise RobotError(f"{path}: {joint!r} mimics {leader!r}, which cannot move")
     frames, placements = _frames(tree, joints, positions, mimics)
+    ElementTree.indent(tree.root)  # PyBullet breaks lines of more than 8,191 letters
     xml = ElementTree.tostring(tree.root, "unicode")
-    index, link_index = _bullet_indices(path, xml)
+    index, link_index, shapes = bullet_indices(path, xml)
+    for link, element in tree.elements.items():
+        if shapes[link] < len(element.findall("collision")):
+            raise RobotError(
+                f"{path}: link {link!r}: PyBullet cannot use one of its collision shapes"
+            )
     links = [
         Link(link_index[link], placements[link][0], _steps(placements[link]))
         for link in tree.links
@@ -123,7 +142,7 @@ def robot_from_urdf(
         contact_free=tuple(bounds.mean(1)),
         observed_pose=tuple(bounds.mean(1)),
         base_position=tuple(map(float, base_position)),
-        base_orientation=tuple(map(float, base_orientation)),
+        base_orientation=tuple((base_orientation / np.linalg.norm(base_orientation)).tolist()),
     )
     adjacent = {
         tuple(sorted((link_index[a], link_index[b]))) for a, b in tree.neighbours(robot, link_index)
@@ -140,6 +159,31 @@ def robot_from_urdf(
         gain = calibrate(robot)[0]
         robot = dataclasses.replace(robot, gains=(gain,) * len(joints))
     return robot
+
+
+def _check_options(path, joints, fixed, limits, gain, **vectors):
+    """Raise RobotError for an option of another type, or one that is not finite."""
+
+    def are_numbers(values, count):
+        return len(values) == count and all(
+            isinstance(x, (int, float, np.number)) and abs(x) <= MAX_NUMBER for x in values
+        )
+
+    sizes = {"end_effector_position": 3, "base_position": 3, "base_orientation": 4}
+    wrong = [f"{name} {v}" for name, v in vectors.items() if not are_numbers(v, sizes[name])]
+    wrong += [f"joints {name!r}" for name in joints if not isinstance(name, str)]
+    wrong += [f"fixed {name}: {x}" for name, x in fixed.items() if not are_numbers([x], 1)]
+    wrong += [
+        f"limits {name}: {pair}"
+        for name, pair in limits.items()
+        if not (isinstance(pair, (list, tuple, np.ndarray)) and are_numbers(pair, 2))
+    ]
+    if gain is not None and not (are_numbers([gain], 1) and 0 < gain <= 1):
+        wrong.append(f"gain {gain}, which must be in (0, 1]")
+    if not wrong and abs(np.linalg.norm(vectors["base_orientation"]) - 1) > MAX_NORM_ERROR:
+        wrong.append(f"base_orientation {vectors['base_orientation']}: its norm is not 1")
+    if wrong:
+        raise RobotError(f"{path}: these options cannot be used: {'; '.join(wrong)}")
 
 
 class _Tree:
@@ -203,11 +247,30 @@ class _Tree:
                 if axis is None:
                     axis = ElementTree.SubElement(joint, "axis", xyz="1 0 0")  # URDF's default
                 axis.set("xyz", " ".join(map(repr, self._axis(name).tolist())))
+        self._add_masses()
+
+    def _add_masses(self):
+        """Give links without `inertial` some: PyBullet would take 1 kg, with a warning each."""
+        for name, link in self.elements.items():
+            if link.find("inertial") is None:
+                joint = self.joints.get(self._parent.get(name))
+                moves = joint is not None and joint.get("type") in MOVABLE
+                mass, inertia = ("1", "1") if moves else LIGHT
+                inertial = ElementTree.SubElement(link, "inertial")
+                ElementTree.SubElement(inertial, "mass", value=mass)
+                moments = dict.fromkeys(("ixx", "iyy", "izz"), inertia)
+                others = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+                ElementTree.SubElement(inertial, "inertia", **moments, **others)
 
     def _by_name(self, tag):
         found = {}
         for element in self.root.findall(tag):
             name = element.get("name")
+            if name and (len(name) > MAX_NAME or not name.isprintable()):
+                raise RobotError(
+                    f"{self.path}: the name of a {tag} has at most {MAX_NAME} letters, and no "
+                    f"control characters: {name[:40]!r}"
+                )
             if not name or name in found:
                 raise RobotError(f"{self.path}: two {tag}s, or one without a name: {name!r}")
             found[name] = element
@@ -226,32 +289,54 @@ class _Tree:
                     raise RobotError(
                         f"{self.path}: {element.tag} {name}={text[:40]!r}: not finite numbers"
                     )
+                if name in POSITIVE and not min(values, default=0.0) > 0:
+                    raise RobotError(
+                        f"{self.path}: {element.tag} {name}={text[:40]!r}: must be positive"
+                    )
+                if len(values) not in VECTORS.get(name, (1,)):
+                    raise RobotError(
+                        f"{self.path}: {element.tag} {name}={text[:40]!r}: {len(values)} numbers"
+                    )
 
     def _check_meshes(self, packages):
         # A URDF is often in a folder beside those of its meshes.
         folders = [self.path.absolute().parent.parent.resolve()]
         folders += [Path(folder).resolve() for folder in (packages or {}).values()]
-        digest = hashlib.sha256()
+        digest, shapes, left = hashlib.sha256(), 0, dict(MAX_MESHES)
         for link in self.elements.values():
-            for kind, limit in (("collision", MAX_COLLISION_MESH), ("visual", MAX_VISUAL_MESH)):
+            for kind, limit in MAX_MESH.items():
                 for mesh in link.findall(f"{kind}/geometry/mesh"):
-                    given = mesh.get("filename") or ""
-                    file = Path(resolve(given, self.path, packages)).resolve()
-                    where = f"{self.path}: link {link.get('name')!r}: mesh {given!r}"
-                    if not any(file.is_relative_to(folder) for folder in folders):
+                    file = self._mesh_file(link, mesh, folders, packages)
+                    size = file.stat().st_size
+                    left[kind] -= size
+                    if size > limit or left[kind] < 0:
+                        most = f"{limit // 1_000_000} MB, or all {MAX_MESHES[kind] // 1_000_000} MB"
                         raise RobotError(
-                            f"{where} is outside of {folders[0]}: name its folder in `packages`"
+                            f"{self.path}: link {link.get('name')!r}: {kind} mesh {file} has more "
+                            f"than {most}"
                         )
-                    if file.suffix.lower() not in MESH_ENDINGS:
-                        raise RobotError(f"{where}: must end in {', '.join(MESH_ENDINGS)}")
-                    if not file.is_file():
-                        raise RobotError(f"{where}: no such file ({file})")
-                    if file.stat().st_size > limit:
-                        raise RobotError(f"{where} has more than {limit // 1_000_000} MB")
                     mesh.set("filename", str(file))
                     if kind == "collision":
-                        digest.update(file.read_bytes())
+                        contents = file.read_bytes()
+                        shapes += contents.count(b"\no ") + contents.count(b"\ng ")
+                        digest.update(contents)
+            shapes += len(link.findall("collision"))
+        if shapes > MAX_SHAPES:
+            raise RobotError(f"{self.path}: {shapes} collision shapes, at most {MAX_SHAPES}")
         self.mesh_digest = digest.hexdigest()
+
+    def _mesh_file(self, link, mesh, folders, packages):
+        """The path of a mesh that may be read: one in `folders`."""
+        given = mesh.get("filename") or ""
+        file = Path(resolve(given, self.path, packages)).resolve()
+        where = f"{self.path}: link {link.get('name')!r}: mesh {given[:MAX_NAME]!r}"
+        if not any(file.is_relative_to(folder) for folder in folders):
+            raise RobotError(f"{where} is outside of {folders[0]}: name its folder in `packages`")
+        if file.suffix.lower() not in MESH_ENDINGS:
+            raise RobotError(f"{where}: must end in {', '.join(MESH_ENDINGS)}")
+        if not file.is_file():
+            raise RobotError(f"{where}: no such file ({file})")
+        return file
 
     def _axis(self, joint):
         axis = self.joints[joint].find("axis")
@@ -367,30 +452,8 @@ class _Tree:
 
 def _read(path):
     """The URDF's XML element. Raises RobotError."""
-    try:
-        if path.stat().st_size > MAX_URDF:
-            raise RobotError(f"{path}: more than {MAX_URDF // 1_000_000} MB")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise RobotError(f"{path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise RobotError(f"{path}: not text: {error}") from error
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise RobotError(f"{path}: has a document type or entities, which no URDF needs")
-    if "xmlns:xacro" in text and "xacro:macro" in text:
-        raise RobotError(f"{path}: has xacro macros: run `xacro` on it first")
-    parser, depth, root = ElementTree.XMLPullParser(("start", "end")), 0, None
-    try:
-        parser.feed(text)
-        parser.close()
-        for event, element in parser.read_events():
-            root = element if root is None else root
-            depth += 1 if event == "start" else -1
-            if depth > MAX_DEPTH:
-                raise RobotError(f"{path}: elements are nested more than {MAX_DEPTH} deep")
-    except ElementTree.ParseError as error:
-        raise RobotError(f"{path}: malformed XML: {error}") from error
-    if root is None or root.tag != "robot":
+    root = read_xml(path)
+    if root.tag != "robot":
         raise RobotError(f"{path}: no URDF: its first element is not <robot>")
     return root
 
@@ -466,20 +529,3 @@ def _steps(placement):
     if (rotation == np.eye(3)).all() and not position.any():
         return ()
     return ((tuple(position.tolist()), tuple(rotation.ravel().tolist())),)
-
-
-def _bullet_indices(path, xml):
-    """PyBullet's indices of joints and links, two dicts from names."""
-    client = p.connect(p.DIRECT)
-    try:
-        with temporary_urdf(xml) as urdf:
-            body = p.loadURDF(urdf, useFixedBase=True, physicsClientId=client)
-        number = p.getNumJoints(body, physicsClientId=client)
-        infos = [p.getJointInfo(body, i, physicsClientId=client) for i in range(number)]
-        base = p.getBodyInfo(body, physicsClientId=client)[0].decode()
-    except p.error as error:
-        raise RobotError(f"{path}: PyBullet cannot load it: {error}") from error
-    finally:
-        p.disconnect(client)
-    joints = {info[1].decode(): info[0] for info in infos}
-    return joints, {base: -1} | {info[12].decode(): info[0] for info in infos}
