@@ -280,6 +280,8 @@ class _Page:
                 "trace": "path of the end effector",
             }
             for option in self.drawing.OPTIONS:
+                if option == "decoded" and simulation.robot != PANDA:
+                    continue  # pretrained encoders are the Panda's
                 box = gui.add_checkbox(names[option], option in self.drawing.show)
                 box.on_update(lambda event, o=option: self.do(self._show, o, event.target.value))
         with gui.add_folder("Edit"):
