@@ -112,6 +112,8 @@ def _shapes(client, robot, body, link):
         if shape[2] == p.GEOM_MESH:
             flags = p.MESH_DATA_SIMULATION_MESH
             mesh = p.getMeshData(body, link, flags=flags, physicsClientId=client)[1]
+            if not mesh:  # one of several, without triangles
+                continue
             mesh, rounding = np.array(mesh), BULLET_MARGIN
         else:
             mesh, rounding = _primitive(shape)

@@ -14,6 +14,7 @@ MAX_FILE, MAX_DEPTH = 5_000_000, 30  # bytes, nested elements
 MAX_HULL = 100_000  # vertices of the convex hulls of all collision meshes
 # PyBullet may crash while it loads a hostile file, so another process tries it first.
 MAX_SECONDS, MAX_MEMORY = 4, 1_000_000_000  # of its processor time; bytes
+LARGEST = 1000.0  # m, of a mesh's coordinates
 TRIAL = """
 import json, os, resource, sys
 resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
@@ -27,10 +28,12 @@ infos = [p.getJointInfo(body, i) for i in range(p.getNumJoints(body))]
 vertices, shapes = 0, []
 for link in range(-1, len(infos)):
     kinds = [shape[2] for shape in p.getCollisionShapeData(body, link)]
-    shapes.append(len(kinds))
     if p.GEOM_MESH in kinds:
-        flags = p.MESH_DATA_SIMULATION_MESH
-        vertices += p.getMeshData(body, link, flags=flags)[0]
+        number, corners = p.getMeshData(body, link, flags=p.MESH_DATA_SIMULATION_MESH)
+        vertices += number
+        if not number or not all(abs(x) <= LARGEST for corner in corners for x in corner):
+            kinds = []
+    shapes.append(len(kinds))
 names = [[info[1].decode(), info[12].decode()] for info in infos]
 base = p.getBodyInfo(body)[0].decode()
 os.write(answer, json.dumps([base, names, shapes, vertices]).encode())
@@ -95,7 +98,7 @@ def bullet_indices(path, xml):
     Raises:
         RobotError: PyBullet cannot load it, or needs too much time, memory or vertices.
     """
-    trial = f"SECONDS, MEMORY = {MAX_SECONDS}, {MAX_MEMORY}\n{TRIAL}"
+    trial = f"SECONDS, MEMORY, LARGEST = {MAX_SECONDS}, {MAX_MEMORY}, {LARGEST}\n{TRIAL}"
     with temporary_urdf(xml) as urdf:
         command = [sys.executable, "-c", trial, urdf]
         done = subprocess.run(command, capture_output=True, env=os.environ | ONE_THREAD)

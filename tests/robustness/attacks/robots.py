@@ -1,5 +1,6 @@
 """Robots: URDFs, their meshes and YAML files with one to three random changes."""
 
+import copy
 import functools
 import random
 from xml.etree import ElementTree
@@ -100,7 +101,7 @@ def hostile(rng):
             if rng.random() < 0.5:
                 parent.remove(child)
             else:
-                rng.choice(elements).append(child)
+                rng.choice(elements).append(copy.deepcopy(child))  # itself would be a cycle
         elif kind < 0.8:
             name = rng.choice(sorted(files))
             contents = bytearray(files[name])
