@@ -141,13 +141,13 @@ class Features(nn.Module):
         """(N, o), (N, g) -> (N, size)."""
         inputs = [observation, desired_goal]
         if not self.plain:
-            state = observation[:, : self.num_joints]
-            angles = state * self.half_range + self.middle
+            joints = self.num_joints
+            angles = observation[:, :joints] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
             if self.goal_type != "config":
                 inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
             if self.goal_type != "ee":
-                inputs.append(5.0 * (desired_goal[:, : self.num_joints] - state))
+                inputs.append(5.0 * (desired_goal[:, :joints] - observation[:, :joints]))
         if self.distances is not None:
             inputs.append(10.0 * observation[:, self.distances])  # they are small numbers
         return torch.cat(inputs, dim=1)
