@@ -2,7 +2,9 @@
 
 import dataclasses
 import itertools
+import os
 import pickle
+import resource
 import time
 
 import numpy as np
@@ -228,7 +230,12 @@ MESH = "0 0 0", "0 0 0", '<mesh filename="{}"/>'
         (link("a", (*MESH[:2], MESH[2].format("/etc/passwd"))), "outside of"),
         (link("a", (*MESH[:2], MESH[2].format("../../../x.stl"))), "outside of"),
         (link("a") + link("a"), "two links"),
+        (link("a", ("0 0 0", "0 0 0", '<sphere radius="0"/>')), "must be positive"),
+        (link("a", ("0 0", "0 0 0", '<sphere radius="1"/>')), "2 numbers"),
+        (link("a" * 300), "has at most 200 letters"),
+        (link("a", *[BAR] * 600), "601 collision shapes|600 collision shapes"),
         ("<link name='a'>" * 40 + "</link>" * 40, "nested more than"),
+        ("<link name='a'>" * 300_000, "nested more than"),
     ],
 )
 def test_unusable_urdf_is_rejected_with_its_reason(urdf, elements, reason):
@@ -257,6 +264,75 @@ def test_malformed_file_is_rejected_with_its_reason(tmp_path, contents, reason):
     with pytest.raises(RobotError, match=reason):
         Robot.from_urdf(path)
     assert time.monotonic() - began < 5
+
+
+def test_pipe_is_rejected_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.urdf")
+    with pytest.raises(RobotError, match="no regular file"):
+        Robot.from_urdf(tmp_path / "pipe.urdf")
+
+
+@pytest.mark.parametrize(
+    "contents", [b"", b"solid", b"v 0 0 0", bytes(84), b"\xff" * 1000, b"f 9 9 9\nv 1 1 1"]
+)
+@pytest.mark.parametrize("ending", ["stl", "obj", "dae"])
+def test_mesh_without_triangles_is_rejected(urdf, contents, ending):
+    path = urdf(TWO + joint("1", "a", "b") + link("c", (*MESH[:2], MESH[2].format(f"x.{ending}"))))
+    text = path.read_text().replace("</robot>", joint("2", "b", "c") + "</robot>")
+    path.write_text(text)
+    (path.parent / f"x.{ending}").write_bytes(contents)
+    with pytest.raises(RobotError, match="PyBullet cannot"):
+        Robot.from_urdf(path)
+
+
+def test_mesh_of_many_vertices_ends_in_an_error_within_time_and_memory(urdf):
+    path = urdf(link("a", (*MESH[:2], MESH[2].format("many.obj"))))
+    with open(path.parent / "many.obj", "w") as file:
+        file.writelines(f"v {i % 977} {i % 991} {i % 997}\n" for i in range(900_000))
+        file.writelines(f"f {i} {i + 1} {i + 2}\n" for i in range(1, 300_000))
+    began = time.process_time(), time.monotonic()
+    with pytest.raises(RobotError):
+        Robot.from_urdf(path)
+    assert time.process_time() - began[0] < 5
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 1_000_000  # kB
+
+
+def test_prefixes_of_other_programs_and_long_lines_are_accepted(urdf):
+    path = urdf(ARM.replace('effort="50"', 'effort="50" drake:acceleration="1"'))
+    text = path.read_text().replace("</robot>", "<drake:x y='1'/></robot>")
+    path.write_text(text.replace("<link ", f"<!-- {'x' * 9000} --><link ", 1))
+    robot = Robot.from_urdf(path, end_effector="tool")
+    assert robot.effort.tolist() == [50] * 3 and len(arm_hulls(robot)[1]) == 9
+
+
+def test_frame_without_inertial_is_light(urdf):
+    """PyBullet would take 1 kg."""
+    robot = Robot.from_urdf(
+        urdf(ARM.replace(link("tool"), '<link name="tool"/>')), end_effector="tool"
+    )
+    client = p.connect(p.DIRECT)
+    body = robot.load(client)
+    assert p.getDynamicsInfo(body, robot.end_effector_link, physicsClientId=client)[0] < 0.01
+    p.disconnect(client)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gain": float("nan")},
+        {"gain": -1},
+        {"base_position": (0, 0)},
+        {"base_orientation": (0, 0, 0, 2)},
+        {"end_effector_position": (0, 0, float("inf"))},
+        {"fixed": {"grip": None}},
+        {"limits": {"turn": 5}},
+        {"limits": {"turn": (float("nan"), 1)}},
+        {"joints": [5]},
+    ],
+)
+def test_options_of_other_types_are_rejected(urdf, options):
+    with pytest.raises(RobotError, match="these options cannot be used"):
+        Robot.from_urdf(urdf(ARM), end_effector="tool", **options)
 
 
 def test_huge_mesh_is_rejected_before_it_is_read(urdf, tmp_path):
