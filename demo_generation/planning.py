@@ -422,7 +422,7 @@ def _checked(path, start, goal):
             f"the planner returned shape {path.shape}: a path has shape (k > 1, {joints})"
         )
     if not np.isfinite(path).all() or np.abs(path).max() > 1.0 + 1e-6:
-        raise ValueError("the planner returned a path that leaves [-1, 1]^n")
+        raise ValueError(f"the planner returned a path that leaves [-1, 1]^{joints}")
     for name, end, wanted in (("start", path[0], start), ("end", path[-1], goal)):
         if np.abs(end - wanted).max() > 1e-6:
             raise ValueError(f"the planner's path does not {name} at the query's {name}: {end}")
