@@ -35,6 +35,7 @@ COMMANDS = {
     "minari": ("demo_generation.export_minari", "export demonstrations as a Minari dataset"),
     "roadmaps": ("demo_generation.roadmaps", "make roadmap paths, for `roboarm train dagger`"),
     "observations": ("scene_embedding_train.collect", "collect observations, for scene encoders"),
+    "robot": ("envs.robot_check", "describe and verify an arm: roboarm robot check FILE"),
     "data": ("envs.datasets", "validate or describe files of queries and demonstrations"),
 }
 

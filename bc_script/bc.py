@@ -20,8 +20,6 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.episodes import observed
 from roboarm_nmp.envs.datasets.format import DatasetError
@@ -113,23 +111,26 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
 class Features(nn.Module):
     """Network inputs: observation, goal and, unless plain, functions of them that ease learning."""
 
-    def __init__(self, args, observation_size):
+    def __init__(self, args, env):
         super().__init__()
         self.plain, self.goal_type = args.plain_networks, args.goal_type
-        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        robot, spaces = env.unwrapped.robot, env.observation_space
+        self.num_joints = robot.num_joints
+        low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        example = torch.zeros(1, observation_size), torch.zeros(1, GOAL_SIZES[args.goal_type])
+        example = (torch.zeros(1, *spaces[name].shape) for name in ("observation", "desired_goal"))
         self.size = self(*example).shape[1]
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""
         inputs = [observation, desired_goal]
         if not self.plain:
-            angles = observation[:, :7] * self.half_range + self.middle
+            joints = self.num_joints
+            angles = observation[:, :joints] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
             if self.goal_type != "config":  # end-effector positions
-                inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, 7:10]))
+                inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, joints : joints + 3]))
         return torch.cat(inputs, dim=1)
 
 
@@ -139,53 +140,57 @@ LOG_STD_MIN, LOG_STD_MAX = -5, 2
 class Actor(nn.Module):
     """A mixture of Gaussians with diagonal covariances over the action, in units of `MAX_STEP`."""
 
-    def __init__(self, args, observation_size):
+    def __init__(self, args, env):
         super().__init__()
-        self.features = Features(args, observation_size)
-        self.num_modes = args.num_modes
-        self.mlp = mlp(self.features.size, 15 * args.num_modes, args)
+        self.features = Features(args, env)
+        self.num_joints, self.num_modes = self.features.num_joints, args.num_modes
+        outputs = (2 * self.num_joints + 1) * args.num_modes
+        self.mlp = mlp(self.features.size, outputs, args)
 
     def modes(self, observation, desired_goal):
-        """Means and log standard deviations (N, K, 7), log weights (N, K)."""
+        """Means and log standard deviations (N, K, n), log weights (N, K)."""
         outputs = self.mlp(self.features(observation, desired_goal))
-        outputs = outputs.unflatten(1, (self.num_modes, 15))
-        log_std = torch.tanh(outputs[..., 7:14])
+        n = self.num_joints
+        outputs = outputs.unflatten(1, (self.num_modes, 2 * n + 1))
+        log_std = torch.tanh(outputs[..., n : 2 * n])
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)
-        return outputs[..., :7], log_std, F.log_softmax(outputs[..., 14], dim=1)
+        return outputs[..., :n], log_std, F.log_softmax(outputs[..., 2 * n], dim=1)
 
     def log_likelihood(self, observation, desired_goal, action):
-        """Of actions (N, 7), in units of `MAX_STEP`: (N,)."""
+        """Of actions (N, n), in units of `MAX_STEP`: (N,)."""
         mean, log_std, log_weight = self.modes(observation, desired_goal)
         standard = (action.unsqueeze(1) - mean) * torch.exp(-log_std)
         log_density = -0.5 * standard.square() - log_std - 0.5 * math.log(2 * math.pi)
         return torch.logsumexp(log_weight + log_density.sum(2), dim=1)
 
     def forward(self, observation, achieved_goal, desired_goal):
-        """The most likely mode's mean (N, 7), as an action; policy.pt contains this function."""
+        """The most likely mode's mean (N, n), as an action; policy.pt contains this function."""
         mean, _, log_weight = self.modes(observation, desired_goal)
-        likeliest = log_weight.argmax(1).reshape(-1, 1, 1).expand(-1, 1, 7)
+        likeliest = log_weight.argmax(1).reshape(-1, 1, 1).expand(-1, 1, self.num_joints)
         return MAX_STEP * mean.gather(1, likeliest).squeeze(1)
 
 
 # ALGO LOGIC: demonstrations
 def transitions(demos, goal_type, num_demos=None):
-    """Observations, goals and actions of demonstrations: float32 (n, 10), (n, g), (n, 7).
+    """Observations, goals and actions of demonstrations: float32 (m, n + 3), (m, g), (m, n).
 
-    And the index of each one's demonstration: int64 (n,). A demonstration is used to its end, also
-    after its goal counts as reached. Actions are in units of `MAX_STEP`.
+    And the index of each one's demonstration: int64 (m,). n is the number of joints. A
+    demonstration is used to its end, also after its goal counts as reached. Actions are in units of
+    `MAX_STEP`.
     """
     number = len(demos) if num_demos is None else min(num_demos, len(demos))
     demo_index = np.repeat(np.arange(number), np.diff(demos.offsets[: number + 1]))
     has_action = np.ones(len(demo_index), bool)
     has_action[demos.offsets[1 : number + 1] - 1] = False  # the last states
     rows, demo_index = np.flatnonzero(has_action), demo_index[has_action]
-    observation, _, goal = observed(demos.states[rows], demos.goal[:number], goal_type)
+    robot = demos.scenes.base.robot
+    observation, _, goal = observed(demos.states[rows], demos.goal[:number], goal_type, robot)
     return observation, goal[demo_index], demos.actions[rows] / MAX_STEP, demo_index
 
 
 # ALGO LOGIC: one update
 def update(actor, optimizer, observation, goal, action):
-    """One step on a batch, (N, o), (N, g), (N, 7). Returns the loss before it."""
+    """One step on a batch, (N, o), (N, g), (N, n). Returns the loss before it."""
     loss = -actor.log_likelihood(observation, goal, action).mean()
     optimizer.zero_grad()
     loss.backward()
@@ -217,9 +222,8 @@ if __name__ == "__main__":
     del parts
 
     # ALGO LOGIC: network and optimiser
-    observation_size = eval_envs[0].observation_space["observation"].shape[0]
-    actor = Actor(args, observation_size).to(device)
-    actor_average = Actor(args, observation_size).to(device).eval()  # evaluated and saved
+    actor = Actor(args, eval_envs[0]).to(device)
+    actor_average = Actor(args, eval_envs[0]).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
     optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
     state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}

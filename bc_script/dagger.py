@@ -24,8 +24,6 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
@@ -48,7 +46,8 @@ class Args(protocol.PolicyFlags):
     goal_type: Literal["config", "combined"] = "combined"
     """what the goal is: configuration, or that and the end-effector's position"""
     paths: Path = Path("roadmaps")
-    """folder of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any task"""
+    """folder of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any task of the
+    same robot"""
 
     # The algorithm
     total_updates: flags.PositiveInt = 24_000
@@ -153,53 +152,59 @@ class Actor(nn.Module):
     max-pooling combines them (PointNet: Qi et al., 2017).
     """
 
-    def __init__(self, args, token_size):
+    def __init__(self, args, env):
         super().__init__()
-        self.token_size = token_size  # numbers per token
-        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        robot, self.token_size = env.unwrapped.robot, env.encoder.token_size  # numbers per token
+        self.num_joints = joints = robot.num_joints
+        low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        size = 10 + GOAL_SIZES[args.goal_type] + 28 + 2 * math.prod(panda.LINK_DISTANCES_SHAPE)
-        self.token_in = nn.Linear(token_size, args.token_width)
+        goal_size = env.observation_space["desired_goal"].shape[0]
+        # Observation, goal, sines and cosines of both, link distances at both.
+        size = joints + 3 + goal_size + 4 * joints + 2 * math.prod(robot.link_distances_shape)
+        self.token_in = nn.Linear(self.token_size, args.token_width)
         self.arm_in = nn.Linear(size, args.token_width)
         self.fuse = Bf16Linear(args.token_width, args.token_width, args.bf16)
         self.first = nn.Linear(size + args.token_width, args.hidden_size)
         blocks = (Block(args.hidden_size, args.bf16) for _ in range(args.num_blocks))
         self.blocks = nn.Sequential(*blocks)
-        self.head = nn.Linear(args.hidden_size, 8)
+        self.head = nn.Linear(args.hidden_size, joints + 1)
         nn.init.zeros_(self.head.weight)  # the initial policy is go-to-goal
         nn.init.zeros_(self.head.bias)
 
     def features(self, observation, desired_goal, link_distances, goal_link_distances):
         """Features of the arm and of the goal (N, size)."""
-        states = torch.cat([observation[:, :7], desired_goal[:, :7]], dim=1)
-        angles = (states.unflatten(1, (2, 7)) * self.half_range + self.middle).flatten(1)
+        joints = self.num_joints
+        states = torch.cat([observation[:, :joints], desired_goal[:, :joints]], dim=1)
+        angles = (states.unflatten(1, (2, joints)) * self.half_range + self.middle).flatten(1)
         distances = torch.stack([link_distances, goal_link_distances], dim=1)
-        # The distances themselves, the first of eight numbers a link, are small.
+        # The distances themselves, the first number of each link, are small.
         distances = torch.cat([10.0 * distances[..., :1], distances[..., 1:]], dim=-1)
-        inputs = observation[:, :10], desired_goal, torch.sin(angles), torch.cos(angles)
+        inputs = observation[:, : joints + 3], desired_goal, torch.sin(angles), torch.cos(angles)
         return torch.cat([*inputs, distances.flatten(1)], dim=1)
 
     def outputs(self, observation, desired_goal, link_distances, goal_link_distances):
-        """The direction (N, 7), of any length, and the remaining length of the path (N,)."""
+        """The direction (N, n), of any length, and the remaining length of the path (N,)."""
         features = self.features(observation, desired_goal, link_distances, goal_link_distances)
-        tokens = observation[:, 10:].unflatten(1, (-1, self.token_size))
+        joints = self.num_joints
+        tokens = observation[:, joints + 3 :].unflatten(1, (-1, self.token_size))
         fused = F.relu(self.token_in(tokens) + self.arm_in(features).unsqueeze(1))
         fused = F.relu(self.fuse(fused))
         is_token = (tokens != 0.0).any(dim=2, keepdim=True)
         pooled = (fused * is_token).amax(1)  # (no number is below zero)
         x = self.blocks(F.relu(self.first(torch.cat([features, pooled], dim=1))))
         outputs = self.head(x)
-        to_goal = desired_goal[:, :7] - observation[:, :7]
-        direction = F.normalize(to_goal, dim=1) + outputs[:, :7]
-        return direction, to_goal.norm(dim=1) + F.softplus(outputs[:, 7])
+        to_goal = desired_goal[:, :joints] - observation[:, :joints]
+        direction = F.normalize(to_goal, dim=1) + outputs[:, :joints]
+        return direction, to_goal.norm(dim=1) + F.softplus(outputs[:, joints])
 
     def forward(
         self, observation, achieved_goal, desired_goal, link_distances, goal_link_distances
     ):
-        """The action (N, 7); policy.pt contains this function."""
+        """The action (N, n); policy.pt contains this function."""
         direction, _ = self.outputs(observation, desired_goal, link_distances, goal_link_distances)
-        to_goal = (desired_goal[:, :7] - observation[:, :7]).norm(dim=1, keepdim=True)
+        joints = self.num_joints
+        to_goal = (desired_goal[:, :joints] - observation[:, :joints]).norm(dim=1, keepdim=True)
         return F.normalize(direction, dim=1) * to_goal.clamp(max=MAX_STEP)
 
 
@@ -226,10 +231,10 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
     Returns the new examples, and the share of queries on which the policy reached the goal.
     """
     rng = np.random.default_rng([args.seed, Stream.DAGGER_ROUNDS, step])
-    parts, reached, visited = [], [], []
+    robot, parts, reached, visited = env.unwrapped.robot, [], [], []
 
     def act(**observation):
-        visited.append(observation["observation"][0, :7].cpu().numpy())
+        visited.append(observation["observation"][0, : robot.num_joints].cpu().numpy())
         return actor(**observation)
 
     bar = progress_bar(None, "round", args.round_queries, unit="query", transient=True)
@@ -238,7 +243,7 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         scene, ends = examples.paths.scenes[number], examples.paths.points[np.r_[first, last]]
         if not ground_truth_checker(scene).is_free(ends, margin=0.001).all():
             continue  # rounding might make the environment reject it
-        query = Query(*panda.denormalise(ends).astype(np.float32), scene)
+        query = Query(*robot.denormalise(ends).astype(np.float32), scene)
         visited.clear()
         seed = int(rng.integers(2**32))  # of the random-walk escapes
         result = protocol.evaluate(act, [env], [query], device, safety_filter, seed)
@@ -285,17 +290,19 @@ if __name__ == "__main__":
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:
         sys.exit("--pool-size must be at least --examples-per-update")
+    robot = validation.scenes.base.robot
     try:
         encoder = make_encoder(args.encoder, args.num_points)
+        encoder.check_robot(robot)
     except ValueError as error:
         sys.exit(f"--encoder: {error}")
     try:
         geometry_source = args.geometry_source or encoder.geometry_source
-        find_checker = find_geometry_source(geometry_source)
+        find_checker = find_geometry_source(geometry_source, robot)
     except ValueError as error:
         sys.exit(f"--geometry-source: {error}")
     try:
-        paths = load_roadmap_paths(args.paths)
+        paths = load_roadmap_paths(args.paths, robot)
     except DatasetError as error:
         sys.exit(f"--paths: {error}")
     env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
@@ -305,8 +312,8 @@ if __name__ == "__main__":
     safety_filter = SafetyFilter(args.safety_margin, args.escape)
 
     # ALGO LOGIC: network and optimiser
-    actor = Actor(args, encoder.token_size).to(device)
-    actor_average = Actor(args, encoder.token_size).to(device).eval()  # evaluated and saved
+    actor = Actor(args, eval_envs[0]).to(device)
+    actor_average = Actor(args, eval_envs[0]).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
     optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
     visited = {}  # examples of all rounds

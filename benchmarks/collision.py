@@ -3,6 +3,7 @@
     pip install -c constraints.txt -e .
     python benchmarks/collision.py                # 2 minutes
     python benchmarks/collision.py --num 15000    # fewer configurations
+    python benchmarks/collision.py --robot examples/robots/iiwa.yaml
 
 Agreement of `envs.collision.checker` with `RoboArmEnv.in_collision`: `--num` configurations, as
 many for each of the thirteen tasks' scenes (random boxes: 40 scenes each, of the validation
@@ -10,14 +11,18 @@ queries) and for the 100 original problems of each MotionBenchMaker shelf. Two t
 The others were moved along a line between two of those to a distance from contact that is uniform
 from -1 cm to 1 cm.
 
+With `--robot`, the scenes are those of another arm: 40 scaled scenes of each distribution of random
+boxes, the obstacles of every other task as they are, as in a scene file with that robot, and the
+files of `--scenes`.
+
 - disagreement: share of configurations with different answers;
 - deepest_mm: of these, the largest distance from contact, by whichever of the two has the larger.
 
 Speed: uniform configurations in 40 scenes of `random_boxes_hard`, processor time of one core, in
 turns, the median of `--rounds`. `link_distances` takes one free configuration at a time, as at
 every step of a policy, with three geometry sources: the ground truth, the observed point cloud, and
-points decoded by the encoder `field`. `pybullet` sets the joints, detects collisions and reads the
-contacts; `in_collision` also clears old contacts first.
+points decoded by the encoder `field`, which is the Panda's. `pybullet` sets the joints, detects
+collisions and reads the contacts; `in_collision` also clears old contacts first.
 
 The last line is JSON.
 """
@@ -27,6 +32,7 @@ import json
 import os
 import platform
 import time
+from dataclasses import replace
 from functools import partial
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -35,20 +41,47 @@ import numpy as np
 from tqdm import tqdm
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.files import load_scene
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.tasks import with_robot
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 CONTACT_RANGE = 0.01  # m
 SCENES = 40  # of each distribution
+NUDGES = 1000  # at most, per scene
+SPEED_TASK = "random_boxes_hard"
 
 
 def scenes_of(task, split):
     """Distinct scenes of a task's queries."""
     scenes = load_queries(task, split).scenes
     return list(dict.fromkeys(scenes[i] for i in range(len(load_queries(task, split)))))
+
+
+def groups_of_panda():
+    """Names of groups of scenes, with the scenes: of validation queries and original problems."""
+    groups = [(task, "validation") for task in envs.TASKS]
+    groups += [(task, "original") for task in envs.TASKS if task.startswith("benchmaker")]
+    for task, split in groups:
+        scenes = scenes_of(task, split)
+        yield f"{task}, {split}", scenes[:SCENES] if split == "validation" else scenes
+
+
+def groups_of(robot, files, rng):
+    """Likewise for another arm."""
+    for name, task in envs.TASKS.items():
+        scene = with_robot(task.scene, robot)
+        if isinstance(scene, Scene):
+            yield f"the obstacles of {name}", [scene]
+        else:
+            yield name, [scene.sample(rng) for _ in range(SCENES)]
+    for file in files:
+        yield file, [replace(load_scene(file), robot=robot)]
 
 
 def nudge(checker, states, rng):
@@ -72,26 +105,28 @@ def nudge(checker, states, rng):
 
 def pybullet_distance(env):
     """Smallest distance (m) that PyBullet reports after `in_collision`; NaN without contacts."""
-    contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
+    contacts = p.getContactPoints(bodyA=env.body, physicsClientId=env.client)
     return min((contact[8] for contact in contacts), default=np.nan)
 
 
 def compare(env, scenes, num, rng, progress):
     """Number of configurations, `num` over all scenes, and depths (m) of the disagreements."""
-    compared, depths = 0, []
+    compared, depths, joints = 0, [], env.robot.num_joints
     shares = np.diff(np.linspace(0, num, len(scenes) + 1).round().astype(int))
     for scene, count in zip(scenes, shares.tolist(), strict=True):
         env.set_scene(scene)
         checker = CollisionChecker(scene)
-        nudged = np.empty((0, 7))
-        while len(nudged) < count // 3:
-            more = nudge(checker, rng.uniform(-1.0, 1.0, (count, 7)), rng)
+        nudged = np.empty((0, joints))
+        for _ in range(NUDGES):  # a line between two configurations may miss contact
+            if len(nudged) == count // 3:
+                break
+            more = nudge(checker, rng.uniform(-1.0, 1.0, (count, joints)), rng)
             nudged = np.concatenate([nudged, more])[: count // 3]
-        uniform = rng.uniform(-1.0, 1.0, (count - len(nudged), 7))
+        uniform = rng.uniform(-1.0, 1.0, (count - len(nudged), joints))
         states = np.concatenate([uniform, nudged])
         free = checker.is_free(states)
         for state, is_free in zip(states, free, strict=True):
-            if env.in_collision(panda.denormalise(state)) == is_free:
+            if env.in_collision(env.robot.denormalise(state)) == is_free:
                 ours = abs(checker.signed_distances(state).distance.min())
                 depths.append(float(np.nanmax([ours, abs(pybullet_distance(env))])))
         compared += count
@@ -100,9 +135,9 @@ def compare(env, scenes, num, rng, progress):
 
 
 def pybullet_check(env, configuration):
-    panda.set_configuration(env.client, env.robot, configuration)
+    env.robot.set_configuration(env.client, env.body, configuration)
     p.performCollisionDetection(physicsClientId=env.client)
-    contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
+    contacts = p.getContactPoints(bodyA=env.body, physicsClientId=env.client)
     return any(contact[8] < 0.0 for contact in contacts)
 
 
@@ -117,32 +152,37 @@ def timed(function, *arguments):
     return time.process_time() - began
 
 
-def speed(rounds, rng):
+def speed(rounds, rng, robot):
     """Microseconds of processor time per configuration: dict name -> median over rounds."""
-    env, batch = envs.make("random_boxes_hard"), 10_000
-    scenes = scenes_of("random_boxes_hard", "validation")[:SCENES]
+    env, batch, joints = envs.RoboArmEnv(Scene(robot=robot)), 10_000, robot.num_joints
+    if robot == PANDA:
+        scenes = scenes_of(SPEED_TASK, "validation")[:SCENES]
+    else:
+        distribution = with_robot(envs.get_task(SPEED_TASK).scene, robot)
+        scenes = [distribution.sample(rng) for _ in range(SCENES)]
     checkers = [CollisionChecker(scene) for scene in scenes]
-    checkers[0].is_free(np.zeros(7))  # compiles
-    checkers[0].signed_distances(np.zeros(7))
+    middle = np.zeros(joints)
+    checkers[0].is_free(middle)  # compiles
+    checkers[0].signed_distances(middle)
     per_source = {
         f"link_distances, {name}": [find_geometry_source(name)(scene) for scene in scenes]
-        for name in ("ground_truth", "point_cloud", "field")
+        for name in ("ground_truth", "point_cloud", *["field"] * (robot == PANDA))
     }
     for ones in per_source.values():
-        ones[0].link_distances(np.zeros(7))
+        ones[0].link_distances(middle)
     names = "is_free", "signed_distances", *per_source, "pybullet", "in_collision"
     seconds = {name: [] for name in names}
     for _ in range(rounds):
         total = dict.fromkeys(seconds, 0.0)
         for i, (scene, checker) in enumerate(zip(scenes, checkers, strict=True)):
-            states = rng.uniform(-1.0, 1.0, (batch, 7))
+            states = rng.uniform(-1.0, 1.0, (batch, joints))
             total["is_free"] += timed(checker.is_free, states) / batch
             total["signed_distances"] += timed(checker.signed_distances, states[:500]) / 500
             free = states[:1000][checker.is_free(states[:1000])][:100]
             for name, ones in per_source.items():
-                total[name] += timed(run, ones[i].link_distances, free) / len(free)
+                total[name] += timed(run, ones[i].link_distances, free) / max(len(free), 1)
             env.set_scene(scene)
-            configurations = panda.denormalise(states[:100]).tolist()
+            configurations = env.robot.denormalise(states[:100]).tolist()
             total["pybullet"] += timed(run, partial(pybullet_check, env), configurations) / 100
             total["in_collision"] += timed(run, env.in_collision, configurations) / 100
         for name, value in total.items():
@@ -153,35 +193,37 @@ def speed(rounds, rng):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--robot", help="a robot's file (.urdf, .yaml); the Panda without")
+    parser.add_argument("--scenes", nargs="*", default=[], help="scene files, with --robot")
     parser.add_argument("--num", type=int, default=100_000, help="configurations to compare")
     parser.add_argument("--rounds", type=int, default=5, help="of timing")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     if args.num < 1000 or args.rounds < 1 or args.seed < 0:
         parser.error("--num must be at least 1000, --rounds at least 1, --seed at least 0")
+    if args.scenes and not args.robot:
+        parser.error("--scenes goes with --robot")
     rng = np.random.default_rng(args.seed)
-    groups = [(task, "validation") for task in envs.TASKS]
-    groups += [(task, "original") for task in envs.TASKS if task.startswith("benchmaker")]
-    env, compared, depths = envs.RoboArmEnv(), 0, []
-    print(f"{'scenes':38}{'configurations':>15}{'disagree':>10}{'deepest':>12}")
+    robot = load_robot(args.robot) if args.robot else PANDA
+    groups = list(groups_of(robot, args.scenes, rng) if args.robot else groups_of_panda())
+    env, compared, depths = envs.RoboArmEnv(Scene(robot=robot)), 0, []
+    print(f"{'scenes':42}{'configurations':>15}{'disagree':>10}{'deepest':>12}")
     with tqdm(total=args.num, unit=" configurations") as progress:
-        for i, (task, split) in enumerate(groups):
-            scenes = scenes_of(task, split)
-            if split == "validation":
-                scenes = scenes[:SCENES]
+        for i, (name, scenes) in enumerate(groups):
             share = args.num * (i + 1) // len(groups) - args.num * i // len(groups)
             count, found = compare(env, scenes, share, rng, progress)
             deepest = f"{1e3 * max(found):.3f} mm" if found else "-"
-            progress.write(f"{task + ', ' + split:38}{count:15,}{len(found):10}{deepest:>12}")
+            progress.write(f"{name:42}{count:15,}{len(found):10}{deepest:>12}")
             compared += count
             depths += found
     env.close()
-    micros = speed(args.rounds, rng)
+    micros = speed(args.rounds, rng, robot)
     print()
     for name, value in micros.items():
         print(f"{name:30}{value:10.2f} us")
     print()
     result = {
+        "robot": robot.name,
         "configurations": compared,
         "disagreement": len(depths) / compared,
         "deepest_mm": 1e3 * max(depths, default=0.0),
@@ -191,7 +233,7 @@ def main():
         "signed_distances_per_second": 1e6 / micros["signed_distances"],
         "link_distances_us": micros["link_distances, ground_truth"],
         "link_distances_point_cloud_us": micros["link_distances, point_cloud"],
-        "link_distances_field_us": micros["link_distances, field"],
+        "link_distances_field_us": micros.get("link_distances, field"),
         "python": platform.python_version(),
     }
     print(json.dumps(result))

@@ -33,7 +33,6 @@ import torch.nn as nn
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import load_queries
@@ -45,6 +44,7 @@ from roboarm_nmp.envs.perception.encoders import (
     pretrained_encoders,
 )
 from roboarm_nmp.envs.perception.geometry_source import DECODED_RADIUS
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import ROW, to_array
 
 TASK = "random_boxes_hard"
@@ -87,7 +87,7 @@ def link_distances(scenes, seed):
         CollisionChecker(replace(scene, table=None, floor=None)).link_distances(batch, within=FAR)
         for scene, batch in zip(tqdm(scenes, desc="distances"), states, strict=True)
     ]
-    frames = panda.joint_frames(panda.denormalise(states))
+    frames = PANDA.frame_poses(PANDA.denormalise(states))
     parts = [part for place, axes in frames for part in (place, axes[..., :, 0], axes[..., :, 2])]
     places = np.concatenate(parts, axis=-1).astype(np.float32)
     return places, np.stack(distances)[..., 0], states

@@ -14,7 +14,7 @@ end" only.
 The plain way follows the examples of PyBullet and OMPL:
 
 - world: PyBullet's default physics (1/240 s); the URDF's self-collision switched on, without
-  filters. Link pairs that always or never collide (those not in `panda.SELF_COLLISION_PAIRS`) and
+  filters. Link pairs that always or never collide (those not in `PANDA.self_collision_pairs`) and
   the base on its table are skipped in Python when contacts are read.
 - validity: `resetJointState` joint by joint, `performCollisionDetection`, `getContactPoints`;
   any overlap is a collision. The resolution is ours, as a fraction of the space's diagonal.
@@ -48,8 +48,8 @@ from tqdm import tqdm
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import collect
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import RESOLUTION
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.envs.utils.bullet import pybullet as p
@@ -70,7 +70,7 @@ class GivenUp(Exception):
 
 def length_of(path):
     """Of a path (n, 7), rad: L2 in the normalised space."""
-    return np.linalg.norm(np.diff(panda.normalise(path), axis=0), axis=1).sum()
+    return np.linalg.norm(np.diff(PANDA.normalise(path), axis=0), axis=1).sum()
 
 
 class Ours:
@@ -133,8 +133,7 @@ class Plain:
             flags=p.URDF_USE_SELF_COLLISION,
             physicsClientId=client,
         )
-        for finger in panda.FINGER_JOINTS:
-            opening = panda.FINGER_OPENING
+        for finger, opening in zip(PANDA.held_indices, PANDA.held_positions, strict=True):
             p.resetJointState(self.robot, finger, opening, physicsClientId=client)
             self.command(finger, opening, 20.0)
         scene = envs.TASKS[options["task"]].scene
@@ -142,16 +141,16 @@ class Plain:
         for box in (Box((0, 0, scene.floor - 0.05), (6, 6, 0.1)), *scene.obstacles):
             self.add(box)
 
-        space = ob.RealVectorStateSpace(panda.NUM_JOINTS)
-        bounds = ob.RealVectorBounds(panda.NUM_JOINTS)
-        for i in range(panda.NUM_JOINTS):
-            bounds.setLow(i, panda.LOWER[i])
-            bounds.setHigh(i, panda.UPPER[i])
+        space = ob.RealVectorStateSpace(PANDA.num_joints)
+        bounds = ob.RealVectorBounds(PANDA.num_joints)
+        for i in range(PANDA.num_joints):
+            bounds.setLow(i, PANDA.lower[i])
+            bounds.setHigh(i, PANDA.upper[i])
         space.setBounds(bounds)
         self.space = ob.SpaceInformation(space)
         self.space.setStateValidityChecker(self.is_valid)
         # A share of the longest motion: as far apart, in the normalised space, as ours.
-        self.space.setStateValidityCheckingResolution(RESOLUTION / (2 * panda.NUM_JOINTS**0.5))
+        self.space.setStateValidityCheckingResolution(RESOLUTION / (2 * PANDA.num_joints**0.5))
         self.space.setup()
 
     def add(self, box):
@@ -173,7 +172,7 @@ class Plain:
         )
 
     def teleport(self, configuration):
-        for i in panda.ARM_JOINTS:
+        for i in PANDA.joint_indices:
             p.resetJointState(self.robot, i, configuration[i], physicsClientId=self.client)
 
     def in_contact(self):
@@ -184,7 +183,7 @@ class Plain:
                 continue
             if body == self.robot:
                 pair = (min(link, other_link), max(link, other_link))
-                if pair in panda.SELF_COLLISION_PAIRS:
+                if pair in PANDA.self_collision_pairs:
                     return True
             elif body != self.table or link != -1:
                 return True
@@ -204,7 +203,7 @@ class Plain:
         ends = []
         for configuration in (start, goal):
             state = self.space.allocState()
-            for i, angle in enumerate(np.clip(configuration, panda.LOWER, panda.UPPER)):
+            for i, angle in enumerate(np.clip(configuration, PANDA.lower, PANDA.upper)):
                 state[i] = float(angle)
             ends.append(state)
         problem = ob.ProblemDefinition(self.space)
@@ -232,22 +231,22 @@ class Plain:
         """Whether the arm follows a path from its start to its end without contact."""
         client, robot = self.client, self.robot
         self.teleport(path[0])
-        targets = subgoals(path)[1:]
+        targets = subgoals(path, PANDA)[1:]
         for target in targets:
-            for i, angle in zip(panda.ARM_JOINTS, panda.denormalise(target), strict=True):
-                self.command(i, angle, panda.MAX_TORQUE[i])
+            for i, angle in zip(PANDA.joint_indices, PANDA.denormalise(target), strict=True):
+                self.command(i, angle, PANDA.effort[i])
             for _ in range(STEP_LIMIT):
                 p.stepSimulation(physicsClientId=client)
                 if self.in_contact():
                     return False
-                joints = p.getJointStates(robot, panda.ARM_JOINTS, physicsClientId=client)
-                state = panda.normalise([joint[0] for joint in joints])
+                joints = p.getJointStates(robot, PANDA.joint_indices, physicsClientId=client)
+                state = PANDA.normalise([joint[0] for joint in joints])
                 if np.linalg.norm(state - target) <= TOLERANCE:
                     break
         link = p.getLinkState(
-            robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=client
+            robot, PANDA.end_effector_link, computeForwardKinematics=1, physicsClientId=client
         )
-        ee_distance = np.linalg.norm(link[4] - panda.forward_kinematics(path[-1]))
+        ee_distance = np.linalg.norm(link[4] - PANDA.forward_kinematics(path[-1]))
         return ee_distance <= 0.02 and np.linalg.norm(state - targets[-1]) <= 0.05
 
     def __call__(self, query):

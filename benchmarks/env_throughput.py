@@ -31,7 +31,9 @@ import panda_gym  # noqa: F401  (registers PandaReachJoints-v3)
 from tqdm import trange
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import arm_env, panda
+from roboarm_nmp.envs.robots.control import SUBSTEPS
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 EPISODE = 100  # steps
@@ -65,25 +67,27 @@ def run_panda_gym(env, actions):
 
 
 def run_bare(env, start, targets):
-    client, robot = env.client, env.robot
-    panda.set_configuration(client, robot, start)
-    forces = panda.MAX_TORQUE.tolist()
+    client, body = env.client, env.body
+    PANDA.set_configuration(client, body, start)
+    forces = PANDA.effort.tolist()
     began = time.perf_counter()
     for target in targets:
         p.setJointMotorControlArray(
-            robot,
-            panda.ARM_JOINTS,
+            body,
+            PANDA.joint_indices,
             p.POSITION_CONTROL,
             targetPositions=target,
             forces=forces,
-            positionGains=arm_env.POSITION_GAINS,
+            positionGains=PANDA.gains,
             physicsClientId=client,
         )
-        for _ in range(arm_env.SUBSTEPS):
+        for _ in range(SUBSTEPS):
             p.stepSimulation(physicsClientId=client)
-            p.getContactPoints(bodyA=robot, physicsClientId=client)
-        p.getJointStates(robot, panda.ARM_JOINTS, physicsClientId=client)
-        p.getLinkState(robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=client)
+            p.getContactPoints(bodyA=body, physicsClientId=client)
+        p.getJointStates(body, PANDA.joint_indices, physicsClientId=client)
+        p.getLinkState(
+            body, PANDA.end_effector_link, computeForwardKinematics=1, physicsClientId=client
+        )
     return time.perf_counter() - began
 
 
@@ -94,24 +98,24 @@ def record_targets(env, episode):
     """
     start, goal, actions = episode
     targets, tracking = [], []
-    command = panda.command
-    panda.command = lambda client, robot, target, gains: (
+    command = Robot.command
+    Robot.command = lambda robot, client, body, target: (
         targets.append(target),
-        command(client, robot, target, gains),
+        command(robot, client, body, target),
     )
     try:
         env.reset_specific(start, goal)
         targets.clear()
-        before = panda.normalise(start)
+        before = PANDA.normalise(start)
         for action in actions:
             observation, _, _, _, info = env.step(action)
             after = observation["observation"][:7].astype(np.float64)
-            asked = panda.normalise(targets[-1]) - before
+            asked = PANDA.normalise(targets[-1]) - before
             if not info["collision"]:
                 tracking.append((after - before) @ asked / (asked @ asked))
             before = after
     finally:
-        panda.command = command
+        Robot.command = command
     return targets, tracking
 
 

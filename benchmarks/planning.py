@@ -33,9 +33,9 @@ from tqdm import tqdm
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import planning
 from roboarm_nmp.demo_generation.planning import MARGIN, MARGIN_GROWTH, Planner, PlanningError
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import RESOLUTION
 from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
@@ -45,20 +45,20 @@ class PyBulletValidity:
 
     def __init__(self, world, margin, ends, deadline):
         self.world, self.margin, self.checks = world, margin, 0
-        self.ends = [(panda.normalise(end), self.distance(end) - 1e-5) for end in ends]
+        self.ends = [(PANDA.normalise(end), self.distance(end) - 1e-5) for end in ends]
         self.deadline = deadline
 
     def distance(self, configuration):
-        client, robot = self.world.client, self.world.robot
-        panda.set_configuration(client, robot, configuration)
+        client, body = self.world.client, self.world.body
+        PANDA.set_configuration(client, body, configuration)
         p.performCollisionDetection(physicsClientId=client)
-        contacts = p.getContactPoints(bodyA=robot, physicsClientId=client)
+        contacts = p.getContactPoints(bodyA=body, physicsClientId=client)
         return min((contact[8] for contact in contacts), default=math.inf)
 
     def __call__(self, state):
         self.checks += 1
-        state = [state[i] for i in range(panda.NUM_JOINTS)]
-        nearest = self.distance(panda.denormalise_one(state))
+        state = [state[i] for i in range(PANDA.num_joints)]
+        nearest = self.distance(PANDA.denormalise_one(state))
         return nearest >= self.margin or any(
             nearest >= distance + MARGIN_GROWTH * math.dist(state, end)
             for end, distance in self.ends
@@ -134,7 +134,7 @@ def plan(planner, query, seconds, seed):
 
 def length_of(path):
     """L2 in the normalised space, of a path (n, 7), rad."""
-    return np.linalg.norm(np.diff(panda.normalise(path), axis=0), axis=1).sum()
+    return np.linalg.norm(np.diff(PANDA.normalise(path), axis=0), axis=1).sum()
 
 
 def main():

@@ -29,8 +29,8 @@ from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner, PlanningError
 from roboarm_nmp.demo_generation.roadmaps import OPTIONS, Args, Roadmap, random_paths_of_scene
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.robots.panda import PANDA
 
 SEED = 2**32 - 1  # the highest: hardly anybody's collection
 
@@ -91,8 +91,8 @@ def main():
         ]
         for i, path in enumerate(chosen):
             near.append(checker.signed_distances(along(path)).distance.min(-1))
-            path = panda.denormalise(path.astype(np.float64)).astype(np.float32)
-            path = np.clip(path, panda.LOWER.astype(np.float32), panda.UPPER.astype(np.float32))
+            path = PANDA.denormalise(path.astype(np.float64)).astype(np.float32)
+            path = np.clip(path, PANDA.lower.astype(np.float32), PANDA.upper.astype(np.float32))
             try:
                 execution = follow(env, path, scene)
             except ValueError:  # start or goal: free for the compiled checks, not for PyBullet
@@ -104,7 +104,7 @@ def main():
             if i < args.peer / args.scenes:
                 with contextlib.suppress(PlanningError):
                     plan = planner.plan(path[0], path[-1], scene, seed=1)
-                    peers.append((length_of(chosen[i]), length_of(panda.normalise(plan))))
+                    peers.append((length_of(chosen[i]), length_of(PANDA.normalise(plan))))
     followed = len(near)
     result |= {name: value / followed for name, value in outcomes.items()} | {"followed": followed}
     names = ("straight", "raw", "smoothed")

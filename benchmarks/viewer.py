@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.viewer import app, demo
 from roboarm_nmp.envs.viewer.drawing import Drawing
 from roboarm_nmp.envs.viewer.simulation import PolicyArm, Simulation, task_episodes
@@ -40,7 +39,7 @@ def move(simulation):
 
 def drag_goal(simulation):
     """Move the goal by 5 mm, to and fro."""
-    position = panda.forward_kinematics(simulation.query.goal)
+    position = simulation.robot.forward_kinematics(simulation.query.goal)
     simulation.move_goal(position + [0.0, 0.005 * np.sign(np.sin(time.monotonic())), 0.0])
 
 

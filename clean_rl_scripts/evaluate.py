@@ -63,6 +63,8 @@ from PIL import Image
 
 from roboarm_nmp.envs.arm_env import STANDARD_RULES
 from roboarm_nmp.envs.policies.baselines import TIME_LIMIT, TRIES
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
     CORES,
@@ -84,6 +86,8 @@ class Args:
     task: str | None = None
     """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); by default the one that the
     policy was trained on"""
+    robot: Path | None = None
+    """another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE"""
     goal_type: Literal["ee", "config", "combined"] | None = None
     """what the goal is; by default the policy's own, otherwise `ee`"""
     split: Literal["test", "validation", "original"] = "test"
@@ -128,8 +132,11 @@ def main(arguments=None):
         # Here, so that neither --help nor these errors wait for PyTorch.
         from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
 
+        if args.task is None and args.robot is not None:
+            raise ValueError("--robot goes with --task")
         options = vars(args) | {"safety_filter": _safety_filter(args)}
-        for name in ("safety_margin", "escape", "json", "image"):
+        options["task"] = task_with_robot(args.task, args.robot)
+        for name in ("robot", "safety_margin", "escape", "json", "image"):
             del options[name]
         result = evaluate(**options, progress=True)
     except ValueError as error:
@@ -177,6 +184,7 @@ def _settings(result):
         margin = f"margin {safety_filter['margin']:g} m, {escape}"
     limit = result["time_limit"]
     return {
+        "robot": None if result["robot"] == PANDA.name else result["robot"],
         "queries": result["queries"],
         "goal type": result["goal_type"],
         "encoder": encoder,

@@ -13,14 +13,13 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
 from roboarm_nmp.envs.training import flags, protocol, runs
 
@@ -59,8 +58,9 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """learning rate of the critics (Adam)"""
     alpha: flags.PositiveFloat = 0.2
     """entropy coefficient; the initial one, if it is tuned"""
-    target_entropy: flags.FiniteFloat | None = -7.0
-    """entropy that alpha is tuned to, of the unscaled action; `None`: alpha is constant"""
+    target_entropy: flags.FiniteFloat | Literal["auto"] | None = "auto"
+    """entropy that alpha is tuned to, of the unscaled action; `auto`: minus the number of joints;
+    `None`: alpha is constant"""
     policy_frequency: flags.PositiveInt = 2
     """updates of the critics per update of the policy (CleanRL: both are equally frequent)"""
     policy_average: flags.PositiveShare = 0.0003
@@ -120,31 +120,35 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
 class Features(nn.Module):
     """Network inputs: observation, goal and, unless plain, functions of them that ease learning."""
 
-    def __init__(self, args, observation_size):
+    def __init__(self, args, env):
         super().__init__()
         self.plain, self.goal_type = args.plain_networks, args.goal_type
-        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        robot, spaces = env.unwrapped.robot, env.observation_space
+        self.num_joints = robot.num_joints
+        low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        end = 10 + 7 * args.velocities  # of the end-effector position, before which are velocities
+        # The configuration, velocities (or not) and the end-effector position.
+        end = self.num_joints * (1 + args.velocities) + 3
         self.ee = slice(end - 3, end)
         # Link distances follow, the first number of each link is the distance.
-        links, numbers = panda.LINK_DISTANCES_SHAPE
+        links, numbers = robot.link_distances_shape
         near = slice(end, end + links * numbers, numbers)
         self.distances = near if args.link_distances else None
-        example = torch.zeros(1, observation_size), torch.zeros(1, GOAL_SIZES[args.goal_type])
+        example = (torch.zeros(1, *spaces[name].shape) for name in ("observation", "desired_goal"))
         self.size = self(*example).shape[1]
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""
         inputs = [observation, desired_goal]
         if not self.plain:
-            angles = observation[:, :7] * self.half_range + self.middle
+            joints = self.num_joints
+            angles = observation[:, :joints] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
             if self.goal_type != "config":
                 inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
             if self.goal_type != "ee":
-                inputs.append(5.0 * (desired_goal[:, :7] - observation[:, :7]))
+                inputs.append(5.0 * (desired_goal[:, :joints] - observation[:, :joints]))
         if self.distances is not None:
             inputs.append(10.0 * observation[:, self.distances])  # they are small numbers
         return torch.cat(inputs, dim=1)
@@ -159,14 +163,14 @@ def action_scale(args):
 class Critics(nn.Module):
     """Q1 and Q2."""
 
-    def __init__(self, args, num_features):
+    def __init__(self, args, features):
         super().__init__()
         self.action_scale = action_scale(args)
-        norm = not args.plain_networks
-        self.mlps = nn.ModuleList(mlp(num_features + 7, 1, args, norm) for _ in range(2))
+        size, norm = features.size + features.num_joints, not args.plain_networks
+        self.mlps = nn.ModuleList(mlp(size, 1, args, norm) for _ in range(2))
 
     def forward(self, features, action, number=2):
-        """(N, f), (N, 7) -> (number, N); of Q1 only with `number` 1."""
+        """(N, f), (N, n) -> (number, N); of Q1 only with `number` 1."""
         inputs = torch.cat([features, action / self.action_scale], dim=1)
         return torch.stack([qf(inputs).squeeze(-1) for qf in self.mlps[:number]])
 
@@ -178,14 +182,14 @@ LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
 
 class Actor(nn.Module):
-    def __init__(self, args, observation_size):
+    def __init__(self, args, env):
         super().__init__()
-        self.features = Features(args, observation_size)
+        self.features = Features(args, env)
         self.action_scale = action_scale(args)
-        self.mlp = mlp(self.features.size, 14, args)
+        self.mlp = mlp(self.features.size, 2 * self.features.num_joints, args)
 
     def get_action(self, features):
-        """A random action (N, 7), and its log-density (N,) before scaling by `action_scale`."""
+        """A random action (N, n), and its log-density (N,) before scaling by `action_scale`."""
         mean, log_std = self.mlp(features).chunk(2, dim=1)
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(log_std) + 1)
         noise = torch.randn_like(mean)
@@ -195,8 +199,8 @@ class Actor(nn.Module):
         return self.action_scale * torch.tanh(x_t), log_prob.sum(1)
 
     def forward(self, observation, achieved_goal, desired_goal, **_):
-        """The deterministic action (N, 7), for evaluation; policy.pt contains this function."""
-        mean = self.mlp(self.features(observation, desired_goal))[:, :7]
+        """The deterministic action (N, n), for evaluation; policy.pt contains this function."""
+        mean = self.mlp(self.features(observation, desired_goal))[:, : self.features.num_joints]
         return self.action_scale * torch.tanh(mean)
 
 
@@ -217,7 +221,7 @@ class HerReplayBuffer:
         goal_size = spaces["desired_goal"].shape[0]
         sizes = {"observation": observation_size, "next_observation": observation_size}
         sizes |= {"next_achieved_goal": goal_size, "desired_goal": goal_size}
-        sizes |= {"action": 7, "collision": 1}
+        sizes |= {"action": env.action_space.shape[0], "collision": 1}
         self.arrays = {name: np.zeros((capacity, n), np.float32) for name, n in sizes.items()}
         self.arrays |= {name: np.zeros(capacity, np.int32) for name in ("remaining", "latent")}
         self.latents, self.latent_numbers = np.zeros((1, latent_size), np.float32), {}
@@ -295,13 +299,15 @@ def updates_due(step, args):
 
 # ALGO LOGIC: networks, optimisers and one update
 class SAC:
-    def __init__(self, args, observation_size, device):
-        self.args = args
-        self.actor = Actor(args, observation_size).to(device)
-        self.actor_average = Actor(args, observation_size).to(device).eval()  # evaluated and saved
+    def __init__(self, args, env, device):
+        self.args, self.target_entropy = args, args.target_entropy
+        if args.target_entropy == "auto":
+            self.target_entropy = -float(env.action_space.shape[0])
+        self.actor = Actor(args, env).to(device)
+        self.actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
         self.actor_average.load_state_dict(self.actor.state_dict())
-        size = self.actor.features.size
-        self.critics, self.critics_target = (Critics(args, size).to(device) for _ in range(2))
+        critics = (Critics(args, self.actor.features).to(device) for _ in range(2))
+        self.critics, self.critics_target = critics
         self.critics_target.load_state_dict(self.critics.state_dict())
         self.log_alpha = torch.full((1,), math.log(args.alpha), device=device, requires_grad=True)
         parameters = [{"params": self.actor.parameters(), "lr": args.policy_lr}]
@@ -311,11 +317,12 @@ class SAC:
 
     def checkpoint_state(self):
         """The parts of a checkpoint, by name."""
-        return {name: part for name, part in vars(self).items() if name != "args"}
+        flags = "args", "target_entropy"
+        return {name: part for name, part in vars(self).items() if name not in flags}
 
     @torch.no_grad()
     def explore(self, observation, achieved_goal, desired_goal, **_):
-        """Random actions (N, 7), a NumPy array, for training."""
+        """Random actions (N, n), a NumPy array, for training."""
         self.actor.eval()
         actions, _ = self.actor.get_action(self.actor.features(observation, desired_goal))
         self.actor.train()
@@ -344,8 +351,8 @@ class SAC:
             actions, log_pi = self.actor.get_action(features)
             min_qf_pi = self.critics(features, actions).amin(0)
             actor_loss = (alpha * log_pi - min_qf_pi).mean()
-            surplus = log_pi.detach().mean() + (args.target_entropy or 0.0)
-            alpha_loss = -self.log_alpha.exp() * surplus * (args.target_entropy is not None)
+            surplus = log_pi.detach().mean() + (self.target_entropy or 0.0)
+            alpha_loss = -self.log_alpha.exp() * surplus * (self.target_entropy is not None)
             self.actor_optimizer.zero_grad()
             (actor_loss + alpha_loss).backward()
             self.actor_optimizer.step()
@@ -368,7 +375,7 @@ if __name__ == "__main__":
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     # END SHARED
 
-    agent = SAC(args, eval_envs[0].observation_space["observation"].shape[0], device)
+    agent = SAC(args, eval_envs[0], device)
     # SHARED: run and episodes
     rng = np.random.default_rng(args.seed)
     rb = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
@@ -384,7 +391,8 @@ if __name__ == "__main__":
     while run.step < args.total_timesteps and not run.reached(args.stop_at_success):
         # ALGO LOGIC: act
         if run.step < args.learning_starts:
-            actions = (2 * torch.rand(args.num_envs, 7) - 1).numpy() * agent.actor.action_scale
+            actions = 2 * torch.rand(args.num_envs, *envs[0].action_space.shape) - 1
+            actions = actions.numpy() * agent.actor.action_scale
         else:
             actions = agent.explore(**protocol.stack(obs, device))
 

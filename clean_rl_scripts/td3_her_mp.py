@@ -18,8 +18,6 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.arm_env import GOAL_SIZES
 from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
 from roboarm_nmp.envs.training import flags, protocol, runs
 
@@ -121,31 +119,35 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
 class Features(nn.Module):
     """Network inputs: observation, goal and, unless plain, functions of them that ease learning."""
 
-    def __init__(self, args, observation_size):
+    def __init__(self, args, env):
         super().__init__()
         self.plain, self.goal_type = args.plain_networks, args.goal_type
-        low, high = torch.tensor(panda.LOWER), torch.tensor(panda.UPPER)
+        robot, spaces = env.unwrapped.robot, env.observation_space
+        self.num_joints = robot.num_joints
+        low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        end = 10 + 7 * args.velocities  # of the end-effector position, before which are velocities
+        # The configuration, velocities (or not) and the end-effector position.
+        end = self.num_joints * (1 + args.velocities) + 3
         self.ee = slice(end - 3, end)
         # Link distances follow, the first number of each link is the distance.
-        links, numbers = panda.LINK_DISTANCES_SHAPE
+        links, numbers = robot.link_distances_shape
         near = slice(end, end + links * numbers, numbers)
         self.distances = near if args.link_distances else None
-        example = torch.zeros(1, observation_size), torch.zeros(1, GOAL_SIZES[args.goal_type])
+        example = (torch.zeros(1, *spaces[name].shape) for name in ("observation", "desired_goal"))
         self.size = self(*example).shape[1]
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""
         inputs = [observation, desired_goal]
         if not self.plain:
-            angles = observation[:, :7] * self.half_range + self.middle
+            joints = self.num_joints
+            angles = observation[:, :joints] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
             if self.goal_type != "config":
                 inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
             if self.goal_type != "ee":
-                inputs.append(5.0 * (desired_goal[:, :7] - observation[:, :7]))
+                inputs.append(5.0 * (desired_goal[:, :joints] - observation[:, :joints]))
         if self.distances is not None:
             inputs.append(10.0 * observation[:, self.distances])  # they are small numbers
         return torch.cat(inputs, dim=1)
@@ -160,14 +162,14 @@ def action_scale(args):
 class Critics(nn.Module):
     """Q1 and Q2."""
 
-    def __init__(self, args, num_features):
+    def __init__(self, args, features):
         super().__init__()
         self.action_scale = action_scale(args)
-        norm = not args.plain_networks
-        self.mlps = nn.ModuleList(mlp(num_features + 7, 1, args, norm) for _ in range(2))
+        size, norm = features.size + features.num_joints, not args.plain_networks
+        self.mlps = nn.ModuleList(mlp(size, 1, args, norm) for _ in range(2))
 
     def forward(self, features, action, number=2):
-        """(N, f), (N, 7) -> (number, N); of Q1 only with `number` 1."""
+        """(N, f), (N, n) -> (number, N); of Q1 only with `number` 1."""
         inputs = torch.cat([features, action / self.action_scale], dim=1)
         return torch.stack([qf(inputs).squeeze(-1) for qf in self.mlps[:number]])
 
@@ -176,19 +178,19 @@ class Critics(nn.Module):
 
 
 class Actor(nn.Module):
-    def __init__(self, args, observation_size):
+    def __init__(self, args, env):
         super().__init__()
-        self.features = Features(args, observation_size)
+        self.features = Features(args, env)
         self.action_scale = action_scale(args)
-        self.mlp = mlp(self.features.size, 7, args)
+        self.mlp = mlp(self.features.size, self.features.num_joints, args)
 
     def get_action(self, features):
-        """The action (N, 7) without noise, and the inputs of the tanh (N, 7)."""
+        """The action (N, n) without noise, and the inputs of the tanh (N, n)."""
         preactivation = self.mlp(features)
         return self.action_scale * torch.tanh(preactivation), preactivation
 
     def forward(self, observation, achieved_goal, desired_goal, **_):
-        """The action (N, 7) without noise; policy.pt contains this function."""
+        """The action (N, n) without noise; policy.pt contains this function."""
         return self.get_action(self.features(observation, desired_goal))[0]
 
 
@@ -209,7 +211,7 @@ class HerReplayBuffer:
         goal_size = spaces["desired_goal"].shape[0]
         sizes = {"observation": observation_size, "next_observation": observation_size}
         sizes |= {"next_achieved_goal": goal_size, "desired_goal": goal_size}
-        sizes |= {"action": 7, "collision": 1}
+        sizes |= {"action": env.action_space.shape[0], "collision": 1}
         self.arrays = {name: np.zeros((capacity, n), np.float32) for name, n in sizes.items()}
         self.arrays |= {name: np.zeros(capacity, np.int32) for name in ("remaining", "latent")}
         self.latents, self.latent_numbers = np.zeros((1, latent_size), np.float32), {}
@@ -290,14 +292,14 @@ POLICY_NOISE, NOISE_CLIP = 0.2, 0.5  # of the critics' target, in units of the a
 
 
 class TD3:
-    def __init__(self, args, observation_size, device):
+    def __init__(self, args, env, device):
         self.args = args
-        self.actor, self.actor_target = (Actor(args, observation_size).to(device) for _ in range(2))
+        self.actor, self.actor_target = (Actor(args, env).to(device) for _ in range(2))
         self.actor_target.load_state_dict(self.actor.state_dict())
-        self.actor_average = Actor(args, observation_size).to(device).eval()  # evaluated and saved
+        self.actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
         self.actor_average.load_state_dict(self.actor.state_dict())
-        size = self.actor.features.size
-        self.critics, self.critics_target = (Critics(args, size).to(device) for _ in range(2))
+        critics = (Critics(args, self.actor.features).to(device) for _ in range(2))
+        self.critics, self.critics_target = critics
         self.critics_target.load_state_dict(self.critics.state_dict())
         parameters = self.actor.parameters()
         self.actor_optimizer = torch.optim.Adam(parameters, lr=args.policy_lr, fused=True)
@@ -309,7 +311,7 @@ class TD3:
 
     @torch.no_grad()
     def explore(self, **observation):
-        """Noisy actions (N, 7), a NumPy array, for training."""
+        """Noisy actions (N, n), a NumPy array, for training."""
         self.actor.eval()
         actions, scale = self.actor(**observation), self.actor.action_scale
         self.actor.train()
@@ -366,7 +368,7 @@ if __name__ == "__main__":
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     # END SHARED
 
-    agent = TD3(args, eval_envs[0].observation_space["observation"].shape[0], device)
+    agent = TD3(args, eval_envs[0], device)
     # SHARED: run and episodes
     rng = np.random.default_rng(args.seed)
     rb = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
@@ -382,7 +384,8 @@ if __name__ == "__main__":
     while run.step < args.total_timesteps and not run.reached(args.stop_at_success):
         # ALGO LOGIC: act
         if run.step < args.learning_starts:
-            actions = (2 * torch.rand(args.num_envs, 7) - 1).numpy() * agent.actor.action_scale
+            actions = 2 * torch.rand(args.num_envs, *envs[0].action_space.shape) - 1
+            actions = actions.numpy() * agent.actor.action_scale
         else:
             actions = agent.explore(**protocol.stack(obs, device))
 

@@ -25,6 +25,7 @@ from roboarm_nmp.envs.datasets.demonstrations import demo_path, write_demos
 from roboarm_nmp.envs.datasets.journal import Journal, journal_of
 from roboarm_nmp.envs.datasets.queries import query_path, validate
 from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
+from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
     CORES,
@@ -48,6 +49,8 @@ REASONS = ("no_plan", "missed", "collided", "too_long")
 class Args:
     task: str
     """Name of a task, or path of a scene file."""
+    robot: Path | None = None
+    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
     num: PositiveInt = 10_000
     """Number of demonstrations."""
     seed: Seed = 0
@@ -69,7 +72,8 @@ class Args:
     allow_collisions: bool = False
     """Accept demonstrations with contact that reach the goal (the paper's rule)."""
     output: Path | None = None
-    """File to write. The default is `envs/demos/<task>.h5`."""
+    """File to write. The default is `envs/demos/<task>.h5`, or `<name>_demos.h5` beside a scene
+    file, or `<task>@<robot>_demos.h5` beside a robot's file."""
     overwrite: bool = False
     """Replace the output, if it exists."""
     ray_address: str | None = None
@@ -147,7 +151,7 @@ def demonstrate(planner, start, goal, rng, attempts, allow_collisions=False, rej
 
     Args:
         planner: a `Planner` with `max_checks`; its environment has the query's scene.
-        start, goal: float32 (7,), rad.
+        start, goal: float32 (j,), rad.
         rng: NumPy Generator of the planner's seeds.
         attempts: plans to try at most.
         allow_collisions: accept an execution with contact.
@@ -178,8 +182,8 @@ def _encode(array):
     return base64.b64encode(array.astype("<f4").tobytes()).decode()
 
 
-def _decode(text):
-    return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 7)
+def _decode(text, num_joints):
+    return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, num_joints)
 
 
 def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
@@ -227,8 +231,9 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             counts["attempts"] += counts[reason]
         counts["queries_given_up"] = sum(demo["given_up"] for demo in demos)
         task, scenes_of = envs.get_task(options["task"]), None
+        base = task.base_scene
+        joints = base.robot.num_joints
         if not isinstance(task.scene, Scene):
-            base = task.base_scene
             scenes_of = [replace(base, obstacles=from_array(demo["obstacles"])) for demo in demos]
         flags = " ".join(f"--{name.replace('_', '-')} {options[name]}" for name in OPTIONS[:-1])
         flags += " --allow-collisions" * options["allow_collisions"]
@@ -236,8 +241,8 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             path,
             options["task"],
             options["seed"],
-            [_decode(demo["plan"]) for demo in demos],
-            [_decode(demo["states"]) for demo in demos],
+            [_decode(demo["plan"], joints) for demo in demos],
+            [_decode(demo["states"], joints) for demo in demos],
             {name: [demo[name] for demo in demos] for name in ("plan_seed", "digest", "collided")},
             made_by=f"roboarm collect --num {num} {flags}",
             parameters={"options": options, "counts": counts},
@@ -268,6 +273,7 @@ def _check(args):
 
 def main(args):
     try:
+        args = replace(args, task=task_with_robot(args.task, args.robot), robot=None)
         path = _check(args)
         options = {name: getattr(args, name) for name in OPTIONS}
         counts = collect(path, args.num, options, args.workers, args.ray_address)

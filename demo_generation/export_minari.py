@@ -12,7 +12,7 @@ training, but the errors accumulate when the actions of an episode are replayed:
 hundred ends just short of its goal. With --exact, replaying the actions repeats the episode.
 
 Minari makes the environment again from its Gymnasium id alone. So this works for the tasks of
-`envs.TASKS` with a fixed scene, not for scenes that vary, and not for scene files.
+`envs.TASKS` with a fixed scene, not for scenes that vary, scene files, or other arms.
 """
 
 import contextlib
@@ -67,7 +67,7 @@ def unrounded(demo, env):
         raise ValueError(
             "the executions differ on this machine: repair them with `roboarm verify FILE --repair`"
         )
-    states, points = execution.states, subgoals(demo.plan)
+    states, points = execution.states, subgoals(demo.plan, env.robot)
     actions = points[np.minimum(np.arange(1, len(states)), len(points) - 1)] - states[:-1]
     actions *= np.minimum(1.0, MAX_STEP / np.linalg.norm(actions, axis=1, keepdims=True))
     return replace(demo, states=states, actions=actions.astype(np.float32))
@@ -82,7 +82,7 @@ def episode(demo, env):
 
     Returns:
         A dict with the fields of Minari's `EpisodeBuffer`, for T actions: `observations`, a dict of
-        float32 arrays (T + 1, ...), `actions`, float32 (T, 7), `rewards`, float32 (T,),
+        float32 arrays (T + 1, ...), `actions`, float32 (T, j), `rewards`, float32 (T,),
         `terminations` and `truncations`, bool (T,), `infos`, a dict with `is_success`, bool
         (T + 1,).
     """
@@ -212,7 +212,7 @@ def main(args):
     try:
         if (args.task is None) == (args.file is None):
             raise ValueError("give --task or --file, one of them")
-        demos = load_demos(args.file or demo_path(args.task))
+        demos = load_demos(args.file or demo_path(args.task), args.task)
         dataset_id, steps = export(
             demos, args.goal_type, args.dataset_id, args.exact, args.overwrite
         )

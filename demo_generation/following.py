@@ -20,7 +20,7 @@ class Execution:
     """The execution of a plan.
 
     Attributes:
-        states: float32 (n + 1, 7), the normalised configuration before each step and at the end.
+        states: float32 (m + 1, n), the normalised configuration before each step and at the end.
         collided: whether there was any contact.
         reached: whether the end is well inside the tolerances of every goal type.
         digest: CRC-32 of the bytes of `states`; the same for exactly the same executions.
@@ -37,21 +37,22 @@ def follow(env, path, scene=None):
 
     Args:
         env: a `RoboArmEnv` with relative actions and a `max_step` of at least 0.03.
-        path: float32 (n, 7), rad.
+        path: float32 (k, n), rad.
         scene: a `Scene` to change the environment to first.
 
     Raises:
         ValueError: the first or last configuration is in collision or outside the limits.
     """
     observation, info = env.reset_specific(path[0], path[-1], scene)
-    targets = subgoals(path)[1:]
-    states = [observation["observation"][:7]]
+    joints = env.robot.num_joints
+    targets = subgoals(path, env.robot)[1:]
+    states = [observation["observation"][:joints]]
     for step in range(len(targets) + SETTLE_STEPS):
         if step >= len(targets) and _reached(env, info):
             break
         target = targets[min(step, len(targets) - 1)]
         observation, _, _, _, info = env.step(target - states[-1])
-        states.append(observation["observation"][:7])
+        states.append(observation["observation"][:joints])
     states = np.stack(states)
     return Execution(
         states,

@@ -34,11 +34,12 @@ from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
 from roboarm_nmp.demo_generation.motionbenchmaker import read_problems
 from roboarm_nmp.demo_generation.planning import Planner
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.format import ORIGINAL
 from roboarm_nmp.envs.datasets.journal import Journal, journal_of
 from roboarm_nmp.envs.datasets.queries import query_path, write_queries
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
+from roboarm_nmp.envs.tasks import is_for_any_robot, task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils import workers
@@ -64,6 +65,8 @@ Region = Annotated[tuple[float, ...], tyro.conf.arg(metavar="XMIN XMAX YMIN YMAX
 class Args:
     task: tuple[str, ...]
     """Names of tasks, paths of scene files, or `all`."""
+    robot: Path | None = None
+    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
     solvable: bool = False
     """Accept only queries that the planner solves."""
     queries_per_scene: PositiveInt = 1
@@ -83,7 +86,7 @@ class Args:
     """JSON file of MotionBenchMaker problems to add as the split `original`; goes with one task."""
     output: Path | None = None
     """File to write; goes with one task. The default is `envs/data/<task>.h5`, or, for a scene
-    file, `<name>_queries.h5` beside it."""
+    file, `<name>_queries.h5` beside it, or, for a robot's file, `<task>@<robot>_queries.h5`."""
     overwrite: bool = False
     """Replace files that exist."""
 
@@ -132,13 +135,14 @@ class Sampler:
         """
         if self.goal_region is None:
             return self.env.sample_query(rng)
-        start, inside = self.env.sample_feasible(rng), 0
+        start, inside, robot = self.env.sample_feasible(rng), 0, self.env.robot
         low, high = np.reshape(self.goal_region, (3, 2)).T
         for _ in range(MAX_GOALS // GOALS):
-            goals = rng.uniform(panda.LOWER, panda.UPPER, (GOALS, 7)).astype(np.float32)
-            positions = panda.forward_kinematics(goals)
+            goals = rng.uniform(robot.lower, robot.upper, (GOALS, robot.num_joints))
+            goals = goals.astype(np.float32)
+            positions = robot.forward_kinematics(goals)
             for i in np.flatnonzero(((low <= positions) & (positions <= high)).all(axis=1)):
-                distance = np.linalg.norm(positions[i] - panda.forward_kinematics(start))
+                distance = np.linalg.norm(positions[i] - robot.forward_kinematics(start))
                 inside += 1
                 if distance > self.env.ee_tolerance and self.env.is_feasible(goals[i]):
                     return start, goals[i]
@@ -166,7 +170,7 @@ def make_queries(
 
     Args:
         path: file to write or replace.
-        task: name of the task, or path of a scene file.
+        task: name of the task, path of a scene file, or `TASK@ROBOT`.
         seed: int >= 0.
         num_test, num_validation: numbers of queries, > 0.
         solvable: accept only queries that the planner solves.
@@ -251,13 +255,18 @@ def make_queries(
 def _check(args):
     """The (task, path) pairs to make. Raises ValueError for arguments that cannot work."""
     flags.check(args)
-    tasks = tuple(envs.TASKS) if args.task == ("all",) else tuple(dict.fromkeys(args.task))
+    tasks = tuple(dict.fromkeys(args.task))
+    if tasks == ("all",):
+        tasks = tuple(name for name in envs.TASKS if not args.robot or is_for_any_robot(name))
+    tasks = tuple(task_with_robot(task, args.robot) for task in tasks)
     if not tasks:
         raise ValueError(f"--task: one or more of {', '.join(envs.TASKS)}, or all")
     if (args.output or args.original) is not None and len(tasks) > 1:
         raise ValueError("--output and --original are one file: they go with one task")
     if args.original is not None:
         read_problems(args.original)
+        if envs.get_task(tasks[0]).base_scene.robot != PANDA:
+            raise ValueError("--original: MotionBenchMaker's problems are the Panda's")
     if args.goal_region:
         region = np.array(args.goal_region)
         if region.shape != (6,) or not (

@@ -6,14 +6,15 @@
 
     env = roboarm_nmp.make("double_walls")
     query = load_queries("double_walls")[0]  # start, goal, scene
-    path = Planner(env).plan(*query, seed=1)  # float32 (n, 7), rad
+    path = Planner(env).plan(*query, seed=1)  # float32 (k, n), rad
 
 Collisions are checked by `envs.collision.checker`. It agrees with PyBullet within a fraction of a
 millimetre and is about twenty times faster. The environment itself decides whether start and goal
-are feasible. Planning happens in the normalised configuration space [-1, 1]^7.
+are feasible. Planning happens in the normalised configuration space [-1, 1]^n.
 """
 
 import math
+import operator
 import time
 
 import numpy as np
@@ -21,7 +22,6 @@ from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.envs.utils.names import suggest
@@ -73,7 +73,7 @@ class PlanningError(RuntimeError):
 class Validity:
     """Decides which normalised configurations and motions are free, and counts the checks.
 
-    Call it with one configuration (7 numbers), or use `free` and `motions_free` for many at once.
+    Call it with one configuration (n numbers), or use `free` and `motions_free` for many at once.
     `checks` is the number of configurations checked so far. `exhausted()` says whether the limits
     of this plan are reached: a planner asks now and then, and gives up.
 
@@ -99,20 +99,20 @@ class Validity:
     def motion_free(self, start, end):
         """Whether the straight motion from a configuration that is free to another is free.
 
-        Both are tuples of 7 floats.
+        Both are tuples of n floats.
         """
         checks = self._check(start, end)
         self._count(abs(checks))
         return checks > 0
 
     def free(self, states):
-        """Which configurations (..., 7) are free: bool (...)."""
+        """Which configurations (..., n) are free: bool (...)."""
         free = self._checker.is_free(states, **self._rule)
         self._count(free.size)
         return free
 
     def motions_free(self, starts, ends):
-        """Which straight motions from `starts` (..., 7) to `ends` (..., 7) are free: bool (...)."""
+        """Which straight motions from `starts` (..., n) to `ends` (..., n) are free: bool (...)."""
         checks = self._checker.motion_checks(starts, ends, **self._rule)
         self._count(int(np.abs(checks).sum()))
         return checks > 0
@@ -144,10 +144,10 @@ class _States(ob.StateValidityChecker):
 
     def __init__(self, space, is_valid):
         super().__init__(space)
-        self._is_valid = is_valid
+        self._is_valid, self._values = is_valid, _values_of(space)
 
     def isValid(self, state):  # noqa: N802 (OMPL's name)
-        state = _values(state)
+        state = self._values(state)
         return self._is_valid.motion_free(state, state)
 
 
@@ -156,14 +156,18 @@ class _Motions(ob.MotionValidator):
 
     def __init__(self, space, is_valid):
         super().__init__(space)
-        self._is_valid = is_valid
+        self._is_valid, self._values = is_valid, _values_of(space)
 
     def checkMotion(self, start, end):  # noqa: N802
-        return self._is_valid.motion_free(_values(start), _values(end))
+        return self._is_valid.motion_free(self._values(start), self._values(end))
 
 
-def _values(state):
-    return state[0], state[1], state[2], state[3], state[4], state[5], state[6]
+def _values_of(space):
+    """A function from a state of OMPL's `SpaceInformation` to a tuple of its numbers."""
+    joints = space.getStateDimension()
+    if joints == 1:
+        return lambda state: (state[0],)
+    return operator.itemgetter(*range(joints))  # in C: planners ask for millions of states
 
 
 class Planner:
@@ -173,8 +177,8 @@ class Planner:
         env: a `RoboArmEnv`; its scene may change between plans. A plan begins by resetting it to
             the query, so reset before the next step.
         planner: one of `PLANNERS`, or your own: a function `(is_valid, start, goal, rng)` that
-            returns a path (n, 7) from start to goal, or None. `is_valid` is a `Validity`, start
-            and goal are normalised configurations (7,), float64, `rng` is a NumPy Generator.
+            returns a path (k, n) from start to goal, or None. `is_valid` is a `Validity`, start
+            and goal are normalised configurations (n,), float64, `rng` is a NumPy Generator.
             `RRTConnect` alternates with `OTHER_PLANNER` where it takes long.
         clearance: metres that a path keeps from the scene, in addition to `MARGIN`. A query that
             starts or ends nearer is planned without it. `MARGIN_SCHEDULE` scales both in a long
@@ -219,14 +223,14 @@ class Planner:
         self.max_checks, self._geometry_source = max_checks, geometry_source
         self._scene, self._checker = env.scene, geometry_source(env.scene)
         # Compile here what is compiled at its first call: a plan's time is for planning.
-        state = (0.0,) * panda.NUM_JOINTS
+        state = (0.0,) * env.robot.num_joints
         self._checker.signed_distances(state)
         self._checker.motion_checker()(state, state)
         self.checks = 0
         """Collision checks of the last plan."""
 
     def plan(self, start, goal, scene=None, *, seed, time_limit=5.0):
-        """A path from start to goal: float32 (n, 7), rad; its ends are exactly start and goal.
+        """A path from start to goal: float32 (k, n), rad; its ends are exactly start and goal.
 
         The same seed gives the same path on every machine, whatever was planned before, as long as
         the time suffices: only a search that `time_limit` ends depends on the machine. If following
@@ -234,14 +238,14 @@ class Planner:
         path is returned.
 
         Args:
-            start, goal: joint angles (7, rad).
+            start, goal: joint angles (n, rad).
             scene: a `Scene` to change the environment to first.
             seed: int >= 0 or a sequence of such ints, as for `np.random.default_rng`.
             time_limit: seconds for all searches; `math.inf` for no limit. The plan may take a
                 little longer.
 
         Raises:
-            ValueError: start or goal is not 7 numbers inside the limits, or is in collision; seed
+            ValueError: start or goal is not n numbers inside the limits, or is in collision; seed
                 or time_limit is out of range; your own planner returned something that is not a
                 path from start to goal.
             PlanningError: no path within `time_limit` and `max_checks`.
@@ -250,8 +254,9 @@ class Planner:
             raise ValueError("seed must be an int or a sequence of ints, got None")
         if not time_limit > 0:
             raise ValueError(f"time_limit must be positive, got {time_limit!r}")
-        if np.shape(goal) == (3,):  # a position, with which an episode may begin
-            raise ValueError("goal must have 7 numbers, got shape (3,)")
+        joints = self.env.robot.num_joints
+        if np.shape(goal) == (3,) != (joints,):  # a position, with which an episode may begin
+            raise ValueError(f"goal must have {joints} numbers, got shape (3,)")
         rng, deadline = np.random.default_rng(seed), time.monotonic() + time_limit
         # Bad queries are rejected here, as an episode would reject them.
         self.env.reset_specific(start, goal, scene)
@@ -261,9 +266,9 @@ class Planner:
             path = self._search(start, goal, int(rng.integers(1, 2**32)), deadline)
             if path is None:
                 break
-            if best is None or len(subgoals(path)) < len(subgoals(best)):
+            if best is None or self._steps(path) < self._steps(best):
                 best = path
-            if len(subgoals(best)) <= self.env.horizon - LAG:
+            if self._steps(best) <= self.env.horizon - LAG:
                 break
         if best is None:
             raise PlanningError(
@@ -272,10 +277,13 @@ class Planner:
             )
         return best
 
+    def _steps(self, path):
+        return len(subgoals(path, self.env.robot))
+
     def _search(self, start, goal, seed, deadline):
-        """The path of one search, float32 (n, 7), rad; None: there was none within the limits."""
-        is_valid = self._validity(start, goal, deadline)
-        states = panda.normalise(start), panda.normalise(goal)
+        """The path of one search, float32 (k, n), rad; None: there was none within the limits."""
+        is_valid, robot = self._validity(start, goal, deadline), self.env.robot
+        states = robot.normalise(start), robot.normalise(goal)
         # For the random number generators that OMPL makes from here on. Spaces make some, for the
         # projections of KPIECE1 and its kin; how many must not matter to the planner.
         ou.RNG.setSeed(seed)
@@ -292,7 +300,7 @@ class Planner:
         self.checks += is_valid.checks
         if path is None:
             return None
-        path = panda.denormalise(path).astype(np.float32)
+        path = robot.denormalise(path).astype(np.float32)
         path[0], path[-1] = start, goal
         return path
 
@@ -300,7 +308,7 @@ class Planner:
         """The `Validity` of one search."""
         if self._scene is not self.env.scene:
             self._scene, self._checker = self.env.scene, self._geometry_source(self.env.scene)
-        ends = np.clip(np.stack([panda.normalise(start), panda.normalise(goal)]), -1.0, 1.0)
+        ends = np.clip(self.env.robot.normalise([start, goal]), -1.0, 1.0)
         near = self._checker.signed_distances(ends).distance.min(-1)
         from_scene = self._checker.signed_distances(ends, self_collisions=False).distance.min(-1)
         clearance = self.clearance if from_scene.min() >= self.clearance else 0.0
@@ -319,7 +327,7 @@ class Planner:
 
     def _space(self, is_valid):
         """OMPL's `SpaceInformation`, which asks `is_valid`."""
-        space = normalised_space()
+        space = normalised_space(self.env.robot.num_joints)
         information = ob.SpaceInformation(space)
         information.setStateValidityChecker(_States(information, is_valid))
         information.setMotionValidator(_Motions(information, is_valid))
@@ -344,10 +352,10 @@ class Planner:
             length *= 2
 
 
-def normalised_space():
+def normalised_space(num_joints):
     """OMPL's view of the normalised configuration space."""
-    space = ob.RealVectorStateSpace(panda.NUM_JOINTS)
-    bounds = ob.RealVectorBounds(panda.NUM_JOINTS)
+    space = ob.RealVectorStateSpace(num_joints)
+    bounds = ob.RealVectorBounds(num_joints)
     bounds.setLow(-1.0)
     bounds.setHigh(1.0)
     space.setBounds(bounds)
@@ -363,7 +371,7 @@ def _state(space, values):
 
 
 def _solve(turns, planner_range, space, is_valid, start, goal):
-    """Normalised path (n, 7) by OMPL's planners; None: there is none within the limits.
+    """Normalised path (k, n) by OMPL's planners; None: there is none within the limits.
 
     `turns`: pairs of a planner's name and the number of checks at which the next planner takes
     over. A planner that had a turn before continues its search.
@@ -384,7 +392,7 @@ def _solve(turns, planner_range, space, is_valid, start, goal):
 
         planners[name].solve(ob.PlannerTerminationCondition(over))
         if problem.hasExactSolution():
-            return _to_array(problem.getSolutionPath())
+            return _to_array(problem.getSolutionPath(), len(start))
         if is_valid.exhausted():
             break
     return None
@@ -399,20 +407,22 @@ def _simplify(space, path, rounds):
         simplifier.reduceVertices(geometric, 0, 0)
         simplifier.partialShortcutPath(geometric, SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS)
     simplifier.collapseCloseVertices(geometric)
-    return _to_array(geometric)
+    return _to_array(geometric, len(path[0]))
 
 
-def _to_array(path):
-    return np.array([[state[i] for i in range(panda.NUM_JOINTS)] for state in path.getStates()])
+def _to_array(path, num_joints):
+    return np.array([[state[i] for i in range(num_joints)] for state in path.getStates()])
 
 
 def _checked(path, start, goal):
     """What a user's own planner returned, as an array. Raises ValueError if it is not a path."""
-    path = np.asarray(path, dtype=np.float64)
-    if path.ndim != 2 or path.shape[1] != panda.NUM_JOINTS or len(path) < 2:
-        raise ValueError(f"the planner returned shape {path.shape}: a path has shape (n > 1, 7)")
+    path, joints = np.asarray(path, dtype=np.float64), len(start)
+    if path.ndim != 2 or path.shape[1] != joints or len(path) < 2:
+        raise ValueError(
+            f"the planner returned shape {path.shape}: a path has shape (k > 1, {joints})"
+        )
     if not np.isfinite(path).all() or np.abs(path).max() > 1.0 + 1e-6:
-        raise ValueError("the planner returned a path that leaves [-1, 1]^7")
+        raise ValueError(f"the planner returned a path that leaves [-1, 1]^{joints}")
     for name, end, wanted in (("start", path[0], start), ("end", path[-1], goal)):
         if np.abs(end - wanted).max() > 1e-6:
             raise ValueError(f"the planner's path does not {name} at the query's {name}: {end}")

@@ -7,10 +7,12 @@
 
 Examples are dicts of NumPy arrays, a row each:
 
-- `observation` float32 (n, 10), without the encoded scene, and `desired_goal` float32 (n, g);
-- `link_distances` and `goal_link_distances` float32 (n, 10, 8), as of
+Of an arm with j joints and l links that may collide:
+
+- `observation` float32 (n, j + 3), without the encoded scene, and `desired_goal` float32 (n, g);
+- `link_distances` and `goal_link_distances` float32 (n, l, 1 + j), as of
   `envs.wrappers.LinkDistancesWrapper`;
-- `direction` float32 (n, 7): the unit vector to continue in, in normalised configurations;
+- `direction` float32 (n, j): the unit vector to continue in, in normalised configurations;
 - `length` float32 (n,): of the remaining path, normalised;
 - `scene` int64 (n,): its index in `paths.scenes`.
 """
@@ -18,7 +20,6 @@ Examples are dicts of NumPy arrays, a row each:
 import numpy as np
 
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.episodes import observed
 from roboarm_nmp.envs.utils.random_streams import Stream
 
@@ -78,7 +79,8 @@ class RoadmapExamples:
             tail, head = self.paths.points[i], self.paths.points[i + 1]
             return tail + share[:, None] * (head - tail)
 
-        states = at(rest) + noise * rng.standard_normal((count, 7))
+        states = at(rest)
+        states = states + noise * rng.standard_normal((count, states.shape[1]))
         states = np.clip(states, -1.0, 1.0)
         rest = np.maximum(rest - AHEAD, 0.0)
         moves = at(rest) - states
@@ -91,7 +93,7 @@ class RoadmapExamples:
 
         Args:
             scene: index of the scene.
-            states, goals: normalised (n, 7).
+            states, goals: normalised (n, j).
             rng: a NumPy Generator.
         """
         directions, lengths = Roadmap(self.paths.scenes[scene], rng).labels(states, goals, rng)
@@ -100,9 +102,10 @@ class RoadmapExamples:
         return self._examples(scene, *labelled)
 
     def _examples(self, scene, states, goals, directions, lengths):
+        robot = self.paths.scenes[scene].robot
         checker = self.geometry_source(self.paths.scenes[scene])
         ends, end_of = np.unique(goals, axis=0, return_inverse=True)
-        observation, _, goal = observed(states, panda.denormalise(goals), self.goal_type)
+        observation, _, goal = observed(states, robot.denormalise(goals), self.goal_type, robot)
         return {
             "observation": observation,
             "desired_goal": goal,

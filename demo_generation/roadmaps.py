@@ -7,7 +7,7 @@ collects paths of many scenes, for `envs.datasets.roadmap_paths.load_roadmap_pat
     from roboarm_nmp.demo_generation.roadmaps import Roadmap
 
     roadmap = Roadmap(scene, rng)
-    roadmap.random_paths(300, rng)           # 300 paths, each (k, 7), normalised
+    roadmap.random_paths(300, rng)           # 300 paths, each (k, j), normalised
     roadmap.paths(starts, goals, rng)        # paths of given queries; None where there is none
     roadmap.labels(states, goals, rng)       # direction and length of the path from each state
 
@@ -18,7 +18,7 @@ shortest path would take them (Bohlin and Kavraki, 2000), which finds the same p
 
 Paths keep `margin` from obstacles and from the arm itself where there is room. Near a node, a start
 or a goal that is closer, the margin is that configuration's own distance, and grows by
-`MARGIN_GROWTH` away from it.
+`MARGIN_GROWTH` away from it. In shapes, j is the robot's number of joints.
 
 Scene i of a collection and its paths depend only on the seed, the options and i, so the files are
 the same for every number of workers. They are written in shards, each atomically. After an
@@ -27,7 +27,7 @@ interruption the same command continues; a finished collection is extended by a 
 
 import copy
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,7 @@ from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
@@ -72,7 +73,7 @@ CHORDS, LEAST_GAIN = 40, 0.005
 # step of the arm.
 AHEAD = 0.01
 _ROUNDING = 1e-5  # m: largest rounding error of a distance
-_DIFFERENCES = 1e-4 * np.stack([-np.eye(7), np.eye(7)])  # normalised: (2, 7, 7)
+_DIFFERENCE = 1e-4  # normalised
 
 
 class Roadmap:
@@ -97,7 +98,8 @@ class Roadmap:
             raise ValueError(f"margin must be at least {NODE_MARGIN} m, got {margin!r}")
         self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
         self._checker = CollisionChecker(scene)
-        self.nodes, self._room = np.empty((0, 7)), np.empty(0)
+        self._joints = scene.robot.num_joints
+        self.nodes, self._room = np.empty((0, self._joints)), np.empty(0)
         # Motions between neighbours: the index of the margin that each keeps, 2 for none; and
         # whether it was checked finely, or only coarsely.
         self._margins = margin, NODE_MARGIN
@@ -106,7 +108,7 @@ class Roadmap:
         self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
 
     def _add_nodes(self, nodes):
-        """Add free configurations (n, 7) as nodes, with edges to their nearest nodes."""
+        """Add free configurations (n, j) as nodes, with edges to their nearest nodes."""
         first = len(self.nodes)
         self.nodes = np.concatenate([self.nodes, nodes])
         self._room = np.concatenate([self._room, self._rooms(nodes)])
@@ -127,21 +129,21 @@ class Roadmap:
         self._is_checked = np.concatenate([self._is_checked, np.zeros(len(kept), bool)])
 
     def _grown(self, around, rng):
-        """This roadmap with more nodes near configurations (n, 7) that have no path in it."""
+        """This roadmap with more nodes near configurations (n, j) that have no path in it."""
         centres = around[np.arange(GROWN) % len(around)]
         scale = rng.uniform(0.0, GROWN_SCALE, (GROWN, 1))
-        new = np.clip(centres + scale * rng.standard_normal((GROWN, 7)), -1.0, 1.0)
+        new = np.clip(centres + scale * rng.standard_normal((GROWN, self._joints)), -1.0, 1.0)
         roadmap = copy.copy(self)
         roadmap._add_nodes(new[self._checker.is_free(new, NODE_MARGIN)])
         return roadmap
 
     def sample(self, number, rng, margin=0.0):
-        """Random free configurations, float64 (number, 7). Raises RuntimeError: none is found."""
-        found, missing = [np.empty((0, 7))], number
+        """Random free configurations, float64 (number, j). Raises RuntimeError: none is found."""
+        found, missing = [np.empty((0, self._joints))], number
         for _ in range(1000):
             if missing == 0:
                 break
-            states = rng.uniform(-1.0, 1.0, (4 * missing, 7))
+            states = rng.uniform(-1.0, 1.0, (4 * missing, self._joints))
             found.append(states[self._checker.is_free(states, margin)][:missing])
             missing -= len(found[-1])
         else:
@@ -149,7 +151,7 @@ class Roadmap:
         return np.concatenate(found)
 
     def random_paths(self, number, rng):
-        """`number` smoothed paths between random free configurations: a list of float32 (k, 7).
+        """`number` smoothed paths between random free configurations: a list of float32 (k, j).
 
         Fewer, where hardly any two configurations have a path between them.
         """
@@ -165,14 +167,14 @@ class Roadmap:
         return paths[:number]
 
     def paths(self, starts, goals, rng):
-        """Smoothed paths from starts (n, 7) to goals (n, 7): a list of float32 (k, 7), k > 1.
+        """Smoothed paths from starts (n, j) to goals (n, j): a list of float32 (k, j), k > 1.
 
         None where there is no path. Starts may be in contact, as for `labels`. Many queries with
         few different goals are fast.
         """
         # The simulated arm may be a little beyond its limits.
         starts, goals = (
-            np.clip(np.asarray(x, dtype=np.float64), -1.0, 1.0).reshape(-1, 7)
+            np.clip(np.asarray(x, dtype=np.float64), -1.0, 1.0).reshape(-1, self._joints)
             for x in (starts, goals)
         )
         begins = self._moved_out(starts, -INSIDE)
@@ -190,7 +192,7 @@ class Roadmap:
                 begins[lost], goals[lost], narrow=True
             )
             states = _dense(points[found])
-            room = self._rooms(states.reshape(-1, 7)).reshape(states.shape[:2])
+            room = self._rooms(states.reshape(-1, self._joints)).reshape(states.shape[:2])
             smooth = self._smooth(points[found], states, room, rng)
             for i, path in zip(lost[found], smooth, strict=True):
                 paths[i] = path
@@ -203,17 +205,17 @@ class Roadmap:
         return paths
 
     def labels(self, states, goals, rng):
-        """Direction and length of a path from each of the states (n, 7) to its goal (n, 7).
+        """Direction and length of a path from each of the states (n, j) to its goal (n, j).
 
         States may be in contact. Where a state is closer than the margin, its path begins at its
         own distance. From a contact deeper than `INSIDE`, the path first leaves the obstacle.
 
         Returns:
-            directions: float32 (n, 7), unit vectors towards the path's point after `AHEAD`. Zeros
+            directions: float32 (n, j), unit vectors towards the path's point after `AHEAD`. Zeros
                 where the state is its goal, NaN where there is no path.
             lengths: float32 (n,), of the path, L2, normalised. NaN where there is none.
         """
-        directions = np.full((len(states), 7), np.nan, np.float32)
+        directions = np.full((len(states), self._joints), np.nan, np.float32)
         lengths = np.full(len(states), np.nan, np.float32)
         for i, path in enumerate(self.paths(states, goals, rng)):
             if path is not None:
@@ -236,19 +238,19 @@ class Roadmap:
         return room
 
     def _free(self, starts, ends, states, room, margin, **options):
-        """Whether motions (n, 7) are free, with the room at each one's states (n, k, 7)."""
+        """Whether motions (n, j) are free, with the room at each one's states (n, k, j)."""
         endpoint_margins = (states, room - _ROUNDING, MARGIN_GROWTH)
         return self._checker.is_motion_free(
             starts, ends, margin, endpoint_margins=endpoint_margins, **options
         )
 
     def _costs(self, starts, ends, start_room, end_room):
-        """Costs of straight motions (..., 7)."""
+        """Costs of straight motions (..., j)."""
         tightness = 1.0 - np.clip(np.minimum(start_room, end_room) / self.margin, 0.0, 1.0)
         return np.linalg.norm(ends - starts, axis=-1) * (1.0 + NARROW * tightness)
 
     def _joined(self, starts, ends, start_room, end_room, margin, resolution=RESOLUTION):
-        """Whether straight motions (n, 7) are free, with the room at both of their ends."""
+        """Whether straight motions (n, j) are free, with the room at both of their ends."""
         states, room = np.stack([starts, ends], axis=1), np.stack([start_room, end_room], axis=1)
         options = {"resolution": resolution, "ends_known": True}
         return self._free(starts, ends, states, room, margin, **options)
@@ -259,11 +261,11 @@ class Roadmap:
         return np.argpartition(squared, number, axis=1)[:, :number]
 
     def _smooth(self, points, states, room, rng):
-        """Shortened paths (n, k, 7), padded, with the room at their states (n, m, 7)."""
+        """Shortened paths (n, k, j), padded, with the room at their states (n, m, j)."""
         return self._cut_short(self._prune(points, states, room), states, room, rng)
 
     def _search(self, starts, goals, narrow=False):
-        """Shortest paths: points (n, k, 7), padded with the goal, their room (n, k), found (n,).
+        """Shortest paths: points (n, k, j), padded with the goal, their room (n, k), found (n,).
 
         `narrow` paths keep `NODE_MARGIN` only.
         """
@@ -361,7 +363,7 @@ class Roadmap:
         return free
 
     def _prune(self, points, states, room):
-        """Paths (n, k, 7), padded, without the vertices that free straight motions bypass."""
+        """Paths (n, k, j), padded, without the vertices that free straight motions bypass."""
         n, size = points.shape[:2]
         lengths = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
         moves = np.full((n, size, size), np.inf)
@@ -389,7 +391,7 @@ class Roadmap:
         return pruned[:, : max(kept.sum(1).max(initial=0), 2)]
 
     def _cut_short(self, points, states, room, rng):
-        """Paths (n, k, 7), padded, shortened by random chords, with the room at their states."""
+        """Paths (n, k, j), padded, shortened by random chords, with the room at their states."""
         rows = np.arange(len(points))
         for _ in range(CHORDS):
             steps = np.linalg.norm(np.diff(points, axis=1), axis=-1)
@@ -424,13 +426,15 @@ class Roadmap:
     def _moved_out(self, states, room):
         """The states; those with less room (m) are moved along the gradient to `NODE_MARGIN`."""
         states = states.copy()
+        differences = _DIFFERENCE * np.stack([-np.eye(self._joints), np.eye(self._joints)])
         inside = np.flatnonzero(self._rooms(states) < room)
         for _ in range(MAX_OUT_STEPS):
             if not len(inside):
                 break
             # Uphill in distance, by central differences.
-            around = np.clip(states[inside, None, None] + _DIFFERENCES, -1.0, 1.0)
-            low, high = np.moveaxis(self._distances(around.reshape(-1, 7)).reshape(-1, 2, 7), 1, 0)
+            around = np.clip(states[inside, None, None] + differences, -1.0, 1.0)
+            distances = self._distances(around.reshape(-1, self._joints))
+            low, high = np.moveaxis(distances.reshape(-1, 2, self._joints), 1, 0)
             uphill = high - low
             uphill /= np.maximum(np.linalg.norm(uphill, axis=1, keepdims=True), 1e-12)
             states[inside] = np.clip(states[inside] + OUT_STEP * uphill, -1.0, 1.0)
@@ -439,11 +443,11 @@ class Roadmap:
 
 
 def _dense(points):
-    """Points along paths (n, k, 7), at most DENSE apart: (n, m, 7)."""
+    """Points along paths (n, k, j), at most DENSE apart: (n, m, j)."""
     moves = np.diff(points, axis=1)[:, :, None]
     pieces = max(int(np.ceil(np.linalg.norm(moves, axis=-1).max(initial=0.0) / DENSE)), 1)
     dense = points[:, :-1, None] + np.arange(pieces)[:, None] / pieces * moves
-    dense = dense.reshape(len(points), moves.shape[1] * pieces, 7)
+    dense = dense.reshape(len(points), moves.shape[1] * pieces, points.shape[-1])
     return np.concatenate([dense, points[:, -1:]], axis=1)
 
 
@@ -454,6 +458,8 @@ class Args:
     task: str = "random_boxes_hard"
     """Name of a task, `mixed_scenes`, or path of a scene file. Each scene has a roadmap of its own,
     also where scenes do not vary."""
+    robot: Path | None = None
+    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
     scenes: PositiveInt = 6000
     """Number of scenes."""
     paths_per_scene: PositiveInt = 300
@@ -521,6 +527,7 @@ def collect(args, progress=True):
         OSError: the folder cannot be written. Finished shards are kept.
     """
     flags.check(args)
+    args = replace(args, task=task_with_robot(args.task, args.robot), robot=None)
     if args.num_nodes <= max(args.num_neighbours, JOINED):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
     if not args.margin >= NODE_MARGIN:
@@ -546,7 +553,7 @@ def collect(args, progress=True):
         per_scene=args.paths_per_scene,
         progress=progress,
     )
-    return load_roadmap_paths(args.output)
+    return load_roadmap_paths(args.output, envs.get_task(args.task).base_scene.robot)
 
 
 def main(args):

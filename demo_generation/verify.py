@@ -20,8 +20,8 @@ from roboarm_nmp.demo_generation.collect import demonstrate, make_planner
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos, write_demos
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.tasks import is_task
+from roboarm_nmp.envs.datasets.format import DatasetError, locate
+from roboarm_nmp.envs.tasks import is_task, task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import CORES, Workers
 from roboarm_nmp.envs.utils import workers
@@ -36,6 +36,10 @@ REPAIR_ATTEMPTS = 10
 class Args:
     files: tyro.conf.Positional[tuple[str, ...]]
     """Demonstration files, or tasks (names or scene files)."""
+    task: str | None = None
+    """The task that the files are for. Files of an arm other than the Panda need it."""
+    robot: Path | None = None
+    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
     workers: Workers = CORES
     """Number of processes, by default that of the cores."""
     repair: bool = False
@@ -45,8 +49,8 @@ class Args:
 class Verifier:
     """Follows the demonstrations of a file; with `repair`, plans failed ones anew."""
 
-    def __init__(self, path, repair):
-        self.demos = load_demos(path)
+    def __init__(self, path, repair, task=None):
+        self.demos = load_demos(path, task)
         self.repair = repair
         self.env = RoboArmEnv(self.demos.scenes.base)
         options = self.demos.parameters["options"]
@@ -97,8 +101,10 @@ def _demo(plan, execution, seed):
     }
 
 
-def verify(task_or_path, num_workers=1, repair=False, progress=True):
+def verify(task_or_path, num_workers=1, repair=False, progress=True, task=None):
     """Follow every demonstration of a task or file; with `repair`, replace the file by a good one.
+
+    `task` is that of a file, as of `load_demos`.
 
     A repair stores an execution that has changed as it is now, plans anew where the execution
     misses the goal or collides, and removes demonstrations for which that fails.
@@ -110,16 +116,17 @@ def verify(task_or_path, num_workers=1, repair=False, progress=True):
         DatasetError: the file cannot be used.
         OSError: it cannot be written.
     """
-    demos = load_demos(task_or_path)
-    path, task = Path(task_or_path), demos.task
-    if is_task(task_or_path):
-        path, task = demo_path(task_or_path), task_or_path
+    path, found = locate(task_or_path, demo_path)
+    task = task or found
+    demos = load_demos(path, task)
+    arguments = path, repair, task
+    task = task or demos.task
     if repair and not is_task(task):
         raise DatasetError(f"{path}: to repair it, name the scene file {task}.yaml instead")
     if "options" not in demos.parameters:
         raise DatasetError(f"{path}: has no record of the options it was collected with")
     counts, kept = Counter(), {}
-    results = workers.run(Verifier, (path, repair), range(len(demos)), num_workers, write_line)
+    results = workers.run(Verifier, arguments, range(len(demos)), num_workers, write_line)
     bar = progress_bar(results, path.name, len(demos), unit="demo", disable=not progress)
     with contextlib.closing(results):
         for index, verdict, demo in bar:
@@ -154,12 +161,17 @@ def verify(task_or_path, num_workers=1, repair=False, progress=True):
 def main(args):
     try:
         flags.check(args)
+        task = args.task and task_with_robot(args.task, args.robot)
+        if args.robot and not task and not all(map(is_task, args.files)):
+            raise ValueError("--robot of a file needs its --task")
     except ValueError as error:
         sys.exit(f"error: {error}")
     failed = False
     for name in args.files:
         try:
-            counts = verify(name, args.workers, args.repair)
+            if is_task(name):
+                name = task_with_robot(name, args.robot)
+            counts = verify(name, args.workers, args.repair, task=task)
         except (ValueError, OSError, RuntimeError) as error:
             print(f"error: {error}", file=sys.stderr)
             failed = True

@@ -14,9 +14,9 @@ from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.show import render_query
 from roboarm_nmp.envs.utils.bullet import pybullet as p
@@ -85,7 +85,7 @@ def main():
         if demo_path(task).exists():
             demos, everywhere = load_demos(task), []
             for i in range(NUM_DEMOS):
-                positions = panda.forward_kinematics(panda.denormalise(demos[i].states))
+                positions = PANDA.forward_kinematics(PANDA.denormalise(demos[i].states))
                 draw_path(env.client, positions, COLOURS[i % len(COLOURS)])
                 everywhere.append(positions)
             pixels = render_query(env, query, SIZE, np.concatenate(everywhere))

@@ -23,7 +23,8 @@ def make(
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
     Args:
-        task: name of a task (`TASKS`), or path of a scene file (docs/customise/scene.md).
+        task: name of a task (`TASKS`), or path of a scene file (docs/customise/scene.md). With
+            another arm `TASK@ROBOT`, where ROBOT is a robot's file (docs/guide/robots.md).
         encoder: appends the encoded scene to `observation`: `oracle`, `point_cloud`, or the name or
             path of an encoder's network (`envs.perception.encoders`); None for nothing.
         num_points: of the encoder `point_cloud`.
@@ -39,8 +40,8 @@ def make(
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:
-        ValueError: unknown task, malformed scene file, an argument out of its range, or a file
-            that is no encoder.
+        ValueError: unknown task, malformed scene or robot's file, an argument out of its range,
+            or a file that is no encoder of this robot.
     """
     for name, value in (("task", task), ("encoder", encoder), ("geometry_source", geometry_source)):
         if not isinstance(value, (str, Path)) and (value is not None or name == "task"):
@@ -67,12 +68,14 @@ def make(
         from roboarm_nmp.envs.wrappers import SceneEncodingWrapper
 
         decoded_by = None if geometry_source in ("ground_truth", "point_cloud") else geometry_source
-        env = SceneEncodingWrapper(env, make_encoder(encoder, num_points, decoded_by))
+        encoder = make_encoder(encoder, num_points, decoded_by)
+        encoder.check_robot(env.robot)
+        env = SceneEncodingWrapper(env, encoder)
     if link_distances:
         from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
         from roboarm_nmp.envs.wrappers import LinkDistancesWrapper
 
-        source = find_geometry_source(geometry_source)
+        source = find_geometry_source(geometry_source, env.robot)
         env = LinkDistancesWrapper(env, source, append_link_distances, goal_link_distances)
     return env
 

@@ -1,4 +1,4 @@
-"""RoboArmEnv: motion planning for a 7-DoF arm as a goal-conditioned MDP.
+"""RoboArmEnv: motion planning for an arm as a goal-conditioned MDP.
 
 Paper: sections 2 and 4, appendix "Extended NMP goal-conditioned MDP description".
 """
@@ -9,23 +9,19 @@ import time
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.scenes.primitives import is_number
+from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
+from roboarm_nmp.envs.scenes.primitives import Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import (
     HOLD_STEPS,
     MAX_EDGE,
-    SUBSTEPS,
-    TIME_STEP,
     World,
     image_array,
     why_no_window,
 )
 
-GOAL_SIZES = {"ee": 3, "config": 7, "combined": 10}
-"""Numbers of a goal, by goal type: position, configuration, or configuration and position."""
-GOAL_TYPES = tuple(GOAL_SIZES)
+GOAL_TYPES = "ee", "config", "combined"
 ACTION_MODES = ("relative", "subgoal")
 # m, and L2 in the normalised space. Hardly any start is farther from its goal than these, so a
 # larger tolerance would leave no query.
@@ -35,6 +31,11 @@ STANDARD_RULES = {"max_step": MAX_STEP, "horizon": HORIZON, "stop_on_collision":
 """Results under other rules are not comparable."""
 
 
+def goal_size(goal_type, num_joints):
+    """Numbers of a goal: a position, a configuration, or a configuration and a position."""
+    return {"ee": 3, "config": num_joints, "combined": num_joints + 3}[goal_type]
+
+
 def deviations(arguments):
     """Those of `RoboArmEnv`'s `arguments`, a dict, that differ from `STANDARD_RULES`."""
     given = {name: arguments.get(name, rule) for name, rule in STANDARD_RULES.items()}
@@ -42,16 +43,16 @@ def deviations(arguments):
 
 
 class RoboArmEnv(gym.Env):
-    """A Franka Panda that has to reach a goal among obstacles, without contact.
+    """An arm of n joints, the Franka Panda (7), that has to reach a goal without contact.
 
     Observations are a dict (the GoalEnv interface of Gymnasium-Robotics), all float32:
 
-    - `observation`: normalised configuration (7), then joint velocities in normalised units per
-      second (7, only with `velocities=True`), then the end-effector position in metres (3);
+    - `observation`: normalised configuration (n), then joint velocities in normalised units per
+      second (n, only with `velocities=True`), then the end-effector position in metres (3);
     - `achieved_goal`, `desired_goal`: `ee` the end-effector position (3, metres), `config` the
-      normalised configuration (7), `combined` both, configuration first (10).
+      normalised configuration (n), `combined` both, configuration first (n + 3).
 
-    Actions are float32 in [-1, 1]^7: `relative`, a displacement of the normalised configuration, or
+    Actions are float32 in [-1, 1]^n: `relative`, a displacement of the normalised configuration, or
     `subgoal`, the next normalised configuration itself. Either way the displacement is clipped to
     the L2 norm `max_step`, so an action is a direction unless it is shorter than that.
 
@@ -170,17 +171,18 @@ class RoboArmEnv(gym.Env):
         self.render_mode = render_mode
         self.render_size = render_size
 
-        goal_size = GOAL_SIZES[goal_type]
-        self._observation_size = 17 if velocities else 10
+        joints = (Scene() if scene is None else scene).robot.num_joints
+        size = goal_size(goal_type, joints)
+        self._observation_size = joints * (2 if velocities else 1) + 3
         unbounded = [
             ("observation", self._observation_size),
-            ("achieved_goal", goal_size),
-            ("desired_goal", goal_size),
+            ("achieved_goal", size),
+            ("desired_goal", size),
         ]
         self.observation_space = gym.spaces.Dict(
             {name: gym.spaces.Box(-np.inf, np.inf, (size,), np.float32) for name, size in unbounded}
         )
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (panda.NUM_JOINTS,), np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (joints,), np.float32)
 
         window = render_mode == "human"
         if window and (problem := why_no_window()):
@@ -189,9 +191,9 @@ class RoboArmEnv(gym.Env):
         self.world = World(scene, window, drawn=render_mode is not None)
         """The simulated `World`. Change its scene by `set_scene` of the environment."""
         self.start_configuration = None
-        """Start of this episode, float32 (7,), rad; None before the first reset."""
+        """Start of this episode, float32 (n,), rad; None before the first reset."""
         self.goal_configuration = None
-        """Goal of this episode, float32 (7,), rad; None if it was given as a position."""
+        """Goal of this episode, float32 (n,), rad; None if it was given as a position."""
 
     def __getstate__(self):
         # Generators are made at their first use: here at the latest, so that copies share them.
@@ -207,8 +209,13 @@ class RoboArmEnv(gym.Env):
 
     @property
     def robot(self):
-        """PyBullet's number of the arm's body."""
+        """The scene's `Robot`."""
         return self.world.robot
+
+    @property
+    def body(self):
+        """PyBullet's number of the arm's body."""
+        return self.world.body
 
     @property
     def scene(self):
@@ -216,7 +223,12 @@ class RoboArmEnv(gym.Env):
         return self.world.scene
 
     def set_scene(self, scene):
-        """Put the arm into another `Scene`. This ends the episode. An equal one does nothing."""
+        """Put the arm into another `Scene`. This ends the episode. An equal one does nothing.
+
+        Raises ValueError: the scene has another robot.
+        """
+        if isinstance(scene, Scene) and scene.robot != self.robot:
+            raise ValueError(f"the scene's robot is {scene.robot.name!r}, not {self.robot.name!r}")
         if self.world.set_scene(scene):
             self.start_configuration = None
 
@@ -233,12 +245,13 @@ class RoboArmEnv(gym.Env):
         return self.world.sample_feasible(rng)
 
     def sample_query(self, rng):
-        """A start and a goal that is not reached from the outset: two float32 (7,), rad."""
+        """A start and a goal that is not reached from the outset: two float32 (n,), rad."""
         start = self.sample_feasible(rng)
         while True:
             goal = self.sample_feasible(rng)
             pair = np.stack([start, goal])
-            states, positions = panda.normalise(pair), panda.forward_kinematics(pair)
+            states = self.robot.normalise(pair)
+            positions = self.robot.forward_kinematics(pair)
             if self.goal_type == "config":
                 if np.linalg.norm(states[0] - states[1]) > self.config_tolerance:
                     return start, goal
@@ -284,8 +297,8 @@ class RoboArmEnv(gym.Env):
         with them, use `reset(options={"start": start, "goal": goal, "scene": scene})`.
 
         Args:
-            start: joint angles (7, rad).
-            goal: joint angles (7, rad); or, with goal type `ee`, an end-effector position (3, m).
+            start: joint angles (n, rad).
+            goal: joint angles (n, rad); or, with goal type `ee`, an end-effector position (3, m).
             scene: a `Scene` to change to first.
 
         Raises:
@@ -293,36 +306,38 @@ class RoboArmEnv(gym.Env):
                 episode then goes on (unless the scene was changed).
         """
         self.world.check_open()
-        start = _vector("start", start, (7,))
-        goal = _vector("goal", goal, (7, 3) if self.goal_type == "ee" else (7,))
+        robot, joints = self.robot, self.robot.num_joints
+        start = _vector("start", start, (joints,))
+        goal = _vector("goal", goal, (joints, 3) if self.goal_type == "ee" else (joints,))
         for name, configuration in (("start", start), ("goal", goal)):
-            if configuration.size == 7:
+            if configuration.size == joints:
                 # float32 may round a limit to just beyond it.
-                outside = np.abs(panda.normalise(configuration)) > 1.0 + 1e-6
+                outside = np.abs(robot.normalise(configuration)) > 1.0 + 1e-6
                 if outside.any():
                     joint = int(np.argmax(outside))
                     raise ValueError(
                         f"{name} is outside the joint limits: joint {joint + 1} is "
-                        f"{configuration[joint]:.4f} rad, limits {panda.LOWER[joint]} to "
-                        f"{panda.UPPER[joint]}"
+                        f"{configuration[joint]:.4f} rad, limits {robot.lower[joint]} to "
+                        f"{robot.upper[joint]}"
                     )
         if scene is not None:
             self.set_scene(scene)
         ends = {"goal": goal, "start": start}
-        self.world.check_free(**{name: end for name, end in ends.items() if end.size == 7})
+        self.world.check_free(**{name: end for name, end in ends.items() if end.size == joints})
         return self._begin(start, goal)
 
     def _begin(self, start, goal):
         self.world.place(start)
         self.world.command(start.tolist())
         self.start_configuration = start
-        if goal.size == 7:
+        joints = self.robot.num_joints
+        if goal.size == joints:
             self.goal_configuration = goal
-            self._goal_state = panda.normalise(goal)
-            self._goal_position = panda.forward_kinematics(goal)
+            self._goal_state = self.robot.normalise(goal)
+            self._goal_position = self.robot.forward_kinematics(goal)
         else:
             self.goal_configuration = None
-            self._goal_state = np.full(7, np.nan)
+            self._goal_state = np.full(joints, np.nan)
             self._goal_position = goal.astype(np.float64)
         self._desired_goal = self._goal_vector(self._goal_state, self._goal_position)
         self._steps = 0
@@ -340,13 +355,13 @@ class RoboArmEnv(gym.Env):
         """One step: `(observation, reward, terminated, truncated, info)`.
 
         Raises:
-            ValueError: the action is not 7 finite numbers; nothing has moved then.
+            ValueError: the action is not n finite numbers; nothing has moved then.
             RuntimeError: there was no reset yet, or the environment is closed.
         """
         self.world.check_open()
         if self.start_configuration is None:
             raise RuntimeError("no episode: call reset() or reset_specific() before step()")
-        action = _action(action)
+        action = _action(action, self.robot.num_joints)
         self._steps += 1
         if self._in_sink:
             info = self._info(False, self._is_success)
@@ -356,7 +371,7 @@ class RoboArmEnv(gym.Env):
         length = math.sqrt(delta @ delta)
         if length > self.max_step:
             delta = delta * (self.max_step / length)
-        target = panda.denormalise(np.clip(self._state + delta, -1.0, 1.0))
+        target = self.robot.denormalise(np.clip(self._state + delta, -1.0, 1.0))
         self.world.command(target.tolist())
         collision = self.world.simulate()
         if self.world.has_window:
@@ -383,9 +398,10 @@ class RoboArmEnv(gym.Env):
 
     def _observation(self):
         observation = np.empty(self._observation_size, np.float32)
-        observation[:7], observation[-3:] = self._state, self._position
+        joints = len(self._state)
+        observation[:joints], observation[-3:] = self._state, self._position
         if self.velocities:
-            observation[7:14] = self._velocity
+            observation[joints : 2 * joints] = self._velocity
         return {
             "observation": observation,
             "achieved_goal": self._goal_vector(self._state, self._position),
@@ -409,7 +425,7 @@ class RoboArmEnv(gym.Env):
     def _distance(self, achieved_goal, desired_goal):
         apart = np.asarray(achieved_goal) - np.asarray(desired_goal)
         if self.goal_type == "combined":
-            apart = apart[..., 7:]  # reached like `ee`
+            apart = apart[..., -3:]  # reached like `ee`
         return np.sqrt(np.square(apart).sum(-1))
 
     def _reward(self, distance):
@@ -491,9 +507,9 @@ def _query_of(options):
     return options
 
 
-def _action(given):
-    """An action as float64 (7,), clipped. Raises ValueError, with the reason, if it is none."""
-    expected = "an action is 7 finite numbers in [-1, 1]"
+def _action(given, num_joints):
+    """An action as float64 (n,), clipped. Raises ValueError, with the reason, if it is none."""
+    expected = f"an action is {num_joints} finite numbers in [-1, 1]"
     try:
         action = np.asarray(given)
     except (TypeError, ValueError, RuntimeError) as error:  # a list in a list, a tensor
@@ -501,7 +517,7 @@ def _action(given):
     if action.dtype.kind not in "fiub" or np.ma.isMaskedArray(given):
         kind = "a masked array" if np.ma.isMaskedArray(given) else f"dtype {action.dtype}"
         raise ValueError(f"{expected}, got {kind}: {given!r}")
-    if action.shape != (panda.NUM_JOINTS,):
+    if action.shape != (num_joints,):
         raise ValueError(f"{expected}, got shape {action.shape}: {given!r}")
     if not np.isfinite(action).all():
         raise ValueError(f"{expected}, got {given!r}")

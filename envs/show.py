@@ -5,6 +5,7 @@
     roboarm show my_scene.yaml --output images.png --draws 9
     roboarm show wall --output episode.gif --policy runs/my_run
     roboarm show double_walls --output episode.gif --policy planner
+    roboarm show random_boxes_hard --robot ur5.yaml --output image.png
     roboarm show wall --output image.png --camera top
     roboarm show wall --output episode.gif --camera 2.5 90 -20
     roboarm show wall --policy planner --save-trajectory episode.csv
@@ -31,7 +32,6 @@ import tyro
 from PIL import Image
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.format import OutOfDateError
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
@@ -44,6 +44,8 @@ from roboarm_nmp.envs.datasets.trajectories import (
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import Scene, to_array
+from roboarm_nmp.envs.scenes.random_boxes import scale_of
+from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeInt, Pixels, PositiveInt, Seed
 from roboarm_nmp.envs.utils.bullet import pybullet as p
@@ -62,11 +64,13 @@ MAX_SECONDS = 3600  # of a trajectory from a file
 # From the front right, as long as the obstacles do not hide more of the arm's surroundings from
 # there than from one of the other corners.
 YAWS = (55.0, 125.0, -55.0, -125.0)
+# In m, for the Panda; for other arms in proportion to their reach.
 AROUND_THE_ARM = [
     [x, y, z] for x in (-0.3, 0, 0.3) for y in (-0.3, 0, 0.3) for z in (0.2, 0.5, 0.8)
 ]
-# Obstacles that reach beyond this box (m) are cut off.
+# Obstacles that reach beyond this box are cut off.
 LOWEST, HIGHEST = (-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)
+EYE_DISTANCE = 4.0
 SAME_DEPTH = 1e-4  # about a centimetre: where arm and ghost coincide, the arm is visible
 GHOST_COLOUR, GHOST_OPACITY = (0.25, 1.0, 0.4), 0.6
 # Of an animation. At the default size a file has about 0.3 MB.
@@ -78,6 +82,8 @@ PAUSE = 1.5  # s, at the end of an episode
 class Args:
     task: tyro.conf.Positional[str]
     """The task's name, or the path of a scene file (.yaml)."""
+    robot: Path | None = None
+    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
     output: Path | None = None
     """Write this file instead of opening a window: an image (.png) or an animation (.gif)."""
     policy: str = "go-to-goal"
@@ -105,9 +111,9 @@ class Args:
     default from a corner that obstacles do not hide."""
     trajectory: Path | None = None
     """Play this file (.csv or .npz) instead of a policy's episode: one of --save-trajectory, or of
-    one's own. A .csv needs columns `q1` to `q7` (rad), and may have `time` (s); a .npz an array
-    `configurations` (n, 7), and perhaps `times`. The arm is moved without physics, in the scene of
-    --query; the ghost is the end."""
+    one's own. A .csv needs columns `q1` to `q7` (rad; as many as joints), and may have `time` (s);
+    a .npz an array `configurations` (k, n), and perhaps `times`. The arm is moved without physics,
+    in the scene of --query; the ghost is the end."""
     save_trajectory: Path | None = None
     """Write the shown episode to this file (.csv or .npz): configurations, actions, contacts,
     times. Without --output there is no window then."""
@@ -166,11 +172,11 @@ def render_configurations(env, query, configurations, size=SIZE, points=(), came
     """Images as of `render_query`, from one point of view, with the arm in each configuration.
 
     Args:
-        configurations: (n, 7), joint angles in rad, e.g. of a `Trajectory`.
+        configurations: (k, n), joint angles in rad, e.g. of a `Trajectory`.
         env, query, size, points, camera: see `render_query`.
 
     Yields:
-        n images, uint8 (height, width, 3).
+        k images, uint8 (height, width, 3).
     """
     env.world.draw()
     env.reset_specific(*query)
@@ -184,11 +190,11 @@ def _render(env, goal, configurations, size, points, view):
     slope = math.tan(math.radians(FIELD_OF_VIEW / 2))
     camera = _camera(env, points, (slope * size[0] / size[1], slope), view)
     if has_ghost:
-        panda.set_configuration(env.client, env.robot, goal)
+        env.robot.set_configuration(env.client, env.body, goal)
         ghost = _shoot(env, camera, size)
         tinted = ghost.colour.mean(-1, keepdims=True) * GHOST_COLOUR
     for configuration in configurations:
-        panda.set_configuration(env.client, env.robot, configuration)
+        env.robot.set_configuration(env.client, env.body, configuration)
         shot = _shoot(env, camera, size)
         pixels = shot.colour
         if has_ghost:
@@ -202,8 +208,8 @@ def _visible(env, goal, configurations):
     """Points (n, 3), m, that must be visible: as `_extent`, and at the goal the arm or a point."""
     if env.goal_type != "ee":
         return _extent(env, [*configurations, goal])
-    if len(goal) == panda.NUM_JOINTS:
-        goal = panda.forward_kinematics(goal)
+    if len(goal) == env.robot.num_joints:
+        goal = env.robot.forward_kinematics(goal)
     return np.concatenate([_extent(env, configurations), [goal]])
 
 
@@ -216,13 +222,18 @@ def _extent(env, configurations):
     turns = np.array([p.getMatrixFromQuaternion(row[4:8]) for row in rows]).reshape(-1, 3, 3)
     halves = np.einsum("nij,nj->ni", np.abs(turns), rows[:, 8:] * scale)
     boxes = np.stack([rows[:, 1:4] - halves, rows[:, 1:4] + halves], axis=1)
-    boxes = [*np.clip(boxes, LOWEST, HIGHEST)]
+    boxes = [*np.clip(boxes, *_around(env.robot, [LOWEST, HIGHEST]))]
     for configuration in configurations:
-        panda.set_configuration(env.client, env.robot, configuration)
-        for link in range(-1, panda.EE_LINK + 1):
-            boxes.append(p.getAABB(env.robot, link, physicsClientId=env.client))
+        env.robot.set_configuration(env.client, env.body, configuration)
+        for link in range(-1, p.getNumJoints(env.body, physicsClientId=env.client)):
+            boxes.append(p.getAABB(env.body, link, physicsClientId=env.client))
     choices = np.array(list(itertools.product((0, 1), repeat=3)))
     return np.concatenate([np.asarray(box)[choices, [0, 1, 2]] for box in boxes])
+
+
+def _around(robot, points):
+    """Points (n, 3), m, around the Panda's base as points around that of a robot."""
+    return np.array(robot.base_position) + scale_of(robot) * np.array(points)
 
 
 def _camera(env, points, slopes, view=None):
@@ -233,7 +244,7 @@ def _camera(env, points, slopes, view=None):
     distance = None
     if view is None:
         # So that all queries of a scene are rendered from the same side, whatever the arm hides.
-        panda.set_configuration(env.client, env.robot, (panda.LOWER + panda.UPPER) / 2)
+        env.robot.set_configuration(env.client, env.body, env.robot.contact_free)
         yaw, pitch = min(YAWS, key=lambda yaw: _hidden(env, yaw)), PITCH
     elif view in VIEWS:
         yaw, pitch = VIEWS[view]
@@ -264,10 +275,10 @@ def _rotation(yaw, pitch=PITCH):
 
 def _hidden(env, yaw):
     """The share of points around the arm that obstacles hide, to a tenth."""
-    towards = 4.0 * _rotation(yaw)[2]
-    eyes = (AROUND_THE_ARM + towards).tolist()
-    hits = p.rayTestBatch(eyes, AROUND_THE_ARM, physicsClientId=env.client)
-    return round(sum(hit[0] not in (-1, env.robot) for hit in hits) / len(hits), 1)
+    points = _around(env.robot, AROUND_THE_ARM)
+    eyes = points + EYE_DISTANCE * scale_of(env.robot) * _rotation(yaw)[2]
+    hits = p.rayTestBatch(eyes.tolist(), points.tolist(), physicsClientId=env.client)
+    return round(sum(hit[0] not in (-1, env.body) for hit in hits) / len(hits), 1)
 
 
 def _shoot(env, camera, size):
@@ -290,7 +301,7 @@ def _shoot(env, camera, size):
     return _Shot(
         image_array(pixels, width, height).astype(np.float32),
         np.reshape(depth, (height, width)),
-        np.reshape(bodies, (height, width)) == env.robot,
+        np.reshape(bodies, (height, width)) == env.body,
     )
 
 
@@ -305,7 +316,7 @@ class _Queries:
         get: function from a number to a `Query`.
         count: the number of queries; None for random ones without end.
         name: of one of them, in messages.
-        replay: function from a number to configurations (n, 7), rad, one per `STEP_SECONDS`, to
+        replay: function from a number to configurations (k, n), rad, one per `STEP_SECONDS`, to
             show instead of a policy's episode; or None.
     """
 
@@ -360,14 +371,15 @@ def _task_queries(args):
 
 def _file_queries(args):
     """From the start to the end of --trajectory, in the scene of a query where scenes vary."""
-    times, path = load_joint_path(args.trajectory)
+    task = envs.get_task(args.task)
+    times, path = load_joint_path(args.trajectory, task.base_scene.robot)
     steps = round((times[-1] - times[0]) / STEP_SECONDS)
     if steps * STEP_SECONDS > MAX_SECONDS:
         raise ShowError(f"{args.trajectory}: it is longer than {MAX_SECONDS} s")
     shown = np.clip(times[0] + np.arange(steps + 1) * STEP_SECONDS, None, times[-1])
     configurations = np.stack([np.interp(shown, times, joint) for joint in path.T], axis=1)
     configurations[-1] = path[-1]
-    scene = envs.get_task(args.task).scene
+    scene = task.scene
     scenes = None if isinstance(scene, Scene) else _task_queries(args)
 
     def get(number):
@@ -380,6 +392,7 @@ def _file_queries(args):
 def _check(args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
+    args.task = task_with_robot(args.task, args.robot)
     envs.get_task(args.task)
     if args.output is not None:
         if args.output.suffix.lower() not in (".png", ".gif"):
@@ -470,7 +483,7 @@ def _draw(args, env, queries, begin):
 
 
 def _images(args, env, queries, query, configurations):
-    """Images of configurations (n, 7), rad, in the scene of a query, with its goal."""
+    """Images of configurations (k, n), rad, in the scene of a query, with its goal."""
     if queries.replay is None:
         yield from render_configurations(env, query, configurations, args.size, (), args.camera)
         return
@@ -482,7 +495,7 @@ def _place(env, query):
     """Show a query's scene and goal, without a reset: the ends of a file may be in collision."""
     env.world.draw()
     env.set_scene(query.scene)
-    env.world.mark_goal(panda.forward_kinematics(query.goal), env.ee_tolerance)
+    env.world.mark_goal(env.robot.forward_kinematics(query.goal), env.ee_tolerance)
 
 
 def _animate(args, env, queries, begin):
@@ -557,7 +570,7 @@ def _window(args, env, queries, begin):
             else:
                 configurations = queries.replay(number)
                 for configuration in configurations:
-                    panda.set_configuration(client, env.robot, configuration)
+                    env.robot.set_configuration(client, env.body, configuration)
                     time.sleep(1 / env.metadata["render_fps"])
             text = _outcome(args, env, queries, number, query, configurations, trajectory)
             print(text, flush=True)

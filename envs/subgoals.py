@@ -2,29 +2,28 @@
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
-
 # With this spacing, the controller's lag seldom makes a step longer than the paper's 0.03, to which
 # it is clipped.
 MAX_STEP = 0.03
 SUBGOAL_SPACING = 0.95 * MAX_STEP
 
 
-def subgoals(path):
+def subgoals(path, robot):
     """Points along a path at most `SUBGOAL_SPACING` apart, including all waypoints.
 
     Args:
-        path: (n, 7), rad.
+        path: (k, n), rad.
+        robot: the `Robot`, with n joints.
 
     Returns:
-        float64 (m, 7), normalised; the first is the path's start, the last its goal.
+        float64 (m, n), normalised; the first is the path's start, the last its goal.
     """
-    return all_subgoals(np.asarray(path), np.array([0, len(path)]))[0]
+    return all_subgoals(np.asarray(path), np.array([0, len(path)]), robot)[0]
 
 
-def all_subgoals(plan, plan_offsets):
-    """The sub-goals of all plans (k, 7), and the offset of each plan's first sub-goal (n + 1,)."""
-    waypoints = panda.normalise(plan.astype(np.float64))
+def all_subgoals(plan, plan_offsets, robot):
+    """The sub-goals of all plans (k, n), and the offset of each plan's first sub-goal (n + 1,)."""
+    waypoints = robot.normalise(plan.astype(np.float64))
     moves = np.diff(waypoints, axis=0)
     steps = np.ceil(np.sqrt(np.square(moves).sum(1)) / SUBGOAL_SPACING)
     steps = np.maximum(steps, 1).astype(np.int64)
@@ -36,12 +35,12 @@ def all_subgoals(plan, plan_offsets):
     return points, np.concatenate([first[plan_offsets[:-1]], [len(points)]])
 
 
-def schedule(plan, plan_offsets, offsets):
-    """For each executed configuration the previous, the due and the next sub-goal, each (m, 7).
+def schedule(plan, plan_offsets, offsets, robot):
+    """For each executed configuration the previous, the due and the next sub-goal, each (m, n).
 
     Before the first sub-goal and after the last, these are repeated.
     """
-    points, first = all_subgoals(plan, plan_offsets)
+    points, first = all_subgoals(plan, plan_offsets, robot)
     demo = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     step = np.arange(offsets[-1]) - offsets[demo]
     here = first[demo] + step

@@ -3,11 +3,16 @@
 Paper: section 4. It names the tasks, but gives no dimensions. They are calibrated so that the
 go-to-goal policy reaches the paper's success rates (docs/guide/tasks.md). MotionBenchMaker's scenes
 are as published.
+
+Tasks are the Panda's. `TASK@ROBOT`, such as `random_boxes_hard@arms/iiwa.yaml`, is a task with
+another arm (`envs.robots.files`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
@@ -40,9 +45,21 @@ class Task:
 def get_task(task):
     """The `Task` of a name in `TASKS` or `TRAINING_SCENES`, or of the path of a scene file.
 
+    With `@` and a robot's file after it, the task is that robot's (`envs.robots.files`).
+
     Raises:
-        ValueError: an unknown name, or a malformed scene file.
+        ValueError: an unknown name, a malformed file, or a task that is the Panda's only.
     """
+    task, robot = split_robot(task)
+    if robot is not None:
+        found, robot = get_task(task), load_robot(robot)
+        if has_name(task) and not is_for_any_robot(task):
+            names = [name for name in (*TASKS, *TRAINING_SCENES) if is_for_any_robot(name)]
+            raise ValueError(
+                f"{task} is the Panda's: its obstacles and queries are. Tasks of any robot are "
+                f"{', '.join(names)} and scene files"
+            )
+        return replace(found, scene=with_robot(found.scene, robot))
     if has_name(task):
         return TASKS[task] if task in TASKS else TRAINING_SCENES[task]
     if is_task(task):
@@ -54,8 +71,50 @@ def get_task(task):
     raise ValueError(f"unknown task {task!r}: {suggest(task, TASKS)} (or a scene file, .yaml)")
 
 
+def split_robot(task):
+    """`TASK@ROBOT` as (task, robot); the robot is None without `@`, and for a name's `@panda`.
+
+    The `@` follows a name or a scene file: folders may have one in their names, and so do a task's
+    data files (`.h5`).
+    """
+    text = str(task)
+    for at in (i for i, letter in enumerate(text) if letter == "@"):
+        task, robot = text[:at], text[at + 1 :]
+        if has_name(task) and robot == PANDA.name:
+            return task, None
+        if (has_name(task) or Path(task).suffix in SCENE_FILES) and Path(robot).suffix != ".h5":
+            return task, robot
+    return text, None
+
+
+def task_with_robot(task, robot):
+    """`TASK@ROBOT`, of the flags `--task` and `--robot`; the task itself if the robot is None.
+
+    Raises ValueError: the task names a robot, too.
+    """
+    if robot is None:
+        return task
+    if split_robot(task)[1] is not None:
+        raise ValueError(f"--robot {robot}: the task names a robot already, {task}")
+    return f"{task}@{robot}"
+
+
+def with_robot(scene, robot):
+    """A `Scene`, or a distribution of scenes, with another robot."""
+    if isinstance(scene, Scene):
+        return replace(scene, robot=robot)
+    return replace(scene, base=replace(scene.base, robot=robot))
+
+
+def is_for_any_robot(name):
+    """Whether a task's obstacles are made for any robot: there are none, or they are random."""
+    scene = TASKS[name].scene if name in TASKS else TRAINING_SCENES[name].scene
+    return not isinstance(scene, Scene) or not scene.obstacles
+
+
 def is_task(task):
-    """Whether `task` is a name, or a path with the suffix of a scene file."""
+    """Whether `task` is a name, or the path of a scene file; a robot may follow."""
+    task, _ = split_robot(task)
     return has_name(task) or Path(task).suffix in SCENE_FILES
 
 
@@ -65,8 +124,8 @@ def has_name(task):
 
 
 def task_name(task):
-    """The name of a task in files: its own, or that of its scene file without suffix."""
-    return task if task in TASKS else Path(task).stem
+    """The name of a task in files: its own, or that of its files without suffix."""
+    return "@".join(Path(part).stem for part in split_robot(task) if part is not None)
 
 
 def _two_walls(gap):

@@ -12,15 +12,10 @@ import sys
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.scenes.primitives import FRICTION, Box, Cylinder, Scene, floor_box
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
-# One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
-# controller; docs/guide/environment.md has the measured tracking error.
-TIME_STEP = 1.0 / 120.0
-SUBSTEPS = 4
-POSITION_GAINS = [0.6] * panda.NUM_JOINTS
 # A configuration is "held" if the controller keeps the arm there without contact for this many
 # environment steps, and the arm drifts no further than this (normalised).
 HOLD_STEPS = 5
@@ -33,10 +28,7 @@ MAX_EDGE = 4096  # pixels of an image: 20,000 by 20,000 would need all of a mach
 # PyBullet keeps about 4 kB of each body that is removed, so the world is made anew after this many
 # bodies. That takes as long as 100 changes of scene.
 MAX_BODIES_MADE = 5_000
-# A place and a configuration without contacts (m, rad). PyBullet places a body by its centre of
-# mass.
-FAR_AWAY, IN_PLACE, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.05), (0.0, 0.0, 0.0, 1.0)
-CONTACT_FREE = ((panda.LOWER + panda.UPPER) / 2).tolist()
+FAR_AWAY, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.0, 1.0)  # a place without contacts (m)
 # A program that connects to the X server, and how long (s) it may take.
 OPEN_DISPLAY = """
 import ctypes, sys
@@ -92,7 +84,8 @@ class World:
 
     Attributes:
         client: PyBullet's number of the engine; None once it is closed.
-        robot: PyBullet's number of the arm's body.
+        robot: the scene's `Robot`.
+        body: PyBullet's number of the arm's body.
         scene: the `Scene`; `set_scene` changes it.
         has_window: whether PyBullet's window is open.
 
@@ -108,7 +101,7 @@ class World:
         _check_scene(scene)
         self.client = p.connect(p.GUI if window else p.DIRECT)
         self.has_window = window
-        self._target = ()  # of the position controllers, 7 angles (rad); empty before a command
+        self._target = ()  # of the position controllers, n angles (rad); empty before a command
         self._make(scene)
 
     def check_open(self):
@@ -124,7 +117,10 @@ class World:
             fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=self.client
         )
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
-        self.robot = self._load_robot()
+        self.robot = scene.robot
+        self.body = self._load_robot()
+        # PyBullet places a body by its centre of mass.
+        self._in_place = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
         self._parts, self._bodies, self._bodies_made = [], [], 0
         self._goal_marker, self._goal = None, None
         self._speck = p.createVisualShape(
@@ -141,7 +137,7 @@ class World:
             self._make_again(self._snapshot())
 
     def _load_robot(self):
-        return panda.load(self.client, self._drawn)
+        return self.robot.load(self.client, self._drawn)
 
     # --- Copies
 
@@ -164,7 +160,7 @@ class World:
 
     def _snapshot(self):
         """Where the arm was placed, its commands since then, and its present state."""
-        joints = p.getJointStates(self.robot, panda.RESET_JOINTS, physicsClientId=self.client)
+        joints = p.getJointStates(self.body, self.robot.reset_indices, physicsClientId=self.client)
         joint_states = [joint[:2] for joint in joints]  # angles and velocities
         return self._start, self._events, self._target, joint_states
 
@@ -184,8 +180,8 @@ class World:
             self.command(target)
         if self._snapshot()[-1] != joint_states:  # it was moved by other means
             p.resetJointStatesMultiDof(
-                self.robot,
-                panda.RESET_JOINTS,
+                self.body,
+                self.robot.reset_indices,
                 [[angle] for angle, _ in joint_states],
                 [[velocity] for _, velocity in joint_states],
                 physicsClientId=self.client,
@@ -202,7 +198,7 @@ class World:
         _check_scene(scene)
         if scene is self.scene or scene == self.scene:
             return False
-        if self._bodies_made > MAX_BODIES_MADE:
+        if self._bodies_made > MAX_BODIES_MADE or scene.robot != self.robot:
             self._make(scene)
             return True
         self._start, self._events = None, []
@@ -250,15 +246,16 @@ class World:
         )
         if friction != FRICTION:
             p.changeDynamics(body, -1, lateralFriction=friction, physicsClientId=client)
-        if obstacle is self.scene.table:  # the arm's base is bolted to the table
-            p.setCollisionFilterPair(self.robot, body, -1, -1, 0, physicsClientId=client)
+        for link in self.robot.links:  # the arm's base is bolted to the table
+            if link.frame < 0 and (link.index >= 0 or obstacle is self.scene.table):
+                p.setCollisionFilterPair(self.body, body, link.index, -1, 0, physicsClientId=client)
         self._bodies.append(body)
         self._bodies_made += 1
 
     # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
 
     def in_collision(self, configuration):
-        """Whether the arm at joint angles (7, rad, inside the limits) overlaps the scene or itself.
+        """Whether the arm at joint angles (n, rad, inside the limits) overlaps the scene or itself.
 
         Moves the arm: call it between episodes, or continue with a reset.
         """
@@ -266,7 +263,7 @@ class World:
         self._detect_collisions()
         return any(
             contact[8] < 0.0
-            for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
+            for contact in p.getContactPoints(bodyA=self.body, physicsClientId=self.client)
         )
 
     def _detect_collisions(self):
@@ -274,12 +271,12 @@ class World:
         self._record(None)
 
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
-        """Whether joint angles (7, rad) are inside the limits, collision free and held.
+        """Whether joint angles (n, rad) are inside the limits, collision free and held.
 
         Held: the position controller keeps the arm there for `hold_steps` environment steps. Moves
         the arm: call it between episodes, or continue with a reset.
         """
-        if np.any(configuration < panda.LOWER) or np.any(configuration > panda.UPPER):
+        if np.any(configuration < self.robot.lower) or np.any(configuration > self.robot.upper):
             return False
         if self.in_collision(configuration):
             return False
@@ -287,16 +284,16 @@ class World:
         for _ in range(hold_steps):
             if self.simulate():
                 return False
-        drift = self.read_arm()[0] - panda.normalise(configuration)
+        drift = self.read_arm()[0] - self.robot.normalise(configuration)
         return math.sqrt(drift @ drift) <= HOLD_DRIFT
 
     def sample_feasible(self, rng):
-        """A feasible configuration, uniform in the limits: float32 (7,), rad.
+        """A feasible configuration, uniform in the limits: float32 (n,), rad.
 
         `rng` is a NumPy Generator.
         """
         for _ in range(MAX_SAMPLING_TRIES):
-            configuration = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
+            configuration = rng.uniform(self.robot.lower, self.robot.upper).astype(np.float32)
             if self.is_feasible(configuration):
                 return configuration
         raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
@@ -305,7 +302,7 @@ class World:
         """Raise ValueError, naming the contacts, if one of the configurations is in collision.
 
         The episode then continues as if it had not been checked; otherwise the arm has moved. E.g.
-        `check_free(start=start)`, joint angles (7, rad).
+        `check_free(start=start)`, joint angles (n, rad).
         """
         self.check_open()
         before = self._snapshot()
@@ -318,10 +315,10 @@ class World:
     def _contact_names(self):
         """The pairs in contact, in words; after `in_collision`."""
         names = set()
-        for contact in p.getContactPoints(bodyA=self.robot, physicsClientId=self.client):
+        for contact in p.getContactPoints(bodyA=self.body, physicsClientId=self.client):
             if contact[8] < 0.0:
                 body = contact[2]
-                if body == self.robot:
+                if body == self.body:
                     names.add("the arm with itself")
                 else:
                     index = self._bodies.index(body)
@@ -334,26 +331,26 @@ class World:
     # --- The arm
 
     def place(self, configuration):
-        """Teleport the arm to joint angles (7, rad), at rest, leaving no old contact points.
+        """Teleport the arm to joint angles (n, rad), at rest, leaving no old contact points.
 
         Bullet keeps the contact points of two bodies while these move little against each other.
         So a configuration could inherit points from an earlier one that brought the same two links
         nearly as close. Far away, in a configuration without contacts, all of them are dropped.
         """
         self.check_open()
-        client, robot = self.client, self.robot
-        p.resetBasePositionAndOrientation(robot, FAR_AWAY, NO_TURN, physicsClientId=client)
-        panda.set_configuration(client, robot, CONTACT_FREE)
+        client, body, robot = self.client, self.body, self.robot
+        p.resetBasePositionAndOrientation(body, FAR_AWAY, NO_TURN, physicsClientId=client)
+        robot.set_configuration(client, body, robot.contact_free)
         p.performCollisionDetection(physicsClientId=client)
-        p.resetBasePositionAndOrientation(robot, IN_PLACE, NO_TURN, physicsClientId=client)
-        panda.set_configuration(client, robot, configuration)
+        p.resetBasePositionAndOrientation(body, *self._in_place, physicsClientId=client)
+        robot.set_configuration(client, body, configuration)
         self._start, self._events = tuple(configuration), []
 
     def command(self, configuration):
-        """Set the targets of the arm's position controllers: joint angles (list of 7, rad)."""
+        """Set the targets of the arm's position controllers: joint angles (list of n, rad)."""
         self.check_open()
         self._target = tuple(configuration)
-        panda.command(self.client, self.robot, configuration, POSITION_GAINS)
+        self.robot.command(self.client, self.body, configuration)
 
     def simulate(self):
         """Run the physics of one environment step. Returns whether the arm was in contact."""
@@ -364,7 +361,7 @@ class World:
             p.stepSimulation(physicsClientId=self.client)
             if not contact:
                 # A contact also counts at distance zero, when the surfaces push on each other.
-                points = p.getContactPoints(bodyA=self.robot, physicsClientId=self.client)
+                points = p.getContactPoints(bodyA=self.body, physicsClientId=self.client)
                 contact = any(point[8] < 0.0 or point[9] > 0.0 for point in points)
         return contact
 
@@ -372,19 +369,17 @@ class World:
         """The arm's state.
 
         Returns:
-            Normalised configuration (7,), joint velocities (7,) in normalised units per second
+            Normalised configuration (n,), joint velocities (n,) in normalised units per second
             (None without `velocities`), and end-effector position (3,), m; all float64.
         """
         self.check_open()
-        joints = p.getJointStates(self.robot, panda.ARM_JOINTS, physicsClientId=self.client)
-        state, velocity = panda.normalise([joint[0] for joint in joints]), None
+        robot = self.robot
+        joints = p.getJointStates(self.body, robot.joint_indices, physicsClientId=self.client)
+        state, velocity = robot.normalise([joint[0] for joint in joints]), None
         if velocities:
             speeds = np.array([joint[1] for joint in joints])
-            velocity = 2.0 * speeds / (panda.UPPER - panda.LOWER)
-        link = p.getLinkState(
-            self.robot, panda.EE_LINK, computeForwardKinematics=1, physicsClientId=self.client
-        )
-        return state, velocity, np.array(link[4])
+            velocity = 2.0 * speeds / (robot.upper - robot.lower)
+        return state, velocity, robot.read_end_effector(self.client, self.body)
 
     def mark_goal(self, position, radius):
         """Show a green ball, visual only, at a position (3,), m. There is only one."""

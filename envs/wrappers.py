@@ -6,7 +6,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.perception.sensors import SensorWorld, cardinal
 
 
@@ -16,14 +15,14 @@ class SensorWrapper(gym.Wrapper):
     Args:
         env: a `RoboArmEnv`, possibly wrapped.
         sensors: dict of name -> sensor: an `envs.perception.sensors.Camera` or `PointCloud`, or
-            any object with their `space` and `observe`; by default four cameras (`cardinal()`).
+            any object with their `space` and `observe`; by default four cameras (`cardinal`).
         every_step: observe in every step; otherwise once per episode, at its start, with the arm in
             the start configuration (paper, appendix "Prediction times investigation").
     """
 
     def __init__(self, env, sensors=None, every_step=False):
         super().__init__(env)
-        self.sensors = cardinal() if sensors is None else dict(sensors)
+        self.sensors = cardinal(robot=env.unwrapped.robot) if sensors is None else dict(sensors)
         self.every_step = every_step
         spaces = {name: sensor.space for name, sensor in self.sensors.items()}
         self.observation_space = gym.spaces.Dict(
@@ -33,7 +32,8 @@ class SensorWrapper(gym.Wrapper):
         self._observed = None
 
     def _observe(self, observation):
-        configuration = panda.denormalise(observation["observation"][: panda.NUM_JOINTS])
+        robot = self.unwrapped.robot
+        configuration = robot.denormalise(observation["observation"][: robot.num_joints])
         self._world.show(self.unwrapped.scene, configuration)
         self._observed = {
             name: sensor.observe(self._world) for name, sensor in self.sensors.items()
@@ -123,11 +123,12 @@ class SceneEncodingWrapper(_ObservingWrapper):
 class LinkDistancesWrapper(_ObservingWrapper):
     """Adds `link_distances` to the observation: the signed distance of each link, and its gradient.
 
-    float32 `panda.LINK_DISTANCES_SHAPE`, a row per `panda.COLLISION_LINKS`: the distance from the
-    nearest obstacle, table or floor in m, clipped to `envs.collision.checker.LINK_DISTANCE_RANGE`,
-    and its gradient, m per unit of normalised configuration (zeros beyond the range). With goals
-    that are configurations, `goal_link_distances` are the same at the goal. All attributes of the
-    wrapped environment are available.
+    float32, the robot's `link_distances_shape`, a row per link that may collide: the distance from
+    the nearest obstacle, table or floor in m, clipped to
+    `envs.collision.checker.LINK_DISTANCE_RANGE`, and its gradient, m per unit of normalised
+    configuration (zeros beyond the range). With goals that are configurations,
+    `goal_link_distances` are the same at the goal. All attributes of the wrapped environment are
+    available.
 
     Hindsight relabelling replaces goals, and must replace `goal_link_distances`, too: see
     docs/guide/environment.md, "Hindsight relabelling".
@@ -146,16 +147,17 @@ class LinkDistancesWrapper(_ObservingWrapper):
         self._geometry_source, self.appends_link_distances = geometry_source, append
         self._of_goals = goal_link_distances and self.goal_type != "ee"
         names = ["link_distances"] + ["goal_link_distances"] * self._of_goals
-        space = gym.spaces.Box(-np.inf, np.inf, panda.LINK_DISTANCES_SHAPE, np.float32)
+        shape = self.unwrapped.robot.link_distances_shape
+        space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
         spaces = env.observation_space.spaces | {name: space for name in names}
         if append:
-            size = spaces["observation"].shape[0] + math.prod(panda.LINK_DISTANCES_SHAPE)
+            size = spaces["observation"].shape[0] + math.prod(shape)
             spaces["observation"] = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.observation_space = gym.spaces.Dict(spaces)
         self._goal, self._at_goal = None, None
 
     def link_distances_at(self, states, scene=None):
-        """`link_distances` at normalised configurations (..., 7): float32 (..., 10, 8).
+        """`link_distances` at normalised configurations (..., n): float32 (..., l, 1 + n).
 
         `scene`: a `Scene`, by default that of the environment.
         """
@@ -174,14 +176,14 @@ class LinkDistancesWrapper(_ObservingWrapper):
         return compute_reward(achieved_goal, desired_goal, info)
 
     def _extend(self, observation):
-        inner = observation["observation"]
-        more = {"link_distances": self.link_distances_at(inner[: panda.NUM_JOINTS])}
+        inner, joints = observation["observation"], self.unwrapped.robot.num_joints
+        more = {"link_distances": self.link_distances_at(inner[:joints])}
         if self.appends_link_distances:
             size = self.unwrapped.observation_space["observation"].shape[0]
             parts = inner[:size], more["link_distances"].ravel(), inner[size:]
             more["observation"] = np.concatenate(parts)
         if self._of_goals:
-            goal = observation["desired_goal"][: panda.NUM_JOINTS]
+            goal = observation["desired_goal"][:joints]
             key = self.unwrapped.scene, goal.tobytes()
             if self._goal != key:
                 self._goal, self._at_goal = key, self.link_distances_at(goal)

@@ -16,7 +16,6 @@ import numpy as np
 import roboarm_nmp
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.datasets.trajectories import save_joint_path, timed
@@ -37,10 +36,10 @@ def main():
 
     # Check. The collision checker takes normalised configurations.
     checker = CollisionChecker(scene)
-    waypoints = np.clip(panda.normalise(path), -1.0, 1.0)
+    waypoints = np.clip(env.robot.normalise(path), -1.0, 1.0)
     free = checker.is_motion_free(waypoints[:-1], waypoints[1:])
-    times, configurations = timed(path)  # at the environment's speed
-    states = np.clip(panda.normalise(configurations), -1.0, 1.0)
+    times, configurations = timed(path, env.robot)  # at the environment's speed
+    states = np.clip(env.robot.normalise(configurations), -1.0, 1.0)
     near = checker.signed_distances(states, self_collisions=False).distance.min()
     print(f"{free.sum()} of {len(free)} motions are free, smallest distance {1000 * near:.1f} mm")
 
@@ -53,7 +52,7 @@ def main():
     contact = "with contact" if execution.collided else "collision-free"
     reached = "reached" if execution.reached else "not reached"
     print(f"in the simulator: goal {reached} in {len(execution.states) - 1} steps, {contact}")
-    hand = panda.forward_kinematics(configurations[-1])  # the point between the fingertips, m
+    hand = env.robot.forward_kinematics(configurations[-1])  # the point between the fingertips, m
     print(f"end effector at the goal: {hand.round(3).tolist()} m")
 
 

@@ -13,7 +13,7 @@ import argparse
 
 import numpy as np
 
-from roboarm_nmp.envs import RoboArmEnv, panda
+from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.perception.point_clouds import POINT_RADIUS, farthest_points, one_per_cell
@@ -57,7 +57,7 @@ def main():
     # The simulated arm stands among nothing but table and floor: all obstacles are points.
     scene = Scene()
     checker = CollisionChecker(scene, points, POINT_RADIUS)
-    ends = panda.normalise(np.stack([START, GOAL]))
+    ends = scene.robot.normalise(np.stack([START, GOAL]))
     straight = "free" if checker.is_motion_free(*ends) else "blocked"
     print(f"{len(points)} points; the straight motion to the goal is {straight}")
     policy, arguments = find_policy(POLICY)

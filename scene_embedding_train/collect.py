@@ -11,7 +11,7 @@ extended by a larger `--num`.
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +21,7 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
+from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers
 from roboarm_nmp.envs.utils.random_streams import Stream
@@ -31,6 +32,8 @@ from roboarm_nmp.envs.utils.signals import end_with_one_line
 class Args:
     task: str = "random_boxes_hard"
     """Name of a task, or path of a scene file."""
+    robot: Path | None = None
+    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
     num: PositiveInt = 20_000
     """Number of scenes."""
     sensors: Literal["images", "clouds", "both"] = "both"
@@ -53,11 +56,11 @@ class Args:
 
 def make_sensors(args):
     """The sensors of the flags: dict of name -> sensor."""
-    sensors = {}
+    sensors, robot = {}, envs.get_task(args.task).base_scene.robot
     if args.sensors != "clouds":
-        sensors |= cardinal(Camera, size=(args.image_size, args.image_size))
+        sensors |= cardinal(Camera, robot, size=(args.image_size, args.image_size))
     if args.sensors != "images":
-        clouds = cardinal(PointCloud, num_samples=args.num_samples)
+        clouds = cardinal(PointCloud, robot, num_samples=args.num_samples)
         sensors |= {f"{name}_cloud": sensor for name, sensor in clouds.items()}
     return sensors
 
@@ -93,6 +96,7 @@ def collect(args, progress=True):
         OSError: the folder cannot be written. Finished shards are kept.
     """
     flags.check(args)
+    args = replace(args, task=task_with_robot(args.task, args.robot), robot=None)
     shards.check_collection(args)
     names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
     given = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
@@ -109,7 +113,7 @@ def collect(args, progress=True):
         unit="scene",
         progress=progress,
     )
-    return Observations(args.output)
+    return Observations(args.output, envs.get_task(args.task).base_scene.robot)
 
 
 def main(args):

@@ -14,7 +14,10 @@ import numpy as np
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.observations import Observations
 from roboarm_nmp.envs.datasets.shards import shard_path
+from roboarm_nmp.envs.networks.exported_networks import robot_metadata
 from roboarm_nmp.envs.perception.sensors import sensors_to_json
+from roboarm_nmp.envs.robots.files import RobotError, load_robot
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training.flags import PositiveInt, Share
 from roboarm_nmp.envs.training.runs import RunFlags
 from roboarm_nmp.envs.utils.files import new_contents
@@ -27,6 +30,8 @@ class EncoderFlags(RunFlags):
 
     observations: Path = Path("observations")
     """folder that `roboarm observations` wrote"""
+    robot: Path | None = None
+    """the robot's file, if the observations are not the Panda's; the encoder is for that robot"""
     validation_share: Share = 0.05
     """share of the scenes, the last ones, that is not trained on"""
     eval_every: PositiveInt = 2_000
@@ -46,10 +51,13 @@ def load_observations(args):
         validate on, an array.
 
     Raises:
-        SystemExit: there are no observations, or too few, or they are damaged.
+        SystemExit: there are no observations, or too few, or they are damaged, or another robot's.
     """
     try:
-        observations = Observations(args.observations)
+        robot = PANDA if args.robot is None else load_robot(args.robot)
+        observations = Observations(args.observations, robot)
+    except RobotError as error:
+        sys.exit(f"--robot: {error}")
     except DatasetError as error:
         sys.exit(f"--observations: {error}")
     num_training = len(observations) - max(1, round(args.validation_share * len(observations)))
@@ -63,6 +71,7 @@ def encoder_metadata(args, observations, names):
     """The metadata of an encoder that receives the outputs of the sensors `names`: a dict."""
     sensors = sensors_to_json({name: observations.sensors[name] for name in names})
     metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
+    metadata |= robot_metadata(observations.base_scene.robot)
     return metadata | {"sensors": sensors, "seed": args.seed}
 
 

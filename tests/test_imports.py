@@ -12,13 +12,14 @@ FOLDERS = ("envs", "demo_generation", "clean_rl_scripts", "bc_script", "scene_em
 # From the bottom to the top. A module may import from its own row and from the rows before it.
 LEVELS = [
     ("envs.utils",),
-    ("envs.panda", "envs.scenes", "envs.networks", "envs.subgoals"),
+    ("envs.robots",),
+    ("envs.scenes", "envs.networks", "envs.subgoals"),
     ("envs.world", "envs.collision", "envs.tasks"),
     ("envs.arm_env", "envs.perception", "envs.wrappers"),
     ("envs",),  # `make`
     ("envs.datasets", "envs.policies"),
     ("envs.training",),
-    ("envs.show",),
+    ("envs.show", "envs.robot_check"),
     ("envs.viewer",),
     ("demo_generation",),
     ("clean_rl_scripts", "bc_script", "scene_embedding_train"),

@@ -3,16 +3,16 @@
     from roboarm_nmp.envs.collision.checker import CollisionChecker
 
     checker = CollisionChecker(scene)
-    checker.is_free(states)                  # normalised (n, 7) -> bool (n,)
+    checker.is_free(states)                  # normalised (m, n) -> bool (m,)
     checker.is_motion_free(starts, ends)     # straight motions, checked every `RESOLUTION`
     checker.signed_distances(states)         # `SignedDistances`, a row per link
     checker.link_distances(states)           # as in observations, and faster
 
 The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`, without a PyBullet
 world. The shapes are: the convex hulls of the links' collision meshes, `BULLET_MARGIN` thicker on
-all sides; boxes and cylinders, with edges rounded by as much; spheres; the table and the floor; and
-`panda.SELF_COLLISION_PAIRS`. As in PyBullet, the base collides only with the arm itself. How often
-the two disagree: docs/benchmark/performance.md.
+all sides; boxes and cylinders, with edges rounded by as much; spheres; the table and the floor. Of
+links, the robot's `self_collision_pairs` are checked. As in PyBullet, the base collides only with
+the arm itself. How often the two disagree: docs/benchmark/performance.md.
 
 Two shapes are compared in three stages, each only if the one before could not separate them: the
 link's bounding sphere against the box around the obstacle; the link's bounding box against that
@@ -31,7 +31,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, group_points, shape_rows
 from roboarm_nmp.envs.collision.kernels import (
     free_batch,
@@ -42,7 +41,6 @@ from roboarm_nmp.envs.collision.kernels import (
 )
 from roboarm_nmp.envs.scenes.primitives import Scene, floor_box
 
-NUM_LINKS = len(panda.COLLISION_LINKS)
 RESOLUTION = 0.021
 """Motions are checked at points at most this far apart, L2 in the normalised space: less than one
 step of the arm (0.03)."""
@@ -53,19 +51,19 @@ NOTHING, TABLE, FLOOR, ARM, POINT = -1, -2, -3, -4, -5
 
 
 class SignedDistances(NamedTuple):
-    """Signed distances of each of `panda.COLLISION_LINKS`, for configurations of shape (...).
+    """Signed distances of each of a robot's `collision_links`, for configurations of shape (...).
 
-    The ten links of a configuration have a row each. Where nothing is in range, the distance is
-    infinite, and normal, witness and gradient are zeros.
+    The l links of a configuration have a row each; the Panda has 10. Where nothing is in range, the
+    distance is infinite, and normal, witness and gradient are zeros.
 
     Attributes:
-        distance: m, (..., 10), from the nearest geometry; in a collision, minus the depth.
-        normal: unit vectors (..., 10, 3), in the base's frame, along which the link moves away.
-        witness: m, (..., 10, 3), in the base's frame: the nearest or deepest point of the link's
+        distance: m, (..., l), from the nearest geometry; in a collision, minus the depth.
+        normal: unit vectors (..., l, 3), in the base's frame, along which the link moves away.
+        witness: m, (..., l, 3), in the base's frame: the nearest or deepest point of the link's
             hull.
-        gradient: m per unit of normalised configuration, (..., 10, 7): the derivative of `distance`
+        gradient: m per unit of normalised configuration, (..., l, n): the derivative of `distance`
             with respect to each joint.
-        geometry: int64 (..., 10): the index of an obstacle, or `TABLE`, `FLOOR`, `ARM` (another
+        geometry: int64 (..., l): the index of an obstacle, or `TABLE`, `FLOOR`, `ARM` (another
             link), `POINT` (one of the points), `NOTHING`.
     """
 
@@ -79,11 +77,11 @@ class SignedDistances(NamedTuple):
 class CollisionChecker:
     """Collisions of the arm with a scene and with itself.
 
-    States are normalised configurations, shape (..., 7), floats in [-1, 1]; an answer has the
+    States are normalised configurations, shape (..., n), floats in [-1, 1]; an answer has the
     batch's shape, (...), and is empty for an empty batch. Safe to use from several threads.
 
     Args:
-        scene: a `Scene`.
+        scene: a `Scene`, whose robot has n joints.
         points: m, (n, 3), in the base's frame: the centres of additional balls, for example an
             observed point cloud.
         point_radius: m, of the balls, in [0, `MAX_MARGIN`).
@@ -100,7 +98,8 @@ class CollisionChecker:
             raise TypeError(
                 f"a scene must be a roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
             )
-        self.scene = scene
+        self.scene, self.robot = scene, scene.robot
+        self._arm = arm_hulls(scene.robot)
         shapes, geometries = list(scene.obstacles), list(range(len(scene.obstacles)))
         if scene.table is not None:
             shapes.append(scene.table)
@@ -117,18 +116,24 @@ class CollisionChecker:
         Without a margin, the answer is that of `not RoboArmEnv.in_collision(...)`.
 
         Args:
-            states: (..., 7), normalised.
+            states: (..., n), normalised.
             margin: m, in [0, `MAX_MARGIN`): from the scene, and between the links.
             clearance: m, in [0, `MAX_MARGIN`): from the scene, in addition.
-            endpoint_margins: None, or `(states (k, 7), distances (k,), growth)`: smaller margins
+            endpoint_margins: None, or `(states (k, n), distances (k,), growth)`: smaller margins
                 around endpoints that are nearer to geometry than `margin`. At L2 distance d
                 (normalised) from one of the states, the margin is at most `distance + growth * d`.
-                Each configuration, or motion, may have its own: (..., k, 7) and (..., k).
+                Each configuration, or motion, may have its own: (..., k, n) and (..., k).
         """
-        states = _states("states", states)
+        states = self._states("states", states)
         free = np.empty(states.shape[:-1], dtype=np.bool_)
-        rule = _rule(margin, clearance, endpoint_margins, batch=states.shape[:-1])
-        free_batch(states.reshape(-1, 7), *rule, arm_hulls(), self._world, free.reshape(-1))
+        rule = self._rule(margin, clearance, endpoint_margins, batch=states.shape[:-1])
+        free_batch(
+            states.reshape(-1, self.robot.num_joints),
+            *rule,
+            self._arm,
+            self._world,
+            free.reshape(-1),
+        )
         return free
 
     def is_motion_free(
@@ -147,7 +152,7 @@ class CollisionChecker:
         the middle, then the middle of each half, and so on, until one is not free.
 
         Args:
-            starts, ends: (..., 7), normalised; one may be broadcast to the other.
+            starts, ends: (..., n), normalised; one may be broadcast to the other.
             margin, clearance, endpoint_margins: as for `is_free`.
             resolution: L2, normalised, > 0.
             ends_known: both ends are known to be free, and are not checked.
@@ -166,117 +171,122 @@ class CollisionChecker:
         ends_known=False,
     ):
         """How many configurations `is_motion_free` checks, int64 (...); negative: not free."""
-        starts, ends = np.broadcast_arrays(_states("starts", starts), _states("ends", ends))
-        rule = _rule(margin, clearance, endpoint_margins, resolution, batch=starts.shape[:-1])
+        starts, ends = np.broadcast_arrays(
+            self._states("starts", starts), self._states("ends", ends)
+        )
+        rule = self._rule(margin, clearance, endpoint_margins, resolution, batch=starts.shape[:-1])
         checks = np.empty(starts.shape[:-1], dtype=np.int64)
-        flat = [np.ascontiguousarray(x.reshape(-1, 7)) for x in (starts, ends)]
-        motion_batch(*flat, *rule, arm_hulls(), self._world, ends_known, checks.reshape(-1))
+        flat = [np.ascontiguousarray(x.reshape(-1, self.robot.num_joints)) for x in (starts, ends)]
+        motion_batch(*flat, *rule, self._arm, self._world, ends_known, checks.reshape(-1))
         return checks
 
     def motion_checker(
         self, margin=0.0, clearance=0.0, endpoint_margins=None, resolution=RESOLUTION
     ):
-        """`motion_checks` of one motion, for planners: a function of two tuples of 7 floats.
+        """`motion_checks` of one motion, for planners: a function of two tuples of n floats.
 
         The function assumes that the start is free, and does not validate its arguments.
         """
-        rule, endpoint_margins = _rule(margin, clearance, endpoint_margins, resolution)
-        return functools.partial(motion, rule, endpoint_margins[0], arm_hulls(), self._world, False)
+        rule, endpoint_margins = self._rule(margin, clearance, endpoint_margins, resolution)
+        return functools.partial(motion, rule, endpoint_margins[0], self._arm, self._world, False)
 
     def signed_distances(self, states, self_collisions=True, within=math.inf):
-        """The `SignedDistances` of `panda.COLLISION_LINKS` from the nearest geometry.
+        """The `SignedDistances` of the robot's `collision_links` from the nearest geometry.
 
         Args:
-            states: (..., 7), normalised.
-            self_collisions: whether other links count (`panda.SELF_COLLISION_PAIRS`).
+            states: (..., n), normalised.
+            self_collisions: whether other links count (the robot's `self_collision_pairs`).
             within: m; geometry farther away counts as `NOTHING`.
         """
-        states = _states("states", states)
-        batch = (*states.shape[:-1], NUM_LINKS)
+        states = self._states("states", states)
+        links, numbers = self.robot.link_distances_shape
+        batch = (*states.shape[:-1], links)
         distance, geometry = np.empty(batch), np.empty(batch, dtype=np.int64)
         normal, witness = np.empty((*batch, 3)), np.empty((*batch, 3))
-        gradient = np.empty((*batch, panda.NUM_JOINTS))
+        gradient = np.empty((*batch, numbers - 1))
         signed_distances_batch(
-            states.reshape(-1, 7),
+            states.reshape(-1, self.robot.num_joints),
             bool(self_collisions),
             float(within),
-            arm_hulls(),
+            self._arm,
             self._world,
-            distance.reshape(-1, NUM_LINKS),
-            normal.reshape(-1, NUM_LINKS, 3),
-            witness.reshape(-1, NUM_LINKS, 3),
-            gradient.reshape(-1, NUM_LINKS, panda.NUM_JOINTS),
-            geometry.reshape(-1, NUM_LINKS),
+            distance.reshape(-1, links),
+            normal.reshape(-1, links, 3),
+            witness.reshape(-1, links, 3),
+            gradient.reshape(-1, links, numbers - 1),
+            geometry.reshape(-1, links),
         )
         return SignedDistances(distance, normal, witness, gradient, self._geometries[geometry])
 
     def link_distances(self, states, self_collisions=False, within=LINK_DISTANCE_RANGE):
-        """The observation of `envs.wrappers.LinkDistancesWrapper`: float32 (..., 10, 8).
+        """The observation of `envs.wrappers.LinkDistancesWrapper`: float32 (..., l, 1 + n).
 
-        Each of `panda.COLLISION_LINKS` has a row: `SignedDistances.distance` in m, clipped to
+        Each of the robot's `collision_links` has a row: `SignedDistances.distance` in m, clipped to
         `within`, and `SignedDistances.gradient`, in m per unit of normalised configuration.
 
         Args:
-            states: (..., 7), normalised. An arm may exceed its limits a little: such states are
+            states: (..., n), normalised. An arm may exceed its limits a little: such states are
                 clipped to the limits.
             self_collisions, within: as for `signed_distances`.
         """
-        states = _numbers("states", states)
-        rows = np.empty((*states.shape[:-1], NUM_LINKS, 8), dtype=np.float32)
-        flat = states.reshape(-1, 7), rows.reshape(-1, NUM_LINKS, 8)
+        states, shape = self._numbers("states", states), self.robot.link_distances_shape
+        rows = np.empty((*states.shape[:-1], *shape), dtype=np.float32)
+        flat = states.reshape(-1, self.robot.num_joints), rows.reshape(-1, *shape)
         options = bool(self_collisions), float(within)
-        if not link_distances_batch(*flat, *options, arm_hulls(), self._world):
+        if not link_distances_batch(*flat, *options, self._arm, self._world):
             raise ValueError("states must be normalised configurations, not NaN")
         return rows
 
+    def _numbers(self, name, states):
+        """Configurations as a contiguous float64 array. Raises ValueError."""
+        joints = self.robot.num_joints
+        try:
+            states = np.asarray(states)
+            if states.dtype.kind not in "fiu":
+                raise TypeError(f"they are of type {states.dtype}")
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name} must be numbers of shape (..., {joints})") from error
+        if states.shape[-1:] != (joints,):
+            raise ValueError(f"{name} must have shape (..., {joints}), got {states.shape}")
+        return np.ascontiguousarray(states, dtype=np.float64)
 
-def _numbers(name, states):
-    """Configurations as a contiguous float64 array. Raises ValueError."""
-    try:
-        states = np.asarray(states)
-        if states.dtype.kind not in "fiu":
-            raise TypeError(f"they are of type {states.dtype}")
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers of shape (..., 7)") from error
-    if states.shape[-1:] != (panda.NUM_JOINTS,):
-        raise ValueError(f"{name} must have shape (..., 7), got {states.shape}")
-    return np.ascontiguousarray(states, dtype=np.float64)
+    def _states(self, name, states):
+        """Normalised configurations as a contiguous float64 array. Raises ValueError."""
+        states = self._numbers(name, states)
+        # float32 may round a limit to just beyond it. (A comparison with NaN is false.)
+        if states.size and not np.abs(states).max() <= 1.0 + 1e-6:
+            raise ValueError(f"{name} must be normalised configurations: finite, in [-1, 1]")
+        return states
 
+    def _rule(self, margin, clearance, endpoint_margins, resolution=RESOLUTION, batch=()):
+        """The arguments of `is_free` and `is_motion_free` as arrays. Raises ValueError.
 
-def _states(name, states):
-    """Normalised configurations as a contiguous float64 array. Raises ValueError."""
-    states = _numbers(name, states)
-    # float32 may round a limit to just beyond it. (A comparison with NaN is false.)
-    if states.size and not np.abs(states).max() <= 1.0 + 1e-6:
-        raise ValueError(f"{name} must be normalised configurations: finite, in [-1, 1]")
-    return states
-
-
-def _rule(margin, clearance, endpoint_margins, resolution=RESOLUTION, batch=()):
-    """The arguments of `is_free` and `is_motion_free` as arrays. Raises ValueError.
-
-    Returns float64 (4,): margin, clearance, growth, resolution; and the endpoints' states and
-    distances, (n, k, 8), with n = 1 if they hold for the whole batch.
-    """
-    for name, value in (("margin", margin), ("clearance", clearance)):
-        if not 0 <= value < MAX_MARGIN:
-            raise ValueError(f"{name} must be in [0, {MAX_MARGIN}) m, got {value!r}")
-    if not 0 < resolution < math.inf:
-        raise ValueError(f"resolution must be positive, got {resolution!r}")
-    if endpoint_margins is None:
-        return np.array([margin, clearance, 0.0, resolution]), np.empty((1, 0, 8))
-    states, distances, growth = endpoint_margins
-    states = _states("endpoint_margins states", states)
-    distances = np.asarray(distances, dtype=np.float64)
-    fits = states.ndim == 2 or (states.ndim > 2 and states.shape[:-2] == batch)
-    if not fits or distances.shape != states.shape[:-1] or np.isnan(distances).any():
-        raise ValueError(f"endpoint_margins: {states.shape} states and {distances.shape} distances")
-    if not 0 <= growth < math.inf:
-        raise ValueError(
-            f"endpoint_margins: growth must be finite and not negative, got {growth!r}"
+        Returns float64 (4,): margin, clearance, growth, resolution; and the endpoints' states and
+        distances, (m, k, n + 1), with m = 1 if they hold for the whole batch.
+        """
+        for name, value in (("margin", margin), ("clearance", clearance)):
+            if not 0 <= value < MAX_MARGIN:
+                raise ValueError(f"{name} must be in [0, {MAX_MARGIN}) m, got {value!r}")
+        if not 0 < resolution < math.inf:
+            raise ValueError(f"resolution must be positive, got {resolution!r}")
+        if endpoint_margins is None:
+            return np.array([margin, clearance, 0.0, resolution]), np.empty(
+                (1, 0, 1 + self.robot.num_joints)
+            )
+        states, distances, growth = endpoint_margins
+        states = self._states("endpoint_margins states", states)
+        distances = np.asarray(distances, dtype=np.float64)
+        fits = states.ndim == 2 or (states.ndim > 2 and states.shape[:-2] == batch)
+        if not fits or distances.shape != states.shape[:-1] or np.isnan(distances).any():
+            raise ValueError(
+                f"endpoint_margins: {states.shape} states and {distances.shape} distances"
+            )
+        if not 0 <= growth < math.inf:
+            raise ValueError(
+                f"endpoint_margins: growth must be finite and not negative, got {growth!r}"
+            )
+        endpoint_margins = np.concatenate([states, distances[..., None]], axis=-1)
+        endpoint_margins = endpoint_margins.reshape(
+            -1 if states.ndim > 2 else 1, *endpoint_margins.shape[-2:]
         )
-    endpoint_margins = np.concatenate([states, distances[..., None]], axis=-1)
-    endpoint_margins = endpoint_margins.reshape(
-        -1 if states.ndim > 2 else 1, *endpoint_margins.shape[-2:]
-    )
-    return np.array([margin, clearance, growth, resolution]), endpoint_margins
+        return np.array([margin, clearance, growth, resolution]), endpoint_margins

@@ -1,12 +1,26 @@
 """The shapes of the arm and of a scene as the arrays that `kernels` takes."""
 
+import contextlib
 import functools
+import itertools
 import math
+import tempfile
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.collision.kernels import BULLET_MARGIN, CELLS, ROW, SPHERE
+from roboarm_nmp.envs.collision.kernels import (
+    BODY_COLUMNS,
+    BULLET_MARGIN,
+    CELLS,
+    FRAME_COLUMNS,
+    POSITION,
+    ROTATION,
+    ROW,
+    SPHERE,
+)
+from roboarm_nmp.envs.robots.robot import matrix, temporary_urdf
 from roboarm_nmp.envs.scenes.primitives import Cylinder, Sphere, to_array
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
@@ -17,43 +31,174 @@ _GROUP_SIZE = 0.16
 
 
 @functools.cache
-def arm_hulls():
-    """The links' hulls as PyBullet makes them: `(bodies, pairs, vertices, cells)`.
+def arm_hulls(robot):
+    """The links' shapes as PyBullet makes them: `(chain, bodies, pairs, vertices, cells)`.
 
-    `bodies`: float64 (11, 8), the base and `panda.COLLISION_LINKS`: the frame in which a body moves
-    (0 for the base's, otherwise the number of a joint), the centre of its bounding box there 3, the
-    radius of the sphere around that centre, half edges 3. `pairs`: int64 (n, 2), the bodies that
-    may collide. `vertices`: float64 (v, 3), m, relative to their body's centre. `cells`: see
-    `_cells`.
+    A body is a convex hull, the points within its rounding included; a link may have several. With
+    f frames, of which the first is the base's:
+
+    - `chain`: float64 (f, `FRAME_COLUMNS`): a frame's parent, its joint, whether that is prismatic,
+      the joint's value at -1 and its range, position 3 and rotation 9 in the parent;
+    - `bodies`: float64 (b, `BODY_COLUMNS`): the frame in which a body moves, the centre of its
+      bounding box there 3, the radius of the sphere around that centre, half edges 3, rounding (m),
+      and the link's row of link distances, -1 for those that do not move, which come first;
+    - `pairs`: int64 (p, 2), the bodies that may collide;
+    - `vertices`: float64 (v, 3), m, relative to their body's centre;
+    - `cells`: see `_cells`.
+    """
+    chain = np.zeros((1 + len(robot.frames), FRAME_COLUMNS))
+    chain[0, POSITION:ROTATION] = robot.base_position
+    chain[0, ROTATION:] = _exact(matrix(robot.base_orientation)).ravel()
+    span = robot.upper - robot.lower
+    for row, frame in zip(chain[1:], robot.frames, strict=True):
+        low, scale, joint = robot.lower[frame.joint], frame.multiplier, frame.joint
+        row[:POSITION] = (
+            *(1 + frame.parent, joint, frame.is_prismatic),
+            *(scale * low + frame.offset, scale * span[joint]),
+        )
+        row[POSITION:] = *frame.position, *_exact(frame.rotation)
+    bodies, meshes, of_link = [], [], {link.index: [] for link in robot.links}
+    rows = {link: row for row, link in enumerate(robot.collision_links)}
+    for link, mesh, rounding in link_shapes(robot):
+        centre = (mesh.min(0) + mesh.max(0)) / 2
+        mesh = mesh - centre
+        radius = np.linalg.norm(mesh, axis=1).max()
+        body = 1 + link.frame, *centre, radius, *mesh.max(0), rounding, rows.get(link.index, -1)
+        of_link[link.index].append(len(bodies))
+        bodies.append(body)
+        meshes.append(mesh)
+    pairs = [
+        pair
+        for a, b in robot.self_collision_pairs
+        for pair in itertools.product(of_link[a], of_link[b])
+    ]
+    pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    bodies = np.reshape(bodies, (-1, BODY_COLUMNS))
+    return chain, bodies, pairs, np.concatenate(meshes), _cells(meshes)
+
+
+def link_shapes(robot):
+    """Each `Link` of a robot with each of its shapes: vertices (v, 3), m, in its frame; rounding.
+
+    PyBullet is asked for them: it replaces a mesh, and a cylinder, by its convex hull.
     """
     client = p.connect(p.DIRECT)
     try:
-        robot = panda.load(client)
-        meshes = []
-        for link in (-1, *panda.COLLISION_LINKS):
-            # PyBullet's vertices are relative to the link's centre of mass.
-            mass_centre = p.getDynamicsInfo(robot, link, physicsClientId=client)[3]
-            flags = p.MESH_DATA_SIMULATION_MESH
-            mesh = p.getMeshData(robot, link, flags=flags, physicsClientId=client)[1]
-            meshes.append(np.array(mesh) + mass_centre)
+        body = robot.load(client, drawn=False)
+        for link in robot.links:
+            for mesh, rounding in _shapes(client, robot, body, link.index):
+                for placement in link.placements:
+                    mesh = _moved(mesh, *placement)
+                yield link, mesh, rounding
     finally:
         p.disconnect(physicsClientId=client)
-    # The hand and the open fingers move with joint 7.
-    for finger, side in ((9, 1.0), (10, -1.0)):
-        meshes[finger] += np.array(panda.HAND_TO_FINGER) + (0.0, side * panda.FINGER_OPENING, 0.0)
-    c, s = math.cos(panda.HAND_YAW), math.sin(panda.HAND_YAW)
-    for body in (8, 9, 10):
-        x, y, z = meshes[body].T
-        meshes[body] = np.stack([c * x - s * y, s * x + c * y, z + panda.FLANGE_LENGTH], axis=1)
-    bodies = np.zeros((len(meshes), 8))
-    for body, mesh in enumerate(meshes):
-        centre = (mesh.min(0) + mesh.max(0)) / 2
-        mesh -= centre
-        radius = np.linalg.norm(mesh, axis=1).max()
-        bodies[body] = (min(body, panda.NUM_JOINTS), *centre, radius, *mesh.max(0))
-    order = {link: body for body, link in enumerate((-1, *panda.COLLISION_LINKS))}
-    pairs = np.array([[order[a], order[b]] for a, b in panda.SELF_COLLISION_PAIRS])
-    return bodies, pairs, np.concatenate(meshes), _cells(meshes)
+
+
+def _shapes(client, robot, body, link):
+    """The shapes of a link of a body: vertices (v, 3), m, in the link's frame, and rounding."""
+    shapes = p.getCollisionShapeData(body, link, physicsClientId=client)
+    if len(shapes) > 1 or any(len(_objects(shape[4].decode())) > 1 for shape in shapes):
+        # PyBullet returns the vertices of all hulls as one, so each is loaded alone.
+        for element in robot.collision_elements(_name(client, body, link)):
+            for one in _one_by_one(element):
+                with temporary_urdf(_ONE_SHAPE.format(one)) as urdf:
+                    alone = p.loadURDF(urdf, physicsClientId=client)
+                yield from _shapes(client, robot, alone, -1)
+                p.removeBody(alone, physicsClientId=client)
+        return
+    # PyBullet's positions are relative to the centre of mass.
+    position, quaternion = p.getDynamicsInfo(body, link, physicsClientId=client)[3:5]
+    for shape in shapes:
+        if shape[2] == p.GEOM_MESH:
+            flags = p.MESH_DATA_SIMULATION_MESH
+            mesh = p.getMeshData(body, link, flags=flags, physicsClientId=client)[1]
+            if not mesh:  # one of several, without triangles
+                continue
+            mesh, rounding = np.array(mesh), BULLET_MARGIN
+        else:
+            mesh, rounding = _primitive(shape)
+        if any(quaternion[:3]):
+            mesh = _moved(mesh, (0.0, 0.0, 0.0), matrix(quaternion).ravel())
+        yield mesh + position, rounding
+
+
+_ONE_SHAPE = """<robot name="shape"><link name="shape"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>{}</link></robot>"""
+
+
+def _objects(file):
+    """The objects of an OBJ file, each as the text of a file; PyBullet makes a hull of each."""
+    if not file.lower().endswith(".obj"):
+        return [None]
+    vertices, objects = [], [[]]
+    for line in Path(file).read_text(errors="replace").splitlines():
+        word = line.split(maxsplit=1)[:1]
+        if word in (["o"], ["g"]):
+            objects.append([])
+        elif word == ["v"]:
+            vertices.append(line)
+        elif word == ["f"]:
+            # Only the vertices' numbers: those of textures and normals are not there.
+            numbers = [corner.partition("/")[0] for corner in line.split()[1:]]
+            objects[-1].append(f"f {' '.join(numbers)}")
+    return ["\n".join([*vertices, *faces]) for faces in objects if faces]
+
+
+@contextlib.contextmanager
+def _temporary_obj(text):
+    with tempfile.NamedTemporaryFile("w", suffix=".obj") as file:
+        file.write(text)
+        file.flush()
+        yield file.name
+
+
+def _one_by_one(element):
+    """A URDF's `collision` element, or one for each object of its OBJ file, as text."""
+    mesh = element.find("geometry/mesh")
+    objects = [] if mesh is None else _objects(mesh.get("filename"))
+    if len(objects) < 2:
+        yield ElementTree.tostring(element, "unicode")
+        return
+    for text in objects:
+        with _temporary_obj(text) as file:
+            mesh.set("filename", file)
+            yield ElementTree.tostring(element, "unicode")
+
+
+def _name(client, body, link):
+    if link < 0:
+        return p.getBodyInfo(body, physicsClientId=client)[0].decode()
+    return p.getJointInfo(body, link, physicsClientId=client)[12].decode()
+
+
+def _primitive(shape):
+    """A box, sphere or capsule as vertices, relative to the centre of mass, and rounding."""
+    kind, size, position, quaternion = shape[2], shape[3], shape[5], shape[6]
+    if kind == p.GEOM_BOX:
+        rounding = min(BULLET_MARGIN, min(size) / 2)
+        half = np.array(size) / 2 - rounding
+        mesh = half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    elif kind == p.GEOM_SPHERE:
+        mesh, rounding = np.zeros((1, 3)), size[0]
+    elif kind == p.GEOM_CAPSULE:
+        mesh, rounding = np.array([(0.0, 0.0, -size[0] / 2), (0.0, 0.0, size[0] / 2)]), size[1]
+    else:
+        raise ValueError(f"a link has a collision shape of PyBullet's kind {kind}")
+    return _moved(mesh, position, matrix(quaternion).ravel()), rounding
+
+
+def _moved(mesh, position, rotation):
+    """Vertices (v, 3) rotated by a row-major matrix (9,), then moved."""
+    (x, y, z), r = mesh.T, rotation
+    rows = [r[i] * x + r[i + 1] * y + r[i + 2] * z + position[i // 3] for i in (0, 3, 6)]
+    return np.stack(rows, axis=1)
+
+
+def _exact(rotation):
+    """A rotation whose right angles are exact: cos(pi / 2) is 6e-17 in floating point."""
+    rotation = np.array(rotation, dtype=np.float64)
+    near = np.round(rotation)
+    return np.where(np.abs(rotation - near) < 1e-9, near, rotation)
 
 
 def _cells(meshes):

@@ -2,17 +2,17 @@
 
 One file holds all of it, because Numba's cache on disk does not notice changes in other files.
 
-All functions compute in float64. Their working memory: `frames` (8, 12), a rotation (row-major) and
-a position each; `centres` (11, 3), of the bodies; `pose` (12,), of a shape in a body's frame;
-`simplex`, see `_gjk`; `other` (1, `ROW`), a link as the shape that another link may hit. What `arm`
-and `world` hold: `arm_hulls`, `shape_rows` and `group_points` in `hulls`.
+All functions compute in float64, for an arm of n joints with l links that may collide, besides the
+base. Their working memory: `frames` (f, 12), a rotation (row-major) and a position each; `centres`
+(b, 3), of the bodies; `pose` (12,), of a shape in a body's frame; `simplex`, see `_gjk`; `other`
+(1, `ROW`), a body as the shape that another one may hit. What `arm` and `world` hold: `arm_hulls`,
+`shape_rows` and `group_points` in `hulls`.
 """
 
 import math
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.numba_cache import compiled
 
 BULLET_MARGIN = 0.001
@@ -30,19 +30,17 @@ CELLS = 8
 _TOLERANCE, _MAX_ITERATIONS = 1e-8, 64
 _EPA_TOLERANCE, _EPA_VERTICES, _EPA_FACES = 1e-7, 128, 768
 
-_LOWER, _SPAN = tuple(panda.LOWER.tolist()), tuple((panda.UPPER - panda.LOWER).tolist())
-_JOINTS = tuple(
-    (x, y, z, float(round(math.sin(roll))), float(round(math.cos(roll))))
-    for x, y, z, roll in panda.JOINT_FRAMES
-)
+# Columns of `arm`'s first two arrays, see `hulls.arm_hulls`.
+PARENT, JOINT, PRISMATIC, BEGIN, SPAN, POSITION, ROTATION, FRAME_COLUMNS = 0, 1, 2, 3, 4, 5, 8, 17
+FRAME, CENTRE, RADIUS, HALF, ROUNDING, LINK_ROW, BODY_COLUMNS = 0, 1, 4, 5, 8, 9, 10
 
 
 @compiled
-def _memory():
+def _memory(chain, bodies):
     """(frames, centres, pose, simplex, other)"""
     return (
-        np.zeros((8, 12)),
-        np.empty((11, 3)),
+        np.zeros((chain.shape[0], 12)),
+        np.empty((bodies.shape[0], 3)),
         np.zeros(12),
         np.empty(32),
         np.zeros((1, ROW)),
@@ -50,25 +48,33 @@ def _memory():
 
 
 @compiled
-def _place(q, bodies, frames, centres):
+def _place(q, chain, bodies, frames, centres):
     """Write the frames and the bodies' centres of a normalised configuration."""
-    frames[0, 0] = frames[0, 4] = frames[0, 8] = 1.0
-    for joint in range(7):
-        x, y, z, sr, cr = _JOINTS[joint]
-        angle = _LOWER[joint] + (q[joint] + 1.0) * 0.5 * _SPAN[joint]
-        c, s = math.cos(angle), math.sin(angle)
-        here, there = frames[joint], frames[joint + 1]
+    for i in range(9):
+        frames[0, i] = chain[0, ROTATION + i]
+    for i in range(3):
+        frames[0, 9 + i] = chain[0, POSITION + i]
+    for frame in range(1, chain.shape[0]):
+        given = chain[frame]
+        here, there = frames[int(given[PARENT])], frames[frame]
+        value = given[BEGIN] + (q[int(given[JOINT])] + 1.0) * 0.5 * given[SPAN]
+        c, s, slide = 1.0, 0.0, value
+        if given[PRISMATIC] == 0.0:
+            c, s, slide = math.cos(value), math.sin(value), 0.0
+        x, y, z = given[POSITION], given[POSITION + 1], given[POSITION + 2]
         for i in range(0, 9, 3):
             rx, ry, rz = here[i], here[i + 1], here[i + 2]
-            there[9 + i // 3] = here[9 + i // 3] + rx * x + ry * y + rz * z
-            # Rotated by the roll about x, then by the joint about its z.
-            ty, tz = cr * ry + sr * rz, cr * rz - sr * ry
-            there[i] = c * rx + s * ty
-            there[i + 1] = c * ty - s * rx
+            # Rotated into the frame, then by the joint about its z.
+            tx = rx * given[ROTATION] + ry * given[ROTATION + 3] + rz * given[ROTATION + 6]
+            ty = rx * given[ROTATION + 1] + ry * given[ROTATION + 4] + rz * given[ROTATION + 7]
+            tz = rx * given[ROTATION + 2] + ry * given[ROTATION + 5] + rz * given[ROTATION + 8]
+            there[9 + i // 3] = here[9 + i // 3] + rx * x + ry * y + rz * z + slide * tz
+            there[i] = c * tx + s * ty
+            there[i + 1] = c * ty - s * tx
             there[i + 2] = tz
     for body in range(bodies.shape[0]):
-        f = frames[int(bodies[body, 0])]
-        x, y, z = bodies[body, 1], bodies[body, 2], bodies[body, 3]
+        f = frames[int(bodies[body, FRAME])]
+        x, y, z = bodies[body, CENTRE], bodies[body, CENTRE + 1], bodies[body, CENTRE + 2]
         for i in range(3):
             centres[body, i] = f[9 + i] + f[3 * i] * x + f[3 * i + 1] * y + f[3 * i + 2] * z
 
@@ -86,7 +92,7 @@ def _sphere_gap(rows, j, centres, k):
 @compiled
 def _box_gap(bodies, k, frames, centres, points, j, pose):
     """Distance (m) of a point from the box around a body. Writes its position to `pose`."""
-    f = frames[int(bodies[k, 0])]
+    f = frames[int(bodies[k, FRAME])]
     x, y, z = (
         points[j, 0] - centres[k, 0],
         points[j, 1] - centres[k, 1],
@@ -95,19 +101,19 @@ def _box_gap(bodies, k, frames, centres, points, j, pose):
     pose[9] = f[0] * x + f[3] * y + f[6] * z
     pose[10] = f[1] * x + f[4] * y + f[7] * z
     pose[11] = f[2] * x + f[5] * y + f[8] * z
-    u = max(abs(pose[9]) - bodies[k, 5], 0.0)
-    v = max(abs(pose[10]) - bodies[k, 6], 0.0)
-    w = max(abs(pose[11]) - bodies[k, 7], 0.0)
+    u = max(abs(pose[9]) - bodies[k, HALF], 0.0)
+    v = max(abs(pose[10]) - bodies[k, HALF + 1], 0.0)
+    w = max(abs(pose[11]) - bodies[k, HALF + 2], 0.0)
     return math.sqrt(u * u + v * v + w * w)
 
 
 @compiled
 def _box_gaps(bodies, k, frames, centres, points, begin, end, gaps):
     """Write distances (m) of points from the box around a body."""
-    f = frames[int(bodies[k, 0])]
+    f = frames[int(bodies[k, FRAME])]
     xx, xy, xz, yx, yy, yz, zx, zy, zz = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     cx, cy, cz = centres[k, 0], centres[k, 1], centres[k, 2]
-    half_x, half_y, half_z = bodies[k, 5], bodies[k, 6], bodies[k, 7]
+    half_x, half_y, half_z = bodies[k, HALF], bodies[k, HALF + 1], bodies[k, HALF + 2]
     for j in range(begin, end):
         x, y, z = points[j, 0] - cx, points[j, 1] - cy, points[j, 2] - cz
         u = max(abs(xx * x + yx * y + zx * z) - half_x, 0.0)
@@ -131,7 +137,7 @@ def _relative(rows, j, frames, f, centres, k, pose):
 def _boxes_apart(bodies, k, rows, j, pose, gap):
     """Whether a face of the body's box, or of the box around the core, separates them by `gap`."""
     for i in range(3):
-        reach = bodies[k, 5 + i]
+        reach = bodies[k, HALF + i]
         for n in range(3):
             reach += abs(pose[3 * i + n]) * rows[j, 13 + n]
         if abs(pose[9 + i]) > reach + gap:
@@ -139,7 +145,7 @@ def _boxes_apart(bodies, k, rows, j, pose, gap):
     for n in range(3):
         reach, along = rows[j, 13 + n], 0.0
         for i in range(3):
-            reach += abs(pose[3 * i + n]) * bodies[k, 5 + i]
+            reach += abs(pose[3 * i + n]) * bodies[k, HALF + i]
             along += pose[3 * i + n] * pose[9 + i]
         if abs(along) > reach + gap:
             return True
@@ -360,7 +366,7 @@ def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
 @compiled
 def _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
     """Whether a body's hull is at least `gap` (m) away from a shape's core."""
-    _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
+    _relative(rows, j, frames, int(bodies[k, FRAME]), centres, k, pose)
     if _boxes_apart(bodies, k, rows, j, pose, gap):
         return True
     _begin(rows, j, pose, s)
@@ -370,36 +376,39 @@ def _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap
 @compiled
 def _as_row(bodies, k, frames, centres, row):
     """Write a body as a shape to `row` (1, `ROW`)."""
-    row[0, 0], row[0, 16], row[0, 17] = LINK, BULLET_MARGIN, k
+    row[0, 0], row[0, 16], row[0, 17] = LINK, bodies[k, ROUNDING], k
     for i in range(3):
-        row[0, 1 + i], row[0, 13 + i] = centres[k, i], bodies[k, 5 + i]
+        row[0, 1 + i], row[0, 13 + i] = centres[k, i], bodies[k, HALF + i]
     for i in range(9):
-        row[0, 4 + i] = frames[int(bodies[k, 0]), i]
+        row[0, 4 + i] = frames[int(bodies[k, FRAME]), i]
 
 
 @compiled
 def _is_free(q, rule, endpoint_margins, arm, world, memory):
     """`CollisionChecker.is_free` of one state."""
-    bodies, pairs, vertices, cells = arm
+    chain, bodies, pairs, vertices, cells = arm
     rows, points, groups, ball = world
     frames, centres, pose, s, other = memory
+    joints = endpoint_margins.shape[1] - 1
     margin, clearance, growth = rule[0], rule[1], rule[2]
     for i in range(endpoint_margins.shape[0]):
         squared = 0.0
-        for j in range(7):
+        for j in range(joints):
             squared += (q[j] - endpoint_margins[i, j]) ** 2
-        margin = min(margin, endpoint_margins[i, 7] + growth * math.sqrt(squared))
-    _place(q, bodies, frames, centres)
-    for k in range(bodies.shape[0] - 1, 0, -1):  # the hand first: it moves most
+        margin = min(margin, endpoint_margins[i, joints] + growth * math.sqrt(squared))
+    _place(q, chain, bodies, frames, centres)
+    for k in range(bodies.shape[0] - 1, -1, -1):  # the hand first: it moves most
+        if bodies[k, LINK_ROW] < 0.0:  # the base stands where it stands
+            break
         for j in range(rows.shape[0]):
-            gap = margin + clearance + rows[j, 16] + BULLET_MARGIN
-            reach = bodies[k, 4] + gap
+            gap = margin + clearance + rows[j, 16] + bodies[k, ROUNDING]
+            reach = bodies[k, RADIUS] + gap
             if reach > 0.0 and _sphere_gap(rows, j, centres, k) >= reach * reach:
                 continue
             if not _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
                 return False
         for g in range(groups.shape[0]):
-            gap = margin + clearance + ball[0, 16] + BULLET_MARGIN
+            gap = margin + clearance + ball[0, 16] + bodies[k, ROUNDING]
             if _box_gap(bodies, k, frames, centres, groups, g, pose) >= groups[g, 3] + gap:
                 continue
             for j in range(int(groups[g, 4]), int(groups[g, 5])):
@@ -408,10 +417,10 @@ def _is_free(q, rule, endpoint_margins, arm, world, memory):
                 _begin(ball, 0, pose, s)
                 if _gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
                     return False
-    gap = margin + 2 * BULLET_MARGIN
     for i in range(pairs.shape[0]):
         a, b = pairs[i, 0], pairs[i, 1]
-        reach = bodies[a, 4] + bodies[b, 4] + gap
+        gap = margin + (bodies[a, ROUNDING] + bodies[b, ROUNDING])
+        reach = bodies[a, RADIUS] + bodies[b, RADIUS] + gap
         x, y = centres[a, 0] - centres[b, 0], centres[a, 1] - centres[b, 1]
         z = centres[a, 2] - centres[b, 2]
         if reach > 0.0 and x * x + y * y + z * z >= reach * reach:
@@ -424,8 +433,8 @@ def _is_free(q, rule, endpoint_margins, arm, world, memory):
 
 @compiled
 def free_batch(states, rule, endpoint_margins, arm, world, free):
-    """Write `CollisionChecker.is_free` of states (n, 7) to `free` (n,)."""
-    memory = _memory()
+    """Write `CollisionChecker.is_free` of states (m, n) to `free` (m,)."""
+    memory = _memory(arm[0], arm[1])
     for i in range(states.shape[0]):
         near = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
         free[i] = _is_free(states[i], rule, near, arm, world, memory)
@@ -434,9 +443,10 @@ def free_batch(states, rule, endpoint_margins, arm, world, free):
 @compiled
 def motion(rule, endpoint_margins, arm, world, end_known, start, end):
     """Number of states of a motion that were checked, without its start; negative: not free."""
-    memory, q = _memory(), np.empty(7)
+    joints = len(start)
+    memory, q = _memory(arm[0], arm[1]), np.empty(joints)
     squared = 0.0
-    for j in range(7):
+    for j in range(joints):
         squared += (end[j] - start[j]) ** 2
     pieces = int(math.ceil(math.sqrt(squared) / rule[3]))
     checks, parts, part = 0, 1, 1
@@ -450,7 +460,7 @@ def motion(rule, endpoint_margins, arm, world, end_known, start, end):
         before, after = (part - 1) * pieces // parts, (part + 1) * pieces // parts
         if parts == 1 or (i != before and i != after):
             share = i / pieces if pieces > 0 else 1.0
-            for j in range(7):
+            for j in range(joints):
                 q[j] = start[j] + (end[j] - start[j]) * share
             checks += 1
             if not _is_free(q, rule, endpoint_margins, arm, world, memory):
@@ -464,8 +474,8 @@ def motion(rule, endpoint_margins, arm, world, end_known, start, end):
 
 @compiled
 def motion_batch(starts, stops, rule, endpoint_margins, arm, world, ends_known, checks):
-    """Write `CollisionChecker.motion_checks` of motions (n, 7), (n, 7) to `checks` (n,)."""
-    memory = _memory()
+    """Write `CollisionChecker.motion_checks` of motions (m, n), (m, n) to `checks` (m,)."""
+    memory = _memory(arm[0], arm[1])
     for i in range(starts.shape[0]):
         near = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
         if ends_known:
@@ -579,11 +589,11 @@ def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose,
     body's centre. Both are in the body's axes.
     """
     squared = _sphere_gap(rows, j, centres, k)
-    reach = bodies[k, 4] + far
+    reach = bodies[k, RADIUS] + far
     # If the centre is outside of the box, the depth is at most the radius less the distance.
     if squared > 0.0 and (reach <= 0.0 or squared >= reach * reach):
         return FAR
-    _relative(rows, j, frames, int(bodies[k, 0]), centres, k, pose)
+    _relative(rows, j, frames, int(bodies[k, FRAME]), centres, k, pose)
     if _boxes_apart(bodies, k, rows, j, pose, far):
         return FAR
     return _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope)
@@ -618,17 +628,28 @@ def _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope):
 
 
 @compiled
-def _gradient(frames, first, last, normal, witness, gradient):
-    """Write the speed of a point along a direction per unit of each joint, `first` to `last`."""
+def _gradient(chain, frames, a, b, normal, witness, gradient):
+    """Write the speed of a point of frame `a` along a direction per unit of each joint.
+
+    That is relative to frame `b`: joints that move both change nothing.
+    """
     gradient[:] = 0.0
-    for joint in range(first, last):
-        f = frames[joint + 1]  # the joint turns about its z
-        x, y, z = witness[0] - f[9], witness[1] - f[10], witness[2] - f[11]
-        gradient[joint] = (
-            normal[0] * (f[5] * z - f[8] * y)
-            + normal[1] * (f[8] * x - f[2] * z)
-            + normal[2] * (f[2] * y - f[5] * x)
-        ) * (0.5 * _SPAN[joint])
+    sign = 1.0
+    while a != b:
+        if a < b:  # parents come first
+            a, b, sign = b, a, -sign
+        joint, f = int(chain[a, JOINT]), frames[a]
+        if chain[a, PRISMATIC] == 0.0:  # the joint turns about its z
+            x, y, z = witness[0] - f[9], witness[1] - f[10], witness[2] - f[11]
+            speed = (
+                normal[0] * (f[5] * z - f[8] * y)
+                + normal[1] * (f[8] * x - f[2] * z)
+                + normal[2] * (f[2] * y - f[5] * x)
+            )
+        else:
+            speed = normal[0] * f[2] + normal[1] * f[5] + normal[2] * f[8]
+        gradient[joint] += sign * (speed * (0.5 * chain[a, SPAN]))
+        a = int(chain[a, PARENT])
 
 
 @compiled
@@ -721,14 +742,14 @@ def signed_distances_batch(
     gradient,
     geometry,
 ):
-    """Write `CollisionChecker.signed_distances` of states (n, 7).
+    """Write `CollisionChecker.signed_distances` of states (m, n).
 
     `geometry`: the index of a row, or the number of rows for another link, one more for a point,
     two more for nothing.
     """
-    bodies, pairs, vertices, cells = arm
+    chain, bodies, pairs, vertices, cells = arm
     rows, points, groups, ball = world
-    frames, centres, pose, s, other = _memory()
+    frames, centres, pose, s, other = _memory(chain, bodies)
     polytope = (
         np.empty((_EPA_VERTICES, 6)),
         np.empty((_EPA_FACES, 7)),
@@ -738,9 +759,11 @@ def signed_distances_batch(
     of_arm = rows.shape[0]
     distance[:], normal[:], witness[:], geometry[:] = within, 0.0, 0.0, of_arm + 2
     for i in range(states.shape[0]):
-        _place(states[i], bodies, frames, centres)
-        for k in range(1, bodies.shape[0]):
-            f, link = int(bodies[k, 0]), k - 1
+        _place(states[i], chain, bodies, frames, centres)
+        for k in range(bodies.shape[0]):
+            f, link = int(bodies[k, FRAME]), int(bodies[k, LINK_ROW])
+            if link < 0:  # the base
+                continue
             # The shape that is probably nearest comes first: it rules out the others.
             first, least = 0, FAR
             for j in range(rows.shape[0]):
@@ -749,7 +772,7 @@ def signed_distances_batch(
                     first, least = j, squared
             for n in range(rows.shape[0]):
                 j = first if n == 0 else n - 1 if n <= first else n
-                rounding = rows[j, 16] + BULLET_MARGIN
+                rounding = rows[j, 16] + bodies[k, ROUNDING]
                 far = min(distance[i, link] + rounding, FAR)
                 core = _signed_distance(
                     bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope
@@ -757,7 +780,7 @@ def signed_distances_batch(
                 if core < far:
                     distance[i, link], geometry[i, link] = core - rounding, j
                     _to_base(frames, f, centres, k, s, 1.0, 0.0, normal[i, link], witness[i, link])
-            rounding = ball[0, 16] + BULLET_MARGIN
+            rounding = ball[0, 16] + bodies[k, ROUNDING]
             far = min(distance[i, link] + rounding, FAR)
             core = _cloud_distance(
                 bodies, vertices, cells, k, world, frames, centres, pose, s, far, polytope, gaps
@@ -765,28 +788,28 @@ def signed_distances_batch(
             if core < far:
                 distance[i, link], geometry[i, link] = core - rounding, of_arm + 1
                 _to_base(frames, f, centres, k, s, 1.0, 0.0, normal[i, link], witness[i, link])
-            _gradient(frames, 0, f, normal[i, link], witness[i, link], gradient[i, link])
-        rounding = 2 * BULLET_MARGIN
+            _gradient(chain, frames, f, 0, normal[i, link], witness[i, link], gradient[i, link])
         for j in range(pairs.shape[0] if self_collisions else 0):
             a, b = pairs[j, 0], pairs[j, 1]
-            far = distance[i, b - 1] if a == 0 else max(distance[i, a - 1], distance[i, b - 1])
+            rounding = bodies[a, ROUNDING] + bodies[b, ROUNDING]
+            far = -FAR
+            for body in (a, b):
+                if bodies[body, LINK_ROW] >= 0.0:
+                    far = max(far, distance[i, int(bodies[body, LINK_ROW])])
             far = min(far + rounding, FAR)
             _as_row(bodies, b, frames, centres, other)
             core = _signed_distance(
                 bodies, vertices, cells, a, other, 0, frames, centres, pose, s, far, polytope
             )
-            fa, fb = int(bodies[a, 0]), int(bodies[b, 0])
+            fa, fb = int(bodies[a, FRAME]), int(bodies[b, FRAME])
             for body, sign, back in ((a, 1.0, 0.0), (b, -1.0, core)):
-                link = body - 1
+                link = int(bodies[body, LINK_ROW])
                 if link >= 0 and core < FAR and core - rounding < distance[i, link]:
                     distance[i, link], geometry[i, link] = core - rounding, of_arm
                     there, at = normal[i, link], witness[i, link]
                     _to_base(frames, fa, centres, a, s, sign, back, there, at)
-                    # Joints that move both links change nothing. A joint between them moves one of
-                    # the two: the sign is the opposite for the link that it does not move.
-                    _gradient(frames, min(fa, fb), max(fa, fb), there, at, gradient[i, link])
-                    if bodies[body, 0] < max(fa, fb):
-                        gradient[i, link] *= -1.0
+                    moved, other_frame = (fa, fb) if body == a else (fb, fa)
+                    _gradient(chain, frames, moved, other_frame, there, at, gradient[i, link])
         for link in range(distance.shape[1]):
             if geometry[i, link] == of_arm + 2:
                 distance[i, link] = np.inf
@@ -794,7 +817,7 @@ def signed_distances_batch(
 
 @compiled
 def link_distances_batch(states, rows, self_collisions, within, arm, world):
-    """Write `CollisionChecker.link_distances` of states (n, 7) to `rows` (n, 10, 8).
+    """Write `CollisionChecker.link_distances` of states (m, n) to `rows` (m, l, 1 + n).
 
     Returns False, and writes nothing, if a state is NaN.
     """
@@ -807,13 +830,13 @@ def link_distances_batch(states, rows, self_collisions, within, arm, world):
     batch = rows.shape[0], rows.shape[1]
     distance, geometry = np.empty(batch), np.empty(batch, np.int64)
     normal, witness = np.empty((batch[0], batch[1], 3)), np.empty((batch[0], batch[1], 3))
-    gradient = np.empty((batch[0], batch[1], 7))
+    gradient = np.empty((batch[0], batch[1], states.shape[1]))
     found = distance, normal, witness, gradient, geometry
     signed_distances_batch(clipped, self_collisions, within, arm, world, *found)
     for i in range(batch[0]):
         for link in range(batch[1]):
             rows[i, link, 0] = min(distance[i, link], within)
-            for j in range(7):
+            for j in range(states.shape[1]):
                 rows[i, link, 1 + j] = gradient[i, link, j]
     return True
 
@@ -832,10 +855,10 @@ def project(
     max_recovery,
     projection_sweeps,
 ):
-    """Change actions (n, 7) in place: `envs.policies.safety_filter.SafetyFilter.__call__`.
+    """Change actions (m, n) in place: `envs.policies.safety_filter.SafetyFilter.__call__`.
 
     Each sweep projects an action onto one link's half-space after the other.
-    `link_distances`: (n, rows, 8); `margins`: m, (n, rows).
+    `link_distances`: (m, l, 1 + n); `margins`: m, (m, l).
     """
     for i in range(actions.shape[0]):
         action = actions[i]
@@ -846,12 +869,12 @@ def project(
                 if row[0] >= activation_distance:
                     continue
                 squared = along = 0.0
-                for j in range(7):
+                for j in range(action.shape[0]):
                     squared += row[1 + j] * row[1 + j]
                     along += row[1 + j] * action[j]
                 short = min(cbf_gain * (margins[i, link] - row[0]), max_recovery) - along
                 if short > 0.0 and squared > 1e-12:
-                    for j in range(7):
+                    for j in range(action.shape[0]):
                         action[j] += row[1 + j] * short / squared
         _shorten(action, max_step)
 
@@ -860,8 +883,8 @@ def project(
 def _shorten(action, max_step):
     """Scale an action to a norm of at most `max_step`, in place."""
     squared = 0.0
-    for j in range(7):
+    for j in range(action.shape[0]):
         squared += action[j] * action[j]
     if squared > max_step * max_step:
-        for j in range(7):
+        for j in range(action.shape[0]):
             action[j] *= max_step / np.sqrt(squared)

@@ -2,15 +2,16 @@
 
 roboarm data validate envs/data/wall.h5 --simulate
 roboarm data describe wall boxes
+roboarm data describe no_obstacles --robot ur5.yaml
 """
 
 import argparse
 import sys
 
-from roboarm_nmp.envs.datasets.demonstrations import describe, load_demos
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, describe, load_demos
 from roboarm_nmp.envs.datasets.format import locate
 from roboarm_nmp.envs.datasets.queries import query_path, validate
-from roboarm_nmp.envs.tasks import get_task
+from roboarm_nmp.envs.tasks import get_task, is_task, task_with_robot
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 
@@ -29,8 +30,7 @@ def main(arguments=None):
         "on stderr that names the error. The exit code is 1 if any is bad. (For demonstrations: "
         "roboarm verify.)",
     )
-    command.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
-    command.add_argument("--task", help="the task the files must be for")
+    _add_files(command)
     command.add_argument(
         "--simulate",
         action="store_true",
@@ -42,23 +42,46 @@ def main(arguments=None):
         help="statistics of demonstration files",
         description="Print statistics of demonstration files, one column per file.",
     )
-    command.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
+    _add_files(command)
     options = parser.parse_args(arguments)
-    return {"validate": _validate, "describe": _describe}[options.command](options)
-
-
-def _validate(options):
     if options.task is not None:
         try:
+            options.task = task_with_robot(options.task, options.robot)
             get_task(options.task)
         except ValueError as error:
             print(f"error: --task: {error}", file=sys.stderr)
             return 1
+    return {"validate": _validate, "describe": _describe}[options.command](options)
+
+
+def _add_files(command):
+    command.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
+    command.add_argument(
+        "--task", help="the task the files must be for; files of arms other than the Panda need it"
+    )
+    command.add_argument(
+        "--robot",
+        metavar="FILE",
+        help="another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE",
+    )
+
+
+def _locate(file, path_of_task, options):
+    """(path, task it must be for) of a file, or of a task with the robot of `--robot`."""
+    if is_task(file):
+        file = task_with_robot(file, options.robot)
+    elif options.robot is not None and options.task is None:
+        raise ValueError(f"{file}: --robot of a file needs its --task")
+    path, task = locate(file, path_of_task)
+    return path, options.task or task
+
+
+def _validate(options):
     bad = False
     for file in options.files:
         try:
-            path, task = locate(file, query_path)
-            queries = validate(path, options.task or task, options.simulate, progress=True)
+            path, task = _locate(file, query_path, options)
+            queries = validate(path, task, options.simulate, progress=True)
         except ValueError as error:
             print(f"error: {error}", file=sys.stderr)
             bad = True
@@ -71,7 +94,9 @@ def _validate(options):
 
 def _describe(options):
     try:
-        columns = [describe(load_demos(file)) for file in options.files]
+        columns = [
+            describe(load_demos(*_locate(file, demo_path, options))) for file in options.files
+        ]
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.format import (
     DEMO_ARRAYS,
     DEMO_SCHEMA,
@@ -45,14 +44,15 @@ class Demo:
     """One demonstration.
 
     `start`, `goal`, `plan` and `configurations` are joint angles in rad, as in queries; `states`
-    and `actions` are normalised, as the environment observes and receives them.
+    and `actions` are normalised, as the environment observes and receives them. The robot is that
+    of the scene; j is the number of its joints.
 
     Attributes:
-        start, goal: float32 (7,), rad.
+        start, goal: float32 (j,), rad.
         scene: the `Scene`.
-        plan: float32 (p, 7), rad: the waypoints from start to goal.
-        states: float32 (m, 7), the executed configurations, normalised.
-        actions: float32 (m - 1, 7), the displacement commanded in each, clipped to `MAX_STEP` as
+        plan: float32 (p, j), rad: the waypoints from start to goal.
+        states: float32 (m, j), the executed configurations, normalised.
+        actions: float32 (m - 1, j), the displacement commanded in each, clipped to `MAX_STEP` as
             the environment does.
         digest: CRC-32 of the bytes of the exact states, before they were rounded.
     """
@@ -67,8 +67,8 @@ class Demo:
 
     @property
     def configurations(self):
-        """The executed configurations: float64 (m, 7), rad."""
-        return panda.denormalise(self.states)
+        """The executed configurations: float64 (m, j), rad."""
+        return self.scene.robot.denormalise(self.states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +81,13 @@ class Demos:
     Attributes:
         task: name of the task they are for.
         seed: of the command that made them.
-        start, goal: float32 (n, 7), rad.
+        start, goal: float32 (n, j), rad.
         scenes: `QueryScenes`; `scenes[i]` is that of demonstration i.
-        states: float32 (m, 7): the executed configurations of all demonstrations, normalised.
-        actions: float32 (m, 7): the displacement commanded in each; zero in the last one of each
+        states: float32 (m, j): the executed configurations of all demonstrations, normalised.
+        actions: float32 (m, j): the displacement commanded in each; zero in the last one of each
             demonstration, which has no action.
         offsets: int64 (n + 1,): demonstration i is `states[offsets[i] : offsets[i + 1]]`.
-        plan: float32 (p, 7), rad: the waypoints of all plans.
+        plan: float32 (p, j), rad: the waypoints of all plans.
         plan_offsets: int64 (n + 1,), the same for `plan`.
         plan_seed: uint32 (n,), the planner's seeds.
         digest: uint32 (n,), see `Demo`.
@@ -165,7 +165,10 @@ def _rows(offsets, chosen):
 def demo_path(task):
     """Path of a task's demonstration file; for a scene file, `<name>_demos.h5` beside it.
 
-    Raises ValueError: `task` is neither.
+    That of `TASK@ROBOT` is `<task>@<robot>_demos.h5` beside the scene file, or, for a name, beside
+    the robot's file.
+
+    Raises ValueError: `task` is none of these.
     """
     return task_file(task, "demos", "_demos.h5")
 
@@ -174,16 +177,19 @@ def load_demos(task_or_path, task=None):
     """The `Demos` of a task's pretrained file, or of any demonstration file.
 
     Args:
-        task_or_path: name of a task, path of a scene file, or path of a demonstration file.
-        task: the task that a demonstration file must be for.
+        task_or_path: name of a task, path of a scene file, `TASK@ROBOT`, or path of a demonstration
+            file.
+        task: the task that a demonstration file must be for. A robot's files need one, unless the
+            robot is the Panda.
 
     Raises:
         DatasetError: the file is missing, corrupt, not a demonstration file, or made for another
-            task or for another version of the task's scene.
+            task, for another version of the task's scene, or for another robot.
     """
     path, found = locate(task_or_path, demo_path)
     task = task or found
-    attributes, arrays = read_file(path, DEMO_SCHEMA, task)
+    attributes, arrays, base = read_file(path, DEMO_SCHEMA, task)
+    robot = base.robot
     offsets, plan_offsets = (
         np.concatenate([[0], np.cumsum(arrays[name].astype(np.int64))])
         for name in ("length", "plan_length")
@@ -192,12 +198,13 @@ def load_demos(task_or_path, task=None):
         raise DatasetError(f"{path}: the lengths do not add up to the number of rows")
     if arrays["length"].min() < 2 or arrays["plan_length"].min() < 2:
         raise DatasetError(f"{path}: a demonstration has at least two configurations")
-    check_configurations(path, "plan", arrays["plan"])
+    check_configurations(path, "plan", arrays["plan"], robot)
     parameters = json.loads(attributes["parameters"])
-    before, here, after = schedule(arrays["plan"], plan_offsets, offsets)
+    before, here, after = schedule(arrays["plan"], plan_offsets, offsets, robot)
     quantum = parameters.get("quantum", QUANTUM)
     numbers = parameters.get("lag"), [quantum]
-    for name, value, count in zip(("lag", "quantum"), numbers, (7, 1), strict=True):
+    counts = robot.num_joints, 1
+    for name, value, count in zip(("lag", "quantum"), numbers, counts, strict=True):
         if not isinstance(value, list) or len(value) != count or not all(map(_is_finite, value)):
             raise DatasetError(f"{path}: parameters: {name} is not {count} finite numbers")
     states = here - parameters["lag"] * (here - before) + arrays["residual"] * quantum
@@ -211,7 +218,7 @@ def load_demos(task_or_path, task=None):
         seed=attributes["seed"],
         start=arrays["plan"][plan_offsets[:-1]],
         goal=arrays["plan"][plan_offsets[1:] - 1],
-        scenes=read_scenes(path, attributes, arrays),
+        scenes=read_scenes(path, base, arrays),
         states=states,
         actions=actions.astype(np.float32),
         offsets=offsets,
@@ -234,10 +241,10 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
 
     Args:
         path: file to write; an existing one is replaced.
-        task: name of the task, or path of a scene file.
+        task: name of the task, path of a scene file, or `TASK@ROBOT`.
         seed: the seed they were made with, an int.
-        plans: list of float32 (p, 7) arrays, rad, from start to goal.
-        executions: list of float32 (m, 7) arrays, normalised configurations, starting at the start.
+        plans: list of float32 (p, j) arrays, rad, from start to goal.
+        executions: list of float32 (m, j) arrays, normalised configurations, starting at the start.
         columns: `{"plan_seed", "digest", "collided"}`: sequences of ints, one per demonstration.
         made_by: the command line that makes this file.
         parameters: JSON-ready dict of everything else that determined them.
@@ -251,15 +258,20 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
     """
     path = Path(path)
     demo_path(task)  # rejects an unknown task
+    base = get_task(task).base_scene
+    robot = base.robot
     lengths, plan_lengths = [len(one) for one in executions], [len(one) for one in plans]
     if not plans or len(executions) != len(plans):
         raise DatasetError(f"{path}: {len(plans)} plans and {len(executions)} executions")
     if min(lengths + plan_lengths) < 2:
         raise DatasetError(f"{path}: a demonstration has at least two configurations")
     plan, states = np.concatenate(plans), np.concatenate(executions)
-    check_configurations(path, "plan", plan)
-    if states.shape[1:] != (panda.NUM_JOINTS,) or not np.isfinite(states).all():
-        raise DatasetError(f"{path}: executions have numbers that are not finite, or not 7 a row")
+    joints = robot.num_joints
+    if (plan.shape[1:], states.shape[1:]) != ((joints,), (joints,)):
+        raise DatasetError(f"{path}: plans and executions must have {joints} numbers a row")
+    check_configurations(path, "plan", plan, robot)
+    if not np.isfinite(states).all():
+        raise DatasetError(f"{path}: executions have numbers that are not finite")
     offsets, plan_offsets = np.cumsum([0, *lengths]), np.cumsum([0, *plan_lengths])
     start, goal = plan[plan_offsets[:-1]], plan[plan_offsets[1:] - 1]
     keys = query_keys(start, goal)
@@ -271,21 +283,21 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
             if shared:
                 raise DatasetError(f"{path}: {shared} queries are {split} queries of {task}")
     # The arm lags behind the sub-goals, each joint by a nearly constant share of the last move.
-    before, here, _ = schedule(plan, plan_offsets, offsets)
+    before, here, _ = schedule(plan, plan_offsets, offsets, robot)
     moved = here - before
     lag = ((here - states) * moved).sum(0) / np.maximum(np.square(moved).sum(0), 1e-9)
     lag = [round(value, 6) for value in lag.tolist()]
     quantum = QUANTUM if scenes_of is None else QUANTUM_IN_SCENES
     residual = np.round((states - (here - lag * moved)) / quantum)
     arrays = {
-        **scene_arrays(path, scenes_of, get_task(task).base_scene),
+        **scene_arrays(path, scenes_of, base),
         "plan": plan,
         "plan_length": np.array(plan_lengths, np.uint32),
         "residual": residual.astype(np.int16),
         "length": np.array(lengths, np.uint32),
         **{name: np.array(columns[name], DEMO_ARRAYS[name][0]) for name in columns},
     }
-    check_format(path, DEMO_SCHEMA, arrays)
+    check_format(path, DEMO_SCHEMA, arrays, robot)
     parameters = {**parameters, "lag": lag}
     if quantum != QUANTUM:
         parameters["quantum"] = quantum
@@ -310,14 +322,15 @@ def describe(demos):
         lengths = np.linalg.norm(displacements[inside], axis=1)
         return np.bincount(owner, lengths, len(demos))
 
-    straight = np.linalg.norm(panda.normalise(demos.goal) - panda.normalise(demos.start), axis=1)
+    robot = demos.scenes.base.robot
+    straight = np.linalg.norm(robot.normalise(demos.goal) - robot.normalise(demos.start), axis=1)
     steps = np.diff(demos.offsets) - 1
     counts = demos.parameters.get("counts", {})
     return {
         "demonstrations": len(demos),
         "steps": float(steps.mean()),
         "steps_95": float(np.percentile(steps, 95)),
-        "path_length": float(length_of(moves * (panda.UPPER - panda.LOWER) / 2).mean()),
+        "path_length": float(length_of(moves * (robot.upper - robot.lower) / 2).mean()),
         "detour": float((length_of(moves) / straight).mean()),
         "waypoints": float(np.diff(demos.plan_offsets).mean()),
         "with_contacts": int(demos.collided.sum()),

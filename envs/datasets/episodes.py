@@ -10,7 +10,6 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.subgoals import MAX_STEP
@@ -19,7 +18,7 @@ from roboarm_nmp.envs.subgoals import MAX_STEP
 class Episode(NamedTuple):
     """One episode of T steps, float32.
 
-    `observation` (T + 1, o), `achieved_goal` (T + 1, g), `desired_goal` (g,), `action` (T, 7), and
+    `observation` (T + 1, o), `achieved_goal` (T + 1, g), `desired_goal` (g,), `action` (T, n), and
     `reached` (T + 1,), bool: whether that observation reaches the goal.
     """
 
@@ -31,9 +30,9 @@ class Episode(NamedTuple):
 
 
 def goal_of(goal_type, state, position):
-    """The goal that an arm achieves: (..., 3) for `ee`, (..., 7) `config`, (..., 10) `combined`.
+    """The goal that an arm achieves: (..., 3) for `ee`, (..., n) `config`, (..., n + 3) `combined`.
 
-    `state` (..., 7) is its normalised configuration, `position` (..., 3) its end effector's, m.
+    `state` (..., n) is its normalised configuration, `position` (..., 3) its end effector's, m.
     """
     if goal_type == "ee":
         return position
@@ -42,19 +41,20 @@ def goal_of(goal_type, state, position):
     return np.concatenate([state, position], axis=-1)
 
 
-def observed(states, goal, goal_type):
+def observed(states, goal, goal_type, robot):
     """Observations at `states`, without velocities, in an episode with `goal`.
 
     Args:
-        states: normalised configurations (n, 7).
-        goal: joint angles (..., 7), rad.
+        states: normalised configurations (m, n).
+        goal: joint angles (..., n), rad.
         goal_type: `ee`, `config` or `combined`.
+        robot: the `Robot`, with n joints.
 
     Returns:
-        float32 `observation` (n, 10), `achieved_goal` (n, g), `desired_goal` (..., g).
+        float32 `observation` (m, n + 3), `achieved_goal` (m, g), `desired_goal` (..., g).
     """
-    positions = panda.forward_kinematics(panda.denormalise(states))
-    goal = goal_of(goal_type, panda.normalise(goal), panda.forward_kinematics(goal))
+    positions = robot.forward_kinematics(robot.denormalise(states))
+    goal = goal_of(goal_type, robot.normalise(goal), robot.forward_kinematics(goal))
     arrays = np.hstack([states, positions]), goal_of(goal_type, states, positions), goal
     return tuple(array.astype(np.float32) for array in arrays)
 
@@ -67,7 +67,9 @@ def demo_episode(demo, env):
         env: an environment of `envs.make` without velocities. Its goal type, action mode, goal
             tolerances, encoder and appended link distances are those of the episode.
     """
-    observation, achieved_goal, desired_goal = observed(demo.states, demo.goal, env.goal_type)
+    observation, achieved_goal, desired_goal = observed(
+        demo.states, demo.goal, env.goal_type, env.robot
+    )
     action = demo.actions
     if env.action_mode == "subgoal":
         action = demo.states[:-1] + demo.actions

@@ -3,7 +3,7 @@
 A query file, `envs/data/<task>.h5`, has the groups `test` and `validation`, and `original` where a
 task has queries from elsewhere, each with
 
-- `start`, `goal`: float32 (n, 7), joint angles in rad, exactly those checked in the simulator;
+- `start`, `goal`: float32 (n, j), joint angles in rad, exactly those checked in the simulator;
 - `goal_position`: float32 (n, 3), the end-effector position at the goal in metres,
 - where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
   uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
@@ -11,18 +11,21 @@ task has queries from elsewhere, each with
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
-- `plan`: float32 (p, 7), joint angles in rad: the waypoints of all plans, one plan after another,
+- `plan`: float32 (p, j), joint angles in rad: the waypoints of all plans, one plan after another,
   the first one of each the start, the last one the goal; `plan_length`: uint32 (n,);
-- `residual`: int16 (m, 7), the executed configurations, one execution after another (see
+- `residual`: int16 (m, j), the executed configurations, one execution after another (see
   `envs.datasets.demonstrations.write_demos`); `length`: uint32 (n,), configurations in each;
 - `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
 - `collided`: uint8 (n,), whether the execution has a contact;
 - where scenes vary, `scene`, `obstacle_count` and `obstacles`, as above.
 
+j is the number of the robot's joints, 7 of the Panda.
+
 Both have the attributes `schema`, `schema_version`, `task`, `seed`, `scene` (JSON: the scene,
-without the obstacles that vary), `made_by` (the command that makes the file again), `parameters`
-(JSON) and `checksum` (SHA-256 of all the others and the arrays). Files are written under a
-temporary name and then renamed: there is never half a file.
+without the obstacles that vary; it has the name and fingerprint of a robot, if that is not the
+Panda), `made_by` (the command that makes the file again), `parameters` (JSON) and `checksum`
+(SHA-256 of all the others and the arrays). Files are written under a temporary name and then
+renamed: there is never half a file.
 """
 
 import hashlib
@@ -34,7 +37,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import (
     MAX_LENGTH,
     ROW,
@@ -43,7 +46,15 @@ from roboarm_nmp.envs.scenes.primitives import (
     scene_to_json,
     to_array,
 )
-from roboarm_nmp.envs.tasks import TASKS, TRAINING_SCENES, get_task, has_name, is_task, task_name
+from roboarm_nmp.envs.tasks import (
+    TASKS,
+    TRAINING_SCENES,
+    get_task,
+    has_name,
+    is_task,
+    split_robot,
+    task_name,
+)
 from roboarm_nmp.envs.utils.files import write_atomically
 
 SPLITS = ("test", "validation")
@@ -52,21 +63,23 @@ QUERY_SCHEMA, DEMO_SCHEMA = "roboarm-nmp queries", "roboarm-nmp demonstrations"
 SCHEMA_VERSION = 1
 MAX_ARRAY_BYTES = 2**30
 """Largest array in memory: 100,000 demonstrations have a fifth of that."""
-# Of each array: dtype, numbers per row (None: one dimension), and the array of the same length.
+JOINTS = "joints"
+# Of each array: dtype, numbers per row (None: one dimension; JOINTS: one per joint of the robot),
+# and the array of the same length.
 SCENE_ARRAYS = {
     "scene": ("<u4", None, None),
     "obstacle_count": ("<u4", None, "obstacle_count"),
     "obstacles": ("<f8", ROW, "obstacles"),
 }
 QUERY_ARRAYS = {
-    "start": ("<f4", 7, "start"),
-    "goal": ("<f4", 7, "start"),
+    "start": ("<f4", JOINTS, "start"),
+    "goal": ("<f4", JOINTS, "start"),
     "goal_position": ("<f4", 3, "start"),
 }
 DEMO_ARRAYS = {
-    "plan": ("<f4", 7, "plan"),
+    "plan": ("<f4", JOINTS, "plan"),
     "plan_length": ("<u4", None, "plan_length"),
-    "residual": ("<i2", 7, "residual"),
+    "residual": ("<i2", JOINTS, "residual"),
     "length": ("<u4", None, "plan_length"),
     "plan_seed": ("<u4", None, "plan_length"),
     "digest": ("<u4", None, "plan_length"),
@@ -140,20 +153,21 @@ class QueryScenes:
 
 
 def task_file(task, folder, suffix):
-    """The path of a task's file in a folder of `envs`, or beside a scene file.
+    """The path of a task's file in a folder of `envs`, or beside a scene file, or a robot's file.
 
     Raises:
         ValueError: there is no such task.
         DatasetError: no files are made for this one.
     """
     get_task(task)  # rejects an unknown task
-    if task in TRAINING_SCENES:
+    name, robot = split_robot(task)
+    if name in TRAINING_SCENES:
         raise DatasetError(
-            f"{task} are scenes for training: there are no queries or demonstrations in them"
+            f"{name} are scenes for training: there are no queries or demonstrations in them"
         )
-    if has_name(task):
-        return Path(__file__).parents[1] / folder / f"{task}.h5"
-    return Path(task).with_name(task_name(task) + suffix)
+    if has_name(name) and robot is None:
+        return Path(__file__).parents[1] / folder / f"{name}.h5"
+    return Path(robot if has_name(name) else name).with_name(task_name(task) + suffix)
 
 
 def locate(task_or_path, path_of_task):
@@ -217,9 +231,8 @@ def scene_arrays(path, scenes_of, base, prefix=""):
     }
 
 
-def read_scenes(path, attributes, arrays, prefix=""):
+def read_scenes(path, base, arrays, prefix=""):
     """The inverse of `scene_arrays`: `QueryScenes`. Raises DatasetError for invalid arrays."""
-    base = scene_from_json(attributes["scene"])
     if f"{prefix}scene" not in arrays:
         return QueryScenes(base)
     index, counts, rows = (arrays[f"{prefix}{name}"] for name in SCENE_ARRAYS)
@@ -239,9 +252,35 @@ def read_scenes(path, attributes, arrays, prefix=""):
     return QueryScenes(base, index.astype(np.int64), offsets, rows)
 
 
+def read_base_scene(path, text, robot):
+    """The `Scene` without the obstacles that vary, from a file's attribute `scene`.
+
+    Args:
+        path: the file.
+        text: the attribute, of `scene_to_json`.
+        robot: the `Robot` for which the file must have been made.
+
+    Raises DatasetError: it was made for another one.
+    """
+    name, fingerprint = json.loads(text).get("robot", (PANDA.name, PANDA.fingerprint))
+    if fingerprint != robot.fingerprint:
+        hint = ""
+        if name == robot.name:
+            hint = ": its description is another one, so make the file again"
+        elif robot == PANDA:
+            hint = ": name the robot's file, as TASK@ROBOT or --robot"
+        raise DatasetError(
+            f"{path}: made for the robot {name!r} ({fingerprint[:12]}), not for {robot.name!r} "
+            f"({robot.fingerprint[:12]}){hint}"
+        )
+    return scene_from_json(text, robot)
+
+
 def _same_scene(one, other):
     """Whether two scenes (JSON) are equal up to rounding."""
     one, other = json.loads(one), json.loads(other)
+    if one.get("robot") != other.get("robot"):
+        return False
     for field in ("obstacles", "table", "floor", "friction"):
         here, there = one.get(field), other.get(field)
         if here is None or there is None:
@@ -263,11 +302,12 @@ def _checksum(attributes, arrays):
     return digest.hexdigest()
 
 
-def check_format(path, schema, arrays):
+def check_format(path, schema, arrays, robot):
     """Shapes and dtypes; `arrays` are NumPy arrays or HDF5 datasets, by name."""
     formats = array_formats(schema, arrays)
     for name, array in arrays.items():
         dtype, width, sibling = formats[name]
+        width = robot.num_joints if width == JOINTS else width
         if array.dtype != np.dtype(dtype):
             raise DatasetError(f"{path}: {name} must be {np.dtype(dtype)}, is {array.dtype}")
         empty = array.size == 0 and name.rpartition("/")[2] != "obstacles"  # of scenes without any
@@ -281,23 +321,38 @@ def check_format(path, schema, arrays):
 
 
 def read_file(path, schema, task):
-    """(attributes, arrays) of a file, after the checks that both kinds share."""
+    """(attributes, arrays, base scene) of a file, after the checks that both kinds share.
+
+    `task`: the task that it must be for; None for any of the Panda.
+    """
+    robot = get_task(task).base_scene.robot if task else PANDA
     try:
         with open(path, "rb"):
             pass
     except OSError as error:
-        missing = "no such file" if task else "no such file or task"
-        what = missing if isinstance(error, FileNotFoundError) else error.strerror
+        what = error.strerror
+        if isinstance(error, FileNotFoundError):
+            what = f"no such file{_command_for(schema, task)}" if task else "no such file or task"
         raise DatasetError(f"{path}: {what}") from error
     if not h5py.is_hdf5(path):
         raise DatasetError(f"{path}: not an HDF5 file")
     try:
         with h5py.File(path, "r") as file:
-            return _read_open(path, file, schema, task)
+            return _read_open(path, file, schema, task, robot)
     except DatasetError:
         raise
     except Exception as error:  # damaged HDF5 raises all kinds of exceptions
         raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
+
+
+def _command_for(schema, task):
+    """The command that makes a task's file, for a message; nothing where there is none."""
+    if schema == DEMO_SCHEMA and not get_task(task).trainable:
+        return ""
+    name, robot = split_robot(task)
+    command = {QUERY_SCHEMA: "queries", DEMO_SCHEMA: "collect"}[schema]
+    flags = f"--task {name}" if robot is None else f"--task {name} --robot {robot}"
+    return f"; make it with: roboarm {command} {flags}"
 
 
 def check_plain(path, group):
@@ -328,7 +383,7 @@ def attribute(file, name):
     return value.decode() if isinstance(value, bytes) else value
 
 
-def _read_open(path, file, schema, task):
+def _read_open(path, file, schema, task, robot):
     attributes = {}
     for name, kind in _ATTRIBUTES.items():
         value = attribute(file, name)
@@ -343,24 +398,25 @@ def _read_open(path, file, schema, task):
             raise DatasetError(f"{path}: schema version {value}, this code reads {SCHEMA_VERSION}")
         attributes[name] = value
 
-    check_plain(path, file)
-    datasets = {name: file.get(name) for name in array_formats(schema, file)}
-    for name, dataset in datasets.items():
-        if not isinstance(dataset, h5py.Dataset):
-            raise DatasetError(f"{path}: array {name} is missing or damaged")
-    check_format(path, schema, datasets)
-    arrays = {name: dataset[()] for name, dataset in datasets.items()}
-    if attribute(file, "checksum") != _checksum(attributes, arrays):
-        raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
-
-    scene_from_json(attributes["scene"])  # raises if it is damaged
-    if not isinstance(json.loads(attributes["parameters"]), dict):
-        raise DatasetError(f"{path}: attribute parameters is not a dict")
     made_for = attributes["task"]
     if task is not None and made_for != task_name(task):
         raise DatasetError(
             f"{path}: this file is for the task {made_for!r}, not {task_name(task)!r}"
         )
+    base = read_base_scene(path, attributes["scene"], robot)
+
+    check_plain(path, file)
+    datasets = {name: file.get(name) for name in array_formats(schema, file)}
+    for name, dataset in datasets.items():
+        if not isinstance(dataset, h5py.Dataset):
+            raise DatasetError(f"{path}: array {name} is missing or damaged")
+    check_format(path, schema, datasets, robot)
+    arrays = {name: dataset[()] for name, dataset in datasets.items()}
+    if attribute(file, "checksum") != _checksum(attributes, arrays):
+        raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
+
+    if not isinstance(json.loads(attributes["parameters"]), dict):
+        raise DatasetError(f"{path}: attribute parameters is not a dict")
     if task is None and made_for in TASKS:
         task = made_for
     # Where the scene file is not at hand, the scene is that of this file.
@@ -371,14 +427,14 @@ def _read_open(path, file, schema, task):
             f"{path}: out of date: made for another version of the scene of {made_for!r}; "
             f"make it again with: {attributes['made_by']}{replacing}"
         )
-    return attributes, arrays
+    return attributes, arrays, base
 
 
-def check_configurations(path, name, configurations):
-    """Raise DatasetError unless configurations (n, 7), rad, are finite and inside the limits."""
+def check_configurations(path, name, configurations, robot):
+    """Raise DatasetError unless configurations (n, j), rad, are finite and inside the limits."""
     if not np.isfinite(configurations).all():
         raise DatasetError(f"{path}: {name} has numbers that are not finite")
-    outside = (configurations < panda.LOWER) | (configurations > panda.UPPER)
+    outside = (configurations < robot.lower) | (configurations > robot.upper)
     if outside.any():
         row = int(np.argmax(outside.any(axis=1)))
         raise DatasetError(f"{path}: {name}[{row}] is outside the joint limits")

@@ -4,7 +4,7 @@ A shard, `shard_00012.h5`, has the arrays (n scenes)
 
 - `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
   rows of `envs.scenes.primitives.to_array`;
-- `configuration` float32 (n, 7), the arm's joint angles in rad;
+- `configuration` float32 (n, j), the arm's joint angles in rad;
 - of each `Camera`, by its name, the outputs: `front/rgb` uint8 (n, height, width, 3),
   `front/segmentation` uint8 (n, height, width), `front/depth` uint16 (n, height, width) in units of
   `far` / 65,535;
@@ -23,14 +23,15 @@ import h5py
 import numpy as np
 
 from roboarm_nmp.envs.datasets import shards
-from roboarm_nmp.envs.datasets.format import DatasetError, attribute
+from roboarm_nmp.envs.datasets.format import DatasetError, attribute, read_base_scene
 from roboarm_nmp.envs.datasets.shards import read_array, shard_path, shard_paths, write_attributes
 from roboarm_nmp.envs.perception.sensors import (
     PointCloud,
     sensors_from_json,
     sensors_to_json,
 )
-from roboarm_nmp.envs.scenes.primitives import from_array, scene_from_json, scene_to_json, to_array
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json, to_array
 from roboarm_nmp.envs.tasks import get_task, task_name
 
 SCHEMA, SCHEMA_VERSION = "roboarm-nmp observations", 1
@@ -57,12 +58,12 @@ def shard_bytes(task, seed, first, sensors, scenes, configurations, observations
     """The contents of a shard's file.
 
     Args:
-        task: name of the task, or path of a scene file.
+        task: name of the task, path of a scene file, or `TASK@ROBOT`.
         seed: of the collection, an int.
         first: number of the first scene.
         sensors: dict of name -> sensor.
         scenes: list of n `Scene`s.
-        configurations: float32 (n, 7), rad.
+        configurations: float32 (n, j), rad.
         observations: list of n dicts, those of `observe`.
         made_by: the command line that makes the shards.
     """
@@ -112,13 +113,14 @@ class Observations:
 
     Args:
         folder: path.
+        robot: the `Robot` that the scenes must have.
 
     Raises:
         DatasetError: there are no shards, or one is missing, damaged, or not of the same collection
-            as the others.
+            as the others; or they were made for another robot.
     """
 
-    def __init__(self, folder):
+    def __init__(self, folder, robot=PANDA):
         self.folder = Path(folder)
         paths = shard_paths(folder, "observations")
         self.offsets = np.zeros(len(paths) + 1, np.int64)
@@ -136,7 +138,7 @@ class Observations:
         self.task, self.seed = first["task"], first["seed"]
         self.sensors = sensors_from_json(first["sensors"])
         """Dict of name -> sensor."""
-        self.base_scene = scene_from_json(first["scene"])
+        self.base_scene = read_base_scene(folder, first["scene"], robot)
 
     def __len__(self):
         return int(self.offsets[-1])

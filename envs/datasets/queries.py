@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.format import (
     ORIGINAL,
     QUERY_ARRAYS,
@@ -41,7 +40,7 @@ _POSITION_TOLERANCE = 1e-6  # m
 
 
 class Query(NamedTuple):
-    """Joint angles at start and goal, float32 (7,), rad, and the `Scene`.
+    """Joint angles at start and goal, float32 (j,), rad, and the `Scene`.
 
     `env.reset_specific(*query)` begins an episode on it.
     """
@@ -59,8 +58,8 @@ class Queries:
         task: name of the task they are for.
         split: `test`, `validation` or `original`.
         seed: of the command that made them.
-        start: float32 (n, 7), rad.
-        goal: float32 (n, 7), rad.
+        start: float32 (n, j), rad, of the j joints of the robot, `scenes.base.robot`.
+        goal: float32 (n, j), rad.
         goal_position: float32 (n, 3), end-effector position at the goal, m.
         scenes: `QueryScenes`; `scenes[i]` is that of query i.
     """
@@ -87,27 +86,32 @@ class Queries:
 def query_path(task):
     """Path of a task's query file; for a scene file, `<name>_queries.h5` beside it.
 
-    Raises ValueError: `task` is neither.
+    That of `TASK@ROBOT` is `<task>@<robot>_queries.h5` beside the scene file, or, for a name,
+    beside the robot's file.
+
+    Raises ValueError: `task` is none of these.
     """
     return task_file(task, "data", "_queries.h5")
 
 
-def load_queries(task_or_path, split="test"):
+def load_queries(task_or_path, split="test", task=None):
     """The `Queries` of a task's pretrained file, or of any query file.
 
     Args:
-        task_or_path: name of a task, path of a scene file, or path of a query file.
+        task_or_path: name of a task, path of a scene file, `TASK@ROBOT`, or path of a query file.
         split: `test`, `validation`, or, where a task has it, `original`.
+        task: the task that a query file must be for. A robot's files need one, unless the robot is
+            the Panda.
 
     Raises:
-        DatasetError: the file is missing, corrupt, not a query file, or made for another task or
-            for another version of the task's scene.
+        DatasetError: the file is missing, corrupt, not a query file, or made for another task, for
+            another version of the task's scene, or for another robot.
         ValueError: unknown split; a malformed scene file.
     """
     if split not in (*SPLITS, ORIGINAL):
         raise ValueError(f"unknown split {split!r}: {suggest(split, (*SPLITS, ORIGINAL))}")
-    path, task = locate(task_or_path, query_path)
-    queries = _read_queries(path, task)[0]
+    path, found = locate(task_or_path, query_path)
+    queries = _read_queries(path, task or found)[0]
     if split not in queries:
         raise DatasetError(f"{path}: has no {split} queries")
     return queries[split]
@@ -120,10 +124,10 @@ def write_queries(path, task, seed, splits, made_by, parameters):
 
     Args:
         path: file to write; an existing one is replaced.
-        task: name of the task, or path of a scene file.
+        task: name of the task, path of a scene file, or `TASK@ROBOT`.
         seed: the seed the queries were made with, an int.
         splits: `{"test": (start, goal, scenes), "validation": (start, goal, scenes)}`, and
-            `original` where there are some; start and goal float32 (n, 7), rad; scenes a sequence
+            `original` where there are some; start and goal float32 (n, j), rad; scenes a sequence
             of n `Scene`s, left out where all of them are the task's.
         made_by: the command line that makes this file.
         parameters: JSON-ready dict of everything else that determined the queries.
@@ -142,11 +146,11 @@ def write_queries(path, task, seed, splits, made_by, parameters):
         start, goal = np.asarray(start), np.asarray(goal)
         arrays |= scene_arrays(path, scenes_of[0] if scenes_of else None, base, f"{split}/")
         arrays |= {f"{split}/start": start, f"{split}/goal": goal}
-        if goal.ndim == 2 and goal.shape[1] == panda.NUM_JOINTS:
-            position = panda.forward_kinematics(goal).astype(np.float32)
+        if goal.ndim == 2 and goal.shape[1] == base.robot.num_joints:
+            position = base.robot.forward_kinematics(goal).astype(np.float32)
             arrays[f"{split}/goal_position"] = position
-    check_format(path, QUERY_SCHEMA, arrays)
-    _check_queries(path, arrays)
+    check_format(path, QUERY_SCHEMA, arrays, base.robot)
+    _check_queries(path, arrays, base.robot)
     write_file(path, QUERY_SCHEMA, task, seed, arrays, made_by, parameters)
 
 
@@ -155,7 +159,7 @@ def validate(path, task=None, simulate=False, progress=False):
 
     Args:
         path: the file.
-        task: the task it should be for; None allows any.
+        task: the task it should be for; None allows any of the Panda.
         simulate: also check in the simulator (minutes for 10,000 queries) that every start and goal
             is feasible, for as long as when the file was made, and that `goal_position` is right.
         progress: show a progress bar while simulating.
@@ -171,30 +175,30 @@ def validate(path, task=None, simulate=False, progress=False):
 
 def _read_queries(path, task):
     """({split: Queries}, parameters) of a file, after every check that needs no simulator."""
-    attributes, arrays = read_file(path, QUERY_SCHEMA, task)
-    _check_queries(path, arrays)
+    attributes, arrays, base = read_file(path, QUERY_SCHEMA, task)
+    _check_queries(path, arrays, base.robot)
     queries = {}
     for split in (*SPLITS, ORIGINAL):
         if f"{split}/start" not in arrays:
             continue
         columns = {name: arrays[f"{split}/{name}"] for name in QUERY_ARRAYS}
-        columns["scenes"] = read_scenes(path, attributes, arrays, f"{split}/")
+        columns["scenes"] = read_scenes(path, base, arrays, f"{split}/")
         queries[split] = Queries(attributes["task"], split, attributes["seed"], **columns)
     return queries, json.loads(attributes["parameters"])
 
 
 def query_keys(start, goal):
-    """The set of queries as bytes: start and goal, each float32 (n, 7), exactly."""
+    """The set of queries as bytes: start and goal, each float32 (n, j), exactly."""
     return {row.tobytes() for row in np.hstack([start, goal])}
 
 
-def _check_queries(path, arrays):
+def _check_queries(path, arrays, robot):
     """Joint limits, finite numbers, and no query in both splits."""
     for split in (*SPLITS, ORIGINAL):
         if f"{split}/start" not in arrays:
             continue
         for name in ("start", "goal"):
-            check_configurations(path, f"{split}/{name}", arrays[f"{split}/{name}"])
+            check_configurations(path, f"{split}/{name}", arrays[f"{split}/{name}"], robot)
         if not np.isfinite(arrays[f"{split}/goal_position"]).all():
             raise DatasetError(f"{path}: {split}/goal_position has numbers that are not finite")
     test, validation = (
@@ -205,8 +209,9 @@ def _check_queries(path, arrays):
 
 
 def _simulate(path, queries, hold_steps, progress):
+    robot = queries["test"].scenes.base.robot
     for split in queries:
-        position = panda.forward_kinematics(queries[split].goal)
+        position = robot.forward_kinematics(queries[split].goal)
         off = np.linalg.norm(position - queries[split].goal_position, axis=1) > _POSITION_TOLERANCE
         if off.any():
             row = int(np.argmax(off))

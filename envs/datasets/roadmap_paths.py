@@ -2,7 +2,7 @@
 
     paths = load_roadmap_paths("roadmaps/hard")   # thousands of scenes in about a second
     paths.scenes[i]                               # the Scene of number i
-    paths.of_scene(i)                             # its paths: list of float32 (k, 7), normalised
+    paths.of_scene(i)                             # its paths: list of float32 (k, j), normalised
     paths.points, paths.offsets                   # the same, flat, for a whole folder
 
 A shard, `shard_00012.h5`, has the arrays
@@ -10,11 +10,11 @@ A shard, `shard_00012.h5`, has the arrays
 - `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
   rows of `envs.scenes.primitives.to_array`;
 - `path_count` uint32 (n,): paths in each scene; `length` uint16 (m,): points of each path;
-- `points` float32 (p, 7): normalised configurations, one path after another, the first point of
+- `points` float32 (p, j): normalised configurations, one path after another, the first point of
   each the start, the last one the goal
 
-and the attributes `schema`, `schema_version`, `task`, `seed`, `first` (number of the first scene),
-`scene` (JSON: the scene without the obstacles that vary), `made_by`.
+of a robot with j joints, and the attributes `schema`, `schema_version`, `task`, `seed`, `first`
+(number of the first scene), `scene` (JSON: the scene without the obstacles that vary), `made_by`.
 """
 
 import io
@@ -24,9 +24,15 @@ import h5py
 import numpy as np
 
 from roboarm_nmp.envs.datasets import shards
-from roboarm_nmp.envs.datasets.format import DatasetError, QueryScenes, attribute
+from roboarm_nmp.envs.datasets.format import (
+    DatasetError,
+    QueryScenes,
+    attribute,
+    read_base_scene,
+)
 from roboarm_nmp.envs.datasets.shards import read_array, shard_paths, write_attributes
-from roboarm_nmp.envs.scenes.primitives import scene_from_json, scene_to_json, to_array
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.primitives import scene_to_json, to_array
 from roboarm_nmp.envs.tasks import get_task, task_name
 
 SCHEMA, SCHEMA_VERSION = "roboarm-nmp roadmap paths", 1
@@ -42,7 +48,7 @@ class RoadmapPaths:
         seed: of the collection, int.
         scenes: `scenes[i]` is the `Scene` of number i, made on access.
         path_offsets: int64 (s + 1,): the paths of scene i begin at number `path_offsets[i]`.
-        points: float32 (p, 7), normalised configurations.
+        points: float32 (p, j), normalised configurations.
         offsets: int64 (n + 1,): path j is `points[offsets[j] : offsets[j + 1]]`.
     """
 
@@ -58,7 +64,7 @@ class RoadmapPaths:
         return len(self.path_offsets) - 1
 
     def of_scene(self, i):
-        """The paths of scene i: a list of float32 (k, 7)."""
+        """The paths of scene i: a list of float32 (k, j)."""
         first, last = self.path_offsets[i : i + 2]
         ends = self.offsets[first : last + 1]
         return [self.points[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
@@ -68,20 +74,21 @@ def shard_bytes(task, seed, first, scenes, paths, made_by):
     """The contents of a shard's file.
 
     Args:
-        task: name of the task, or path of a scene file.
+        task: name of the task, path of a scene file, or `TASK@ROBOT`.
         seed: of the collection, an int.
         first: number of the first scene.
         scenes: list of n `Scene`s.
-        paths: list of n lists of float32 (k, 7), normalised.
+        paths: list of n lists of float32 (k, j), normalised.
         made_by: the command line that makes the shards.
     """
     flat = [path for of_scene in paths for path in of_scene]
+    base = get_task(task).base_scene
     arrays = {
         "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
         "obstacles": to_array([o for scene in scenes for o in scene.obstacles]),
         "path_count": np.array([len(of_scene) for of_scene in paths], np.uint32),
         "length": np.array([len(path) for path in flat], np.uint16),
-        "points": np.concatenate([np.empty((0, 7), np.float32), *flat]),
+        "points": np.concatenate([np.empty((0, base.robot.num_joints), np.float32), *flat]),
     }
     attributes = {
         "schema": SCHEMA,
@@ -89,7 +96,7 @@ def shard_bytes(task, seed, first, scenes, paths, made_by):
         "task": task_name(task),
         "seed": int(seed),
         "first": int(first),
-        "scene": scene_to_json(get_task(task).base_scene),
+        "scene": scene_to_json(base),
         "made_by": made_by,
     }
     contents = io.BytesIO()
@@ -105,12 +112,12 @@ def open_shard(path):
     return shards.open_shard(path, "roadmap paths", SCHEMA, SCHEMA_VERSION)
 
 
-def load_roadmap_paths(folder):
-    """All of a folder's `RoadmapPaths`.
+def load_roadmap_paths(folder, robot=PANDA):
+    """All of a folder's `RoadmapPaths`, which must be those of `robot`.
 
     Raises:
         DatasetError: there are no shards, or one is missing, damaged, or not of the same collection
-            as the others.
+            as the others; or they were made for another robot.
     """
     parts, first = {name: [] for name in _ARRAYS}, None
     for path in shard_paths(folder, "roadmap paths"):
@@ -127,6 +134,7 @@ def load_roadmap_paths(folder):
         np.concatenate([[0], np.cumsum(arrays[name], dtype=np.int64)])
         for name in ("obstacle_count", "path_count", "length")
     )
-    base, count = scene_from_json(first["scene"]), len(arrays["path_count"])
-    scenes = QueryScenes(base, np.arange(count), obstacles, arrays["obstacles"])
+    base = read_base_scene(folder, first["scene"], robot)
+    indices = np.arange(len(arrays["path_count"]))
+    scenes = QueryScenes(base, indices, obstacles, arrays["obstacles"])
     return RoadmapPaths(first["task"], first["seed"], scenes, paths, arrays["points"], offsets)

@@ -13,18 +13,20 @@ promises less: it may unpickle objects, and evaluates strings of the file as Pyt
 PyTorch's default dtype and default device change nothing: networks compute in float32, on the
 device that they were loaded for.
 
-A **policy** is a network from `observation` (N, 10 or more), `achieved_goal` and `desired_goal`
-(N, 3, 7 or 10), float32 as `RoboArmEnv` returns them, to the deterministic action (N, 7), float32
-in [-1, 1]. Other keys of the observation may be inputs, too. The metadata of a policy hold
+A **policy** of an arm with n joints is a network from `observation` (N, n + 3 or more),
+`achieved_goal` and `desired_goal` (N, 3, n or n + 3), float32 as `RoboArmEnv` returns them, to the
+deterministic action (N, n), float32 in [-1, 1]. Other keys of the observation may be inputs, too.
+The metadata of a policy hold
 
 - `kind`: "policy";
 - `task`: name of the task it was trained on;
+- `robot`: name and fingerprint of the `Robot`; without it, the robot is the Panda;
 - `env`: dict of the arguments of `envs.make` it was trained with: `goal_type`, and, where they
   differ from the defaults, `action_mode`, `max_step`, `velocities`, `encoder`, `num_points`,
   `geometry_source`, `link_distances` and `append_link_distances`. Others (`horizon`, tolerances)
-  are ignored: they define success. With `append_link_distances`, `observation` is longer by 80;
-  with an `encoder`, it then ends with z_E. With `link_distances`, `link_distances` and
-  `goal_link_distances` (N, 10, 8) may be inputs;
+  are ignored: they define success. With `append_link_distances`, `observation` contains these, too
+  (80 numbers of the Panda); with an `encoder`, it then ends with z_E. With `link_distances`,
+  `link_distances` and `goal_link_distances` (N, l, 1 + n) of l links may be inputs;
 - `safety_filter`, optional: dict of `margin` (m) and `escape` (bool). Whoever runs the policy by
   name (`envs.policies.registry`) puts that `envs.policies.safety_filter.SafetyFilter` around it;
 - `recurrent_size`, optional: an int. The policy then has an input `recurrent_state`
@@ -32,8 +34,8 @@ in [-1, 1]. Other keys of the observation may be inputs, too. The metadata of a 
 
 An **encoder** is a network from observations of sensors to z_E (N, size), float32. Inputs are the
 images of cameras, uint8 (N, height, width, 3), by the sensor's name, and `<name>_points` and
-`<name>_labels` of point clouds. Its metadata hold `kind` ("encoder") and `sensors`
-(`envs.perception.sensors.sensors_to_json`).
+`<name>_labels` of point clouds. Its metadata hold `kind` ("encoder"), `sensors`
+(`envs.perception.sensors.sensors_to_json`) and, as a policy's, `robot`.
 """
 
 import contextlib
@@ -53,6 +55,7 @@ from torch.utils import _pytree as pytree
 
 from roboarm_nmp.envs.networks import operations as network_operations
 from roboarm_nmp.envs.networks.operations import NetworkError
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.utils.files import check_archive, write_atomically
 
 FORMAT = "roboarm-nmp program"
@@ -114,6 +117,26 @@ def save_network(path, module, example_inputs, metadata):
     buffer = io.BytesIO()
     torch.save(content, buffer)
     write_atomically(path, buffer.getbuffer())
+
+
+def robot_metadata(robot):
+    """The part of a network's metadata that names its `Robot`, a dict; empty for the Panda."""
+    return {} if robot == PANDA else {"robot": [robot.name, robot.fingerprint]}
+
+
+def check_robot(path, metadata, robot):
+    """Raise NetworkError unless the network at `path`, with this metadata, is for a `Robot`."""
+    trained = metadata.get("robot", [PANDA.name, PANDA.fingerprint])
+    if trained != [robot.name, robot.fingerprint]:
+        raise NetworkError(
+            f"{path}: it was trained for the robot {_words(trained)}, not for "
+            f"{_words([robot.name, robot.fingerprint])}"
+        )
+
+
+def _words(robot):
+    name, fingerprint = robot if isinstance(robot, list) and len(robot) == 2 else (robot, "?")
+    return f"{name!r} ({str(fingerprint)[:12]})"
 
 
 def to_float16(path, output):

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from roboarm_nmp.envs.networks.exported_networks import NetworkError, load_network
+from roboarm_nmp.envs.networks.exported_networks import NetworkError, check_robot, load_network
 from roboarm_nmp.envs.perception.point_clouds import (
     NUM_POINTS,
     POINT_CLOUD,
@@ -131,6 +131,9 @@ class SceneEncoder:
         z = self._of_demos.get(scene)
         return self._cached(scene) if z is None else z
 
+    def check_robot(self, robot):
+        """Raise NetworkError if the encoder was trained for another `Robot`."""
+
     def encode_demos(self, demos):
         """z_E of all scenes of `envs.datasets.demonstrations.Demos`: float32 (n, size).
 
@@ -190,6 +193,11 @@ class PointCloudEncoder(SceneEncoder):
         if encoder is not None:
             self.geometry_source = encoder.name
 
+    def check_robot(self, robot):
+        """As `SceneEncoder.check_robot`."""
+        if self._encoder is not None:
+            self._encoder.check_robot(robot)
+
     def __reduce__(self):
         return _shared, (PointCloudEncoder, self.num_points, self._encoder)
 
@@ -242,6 +250,10 @@ class NetworkEncoder(SceneEncoder):
             return make_encoder, (self.name,)
         return _shared, (NetworkEncoder, self.path.absolute(), self.name)
 
+    def check_robot(self, robot):
+        """As `SceneEncoder.check_robot`: what sensors observe contains the robot."""
+        check_robot(self.name, self._network.metadata, robot)
+
     def observe(self, scene):
         """The network's inputs, a batch of one: what the sensors observe of a `Scene`."""
         inputs = {}
@@ -257,6 +269,7 @@ class NetworkEncoder(SceneEncoder):
         return self._network.predict_one(observed)
 
     def _encode(self, scene):
+        self.check_robot(scene.robot)
         return self.encode(self.observe(scene))
 
     def _encode_all(self, scenes, task):

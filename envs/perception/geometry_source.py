@@ -15,6 +15,8 @@ from dataclasses import replace
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, POINT_RADIUS, observed_points
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.random_boxes import scale_of
 from roboarm_nmp.envs.utils.names import suggest
 
 GROUND_TRUTH = "ground_truth"
@@ -22,14 +24,15 @@ CACHED_CHECKERS = 64  # about 60 kB each
 DECODED_RADIUS = 0.0  # m, of the ball around a decoded point
 
 
-def find_geometry_source(name):
+def find_geometry_source(name, robot=PANDA):
     """A function from a `Scene` to a `CollisionChecker` of its obstacles as the source has them.
 
     Args:
         name: `ground_truth`, `point_cloud`, or the name or path of an encoder with a decoder.
+        robot: the `Robot` of the scenes.
 
     Raises:
-        ValueError: it is none of these.
+        ValueError: it is none of these, or an encoder for another robot.
     """
     name = str(name)
     if name == GROUND_TRUTH:
@@ -45,6 +48,7 @@ def find_geometry_source(name):
             f"a geometry source is {GROUND_TRUTH}, {POINT_CLOUD} or an encoder with a decoder: "
             f"{suggest(name, [GROUND_TRUTH, POINT_CLOUD], str(error))}"
         ) from error
+    encoder.check_robot(robot)
     return functools.partial(decoded_checker, encoder=encoder)
 
 
@@ -57,7 +61,8 @@ def ground_truth_checker(scene):
 @functools.lru_cache(CACHED_CHECKERS)
 def observed_checker(scene):
     """A `CollisionChecker` of table, floor, and the observed points of a `Scene`'s obstacles."""
-    return CollisionChecker(replace(scene, obstacles=()), observed_points(scene), POINT_RADIUS)
+    radius = scale_of(scene.robot) * POINT_RADIUS
+    return CollisionChecker(replace(scene, obstacles=()), observed_points(scene), radius)
 
 
 @functools.lru_cache(CACHED_CHECKERS)

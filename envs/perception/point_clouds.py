@@ -12,13 +12,15 @@ import functools
 import numpy as np
 
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, cardinal, observe_scene
+from roboarm_nmp.envs.scenes.random_boxes import scale_of
 
 POINT_CLOUD = "point_cloud"
 """Its name as an encoder and as a geometry source."""
 NUM_POINTS = 64
 """Of the encoder `point_cloud`, by default."""
 CELL = 0.025
-"""m. One point of each cube of this size is used: about 1,500 on `random_boxes_hard`."""
+"""m. One point of each cube of this size is used: about 1,500 on `random_boxes_hard`. For an arm of
+another reach than the Panda's, it is scaled, and so is `POINT_RADIUS`."""
 POINT_RADIUS = 0.01
 """m. The ball around a point in collision checks: with this radius surfaces have hardly a hole."""
 CACHED_SCENES = 500  # about 20 kB each
@@ -41,17 +43,17 @@ def remember_points(scene):
 
 @functools.lru_cache(CACHED_SCENES)
 def _observe(scene):
-    clouds = observe_scene(scene, cardinal(PointCloud)).values()
+    clouds = observe_scene(scene, cardinal(PointCloud, scene.robot)).values()
     points = np.concatenate([one["points"][one["labels"] == OBSTACLE] for one in clouds])
-    return one_per_cell(points)
+    return one_per_cell(points, scale_of(scene.robot) * CELL)
 
 
-def one_per_cell(points):
-    """The first of the points (n, 3), m, in each cube with edges of `CELL`, in their order.
+def one_per_cell(points, cell=CELL):
+    """The first of the points (n, 3), m, in each cube with edges of `cell`, m, in their order.
 
     Use it with points of your own: the pretrained policies were trained with such clouds.
     """
-    _, first = np.unique(np.floor(points / CELL).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(first)]
 
 

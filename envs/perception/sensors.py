@@ -13,8 +13,9 @@ from dataclasses import asdict, dataclass
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
+from roboarm_nmp.envs.scenes.random_boxes import scale_of
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
 
@@ -26,9 +27,9 @@ OUTPUTS = ("rgb", "depth", "segmentation")
 MIN_NEAR = 0.001  # m, of `near`: far below it, depths have no resolution left
 # Cardinal directions as seen by the robot: x is forward, y left.
 CARDINAL = {"front": (1, 0), "left": (0, 1), "back": (-1, 0), "right": (0, -1)}
-DISTANCE, HEIGHT = 1.6, 0.8  # of the default sensors' places, m
-# Of the arm while a scene is encoded, rad: always the same, so that z_E depends on the scene alone.
-POSE = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
+# Of the default sensors around the Panda: their distance and height, the height they look at, the
+# farthest visible distance (m). For another arm they are scaled with its reach.
+DISTANCE, HEIGHT, TARGET, FAR = 1.6, 0.8, 0.4, 5.0
 
 
 @dataclass(frozen=True)
@@ -162,13 +163,15 @@ class PointCloud:
         return self.points(**self.camera.observe(world))
 
 
-def cardinal(kind=Camera, **options):
-    """Four sensors of a kind around the robot, looking at it: a dict of name -> sensor.
+def cardinal(kind=Camera, robot=PANDA, **options):
+    """Four sensors of a kind around a `Robot`, looking at it: a dict of name -> sensor.
 
     (Paper, section 4: "four sensors located in cardinal directions".) `options` go to each.
     """
+    scale = scale_of(robot)
+    options = {"target": (0.0, 0.0, scale * TARGET), "far": scale * FAR} | options
     return {
-        name: kind(eye=(DISTANCE * x, DISTANCE * y, HEIGHT), **options)
+        name: kind(eye=(scale * DISTANCE * x, scale * DISTANCE * y, scale * HEIGHT), **options)
         for name, (x, y) in CARDINAL.items()
     }
 
@@ -229,12 +232,12 @@ class SensorWorld(World):
     """
 
     def _load_robot(self):
-        return panda.load_coarse(self.client, ROBOT_COLOUR)
+        return self.robot.load_coarse(self.client, ROBOT_COLOUR)
 
     def show(self, scene, configuration):
-        """Change to a `Scene` with the arm at joint angles (7, rad)."""
+        """Change to a `Scene` with the arm at joint angles (n, rad)."""
         self.set_scene(scene)
-        panda.set_configuration(self.client, self.robot, configuration)
+        self.robot.set_configuration(self.client, self.body, configuration)
 
     def render(self, sensor, size):
         """Images from a sensor's place, with `size` (width, height) in pixels.
@@ -262,7 +265,7 @@ class SensorWorld(World):
         bodies = np.reshape(bodies, (height, width))
         num_static = (self.scene.floor is not None) + (self.scene.table is not None)
         segmentation = np.full((height, width), OBSTACLE, np.uint8)
-        segmentation[bodies == self.robot] = ROBOT
+        segmentation[bodies == self.body] = ROBOT
         segmentation[np.isin(bodies, self._bodies[:num_static])] = STATIC
         segmentation[bodies < 0], depth[bodies < 0] = NOTHING, sensor.far
         return rgb, depth.astype(np.float32), segmentation
@@ -274,7 +277,7 @@ def _shared_world():
 
 
 def observe_scene(scene, sensors):
-    """Observations of a `Scene` with the arm in `POSE`.
+    """Observations of a `Scene` with the arm in its robot's `observed_pose`.
 
     Args:
         scene: a `Scene`.
@@ -284,7 +287,7 @@ def observe_scene(scene, sensors):
         Dict of name -> the sensor's observation, a dict.
     """
     world = _shared_world()
-    world.show(scene, POSE)
+    world.show(scene, scene.robot.observed_pose)
     return {name: sensor.observe(world) for name, sensor in sensors.items()}
 
 

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.subgoals import subgoals
 
 PLANNERS = ("via-points", "planner")
@@ -34,7 +33,7 @@ PLANNING_MODULE = "roboarm_nmp.demo_generation.planning"
 class EpisodePolicy(NamedTuple):
     """A policy in one episode.
 
-    act: act(observation) -> action (7,); None: the policy gives up.
+    act: act(observation) -> action (n,); None: the policy gives up.
     plan_found: whether it found a motion; None if it does not look for one.
     """
 
@@ -53,18 +52,22 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
         ValueError: the environment's actions are not displacements, there is no such geometry
             source, or `planner` lacks OMPL.
     """
+    robot = env.robot
     if name == "random":
-        return lambda number, query: EpisodePolicy(_random(np.random.default_rng([seed, number])))
+        joints = robot.num_joints
+        return lambda number, query: EpisodePolicy(
+            _random(np.random.default_rng([seed, number]), joints)
+        )
     if env.action_mode != "relative":
         raise ValueError(f"{name} gives displacements, not actions of mode {env.action_mode!r}")
     if name == "go-to-goal":
-        return lambda number, query: EpisodePolicy(_go_to_goal(query.goal))
+        return lambda number, query: EpisodePolicy(_go_to_goal(query.goal, robot))
     # Here, because Numba takes a while to import.
     from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 
-    source = find_geometry_source(geometry_source)
+    source = find_geometry_source(geometry_source, robot)
     if name == "via-points":
-        return _via_points(seed, tries, source)
+        return _via_points(robot, seed, tries, source)
     return _planner(env, seed, time_limit, source)
 
 
@@ -76,29 +79,31 @@ def import_planning():
         raise ValueError(f"the policy planner needs OMPL: {error}") from error
 
 
-def _go_to_goal(goal):
-    target = panda.normalise(goal)
-    return lambda observation: target - observation["observation"][:7]
+def _go_to_goal(goal, robot):
+    target = robot.normalise(goal)
+    return lambda observation: target - observation["observation"][: len(target)]
 
 
-def _random(rng):
-    return lambda observation: rng.uniform(-1.0, 1.0, panda.NUM_JOINTS)
+def _random(rng, num_joints):
+    return lambda observation: rng.uniform(-1.0, 1.0, num_joints)
 
 
-def _via_points(seed, tries, geometry_source):
+def _via_points(robot, seed, tries, geometry_source):
     # Without a margin, which would reject more than it saves: with 3 mm, collision-free success was
     # 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
     def begin(number, query):
         checker = geometry_source(query.scene)
         # float32 may round a limit to just beyond it.
-        start, goal = np.clip(panda.normalise(np.stack([query.start, query.goal])), -1.0, 1.0)
+        start, goal = np.clip(robot.normalise([query.start, query.goal]), -1.0, 1.0)
         if checker.is_motion_free(start, goal):
-            return EpisodePolicy(_go_to_goal(query.goal), plan_found=True)
-        for via in np.random.default_rng([seed, number]).uniform(-1.0, 1.0, (tries, 7)):
+            return EpisodePolicy(_go_to_goal(query.goal, robot), plan_found=True)
+        for via in np.random.default_rng([seed, number]).uniform(
+            -1.0, 1.0, (tries, robot.num_joints)
+        ):
             if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
-                path = panda.denormalise(np.stack([start, via, goal]))
-                return EpisodePolicy(_follow(path), plan_found=True)
-        return EpisodePolicy(_go_to_goal(query.goal), plan_found=False)
+                path = robot.denormalise(np.stack([start, via, goal]))
+                return EpisodePolicy(_follow(path, robot), plan_found=True)
+        return EpisodePolicy(_go_to_goal(query.goal, robot), plan_found=False)
 
     return begin
 
@@ -112,13 +117,13 @@ def _planner(env, seed, time_limit, geometry_source):
             path = planner.plan(*query, seed=[seed, number], time_limit=time_limit)
         except planning.PlanningError:
             return EpisodePolicy(None, plan_found=False)
-        return EpisodePolicy(_follow(path), plan_found=True)
+        return EpisodePolicy(_follow(path, env.robot), plan_found=True)
 
     return begin
 
 
-def _follow(path):
-    """One sub-goal per step along a path (n, 7), rad; at its end the goal, repeatedly."""
-    targets = subgoals(path)[1:]
+def _follow(path, robot):
+    """One sub-goal per step along a path (k, n), rad; at its end the goal, repeatedly."""
+    targets = subgoals(path, robot)[1:]
     left = itertools.chain(targets, itertools.repeat(targets[-1]))
-    return lambda observation: next(left) - observation["observation"][:7]
+    return lambda observation: next(left) - observation["observation"][: robot.num_joints]

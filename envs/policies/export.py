@@ -11,8 +11,7 @@ import copy
 import torch
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
-from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.networks.exported_networks import robot_metadata, save_network
 from roboarm_nmp.envs.networks.operations import NetworkError
 from roboarm_nmp.envs.policies.registry import ENV_ARGUMENTS, PolicyError
 
@@ -24,9 +23,9 @@ def save_policy(path, module, task, safety_filter=None, **env_arguments):
         path: the file to write, e.g. `policy.pt`; its folder must exist.
         module: `nn.Module`. Its `forward` receives the observation by name (`observation`,
             `achieved_goal`, `desired_goal` and what else the environment observes), float32
-            (N, ...), and returns deterministic actions, float32 (N, 7), in [-1, 1]. It may not
+            (N, ...), and returns deterministic actions, float32 (N, n), in [-1, 1]. It may not
             branch on values or draw random numbers.
-        task: name of the task it was trained on, or path of a scene file.
+        task: name of the task it was trained on, or path of a scene file; or `TASK@ROBOT`.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` that belongs to the policy.
         env_arguments: the arguments of `roboarm_nmp.make` it was trained with: those of
             `envs.policies.registry.ENV_ARGUMENTS`. Others define success, and are not stored.
@@ -44,7 +43,8 @@ def save_policy(path, module, task, safety_filter=None, **env_arguments):
             f"{', '.join(ENV_ARGUMENTS)}"
         )
     env = envs.make(task, **env_arguments)
-    goal_type, observations = env.goal_type, [env.reset(seed=seed)[0] for seed in (0, 1)]
+    goal_type, robot = env.goal_type, env.unwrapped.robot
+    observations = [env.reset(seed=seed)[0] for seed in (0, 1)]
     env.close()
     example = {
         name: torch.stack([torch.from_numpy(one[name]) for one in observations])
@@ -52,12 +52,13 @@ def save_policy(path, module, task, safety_filter=None, **env_arguments):
     }
     metadata = {"kind": "policy", "task": str(task), "env": {"goal_type": goal_type}}
     metadata["env"] |= env_arguments
+    metadata |= robot_metadata(robot)
     if safety_filter is not None:
         margin, escape = safety_filter.margin, safety_filter.escape
         metadata["safety_filter"] = {"margin": margin, "escape": escape}
     with torch.no_grad():
         action = copy.deepcopy(module).cpu().eval()(**example)
-    shape = (len(observations), panda.NUM_JOINTS)
+    shape = (len(observations), robot.num_joints)
     if not isinstance(action, torch.Tensor) or action.shape != shape:
         got = tuple(action.shape) if isinstance(action, torch.Tensor) else type(action).__name__
         raise PolicyError(f"{path}: actions for {shape[0]} observations must be {shape}, got {got}")

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.policies.baselines import (
     BASELINES,
     TIME_LIMIT,
@@ -140,7 +139,7 @@ def make_policy(
 
     Args:
         policy: one of `BASELINES`, the path of a policy network, or a function from an observation
-            to an action (7,).
+            to an action (n,).
         env: the `RoboArmEnv` it will act in.
         seed: of random numbers, >= 0; each query has its own generator.
         tries: random configurations that `via-points` tries per query.
@@ -219,9 +218,15 @@ def _trained(path, env):
     """`make_policy` of a policy network."""
     import torch
 
+    from roboarm_nmp.envs.networks.exported_networks import check_robot
     from roboarm_nmp.envs.networks.operations import NetworkError
 
     network, trained, _ = _load(path)
+    robot = env.unwrapped.robot
+    try:
+        check_robot(path, network.metadata, robot)
+    except NetworkError as error:
+        raise PolicyError(str(error)) from error
     mode = trained.get("action_mode", "relative")
     if mode != env.action_mode:
         raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
@@ -237,8 +242,8 @@ def _trained(path, env):
             given = observation | {"recurrent_state": recurrent_state} if size else observation
             inputs = {name: torch.from_numpy(given[name])[None] for name in network.inputs}
             if not size:
-                return network.predict_one(inputs, panda.NUM_JOINTS)
-            action, recurrent_state = network.predict_one(inputs, (panda.NUM_JOINTS, size))
+                return network.predict_one(inputs, robot.num_joints)
+            action, recurrent_state = network.predict_one(inputs, (robot.num_joints, size))
             return action
 
         return EpisodePolicy(act)

@@ -13,19 +13,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """An episode of T steps.
+    """An episode of T steps of an arm with n joints.
 
     Attributes:
-        states: float32 (T + 1, 7), normalised configurations, from the start on.
-        actions: float64 (T, 7), as the environment received them.
+        states: float32 (T + 1, n), normalised configurations, from the start on.
+        actions: float64 (T, n), as the environment received them.
         contacts: bool (T,), whether the arm was in contact during each step.
         times: float64 (T,), s, from each observation to its action.
         success: whether the goal was reached.
+        robot: the `Robot`.
     """
 
     states: np.ndarray
@@ -33,6 +35,7 @@ class Trajectory:
     contacts: np.ndarray
     times: np.ndarray
     success: bool
+    robot: Robot = PANDA
 
     def __len__(self):
         """The number of steps."""
@@ -40,8 +43,8 @@ class Trajectory:
 
     @property
     def configurations(self):
-        """Joint angles (T + 1, 7), rad."""
-        return panda.denormalise(self.states)
+        """Joint angles (T + 1, n), rad."""
+        return self.robot.denormalise(self.states)
 
     @property
     def collides(self):
@@ -65,19 +68,22 @@ class Episode:
     """
 
     def __init__(self, env, query):
-        self.env = env
+        self.env, self._robot = env, env.unwrapped.robot
         self.observation, self.info = env.reset_specific(*query)
         self.ended = self._success = self.info["is_success"]
-        self._states, self._actions = [self.observation["observation"][:7]], []
+        self._states, self._actions = [self._state()], []
         self._contacts, self._times = [], []
         self._observed = time.perf_counter()
+
+    def _state(self):
+        return self.observation["observation"][: self._robot.num_joints]
 
     def step(self, action):
         """One step of the environment. Raises ValueError: it refuses the action."""
         seconds = time.perf_counter() - self._observed
         self.observation, _, terminated, truncated, self.info = self.env.step(action)
         self.ended, self._success = terminated or truncated, self.info["is_success"]
-        self._states.append(self.observation["observation"][:7])
+        self._states.append(self._state())
         self._actions.append(np.array(action, dtype=np.float64))
         self._contacts.append(self.info["collision"])
         self._times.append(seconds)
@@ -87,10 +93,11 @@ class Episode:
         """The `Trajectory` so far."""
         return Trajectory(
             np.array(self._states),
-            np.array(self._actions).reshape(-1, panda.NUM_JOINTS),
+            np.array(self._actions).reshape(-1, self._robot.num_joints),
             np.array(self._contacts, dtype=bool),
             np.array(self._times),
             self._success,
+            self._robot,
         )
 
 
@@ -100,7 +107,7 @@ def rollout(env, query, policy):
     Args:
         env: a `RoboArmEnv`, possibly wrapped.
         query: an `envs.datasets.queries.Query`.
-        policy: a function from an observation to an action (7,); None: no step is made.
+        policy: a function from an observation to an action (n,); None: no step is made.
 
     Raises:
         ValueError: the environment refuses the query or an action.
@@ -117,7 +124,7 @@ def render_strip(env, query, actions, steps):
     Args:
         env: an environment like the episode's, which renders to `rgb_array`.
         query: the episode's.
-        actions: (T, 7), of its `Trajectory`.
+        actions: (T, n), of its `Trajectory`.
         steps: n numbers from 0 (the start) to T: the steps after which there is an image.
     """
     env.reset_specific(*query)

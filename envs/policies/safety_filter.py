@@ -32,7 +32,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.kernels import project
 from roboarm_nmp.envs.scenes.primitives import Scene, is_number
@@ -57,7 +56,7 @@ PROJECTION_SWEEPS = 12  # of cyclic projection
 # distance: where there is little room, the arm arrives slowly.
 PATIENCE, PROGRESS, PROGRESS_SHARE = 10, 0.06, 0.3
 ESCAPE_STEPS = 10  # into one random direction
-ESCAPE_JOINTS = 4  # from the base on: they move the arm, the others turn the hand
+TURNING_JOINTS = 3  # the last ones, which turn the hand: escapes move the others
 # After an escape, the last action's direction is added to the policy's action: at first MOMENTUM
 # times as long as the longest action, fading over MOMENTUM_STEPS.
 MOMENTUM, MOMENTUM_STEPS = 2.0, 40
@@ -104,14 +103,14 @@ class SafetyFilter:
             raise ValueError(f"invalid safety_filter in its metadata: {options!r}") from error
 
     def __call__(self, actions, link_distances, margins=None, max_step=MAX_STEP, cbf_gain=CBF_GAIN):
-        """Actions (..., 7), float32, that satisfy the constraints of all rows, to first order.
+        """Actions (..., n), float32, that satisfy the constraints of all rows, to first order.
 
         They are close to the given actions, but not always the closest. Where the constraints
         conflict, or the sweeps do not suffice, some are violated.
 
         Args:
-            actions: (..., 7), displacements of the normalised configuration.
-            link_distances: (..., rows, 8), as from `envs.wrappers.LinkDistancesWrapper`: m, and
+            actions: (..., n), displacements of the normalised configuration.
+            link_distances: (..., rows, 1 + n), as from `envs.wrappers.LinkDistancesWrapper`: m, and
                 gradients in m per unit of normalised configuration.
             margins: m, (..., rows), instead of the filter's `margin`.
             max_step: longest action (L2, normalised).
@@ -123,8 +122,8 @@ class SafetyFilter:
         margins = self.margin if margins is None else margins
         margins = np.broadcast_to(margins, link_distances.shape[:-1]).astype(np.float64)
         project(
-            actions.reshape(-1, 7),
-            link_distances.reshape(-1, rows, 8),
+            actions.reshape(-1, actions.shape[-1]),
+            link_distances.reshape(-1, rows, link_distances.shape[-1]),
             margins.reshape(-1, rows),
             max_step,
             cbf_gain,
@@ -138,7 +137,7 @@ class SafetyFilter:
         """A policy through this filter, for one episode.
 
         Args:
-            act: the policy, a function from an observation to an action (7,).
+            act: the policy, a function from an observation to an action (n,).
             env: the `RoboArmEnv` of the episode. See `check_env`.
             rng: a NumPy Generator, for the directions of escapes.
 
@@ -146,17 +145,18 @@ class SafetyFilter:
             A function like `act`.
         """
         link_distances_at, max_step = env.get_wrapper_attr("link_distances_at"), env.max_step
-        local_minima, goal_distances = _LocalMinima(rng, max_step), None
+        robot, joints = env.robot, env.robot.num_joints
+        local_minima, goal_distances = _LocalMinima(rng, max_step, joints), None
 
         def act_safely(observation):
             nonlocal goal_distances
-            state, goal = observation["observation"][: panda.NUM_JOINTS], None
-            here = np.concatenate([observation["link_distances"], _self_distances(state)])
+            state, goal = observation["observation"][:joints], None
+            here = np.concatenate([observation["link_distances"], _self_distances(robot, state)])
             margins, cbf_gain = np.broadcast_to(self.margin, len(here)), CBF_GAIN
             if "goal_link_distances" in observation:
-                goal = observation["desired_goal"][: panda.NUM_JOINTS]
+                goal = observation["desired_goal"][:joints]
                 if goal_distances is None:
-                    rows = observation["goal_link_distances"], _self_distances(goal)
+                    rows = observation["goal_link_distances"], _self_distances(robot, goal)
                     goal_distances = np.concatenate(rows)[:, 0]
                 remaining = np.linalg.norm(state - goal)
                 margins = self.margins_near_goal(goal_distances, remaining)
@@ -170,7 +170,8 @@ class SafetyFilter:
             margins_here = np.concatenate([np.zeros(len(virtual)), margins])
             move = self(action, here, margins_here, max_step, cbf_gain)
             # Distances at the end of the step, extrapolated back to its start.
-            there = np.concatenate([link_distances_at(state + move), _self_distances(state + move)])
+            end = state + move
+            there = np.concatenate([link_distances_at(end), _self_distances(robot, end)])
             there[:, 0] -= there[:, 1:] @ move
             rows = np.concatenate([here, there])
             margins = np.concatenate([margins_here, margins])
@@ -192,18 +193,19 @@ class SafetyFilter:
 class _LocalMinima:
     """The local minima of one episode: escapes from them, and virtual obstacles around them."""
 
-    def __init__(self, rng, max_step):
-        self.rng, self.max_step = rng, max_step
+    def __init__(self, rng, max_step, num_joints):
+        self.rng, self.max_step, self.num_joints = rng, max_step, num_joints
+        self.num_escape_joints = max(num_joints - TURNING_JOINTS, 1)
         self.states = deque(maxlen=PATIENCE + 1)  # since the last escape
         self.steps_left, self.direction = 0, None  # of an escape
         self.momentum, self.last_action = 0.0, None
         self.obstacles = []  # configuration of the escape joints, radius
 
     def escape(self, state, goal):
-        """The next action of an escape, (7,); None where none is needed.
+        """The next action of an escape, (n,); None where none is needed.
 
         Args:
-            state: configuration (7,), normalised.
+            state: configuration (n,), normalised.
             goal: the goal's configuration, or None if it is unknown: then there are no virtual
                 obstacles, which might contain it.
         """
@@ -213,13 +215,14 @@ class _LocalMinima:
             remaining = np.linalg.norm(goal - self.states[0])
             progress = min(PROGRESS, PROGRESS_SHARE * remaining)
         if self.steps_left == 0 and len(self.states) > PATIENCE and moved < progress:
-            direction = self.rng.standard_normal(ESCAPE_JOINTS)
-            self.steps_left, self.direction = ESCAPE_STEPS, np.zeros(panda.NUM_JOINTS)
-            self.direction[:ESCAPE_JOINTS] = direction * (self.max_step / np.linalg.norm(direction))
+            direction = self.rng.standard_normal(self.num_escape_joints)
+            self.steps_left, self.direction = ESCAPE_STEPS, np.zeros(self.num_joints)
+            direction *= self.max_step / np.linalg.norm(direction)
+            self.direction[: self.num_escape_joints] = direction
             if goal is not None:
-                remaining = np.linalg.norm((goal - state)[:ESCAPE_JOINTS])
+                remaining = np.linalg.norm((goal - state)[: self.num_escape_joints])
                 radius = min(VIRTUAL_RADIUS, VIRTUAL_RADIUS_SHARE * remaining)
-                self.obstacles.append((state[:ESCAPE_JOINTS], radius))
+                self.obstacles.append((state[: self.num_escape_joints], radius))
         if self.steps_left == 0:
             return None
         self.steps_left -= 1
@@ -229,7 +232,7 @@ class _LocalMinima:
         return self.direction
 
     def add_momentum(self, action):
-        """The policy's action (7,) and what is left of the momentum of the last escape."""
+        """The policy's action (n,) and what is left of the momentum of the last escape."""
         if self.momentum <= 0.0:
             return action
         self.momentum -= MOMENTUM / MOMENTUM_STEPS
@@ -237,13 +240,13 @@ class _LocalMinima:
         return action + self.momentum * self.max_step / length * self.last_action
 
     def virtual_obstacles(self, state):
-        """Their distances and gradients, (n, 8), as those of links; none during an escape."""
-        rows = np.zeros((len(self.obstacles) if self.steps_left == 0 else 0, 8))
+        """Their distances and gradients, (m, 1 + n), as those of links; none during an escape."""
+        rows = np.zeros((len(self.obstacles) if self.steps_left == 0 else 0, 1 + self.num_joints))
         for row, (centre, radius) in zip(rows, self.obstacles, strict=False):
-            offset = state[:ESCAPE_JOINTS] - centre
+            offset = state[: self.num_escape_joints] - centre
             distance = np.linalg.norm(offset)
             row[0] = VIRTUAL_SCALE * (distance - radius)
-            row[1 : 1 + ESCAPE_JOINTS] = VIRTUAL_SCALE * offset / max(distance, 1e-6)
+            row[1 : 1 + self.num_escape_joints] = VIRTUAL_SCALE * offset / max(distance, 1e-6)
         return rows
 
 
@@ -262,10 +265,10 @@ def check_env(env):
 
 
 @functools.cache
-def _arm_alone():
-    return CollisionChecker(Scene(table=None, floor=None))
+def _arm_alone(robot):
+    return CollisionChecker(Scene(table=None, floor=None, robot=robot))
 
 
-def _self_distances(state):
-    """Link distances from the other links, (10, 8)."""
-    return _arm_alone().link_distances(state, self_collisions=True, within=ACTIVATION_DISTANCE)
+def _self_distances(robot, state):
+    """Link distances from the other links, (l, 1 + n)."""
+    return _arm_alone(robot).link_distances(state, self_collisions=True, within=ACTIVATION_DISTANCE)

@@ -2,6 +2,8 @@
 
 All lengths in metres, in the frame of the robot's base (x forward, y left, z up):
 
+    robot: ur5.yaml # the arm: a file, relative to this one (docs/guide/robots.md); the Panda if
+                    # left out
     table: true     # true (as if left out): the standard table; false: none; or one of your own,
                     # {position: [x, y, z], size: [x, y, z]}, turned like a box
     floor: -0.6     # height of the floor's surface (-0.6 if left out); false: none
@@ -25,6 +27,8 @@ from pathlib import Path
 
 import yaml
 
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import (
     FLOOR,
     FRICTION,
@@ -65,7 +69,7 @@ def load_scene(path):
     except OSError as error:
         raise SceneFileError(f"{path}: {error.strerror}") from error
     try:
-        return _parse(contents)
+        return _parse(contents, Path(path).parent)
     except _Mistake as mistake:
         raise SceneFileError(f"{path}:{mistake.line}: {mistake.reason}") from mistake.__cause__
 
@@ -82,7 +86,7 @@ def save_scene(scene, path):
     path = Path(path)
     text = _format_scene(scene)
     try:
-        _parse(text.encode())
+        _parse(text.encode(), path.parent)
     except _Mistake as mistake:
         line = text.splitlines()[mistake.line - 1].strip()
         raise SceneFileError(f"{path}: cannot be written, {mistake.reason}: {line}") from None
@@ -95,6 +99,7 @@ def save_scene(scene, path):
 def _format_scene(scene):
     table = "false" if scene.table is None else _format_fields(scene.table)
     lines = [
+        *[f"robot: {scene.robot.source}"] * (scene.robot != PANDA),
         f"table: {'true' if scene.table == TABLE else table}",
         f"floor: {'false' if scene.floor is None else repr(float(scene.floor))}",
         *[f"friction: {float(scene.friction)!r}"] * (scene.friction != FRICTION),
@@ -149,8 +154,8 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
-def _parse(contents):
-    """bytes -> `Scene`. Raises `_Mistake`."""
+def _parse(contents, folder):
+    """bytes -> `Scene`, whose robot's file is relative to `folder`. Raises `_Mistake`."""
     try:
         text = contents.decode()
     except UnicodeDecodeError as error:
@@ -159,7 +164,7 @@ def _parse(contents):
     node = _compose(text)
     if node is None or _is_plain(node) and node.value == "":
         raise _Mistake(1, "the file is empty (a scene without obstacles of its own is {})")
-    return _scene(node)
+    return _scene(node, folder)
 
 
 def _compose(text):
@@ -182,9 +187,12 @@ def _compose(text):
         loader.dispose()
 
 
-def _scene(node):
-    fields = _mapping(node, "a scene", optional=("table", "floor", "friction", "obstacles"))
-    table, floor, friction, obstacles = TABLE, FLOOR, FRICTION, ()
+def _scene(node, folder):
+    keys = ("robot", "table", "floor", "friction", "obstacles")
+    fields = _mapping(node, "a scene", optional=keys)
+    table, floor, friction, obstacles, robot = TABLE, FLOOR, FRICTION, (), PANDA
+    if "robot" in fields:
+        robot = _robot(fields["robot"], folder)
     if "table" in fields:
         table = _table(fields["table"])
     if "floor" in fields:
@@ -204,7 +212,16 @@ def _scene(node):
         if len(node.value) > MAX_SCENE_OBSTACLES:
             raise _mistake(node, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
         obstacles = tuple(_obstacle(entry) for entry in node.value)
-    return Scene(obstacles, table, floor, friction)
+    return Scene(obstacles, table, floor, friction, robot)
+
+
+def _robot(node, folder):
+    if not isinstance(node, yaml.ScalarNode):
+        raise _mistake(node, f"robot must be a file's name, got {_describe(node)}")
+    try:
+        return load_robot(node.value if node.value == PANDA.name else folder / node.value)
+    except ValueError as error:
+        raise _mistake(node, str(error)) from error
 
 
 def _table(node):

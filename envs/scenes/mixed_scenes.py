@@ -6,12 +6,12 @@ tasks' own, except for the random boxes (docs/guide/tasks.md).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
-from roboarm_nmp.envs.scenes.random_boxes import FRICTION, TURN, RandomBoxes, rounded
+from roboarm_nmp.envs.scenes.random_boxes import FRICTION, TURN, RandomBoxes, rounded, scale_of
 
-BOXES = RandomBoxes(2, 8)
+FEWEST, MOST_BOXES = 2, 8
 # m. Walls stand on the table, edge-on to the robot. In two of three scenes the second wall is
 # opposite the first, with the robot in the gap.
 WALL = {
@@ -50,13 +50,14 @@ class MixedScenes:
         """A `Scene` drawn with a NumPy Generator."""
         kind = rng.integers(3)
         if kind == 0:
-            obstacles = BOXES.sample(rng).obstacles
+            obstacles = RandomBoxes(FEWEST, MOST_BOXES, self.base).sample(rng).obstacles
         else:
-            obstacles = _walls(rng) if kind == 1 else _racks(rng)
-        return Scene(tuple(obstacles), self.base.table, self.base.floor, self.base.friction)
+            scale = scale_of(self.base.robot)
+            obstacles = _walls(rng, scale) if kind == 1 else _racks(rng, scale)
+        return replace(self.base, obstacles=tuple(obstacles))
 
 
-def _walls(rng):
+def _walls(rng, scale):
     count = int(rng.integers(1, WALLS + 1))
     azimuth = rng.uniform(-math.pi, math.pi)
     opposite = rng.random() < OPPOSITE
@@ -66,7 +67,7 @@ def _walls(rng):
         centre = shape["near"] + shape["length"] / 2, 0.0, shape["height"] / 2
         size = shape["length"], shape["thickness"], shape["height"]
         turned = rng.uniform(-TURNED, TURNED)
-        walls.append(_placed(centre, size, azimuth + turned))
+        walls.append(_placed(centre, size, azimuth + turned, scale))
         # The next wall is opposite this one, or at least a sixth of a turn from it. A third wall
         # may be near the first.
         between = math.pi if number == 0 and opposite else rng.uniform(math.pi / 3, math.pi * 5 / 6)
@@ -74,7 +75,7 @@ def _walls(rng):
     return walls
 
 
-def _racks(rng):
+def _racks(rng, scale):
     count = int(rng.integers(1, RACKS + 1))
     first = rng.uniform(-math.pi, math.pi)
     parts = []
@@ -100,18 +101,18 @@ def _racks(rng):
             z = heights[rng.integers(boards)] + (BOARD + length) / 2
             of_rack.append(((*place, z), (radius, length)))
         azimuth = first + quarter * math.pi / 2
-        parts += [_placed(*part, azimuth) for part in of_rack]
+        parts += [_placed(*part, azimuth, scale) for part in of_rack]
     return parts
 
 
-def _placed(centre, size, azimuth):
+def _placed(centre, size, azimuth, scale):
     """An obstacle described in front of the robot, turned about the robot's axis.
 
-    A box with three sizes, or an upright cylinder with its radius and length.
+    A box with three sizes, or an upright cylinder with its radius and length. Both are scaled.
     """
     half = round(azimuth / TURN) * TURN / 2
     cos, sin = math.cos(2 * half), math.sin(2 * half)
-    x, y, z = centre
+    (x, y, z), size = (scale * length for length in centre), [scale * edge for edge in size]
     place = rounded(cos * x - sin * y, sin * x + cos * y, z)
     if len(size) == 2:
         return Cylinder(place, *rounded(*size))

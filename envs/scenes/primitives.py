@@ -1,6 +1,6 @@
-"""Scenes as plain data: boxes, cylinders and spheres around the arm, a table and a floor.
+"""Scenes as plain data: an arm, boxes, cylinders and spheres around it, a table and a floor.
 
-All lengths in metres, in the frame of the robot's base (x forward, y left, z up).
+All lengths in metres, in the world's frame: that of the Panda's base (x forward, y left, z up).
 """
 
 import json
@@ -8,6 +8,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 MAX_LENGTH, MAX_SCENE_OBSTACLES = 1000.0, 10_000
@@ -106,10 +109,11 @@ def floor_box(height):
 
 @dataclass(frozen=True)
 class Scene:
-    """All geometry around the arm. `table=None` or `floor=None` leave them out.
+    """An arm and all geometry around it. `table=None` or `floor=None` leave them out.
 
-    `floor` is the height of the floor's surface. `friction` is the obstacles' coefficient; PyBullet
-    multiplies it by the arm's, 0.5. Scenes are values: they can be compared and hashed.
+    `robot` is the arm. `floor` is the height of the floor's surface. `friction` is the obstacles'
+    coefficient; PyBullet multiplies it by the arm's, 0.5. Scenes are values: they can be compared
+    and hashed.
 
     Raises:
         TypeError: an obstacle or the table is of another type.
@@ -120,6 +124,7 @@ class Scene:
     table: Box | None = TABLE
     floor: float | None = FLOOR
     friction: float = FRICTION
+    robot: Robot = PANDA
 
     def __post_init__(self):
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
@@ -137,6 +142,8 @@ class Scene:
             raise ValueError(f"floor must be a height in m or None, got {self.floor!r}")
         if not (is_number(self.friction) and self.friction >= 0):
             raise ValueError(f"friction must be a number from 0 on, got {self.friction!r}")
+        if not isinstance(self.robot, Robot):
+            raise TypeError(f"robot must be a Robot, got {self.robot!r}")
 
 
 def _is_length(value):
@@ -221,13 +228,18 @@ def scene_to_json(scene):
     }
     if scene.friction != FRICTION:
         fields["friction"] = scene.friction
+    if scene.robot != PANDA:
+        fields["robot"] = scene.robot.name, scene.robot.fingerprint
     return json.dumps(fields, sort_keys=True)
 
 
-def scene_from_json(text):
-    """The inverse of `scene_to_json`."""
+def scene_from_json(text, robot=PANDA):
+    """The inverse of `scene_to_json`. Raises ValueError: the scene has another robot."""
     fields = json.loads(text)
+    name, fingerprint = fields.get("robot", (PANDA.name, PANDA.fingerprint))
+    if fingerprint != robot.fingerprint:
+        raise ValueError(f"made for another robot, {name!r}, than {robot.name!r}")
     table = fields["table"] and from_array([fields["table"]])[0]
     rows = np.array(fields["obstacles"]).reshape(-1, ROW)
     friction = fields.get("friction", FRICTION)
-    return Scene(from_array(rows), table, fields["floor"], friction)
+    return Scene(from_array(rows), table, fields["floor"], friction, robot)

@@ -1,12 +1,14 @@
 """Random scenes: shelves, poles and walls around the arm (paper, section 4).
 
 The paper gives the kinds of obstacles and their numbers. The distribution is calibrated to
-go-to-goal's success rate in the paper (docs/guide/tasks.md).
+go-to-goal's success rate in the paper (docs/guide/tasks.md). For an arm other than the Panda, all
+lengths are multiplied by the ratio of their reaches.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
 # Positions and sizes are multiples of this (m), about a millimetre, and yaws of a 256th of a turn,
@@ -41,31 +43,39 @@ class RandomBoxes:
 
     def sample(self, rng):
         """A `Scene` drawn with a NumPy Generator."""
-        count = int(rng.integers(self.fewest, self.most + 1))
+        count, scale = int(rng.integers(self.fewest, self.most + 1)), scale_of(self.base.robot)
         first = rng.uniform(-math.pi, math.pi)
         sector = 2 * math.pi / count
         boxes = []
         while len(boxes) < count:
             # Each box has a sector of its own, so that they stand all around the robot.
             azimuth = first + sector * (len(boxes) + rng.uniform(-0.5, 0.5))
-            box = _sample_box(rng, azimuth)
-            if _distance_to_robot(box) >= KEEP_CLEAR:
+            box = _sample_box(rng, azimuth, scale)
+            if _distance_to_robot(box, scale) >= KEEP_CLEAR * scale:
                 boxes.append(box)
-        return Scene(tuple(boxes), self.base.table, self.base.floor, self.base.friction)
+        return replace(self.base, obstacles=tuple(boxes))
 
 
-def _sample_box(rng, azimuth):
+def scale_of(robot):
+    """A robot's reach as a share of the Panda's."""
+    return 1.0 if robot == PANDA else robot.reach / PANDA.reach
+
+
+def _sample_box(rng, azimuth, scale):
+    def shape_of(ranges):
+        return {name: scale * rng.uniform(*limits) for name, limits in ranges.items()}
+
     kind = rng.random()
     if kind < SHELVES:
-        shape = {name: rng.uniform(*limits) for name, limits in SHELF.items()}
+        shape = shape_of(SHELF)
         size = (shape["depth"], shape["width"], shape["thickness"])
-        distance, height = shape["near"] + shape["depth"] / 2, rng.uniform(*SHELF_HEIGHT)
+        distance, height = shape["near"] + shape["depth"] / 2, scale * rng.uniform(*SHELF_HEIGHT)
     elif kind < SHELVES + POLES:
-        shape = {name: rng.uniform(*limits) for name, limits in POLE.items()}
-        size = (shape["thickness"], rng.uniform(*POLE["thickness"]), shape["height"])
+        shape = shape_of(POLE)
+        size = (shape["thickness"], scale * rng.uniform(*POLE["thickness"]), shape["height"])
         distance, height = shape["centre"], shape["height"] / 2
     else:
-        shape = {name: rng.uniform(*limits) for name, limits in WALL.items()}
+        shape = shape_of(WALL)
         size = (shape["length"], shape["thickness"], shape["height"])
         distance, height = shape["near"] + shape["length"] / 2, shape["height"] / 2
     yaw = azimuth + rng.uniform(-math.pi / 2, math.pi / 2)
@@ -82,11 +92,11 @@ def rounded(*lengths):
     return tuple(round(length / GRID) * GRID for length in lengths)
 
 
-def _distance_to_robot(box):
+def _distance_to_robot(box, scale):
     """Distance (m) of an upright box from the part of the robot's axis below its shoulder's top."""
     sin, cos = 2 * box.orientation[2] * box.orientation[3], 1 - 2 * box.orientation[2] ** 2
     x, y, z = box.position
     # The axis in the box's frame.
     across = (abs(cos * x + sin * y) - box.size[0] / 2, abs(cos * y - sin * x) - box.size[1] / 2)
-    below, above = z - box.size[2] / 2 - SHOULDER, -(z + box.size[2] / 2)
+    below, above = z - box.size[2] / 2 - SHOULDER * scale, -(z + box.size[2] / 2)
     return math.hypot(max(across[0], 0.0), max(across[1], 0.0), max(below, above, 0.0))

@@ -56,7 +56,7 @@ class EvaluationOptions:
     Attributes:
         goal_type: `ee`, `config`, `combined`; None for the policy's own, otherwise `ee`.
         queries: queries instead of the task's own: the path of a query file, or an object with
-            `start` and `goal`, float32 (n, 7), rad, and `scenes`, a sequence of n `Scene`s, like
+            `start` and `goal`, float32 (m, n), rad, and `scenes`, a sequence of m `Scene`s, like
             `envs.datasets.queries.Queries`. Without `scenes` they are in the task's scene, which
             must then not be random.
         split: `test`, `validation` or `original`; which queries of the file.
@@ -108,10 +108,10 @@ def evaluate(policy, task=None, *, progress=False, **options):
     Args:
         policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy network or of
             a folder with a `policy.pt`, the name of a pretrained policy, or a function from an
-            observation (dict of `RoboArmEnv`) to an action (7,); with several workers, one that can
+            observation (dict of `RoboArmEnv`) to an action (n,); with several workers, one that can
             be pickled.
-        task: name of the task, or path of a scene file; None for the task that the policy was
-            trained on.
+        task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
+            for the task that the policy was trained on.
         progress: show a progress bar, with the success rate so far.
         options: the fields of `EvaluationOptions`.
 
@@ -125,9 +125,9 @@ def evaluate(policy, task=None, *, progress=False, **options):
         - `ms_per_action`: of the policy alone, without the simulator and without planning;
         - `planning_seconds`, `planning_seconds_solved`: means over all queries, and over those with
           a motion found; `free_motion_rate`, only of `via-points`;
-        - `policy`, `task`, `goal_type`, `split`, `queries` (the file, if it is not the task's own),
-          `num_queries`, `env`, `deviations` (from the standard rules), `safety_filter`, `seed`,
-          `tries`, `time_limit`, `versions`;
+        - `policy`, `task`, `robot` (its name), `goal_type`, `split`, `queries` (the file, if it is
+          not the task's own), `num_queries`, `env`, `deviations` (from the standard rules),
+          `safety_filter`, `seed`, `tries`, `time_limit`, `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles.
 
@@ -177,12 +177,12 @@ def wilson_interval(successes, n):
 
 
 def path_length(configurations):
-    """Sum of the L2 distances, in rad, between successive configurations (T + 1, 7), rad."""
+    """Sum of the L2 distances, in rad, between successive configurations (T + 1, n), rad."""
     return float(np.linalg.norm(np.diff(configurations, axis=0), axis=1).sum())
 
 
 def smoothness(configurations):
-    """Mean L2 norm of the second differences, rad per step^2, of configurations (T + 1, 7), rad.
+    """Mean L2 norm of the second differences, rad per step^2, of configurations (T + 1, n), rad.
 
     Zero for fewer than three configurations.
     """
@@ -282,7 +282,7 @@ def _queries(task, options):
         queries = load_queries(task, options.split)
     elif isinstance(queries, (str, Path)):
         validate(queries, task)  # they are for this task, with the scene it has now
-        queries = load_queries(queries, options.split)
+        queries = load_queries(queries, options.split, task)
     name = task_name(task)
     if getattr(queries, "task", name) != name:
         raise EvaluationError(f"these queries are for the task {queries.task!r}, not {name!r}")
@@ -413,6 +413,7 @@ def _summary(job, outcomes):
     return {
         "policy": getattr(job.policy, "__name__", str(job.policy)),
         "task": job.task,
+        "robot": get_task(job.task).base_scene.robot.name,
         "goal_type": options.env["goal_type"],
         "split": options.split,
         "queries": options.queries,

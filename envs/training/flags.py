@@ -32,7 +32,7 @@ OTHERS = "algorithm"
 GROUPS = {
     "policy": ("policy", "tries", "time_limit"),
     "task": (
-        *("task", "goal_type", "split", "queries", "num_queries", "query", "num"),
+        *("task", "robot", "goal_type", "split", "queries", "num_queries", "query", "num"),
         *("action_mode", "max_step", "horizon", "stop_on_collision"),
     ),
     "observation": (*("encoder", "num_points", "velocities", "geometry_source", "link_distances"),),
@@ -170,13 +170,13 @@ def check(args):
     """Raise ValueError, in one line, unless every flag is within its range.
 
     Args:
-        args: an instance of a dataclass. None, where a flag may be that, is in every range.
+        args: an instance of a dataclass. None, or a word, where a flag may be that, is in range.
     """
     hints = typing.get_type_hints(type(args), include_extras=True)
     for field in dataclasses.fields(args):
         limits, value = _range_of(hints[field.name]), getattr(args, field.name)
         values = value if isinstance(value, tuple) else [value]
-        if limits is None or value is None:
+        if limits is None or value is None or isinstance(value, str):
             continue
         for one in values:
             if math.isnan(one) or not limits.least <= one <= limits.most:

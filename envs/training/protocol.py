@@ -11,6 +11,7 @@ message.
 import collections
 import sys
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -20,11 +21,15 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs.arm_env import HORIZON, STANDARD_RULES, deviations
 from roboarm_nmp.envs.datasets.episodes import DemoQueriesWrapper, load_demos_for
 from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
+from roboarm_nmp.envs.networks.exported_networks import (
+    load_network,
+    robot_metadata,
+    save_network,
+)
 from roboarm_nmp.envs.policies.registry import recurrent_size
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.tasks import task_name
+from roboarm_nmp.envs.tasks import task_name, task_with_robot
 from roboarm_nmp.envs.training.flags import NonNegativeInt, PositiveFloat, PositiveInt
 from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite
 from roboarm_nmp.envs.utils.progress import progress_bar
@@ -41,10 +46,16 @@ class PolicyFlags(RunFlags):
 
     task: str = "no_obstacles"
     """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
+    robot: Path | None = None
+    """another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE"""
     eval_queries: PositiveInt = 200
     """validation queries per evaluation"""
     test_queries: NonNegativeInt = 1_000
     """test queries for the best policy at the end (0: no test)"""
+
+    def __post_init__(self):
+        # The task names the robot from here on: in files, messages and the run's flags.
+        self.task, self.robot = task_with_robot(self.task, self.robot), None
 
 
 @dataclass
@@ -186,7 +197,7 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0, descript
 
     Args:
         policy: from `observation`, `achieved_goal`, `desired_goal` and what else is observed,
-            tensors (N, ...), to actions (N, 7); a module or an exported network. A recurrent one
+            tensors (N, ...), to actions (N, n); a module or an exported network. A recurrent one
             (`envs.policies.registry.recurrent_size`) also receives its state, and returns the next.
         envs: the environments to do it in.
         queries: `envs.datasets.queries.Queries`, or a list of `Query`.
@@ -268,7 +279,7 @@ def _rollouts(policy, envs, queries, device, safety_filter, seed=0):
 
 
 def _actions(policy, observations, states, device):
-    """Actions (n, 7) for n observations, and the policy's n recurrent states after them."""
+    """Actions (m, n) for m observations, and the policy's m recurrent states after them."""
     if not len(states[0]):
         actions = policy(**stack(observations, device)).cpu().numpy()
     else:
@@ -369,6 +380,7 @@ class PolicyRun(Run):
         """
         args = self.args
         metadata = {"kind": "policy", "task": args.task, "env": self.env_arguments}
+        metadata |= robot_metadata(self.eval_envs[0].unwrapped.robot)
         if self.safety_filter is not None:
             margin, escape = self.safety_filter.margin, self.safety_filter.escape
             metadata["safety_filter"] = {"margin": margin, "escape": escape}
@@ -392,7 +404,8 @@ class PolicyRun(Run):
         self.close()
         args = self.args
         result, text = self._test(queries) if len(queries) else ({}, "no test, --test-queries 0")
-        result |= {"task": args.task, "goal_type": args.goal_type, "num_queries": len(queries)}
+        result |= {"task": args.task, "robot": self.eval_envs[0].unwrapped.robot.name}
+        result |= {"goal_type": args.goal_type, "num_queries": len(queries)}
         result |= {"policy": str(self.folder / "policy.pt"), "policy_step": self.best_step}
         result |= {"validation_success_rate": self.best_score, "steps": self.step}
         self.write_result(result | {"seconds": round(self.seconds)})

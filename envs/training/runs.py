@@ -43,7 +43,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from roboarm_nmp.envs.tasks import SCENE_FILES
+from roboarm_nmp.envs.robots.files import ROBOT_FILES
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import Seed
 from roboarm_nmp.envs.utils.files import (
@@ -91,10 +91,10 @@ def parse_args(Args, may_change=()):
         SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
     """
     end_with_one_line("nothing was written")
-    args = flags.parse(Args)
-    if args.resume is not None:
-        args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
     try:
+        args = flags.parse(Args)
+        if args.resume is not None:
+            args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
         flags.check(args)
     except ValueError as error:
         sys.exit(str(error))
@@ -148,12 +148,20 @@ def _from_json(value, kind, begun_in):
     """
     if isinstance(value, list):
         return tuple(_from_json(one, kind, begun_in) for one in value)
-    is_path = Path in (kind, *typing.get_args(kind))
-    if not isinstance(value, str) or not (is_path or value.endswith(SCENE_FILES)):
+    if not isinstance(value, str):
         return value
+    if Path in (kind, *typing.get_args(kind)):
+        return Path(_from_here(value, begun_in))
+    files = [
+        _from_here(part, begun_in) if part.endswith(ROBOT_FILES) else part
+        for part in value.split("@")  # TASK@ROBOT
+    ]
+    return "@".join(files)
+
+
+def _from_here(value, begun_in):
     first = begun_in / value
-    value = first if first.exists() and not Path(value).exists() else value
-    return Path(value) if is_path else str(value)
+    return str(first) if first.exists() and not Path(value).exists() else value
 
 
 def _to_json(content):

@@ -3,6 +3,7 @@
     roboarm view wall
     roboarm view wall --policy sac-ee-wall-p1-s1 go-to-goal
     roboarm view my_scene.yaml
+    roboarm view random_boxes_hard --robot ur5.yaml
     roboarm view wall --demos
     roboarm view roadmaps
     roboarm view wall --policy planner --record replay.html
@@ -33,10 +34,11 @@ import numpy as np
 import tyro
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.policies.baselines import BASELINES
 from roboarm_nmp.envs.policies.registry import policy_file, pretrained_policies
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Sphere
+from roboarm_nmp.envs.scenes.random_boxes import scale_of
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, Seed
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
@@ -58,7 +60,7 @@ KINEMATIC = (
     "**Kinematic simulation**, because goal or scene were edited: no forces, and obstacles do not "
     "stop the arm. *Restart* runs the edited query in the physics."
 )
-NEW_OBSTACLES = {
+NEW_OBSTACLES = {  # in front of the Panda; for other arms in proportion to their reach
     "box": Box((0.5, 0.0, 0.5), (0.15, 0.15, 0.15)),
     "cylinder": Cylinder((0.5, 0.0, 0.5), 0.06, 0.3),
     "sphere": Sphere((0.5, 0.0, 0.5), 0.1),
@@ -75,6 +77,8 @@ class ViewError(ValueError):
 class Args:
     task: tyro.conf.Positional[str]
     """the task's name, the path of a scene file (.yaml), or a folder of roadmap paths"""
+    robot: Path | None = None
+    """another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE"""
     policy: tuple[str, ...] = ()
     """the policies, side by side: `go-to-goal`, `random`, `via-points`, `planner`, a policy
     network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy; without
@@ -200,8 +204,8 @@ class _Page:
 
     def _try(self, function, *arguments):
         try:
-            function(*arguments)
             self._message = ""
+            function(*arguments)
         except (OSError, ValueError) as error:
             self._message = str(error)
 
@@ -276,10 +280,12 @@ class _Page:
                 "trace": "path of the end effector",
             }
             for option in self.drawing.OPTIONS:
+                if option == "decoded" and simulation.robot != PANDA:
+                    continue  # pretrained encoders are the Panda's
                 box = gui.add_checkbox(names[option], option in self.drawing.show)
                 box.on_update(lambda event, o=option: self.do(self._show, o, event.target.value))
         with gui.add_folder("Edit"):
-            position = tuple(panda.forward_kinematics(simulation.query.goal))
+            position = tuple(simulation.robot.forward_kinematics(simulation.query.goal))
             self._goal = gui.add_vector3("goal (m)", position, step=0.01)
             self._goal.on_update(lambda event: self._goal_typed(event))
             self._obstacle = gui.add_dropdown("obstacle", self._obstacle_names())
@@ -307,7 +313,7 @@ class _Page:
     def _update_controls(self):
         """Set controls and gizmos that are not being used to the simulation's values."""
         simulation = self.simulation
-        position = panda.forward_kinematics(simulation.query.goal)
+        position = simulation.robot.forward_kinematics(simulation.query.goal)
         if "goal" not in self._dragging:
             _set(self._goal_gizmo, "position", position)
         _set(self._goal, "value", tuple(float(x) for x in np.round(position, 4)))
@@ -440,7 +446,7 @@ class _Page:
         self.selected = self.drawing.selected = index
 
     def _add_obstacle(self, kind):
-        self.simulation.add_obstacle(NEW_OBSTACLES[kind])
+        self.simulation.add_obstacle(new_obstacle(kind, self.simulation.robot))
         self._select_obstacle(len(self.simulation.query.scene.obstacles) - 1)
 
     def _delete(self):
@@ -452,7 +458,20 @@ class _Page:
 
     def _save(self):
         path = self.simulation.save_scene(self._file.value)
+        self._message = f"The scene was saved as {path}."
         print(f"{path}: written", flush=True)
+
+
+def new_obstacle(kind, robot):
+    """An obstacle in front of a robot's base; its lengths are in proportion to the reach."""
+    obstacle, scale = NEW_OBSTACLES[kind], scale_of(robot)
+    sizes = {
+        name: tuple(scale * x for x in size) if isinstance(size, tuple) else scale * size
+        for name, size in vars(obstacle).items()
+        if name in ("size", "radius", "length")
+    }
+    position = (b + scale * x for b, x in zip(robot.base_position, obstacle.position, strict=True))
+    return replace(obstacle, position=tuple(position), **sizes)
 
 
 def _set(handle, name, value):
@@ -467,8 +486,10 @@ def _set(handle, name, value):
 def _check(args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
-    if args.demos and Path(args.task).is_dir():
-        raise ViewError("--demos goes with a task, not with a folder of roadmap paths")
+    for flag in ("demos", "robot"):
+        if getattr(args, flag) and Path(args.task).is_dir():
+            raise ViewError(f"--{flag} goes with a task, not with a folder of roadmap paths")
+    args.task = envs.tasks.task_with_robot(args.task, args.robot)
     if not Path(args.task).is_dir():
         envs.get_task(args.task)
     for policy in args.policy:
@@ -533,12 +554,13 @@ def _simulation(args):
     return simulation
 
 
-def _choices(args, recording):
+def _choices(args, simulation):
     """The policies of the arguments, and all that the page's list offers: lists of `_Choice`."""
-    names = args.policy or (() if recording else ("go-to-goal",))
+    names = args.policy or (() if simulation.episodes.recording else ("go-to-goal",))
     given = [_Choice(name, name, args.geometry_source) for name in names]
     offered = {choice.label: choice for choice in given}
-    for name in (*BASELINES, *pretrained_policies()):
+    pretrained = pretrained_policies() if simulation.robot == PANDA else ()
+    for name in (*BASELINES, *pretrained):
         offered.setdefault(name, _Choice(name, name, args.geometry_source))
     offered[POINT_CLOUD_PLANNER] = _Choice(POINT_CLOUD_PLANNER, "planner", "point_cloud")
     return given, list(offered.values())
@@ -579,7 +601,7 @@ def _serve(server, simulation, args):
     from roboarm_nmp.envs.viewer.simulation import WaitingArm
 
     task = simulation.episodes.task
-    given, offered = _choices(args, simulation.episodes.recording)
+    given, offered = _choices(args, simulation)
     for choice in given:
         simulation.add(WaitingArm(choice.label))
     lock = threading.Lock()  # arms are made one after another
@@ -604,7 +626,7 @@ def _serve(server, simulation, args):
         threading.Thread(target=work, daemon=True).start()
 
     page = _Page(server, simulation, args, offered, load)
-    _place_camera(server, len(simulation.arms))
+    _place_camera(server, simulation)
     url = f"http://{args.host}:{args.port}"
     server.on_client_disconnect(
         lambda client: print(f"a page was closed or lost; {url} opens it again", flush=True)
@@ -625,17 +647,19 @@ def _open(url):
         return False
 
 
-def camera(arms):
+def camera(arms, robot=PANDA):
     """Where the camera of a page with so many arms is at first, m; its target; its field (rad)."""
     from roboarm_nmp.envs.viewer.drawing import SPACING
 
-    middle = SPACING * (arms - 1) / 2
-    return (1.4 + arms, middle + 0.6, 0.9 + 0.3 * arms), (0.0, middle, 0.4), math.radians(50)
+    middle, base = SPACING * (arms - 1) / 2, np.array(robot.base_position)
+    eye, target = (1.4 + arms, middle + 0.6, 0.9 + 0.3 * arms), (0.0, middle, 0.4)
+    eye, target = (base + scale_of(robot) * np.array(point) for point in (eye, target))
+    return eye, target, math.radians(50)
 
 
-def _place_camera(server, arms):
+def _place_camera(server, simulation):
     first = server.initial_camera
-    first.position, first.look_at, first.fov = camera(arms)
+    first.position, first.look_at, first.fov = camera(len(simulation.arms), simulation.robot)
 
 
 def _record(args):
@@ -643,13 +667,13 @@ def _record(args):
     from roboarm_nmp.envs.viewer.drawing import COARSE_MESH_CELL, Drawing, outcome
 
     simulation = _simulation(args)
-    given, _ = _choices(args, simulation.episodes.recording)
+    given, _ = _choices(args, simulation)
     for choice in given:
         simulation.add(_arm(args, simulation.episodes.task, choice, args.seed))
     server = _server("127.0.0.1", args.port)
     try:
         drawing = Drawing(server, simulation, COARSE_MESH_CELL)
-        _place_camera(server, len(simulation.arms))
+        _place_camera(server, simulation)
         drawing.update()
         recording = server.get_scene_serializer()
         while not simulation.ended:

@@ -1,27 +1,21 @@
 """Drawing a `Simulation` with viser: arms side by side, scene, goal, points, distances, contacts.
 
 Every arm has its own copy of the scene, `SPACING` beside the last one. The arm's links are nested
-frames, of which only the seven joints turn.
+frames, of which only the joints move.
 """
 
-import functools
-import math
-from pathlib import Path
-
 import numpy as np
-import pybullet_data
-import trimesh
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, find_geometry_source
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder
+from roboarm_nmp.envs.scenes.random_boxes import scale_of
+from roboarm_nmp.envs.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, arm_joints, link_meshes
 
-SPACING = 2.2  # m, between the bases of two arms
-# Visual meshes are reduced by merging the vertices in each cube of this size (m).
-# Ghosts and recordings have the larger one: browsers without a GPU render slowly.
-MESH_CELL, COARSE_MESH_CELL = 0.005, 0.013
+# m, for the Panda; for other arms in proportion to their reach.
+SPACING, LABEL_HEIGHT = 2.2, 1.35  # between the bases of two arms; of the arms' names
 ORIENTATION_STEPS = 2**14  # quaternions are rounded, so that recordings stay small
+POSITION_STEPS = 2**13  # per m, likewise
 DECODED_BY = "field"  # the encoder whose decoded points are shown where an arm uses none
 
 # Colours (red, green, blue).
@@ -34,53 +28,6 @@ TRACE_COLOUR = (235, 150, 40)
 NEAR, FAR = 0.05, 0.3  # m: link distances are red up to the first, and not drawn beyond the second
 ARROW_LENGTH = 0.25  # m, of the end effector's motion in a step of the longest length
 
-_MESHES = Path(pybullet_data.getDataPath(), "franka_panda", "meshes")
-_LINK_FILES = {
-    -1: "collision/link0.obj",
-    **{link: f"visual/link{link + 1}.obj" for link in range(6)},
-    6: "collision/link7.obj",
-    8: "visual/hand.obj",
-    9: "visual/finger.obj",
-    10: "visual/finger.obj",
-}
-
-
-@functools.cache
-def link_meshes(cell):
-    """The arm's meshes: dict of PyBullet's link index -> list of (colour, vertices, faces).
-
-    `cell`: m, see `MESH_CELL`. Vertices are float32 (n, 3), m, in the link's frame.
-    """
-    return {link: _reduced(_MESHES / name, cell) for link, name in _LINK_FILES.items()}
-
-
-@functools.cache
-def _reduced(path, cell):
-    loaded = trimesh.load(path, process=False)
-    parts = loaded.geometry.values() if isinstance(loaded, trimesh.Scene) else [loaded]
-    of_colour = {}
-    for part in parts:
-        diffuse = getattr(getattr(part.visual, "material", None), "diffuse", None)
-        colour = (255, 255, 255) if diffuse is None else tuple(int(c) for c in diffuse[:3])
-        of_colour.setdefault(colour, []).append(part)
-    return [(colour, *_merged(parts, cell)) for colour, parts in of_colour.items()]
-
-
-def _merged(parts, cell):
-    """Vertices and faces of meshes, with one vertex for each cube of size `cell`."""
-    vertices = np.concatenate([part.vertices for part in parts])
-    first = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    faces = np.concatenate([part.faces + k for part, k in zip(parts, first, strict=True)])
-    cubes, cube = np.unique(np.round(vertices / cell), axis=0, return_inverse=True)
-    cube = cube.ravel()
-    centres = np.zeros((len(cubes), 3))
-    np.add.at(centres, cube, vertices)
-    centres /= np.bincount(cube)[:, None]
-    faces = cube[faces]
-    a, b, c = faces.T
-    faces = np.unique(faces[(a != b) & (b != c) & (a != c)], axis=0)
-    return np.round(centres, 4).astype(np.float32), faces.astype(np.uint32)
-
 
 def _wxyz(orientation):
     """A quaternion (x, y, z, w) in viser's order."""
@@ -88,64 +35,47 @@ def _wxyz(orientation):
     return (w, x, y, z)
 
 
-def _about_x(angle):
-    return (math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0)
-
-
-def _about_z(angle):
-    return (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))
-
-
 class ArmDrawing:
     """An arm as nested frames.
 
     Args:
         scene: viser's `SceneApi`.
+        robot: the `Robot`.
         name: of its node.
         cell: m, see `MESH_CELL`.
         colour, opacity: of a ghost; None for the arm's own colours.
     """
 
-    def __init__(self, scene, name, cell=MESH_CELL, colour=None, opacity=None):
-        self._root = scene.add_frame(name, show_axes=False)
-        self._meshes, self._red, self._joints = {}, frozenset(), []
-        meshes = link_meshes(cell)
-
-        def add(link, node, turn=(1.0, 0.0, 0.0, 0.0)):
+    def __init__(self, scene, robot, name, cell=MESH_CELL, colour=None, opacity=None):
+        self._root = scene.add_frame(
+            name,
+            show_axes=False,
+            position=robot.base_position,
+            wxyz=_wxyz(robot.base_orientation),
+        )
+        self._meshes, self._red, self._joints, nodes = {}, frozenset(), [], {-1: name}
+        for joint in arm_joints(robot):
+            node = f"{nodes[joint.parent]}/joint{joint.link}"
+            scene.add_frame(node, show_axes=False, position=joint.position, wxyz=joint.wxyz)
+            if not joint.is_fixed:
+                node = f"{node}/moved"
+                self._joints.append((joint, scene.add_frame(node, show_axes=False)))
+            nodes[joint.link] = node
+        still = colour is not None  # the bases of ghosts are where the arm's is
+        for link, meshes in link_meshes(robot, cell * scale_of(robot)).items():
             self._meshes[link] = []
-            for i, (own, vertices, faces) in enumerate(meshes[link]):
+            for i, (own, vertices, faces) in enumerate(() if still and link == -1 else meshes):
                 shown = own if colour is None else colour
                 handle = scene.add_mesh_simple(
-                    f"{node}/mesh{i}",
+                    f"{nodes[link]}/mesh{i}",
                     vertices,
                     faces,
                     color=shown,
                     opacity=opacity,
-                    wxyz=turn,
                     cast_shadow=opacity is None,
                     receive_shadow=opacity is None,
                 )
                 self._meshes[link].append((handle, shown))
-
-        node = name
-        if colour is None:  # the bases of ghosts are where the arm's is
-            add(-1, node)
-        for joint, (x, y, z, roll) in enumerate(panda.JOINT_FRAMES):
-            node = f"{node}/frame{joint}"
-            scene.add_frame(node, show_axes=False, position=(x, y, z), wxyz=_about_x(roll))
-            node = f"{node}/joint{joint}"
-            self._joints.append(scene.add_frame(node, show_axes=False))
-            add(joint, node)
-        node = f"{node}/hand"
-        flange = (0.0, 0.0, panda.FLANGE_LENGTH)
-        scene.add_frame(node, show_axes=False, position=flange, wxyz=_about_z(panda.HAND_YAW))
-        add(8, node)
-        x, y, z = panda.HAND_TO_FINGER
-        for link, side in ((9, 1), (10, -1)):
-            finger = f"{node}/finger{link}"
-            position = (x, y + side * panda.FINGER_OPENING, z)
-            scene.add_frame(finger, show_axes=False, position=position)
-            add(link, finger, _about_z(0.0 if side == 1 else math.pi))
 
     @property
     def visible(self):
@@ -158,11 +88,16 @@ class ArmDrawing:
             self._root.visible = visible
 
     def set(self, configuration):
-        """Draw it at joint angles (7,), rad."""
-        for handle, angle in zip(self._joints, configuration, strict=True):
-            wxyz = np.round(np.array(_about_z(angle)) * ORIENTATION_STEPS) / ORIENTATION_STEPS
-            if not np.array_equal(handle.wxyz, wxyz):
-                handle.wxyz = wxyz
+        """Draw it at joint angles (n,), rad."""
+        for joint, handle in self._joints:
+            position, wxyz = joint.pose(configuration)
+            for name, value, steps in (
+                ("position", position, POSITION_STEPS),
+                ("wxyz", wxyz, ORIENTATION_STEPS),
+            ):
+                value = np.round(np.array(value) * steps) / steps
+                if not np.array_equal(getattr(handle, name), value):
+                    setattr(handle, name, value)
 
     def colour(self, links):
         """Draw the links of these indices in red, the others in their own colours."""
@@ -182,15 +117,21 @@ class ArmDrawing:
 class _Place:
     """The handles of one arm and of the scene around it."""
 
-    def __init__(self, scene, index, cell):
-        self.name, self.offset = f"/arm{index}", np.array([0.0, SPACING * index, 0.0])
+    def __init__(self, scene, robot, index, cell):
+        scale = scale_of(robot)
+        self.name, self.offset = f"/arm{index}", np.array([0.0, SPACING * scale * index, 0.0])
         scene.add_frame(self.name, show_axes=False, position=self.offset)
-        self.arm = ArmDrawing(scene, f"{self.name}/robot", cell)
-        self.start = ArmDrawing(scene, f"{self.name}/start", COARSE_MESH_CELL, START_COLOUR, 0.3)
-        self.goal = ArmDrawing(scene, f"{self.name}/goal", COARSE_MESH_CELL, GOAL_COLOUR, 0.4)
+        self.arm = ArmDrawing(scene, robot, f"{self.name}/robot", cell)
+        ghost = COARSE_MESH_CELL
+        self.start = ArmDrawing(scene, robot, f"{self.name}/start", ghost, START_COLOUR, 0.3)
+        self.goal = ArmDrawing(scene, robot, f"{self.name}/goal", ghost, GOAL_COLOUR, 0.4)
         self.ball = scene.add_icosphere(f"{self.name}/ball", radius=0.02, color=GOAL_COLOUR)
+        x, y, z = robot.base_position
         self.label = scene.add_label(
-            f"{self.name}/label", "", position=(0.0, 0.0, 1.35), anchor="bottom-center"
+            f"{self.name}/label",
+            "",
+            position=(x, y, z + LABEL_HEIGHT * scale),
+            anchor="bottom-center",
         )
         self.scene, self.bodies, self.shapes = None, [], {}
 
@@ -231,7 +172,7 @@ class Drawing:
         simulation = self.simulation
         for index, arm in enumerate(simulation.arms):
             if index == len(self._places):
-                self._places.append(_Place(self._scene, index, self._cell))
+                self._places.append(_Place(self._scene, simulation.robot, index, self._cell))
                 self._add_floor()
             place = self._places[index]
             self._draw_scene(place, simulation.query.scene)
@@ -241,7 +182,7 @@ class Drawing:
     def _add_floor(self):
         """A floor under all arms."""
         floor = self.simulation.query.scene.floor
-        middle = SPACING * (len(self._places) - 1) / 2
+        middle = self._places[-1].offset[1] / 2
         self._scene.add_grid(
             "/floor",
             width=8.0,
@@ -312,14 +253,14 @@ class Drawing:
     # --- The arm
 
     def _draw_arm(self, place, arm):
-        query = self.simulation.query
-        place.arm.set(panda.denormalise(arm.state))
+        query, robot = self.simulation.query, self.simulation.robot
+        place.arm.set(robot.denormalise(arm.state))
         place.arm.colour(arm.contacts.links)
         place.start.visible = "start" in self.show
         place.start.set(query.start)
         place.goal.visible = place.ball.visible = "goal" in self.show
         place.goal.set(query.goal)
-        place.ball.position = panda.forward_kinematics(query.goal)
+        place.ball.position = robot.forward_kinematics(query.goal)
         text = f"{arm.name}{_label(arm)}"  # seldom another: a browser takes long to draw text
         if place.label.text != text:
             place.label.text = text
@@ -327,11 +268,12 @@ class Drawing:
     # --- Overlays: redrawn while they are shown
 
     def _draw_overlays(self, place, arm):
+        robot = self.simulation.robot
         self._points(place, "observed", OBSERVED_COLOUR, arm, _observed)
         self._points(place, "decoded", DECODED_COLOUR, arm, _decoded)
         self._lines(place, "distances", 0.004, lambda: _distance_lines(arm, self.simulation))
-        self._lines(place, "correction", 0.012, lambda: _arrows(arm), arrows=True)
-        self._lines(place, "trace", 0.006, lambda: _trace(arm))
+        self._lines(place, "correction", 0.012, lambda: _arrows(arm, robot), arrows=True)
+        self._lines(place, "trace", 0.006, lambda: _trace(arm, robot))
         self._contacts(place, arm)
 
     def _points(self, place, name, colour, arm, find):
@@ -430,21 +372,21 @@ def _distance_lines(arm, simulation):
     return points, np.repeat(colours[:, None], 2, axis=1).astype(np.uint8)
 
 
-def _arrows(arm):
+def _arrows(arm, robot):
     """The end effector's motion as the policy wants it, and as the safety filter corrects it."""
     if arm.correction is None or arm.correction < 1e-3 or arm.ended or len(arm.trace) < 2:
         return np.zeros((0, 2, 3)), None
     before = arm.trace[-2]
     states = np.clip(np.stack([before, before + arm.wanted, before + arm.action]), -1.0, 1.0)
-    start, *ends = panda.forward_kinematics(panda.denormalise(states))
+    start, *ends = robot.forward_kinematics(robot.denormalise(states))
     scale = ARROW_LENGTH / 0.03
     points = np.array([[start, start + scale * (end - start)] for end in ends])
     return points, np.array([WANTED_COLOUR, FILTERED_COLOUR], np.uint8)
 
 
-def _trace(arm):
+def _trace(arm, robot):
     """The path of the end effector so far."""
     if len(arm.trace) < 2:
         return np.zeros((0, 2, 3)), None
-    positions = panda.forward_kinematics(panda.denormalise(np.array(arm.trace)))
+    positions = robot.forward_kinematics(robot.denormalise(np.array(arm.trace)))
     return np.stack([positions[:-1], positions[1:]], axis=1), np.array(TRACE_COLOUR, np.uint8)

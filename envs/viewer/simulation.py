@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.format import ORIGINAL, SPLITS, DatasetError
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
@@ -123,9 +122,10 @@ def roadmap_episodes(folder):
     def get(split, number):
         scene = int(np.searchsorted(paths.path_offsets, number, side="right")) - 1
         points = paths.points[paths.offsets[number] : paths.offsets[number + 1]]
-        path = panda.denormalise(points)
-        query = Query(path[0].astype(np.float32), path[-1].astype(np.float32), paths.scenes[scene])
-        return query, subgoals(path).astype(np.float32)
+        scene = paths.scenes[scene]
+        path = scene.robot.denormalise(points)
+        query = Query(path[0].astype(np.float32), path[-1].astype(np.float32), scene)
+        return query, subgoals(path, scene.robot).astype(np.float32)
 
     count = len(paths.offsets) - 1
     return Episodes(paths.task, ("roadmap paths",), lambda split: count, get, "roadmap path")
@@ -163,11 +163,11 @@ def contacts_in(world):
     """The `Contacts` of the last simulated step in a `World`."""
     found = [
         contact
-        for contact in p.getContactPoints(bodyA=world.robot, physicsClientId=world.client)
+        for contact in p.getContactPoints(bodyA=world.body, physicsClientId=world.client)
         if contact[8] < 0.0 or contact[9] > 0.0
     ]
     links = {contact[3] for contact in found}
-    links |= {contact[4] for contact in found if contact[2] == world.robot}
+    links |= {contact[4] for contact in found if contact[2] == world.body}
     return Contacts(np.array([contact[5] for contact in found]).reshape(-1, 3), frozenset(links))
 
 
@@ -176,7 +176,7 @@ class _Arm:
 
     Attributes:
         name: what moves it.
-        state: its normalised configuration (7,).
+        state: its normalised configuration (n,); None before `begin`.
         steps, contact_steps: steps so far, and those with a contact.
         contacts: the `Contacts` after the last step.
         success: whether it has reached its goal.
@@ -184,10 +184,10 @@ class _Arm:
         kinematic: whether there are no forces.
         geometry_source: where its observations or its plan take the obstacles from; None: nowhere.
         problem: why it does not move, in words; None if it does.
-        trace: the configurations so far, a list of (7,), normalised.
+        trace: the configurations so far, a list of (n,), normalised.
         ms_per_action: mean over the episode; None before the first action.
-        action: the last action (7,).
-        wanted: the policy's last action (7,), before the safety filter; None without a filter, and
+        action: the last action (n,).
+        wanted: the policy's last action (n,), before the safety filter; None without a filter, and
             while the filter escapes from a local minimum.
         correction: the filter's change of it, L2, normalised; None where `wanted` is None.
         escaping: whether the filter escapes from a local minimum.
@@ -195,7 +195,7 @@ class _Arm:
 
     def __init__(self, name):
         self.name, self.geometry_source = name, None
-        self.state, self.trace = np.zeros(panda.NUM_JOINTS), []
+        self.state, self.trace = None, []
         self._clear()
 
     def _clear(self):
@@ -227,7 +227,7 @@ class WaitingArm(_Arm):
     def begin(self, number, query, states=None):
         """Put it at the start."""
         self._clear()
-        self.state, self.trace = panda.normalise(query.start), []
+        self.state, self.trace = query.scene.robot.normalise(query.start), []
         self.problem, self.ended = self._problem, True
 
     def edit(self, query):
@@ -268,7 +268,7 @@ class RecordedArm(_Arm):
         self.steps += 1
         self.state = self._states[self.steps]
         self.trace.append(self.state)
-        self._world.in_collision(panda.denormalise(self.state))
+        self._world.in_collision(self._world.robot.denormalise(self.state))
         self.contacts = contacts_in(self._world)
         self.contact_steps += self.in_contact
         self.ended = self.success = self.steps == len(self._states) - 1
@@ -340,7 +340,8 @@ class PolicyArm(_Arm):
         # Here, because Numba takes a while to import.
         from roboarm_nmp.envs.collision.checker import CollisionChecker
 
-        checker, state = CollisionChecker(Scene()), np.zeros(panda.NUM_JOINTS)
+        robot = self.env.unwrapped.robot
+        checker, state = CollisionChecker(Scene(robot=robot)), np.zeros(robot.num_joints)
         if "link_distances" in self.env.observation_space.spaces:
             distances = checker.link_distances(state)
             if self._filter:
@@ -360,7 +361,7 @@ class PolicyArm(_Arm):
         self.env.unwrapped.world = self._kinematics
         self._kinematics.set_scene(query.scene)
         collides = self._kinematics.in_collision(query.goal)
-        self._start(query._replace(start=panda.denormalise(self.state)))
+        self._start(query._replace(start=self.env.unwrapped.robot.denormalise(self.state)))
         self.kinematic = True
         if collides:
             self.problem = "the goal is in collision"
@@ -368,10 +369,10 @@ class PolicyArm(_Arm):
 
     def _start(self, query):
         self._clear()
-        self._seconds, self._act = 0.0, None
-        self.state = panda.normalise(query.start)
+        self._seconds, self._act, robot = 0.0, None, self.env.unwrapped.robot
+        self.state = robot.normalise(query.start)
         self.trace = [self.state]
-        query = query._replace(start=np.clip(query.start, panda.LOWER, panda.UPPER))
+        query = query._replace(start=np.clip(query.start, robot.lower, robot.upper))
         try:
             self.env.reset_specific(*query)  # before planning, as `evaluate` does
             act, plan_found = self._begin(self._number, query)
@@ -383,7 +384,11 @@ class PolicyArm(_Arm):
             self.problem = "no plan found"
         self._act = self._recorded(act) if act is not None else None
         self.ended, self.success = self._episode.ended or act is None, self._episode.ended
-        self.state = self._episode.observation["observation"][: panda.NUM_JOINTS]
+        self.state = self._state()
+
+    def _state(self):
+        joints = self.env.unwrapped.robot.num_joints
+        return self._episode.observation["observation"][:joints]
 
     def _recorded(self, act):
         """The policy through its safety filter, which notes what the policy wanted."""
@@ -419,7 +424,7 @@ class PolicyArm(_Arm):
         self._episode.step(self.action)
         self.steps += 1
         self.ms_per_action = 1000 * self._seconds / self.steps
-        self.state = self._episode.observation["observation"][: panda.NUM_JOINTS]
+        self.state = self._state()
         self.trace.append(self.state)
         self.contacts = contacts_in(self.env.unwrapped.world)
         self.contact_steps += self._episode.info["collision"]
@@ -500,6 +505,11 @@ class Simulation:
         """Whether the episodes of all arms are over."""
         return all(arm.ended for arm in self.arms)
 
+    @property
+    def robot(self):
+        """The `Robot` of the query's scene."""
+        return self.query.scene.robot
+
     # --- Edits. All arms go on from where they are.
 
     def _edit(self, **changes):
@@ -508,15 +518,15 @@ class Simulation:
             arm.edit(self.query)
 
     def set_goal(self, goal):
-        """Another goal, joint angles (7,), rad; clipped to the limits."""
-        self._edit(goal=np.clip(goal, panda.LOWER, panda.UPPER).astype(np.float32))
+        """Another goal, joint angles (n,), rad; clipped to the limits."""
+        self._edit(goal=np.clip(goal, self.robot.lower, self.robot.upper).astype(np.float32))
 
     def move_goal(self, position):
         """Another goal whose end effector is at a position (3,), m, near the present goal.
 
         Where the arm does not reach that far, the end effector comes as near as it finds.
         """
-        self.set_goal(inverse_kinematics(position, self.query.goal))
+        self.set_goal(inverse_kinematics(self.robot, position, self.query.goal))
 
     def replace_obstacle(self, index, obstacle):
         """Another obstacle in the place of one. Raises ValueError: its numbers are invalid."""
@@ -536,10 +546,17 @@ class Simulation:
         self._edit(scene=replace(self.query.scene, obstacles=tuple(obstacles)))
 
     def save_scene(self, path):
-        """Write the scene as YAML. Raises SceneFileError, OSError: it cannot be written."""
+        """Write the scene as YAML, never over a file that is there: `name_2.yaml` follows it.
+
+        Returns the path of the file. Raises SceneFileError, OSError: it cannot be written.
+        """
         path = Path(path)
         if path.suffix not in envs.tasks.SCENE_FILES:
             path = path.with_name(f"{path.name}.yaml")
+        first, number = path, 2
+        while path.exists():
+            path = first.with_stem(f"{first.stem}_{number}")
+            number += 1
         save_scene(self.query.scene, path)
         return path
 
@@ -549,32 +566,43 @@ class Simulation:
             arm.close()
 
 
-def inverse_kinematics(position, configuration):
-    """Joint angles (7,), rad, near a configuration, with the end effector at a position (3,), m.
+def inverse_kinematics(robot, position, configuration):
+    """Joint angles (n,), rad, near a configuration, with the end effector at a position (3,), m.
 
     Damped least squares (Wampler, 1986) within the joint limits. Where the position is not reached,
     the nearest configuration that was found.
 
     Args:
-        position: (3,), m, in the base's frame.
-        configuration: (7,), rad, where the search begins.
+        robot: the `Robot`.
+        position: (3,), m, in the world.
+        configuration: (n,), rad, where the search begins.
     """
     c, position = np.array(configuration, np.float64), np.asarray(position, np.float64)
     best, least = c, np.inf
     for _ in range(IK_STEPS):
-        frames = list(panda.joint_frames(c))
-        origins = np.array([origin for origin, _ in frames])
-        axes = np.array([rotation[:, 2] for _, rotation in frames])
-        here = panda.forward_kinematics(c)
+        here = robot.forward_kinematics(c)
         error = position - here
         distance = np.linalg.norm(error)
         if distance < least:
             best, least = c, distance
         if distance < IK_TOLERANCE:
             break
-        jacobian = np.cross(axes, here - origins).T  # (3, 7), m per rad
+        jacobian = _jacobian(robot, c, here)
         damped = jacobian @ jacobian.T + IK_DAMPING**2 * np.eye(3)
         step = jacobian.T @ np.linalg.solve(damped, error)
         step *= min(1.0, IK_MAX_STEP / max(np.abs(step).max(), 1e-12))
-        c = np.clip(c + step, panda.LOWER, panda.UPPER)
+        c = np.clip(c + step, robot.lower, robot.upper)
     return best
+
+
+def _jacobian(robot, configuration, end_effector):
+    """The Jacobian (3, n), m per rad, of the end effector, which is at a position (3,), m."""
+    jacobian, poses = np.zeros((3, robot.num_joints)), robot.frame_poses(configuration)
+    index = robot.end_effector_frame
+    while index >= 0:
+        frame, (origin, axes) = robot.frames[index], poses[index]
+        axis = axes[:, 2]
+        motion = axis if frame.is_prismatic else np.cross(axis, end_effector - origin)
+        jacobian[:, frame.joint] += frame.multiplier * motion
+        index = frame.parent
+    return jacobian

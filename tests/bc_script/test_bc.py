@@ -7,12 +7,12 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
-from trainers import PATHS, load, refusal, run_here, run_script
+from trainers import PATHS, load, panda_env, refusal, run_here, run_script
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training.protocol import stack
 
 bc = load("bc")
@@ -21,7 +21,7 @@ bc = load("bc")
 @pytest.mark.parametrize("num_modes", [1, 3])
 def test_log_likelihood_is_that_of_torch_distributions(num_modes):
     torch.manual_seed(0)
-    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=num_modes), 10).eval()
+    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=num_modes), panda_env()).eval()
     observation, goal, action = torch.randn(32, 10), torch.randn(32, 3), torch.randn(32, 7)
     outputs = actor.mlp(actor.features(observation, goal)).reshape(32, num_modes, 15).double()
     std = (-5 + 3.5 * (torch.tanh(outputs[..., 7:14]) + 1)).exp()
@@ -37,7 +37,7 @@ def test_log_likelihood_is_that_of_torch_distributions(num_modes):
 
 def test_action_is_the_most_likely_modes_mean():
     torch.manual_seed(0)
-    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=3), 10).eval()
+    actor = bc.Actor(bc.Args(goal_type="ee", num_modes=3), panda_env()).eval()
     observation, goal = torch.randn(64, 10), torch.randn(64, 3)
     mean, _, log_weight = actor.modes(observation, goal)
     chosen = [mean[i, int(log_weight[i].argmax())] for i in range(64)]
@@ -53,12 +53,12 @@ def test_transitions_of_demonstrations_by_hand(goal_type):
     expected = []
     for i in range(3):
         demo = demos[i]
-        goal_position, goal_state = panda.forward_kinematics(demo.goal), panda.normalise(demo.goal)
+        goal_position, goal_state = PANDA.forward_kinematics(demo.goal), PANDA.normalise(demo.goal)
         goal = {"ee": [goal_position], "config": [goal_state]}.get(
             goal_type, [goal_state, goal_position]
         )
         for state, action in zip(demo.states[:-1], demo.actions, strict=True):
-            position = panda.forward_kinematics(panda.denormalise(state))
+            position = PANDA.forward_kinematics(PANDA.denormalise(state))
             expected.append(np.concatenate([state, position, *goal, action / 0.03]))
     found = np.hstack([observations, goals, actions])
     np.testing.assert_allclose(found, np.array(expected), atol=1e-5)

@@ -64,7 +64,7 @@ def setting(request, folder, tmp_path_factory):
     batch = dagger.concat([dagger.on_device(draw, "cpu") for draw in draws])
     assert set(batch["scene"].tolist()) == {0, 2}
     torch.manual_seed(1)
-    actor = dagger.Actor(args, env.encoder.token_size)
+    actor = dagger.Actor(args, env)
     torch.nn.init.normal_(actor.head.weight)  # (the initial one ignores the scene)
     latents = torch.as_tensor(env.encoder.encode_demos(paths))
     yield actor, env, dagger.with_scene(batch, latents, actor.token_size)
@@ -102,7 +102,7 @@ def test_initial_action_is_straight_to_the_goal(setting):
     inputs = inputs_of(batch)
     to_goal = inputs["desired_goal"][:, :7] - inputs["observation"][:, :7]
     near = to_goal / to_goal.norm(dim=1, keepdim=True).clamp(min=0.03) * 0.03
-    action = dagger.Actor(dagger.Args(), env.encoder.token_size)(achieved_goal=None, **inputs)
+    action = dagger.Actor(dagger.Args(), env)(achieved_goal=None, **inputs)
     torch.testing.assert_close(action, near)
 
 

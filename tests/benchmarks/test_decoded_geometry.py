@@ -11,10 +11,10 @@ import pytest
 import torch
 from paths import ROOT
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.perception.encoders import make_encoder
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
 
 oracle = make_encoder("oracle")
@@ -104,7 +104,7 @@ def test_link_places_and_distances_equal_kinematics_and_checker():
     assert places.shape == (2, benchmark.POSES, 63) and distances.shape == (2, benchmark.POSES, 10)
     # The end-effector is 0.212 m along the last joint's axis.
     tips = places[..., 54:57] + 0.212 * places[..., 60:63]
-    np.testing.assert_allclose(tips, panda.forward_kinematics(panda.denormalise(states)), atol=1e-5)
+    np.testing.assert_allclose(tips, PANDA.forward_kinematics(PANDA.denormalise(states)), atol=1e-5)
     assert (distances[1] == np.float32(benchmark.FAR)).all()  # no table, no floor
     bare = Scene(scenes[0].obstacles, table=None, floor=None)
     expected = CollisionChecker(bare).signed_distances(states[0], self_collisions=False).distance

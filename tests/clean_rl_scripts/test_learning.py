@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from trainers import load, run_script
+from trainers import load, panda_env, run_script
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import protocol
 
 READY = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)  # rad
@@ -21,8 +21,8 @@ OF_SAC = " --alpha 0.02 --target-entropy -14"
 
 def query(_, rng):
     """From `READY`, a goal about ten steps away in any direction."""
-    goal = panda.normalise(READY) + rng.uniform(-0.3, 0.3, 7)
-    return READY, panda.denormalise(goal).astype(np.float32)
+    goal = PANDA.normalise(READY) + rng.uniform(-0.3, 0.3, 7)
+    return READY, PANDA.denormalise(goal).astype(np.float32)
 
 
 @pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
@@ -38,7 +38,7 @@ def test_trainer_learns_to_reach_near_goals(trainer, tmp_path, monkeypatch):
     queries = [Query(*query(None, rng), scene) for _ in range(60)]
     made = protocol.make_envs("no_obstacles", 4, horizon=30)
     module = load(trainer)
-    untrained = module.Actor(module.Args(hidden_size=64, bf16=False), 10).eval()
+    untrained = module.Actor(module.Args(hidden_size=64, bf16=False), panda_env()).eval()
     before, after = (
         protocol.evaluate(policy, made, queries, "cpu")["success_rate"]
         for policy in (untrained, load_network(run / "policy.pt"))

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import load, run_script
+from trainers import load, panda_env, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import collect
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import Demos, load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_transitions
 from roboarm_nmp.envs.datasets.format import QueryScenes
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import protocol
 from roboarm_nmp.envs.training.protocol import stack
 
@@ -34,7 +34,7 @@ def test_polyak_update_by_hand():
 
 def test_log_probability_is_that_of_a_squashed_gaussian():
     torch.manual_seed(0)
-    actor = sac.Actor(sac.Args(bf16=False), 10).eval()
+    actor = sac.Actor(sac.Args(bf16=False), panda_env()).eval()
     observation, goal = torch.randn(64, 10), torch.randn(64, 3)
     action, log_prob = actor.get_action(actor.features(observation, goal))
     mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
@@ -52,8 +52,8 @@ def test_log_probability_is_that_of_a_squashed_gaussian():
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
 def test_network_inputs(goal_type):
     rng = np.random.default_rng(0)
-    c = rng.uniform(panda.LOWER, panda.UPPER, (5, 7))
-    state, goal_state = panda.normalise(c), rng.uniform(-1, 1, (5, 7))
+    c = rng.uniform(PANDA.lower, PANDA.upper, (5, 7))
+    state, goal_state = PANDA.normalise(c), rng.uniform(-1, 1, (5, 7))
     position, goal_position = rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
     goal = {"ee": goal_position, "config": goal_state}.get(
         goal_type, np.hstack([goal_state, goal_position])
@@ -62,12 +62,12 @@ def test_network_inputs(goal_type):
     expected += [5 * (goal_position - position)] * (goal_type != "config")
     expected += [5 * (goal_state - state)] * (goal_type != "ee")
     observation = np.hstack([state, position])
-    features = sac.Features(sac.Args(goal_type=goal_type), 10)
+    features = sac.Features(sac.Args(goal_type=goal_type), panda_env(goal_type))
     tensors = torch.tensor(observation).float(), torch.tensor(goal).float()
     inputs = features(*tensors).numpy()
     assert inputs.shape == (5, features.size)
     np.testing.assert_allclose(inputs, np.hstack(expected), atol=1e-5)
-    plain = sac.Features(sac.Args(goal_type=goal_type, plain_networks=True), 10)
+    plain = sac.Features(sac.Args(goal_type=goal_type, plain_networks=True), panda_env(goal_type))
     np.testing.assert_array_equal(plain(*tensors), torch.cat(tensors, dim=1))
 
 
@@ -80,14 +80,14 @@ def test_networks_fit_every_observation(goal_type, velocities, link_distances):
     args = sac.Args(**shared, num_hidden_layers=4)
     env = envs.make("wall", **shared, append_link_distances=link_distances)
     batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
-    actor = sac.Actor(args, env.observation_space["observation"].shape[0])
+    actor = sac.Actor(args, env)
     if link_distances:  # distances, ten times as large, are the last inputs
         features = actor.features(batch["observation"], batch["desired_goal"])
         torch.testing.assert_close(features[:, -10:], 10.0 * batch["link_distances"][..., 0])
     action = actor(**batch)
     assert action.shape == (2, 7)
     features = actor.features(batch["observation"], batch["desired_goal"])
-    assert sac.Critics(args, actor.features.size)(features, action).shape == (2, 2)
+    assert sac.Critics(args, actor.features)(features, action).shape == (2, 2)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_networks_fit_every_observation(goal_type, velocities, link_distances):
 def test_actions_are_within_twice_the_longest_step(flags, scale):
     args = sac.Args(**flags, bf16=False)
     assert sac.action_scale(args) == scale
-    actor = sac.Actor(args, 10)
+    actor = sac.Actor(args, panda_env())
     with torch.no_grad():
         actor.mlp[-1].bias.fill_(100.0)  # saturated
         action = actor(torch.zeros(1, 10), None, torch.zeros(1, 3))
@@ -111,7 +111,8 @@ def test_actions_are_within_twice_the_longest_step(flags, scale):
 
 def test_plain_critics_have_no_layer_norm():
     for plain in (False, True):
-        modules = sac.Critics(sac.Args(plain_networks=plain), 30).modules()
+        args = sac.Args(plain_networks=plain)
+        modules = sac.Critics(args, sac.Features(args, panda_env())).modules()
         assert any(isinstance(one, torch.nn.LayerNorm) for one in modules) is not plain
 
 
@@ -196,8 +197,9 @@ def test_million_transitions_fit_into_400_mb():
 def test_bfloat16_products_stay_close_to_float32():
     torch.manual_seed(0)
     args = sac.Args(bf16=True)
-    critics = sac.Critics(args, 30)
-    inputs = torch.randn(256, 30), torch.rand(256, 7) * 0.06
+    features = sac.Features(args, panda_env())
+    critics = sac.Critics(args, features)
+    inputs = torch.randn(256, features.size), torch.rand(256, 7) * 0.06
     in_training, exact = critics.train()(*inputs), critics.eval()(*inputs)
     assert 0 < (in_training - exact).abs().max() < 0.02
     assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
@@ -236,7 +238,7 @@ def hand_made_demos(number=3, steps=12, task="no_obstacles"):
     states = first[:, None] + np.arange(steps + 1)[:, None] * direction[:, None]
     actions = np.repeat(direction[:, None], steps + 1, axis=1)
     actions[:, -1] = 0.0
-    ends = panda.denormalise(states[:, [0, -1]]).astype(np.float32)
+    ends = PANDA.denormalise(states[:, [0, -1]]).astype(np.float32)
     return Demos(
         task=task,
         seed=0,
@@ -261,11 +263,11 @@ def test_demonstration_as_transitions_by_hand(goal_type):
     demo = hand_made_demos()[1]
     env = envs.make("no_obstacles", goal_type=goal_type)
     episode = demo_transitions(demo, env)
-    angles = panda.denormalise(demo.states.astype(np.float64))
-    positions = panda.forward_kinematics(angles)
-    goal_position = panda.forward_kinematics(demo.goal)
+    angles = PANDA.denormalise(demo.states.astype(np.float64))
+    positions = PANDA.forward_kinematics(angles)
+    goal_position = PANDA.forward_kinematics(demo.goal)
     if goal_type == "config":
-        reached = np.linalg.norm(demo.states - panda.normalise(demo.goal), axis=1) <= 0.05
+        reached = np.linalg.norm(demo.states - PANDA.normalise(demo.goal), axis=1) <= 0.05
     else:
         reached = np.linalg.norm(positions - goal_position, axis=1) <= 0.02
     assert len(episode) == np.argmax(reached) < len(demo.actions)  # cut where the goal is reached
@@ -278,8 +280,8 @@ def test_demonstration_as_transitions_by_hand(goal_type):
         assert not transition["collision"]
         goal = {
             "ee": goal_position,
-            "config": panda.normalise(demo.goal),
-            "combined": np.concatenate([panda.normalise(demo.goal), goal_position]),
+            "config": PANDA.normalise(demo.goal),
+            "combined": np.concatenate([PANDA.normalise(demo.goal), goal_position]),
         }[goal_type]
         np.testing.assert_allclose(transition["desired_goal"], goal, atol=1e-6)
     env.action_mode = "subgoal"
@@ -331,10 +333,10 @@ def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, de
     arrays, events = demo_run(tmp_path, demo_file, prob)
     first = np.concatenate([[True], arrays["remaining"][:-1] == 0])
     observation, goal = arrays["observation"][first], arrays["desired_goal"][first]
-    starts = panda.normalise(demos.start)
+    starts = PANDA.normalise(demos.start)
     query = np.array([np.abs(starts - row[:7]).max(1).argmin() for row in observation])
     assert np.abs(starts[query] - observation[:, :7]).max() < 1e-3  # all on the demos' queries
-    np.testing.assert_allclose(goal, panda.forward_kinematics(demos.goal)[query], atol=1e-6)
+    np.testing.assert_allclose(goal, PANDA.forward_kinematics(demos.goal)[query], atol=1e-6)
     injected = [
         np.abs(action - demos[q].actions[0]).max() < 1e-6
         for q, action in zip(query, arrays["action"][first], strict=True)

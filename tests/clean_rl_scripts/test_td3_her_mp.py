@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import load, run_script
+from trainers import load, panda_env, run_script
 
 td3 = load("td3_her_mp")
 
@@ -36,7 +36,7 @@ def test_exploration_noise_has_the_given_size(tmp_path):
     flags = ["--updates-per-step", "0", "--exploration-noise", "0.2"]
     run = run_script("td3_her_mp", tmp_path, *flags)
     state = torch.load(run / "checkpoint.pt", weights_only=True)
-    actor = td3.Actor(td3.Args(hidden_size=16, bf16=False), 10).eval()
+    actor = td3.Actor(td3.Args(hidden_size=16, bf16=False), panda_env()).eval()
     actor.load_state_dict(state["actor"])
     # The first 200 steps are random.
     arrays = {name: array[-900:] for name, array in state["buffer"]["arrays"].items()}
@@ -52,7 +52,7 @@ def test_penalty_keeps_the_tanh_from_saturating(tmp_path):
         flags = ["--updates-per-step", "0.5", "--preactivation-penalty", penalty]
         run = run_script("td3_her_mp", tmp_path / penalty, *flags)
         state = torch.load(run / "checkpoint.pt", weights_only=True)
-        actor = td3.Actor(td3.Args(hidden_size=16, bf16=False), 10).eval()
+        actor = td3.Actor(td3.Args(hidden_size=16, bf16=False), panda_env()).eval()
         actor.load_state_dict(state["actor"])
         observation = state["buffer"]["arrays"]["observation"]
         goal = state["buffer"]["arrays"]["desired_goal"]

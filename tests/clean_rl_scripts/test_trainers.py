@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import GPU, PATHS, TRAINERS, command, load, refusal, run_here, run_script
+from trainers import (
+    GPU,
+    PATHS,
+    TRAINERS,
+    command,
+    load,
+    panda_env,
+    refusal,
+    run_here,
+    run_script,
+)
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.demonstrations import demo_path
@@ -112,7 +122,7 @@ def test_running_average_of_the_policy_is_saved(tmp_path, trainer, short_episode
     assert "success_rate" not in json.loads((run / "result.json").read_text())
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     args = module.Args(hidden_size=16, bf16=False, goal_type="ee")
-    actor, average = (module.Actor(args, 10).eval() for _ in range(2))
+    actor, average = (module.Actor(args, panda_env()).eval() for _ in range(2))
     actor.load_state_dict(state["actor"])
     average.load_state_dict(state["actor_average"])
     observation, goal = torch.randn(8, 10), torch.randn(8, 3)

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
-from trainers import load
+from trainers import load, panda_env
 
 sac, td3, bc = load("sac_her_mp"), load("td3_her_mp"), load("bc")
 N = 64
@@ -34,7 +34,7 @@ def batch(seed=0):
 def make(module, kind, **flags):
     torch.manual_seed(1)
     args = module.Args(hidden_size=16, bf16=False, batch_size=N, **flags)
-    return getattr(module, kind)(args, 10, torch.device("cpu"))
+    return getattr(module, kind)(args, panda_env(), torch.device("cpu"))
 
 
 def take_apart(agent, *names):
@@ -241,7 +241,7 @@ def test_agent_learns_the_best_action(module, kind):
 
 def test_update_of_behavioural_cloning():
     torch.manual_seed(1)
-    actor = bc.Actor(bc.Args(goal_type="ee", hidden_size=16, num_modes=1), 10)
+    actor = bc.Actor(bc.Args(goal_type="ee", hidden_size=16, num_modes=1), panda_env())
     optimizer = torch.optim.Adam(actor.parameters(), lr=0.01, fused=True)
     data, old = batch(), copy.deepcopy(actor)
     inputs = data["observation"], data["desired_goal"], data["action"] / 0.03

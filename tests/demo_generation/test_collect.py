@@ -24,10 +24,10 @@ from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.demo_generation.verify import VERDICTS, Verifier, verify
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.journal import VERSION, line_of
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json
 from roboarm_nmp.envs.utils import workers
 
@@ -139,7 +139,7 @@ def test_a_demonstration_depends_on_its_number_alone(whole):
         made = collector(index)
         assert made["index"] == index and made["digest"] == demos[index].digest
         assert made["plan_seed"] == demos.plan_seed[index]
-        np.testing.assert_array_equal(collect._decode(made["plan"]), demos[index].plan)
+        np.testing.assert_array_equal(collect._decode(made["plan"], 7), demos[index].plan)
     assert collect.Collector(options(seed=1))(3)["digest"] != demos[3].digest
     assert len(set(demos.digest.tolist())) == NUM
 
@@ -176,7 +176,7 @@ def test_pretrained_demonstrations_have_the_queries_of_their_seed(task):
     for index in (0, 1, 4_321):
         demo = collector(index)
         assert demo["given_up"] == 0
-        plan = collect._decode(demo["plan"])
+        plan = collect._decode(demo["plan"], 7)
         assert plan[[0, -1]].tobytes() == pretrained[index].plan[[0, -1]].tobytes()
         assert from_array(demo["obstacles"]) == pretrained[index].scene.obstacles
 
@@ -526,7 +526,7 @@ def colliding():
     rng = np.random.default_rng(0)
     with contextlib.closing(envs.make(TASK)) as env:
         while True:
-            configuration = rng.uniform(0.9 * panda.LOWER, 0.9 * panda.UPPER).astype(np.float32)
+            configuration = rng.uniform(0.9 * PANDA.lower, 0.9 * PANDA.upper).astype(np.float32)
             if env.in_collision(configuration):
                 return configuration
 

@@ -14,9 +14,9 @@ import minari  # noqa: E402
 
 from roboarm_nmp import envs  # noqa: E402
 from roboarm_nmp.demo_generation import collect, export_minari  # noqa: E402
-from roboarm_nmp.envs import panda  # noqa: E402
 from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos  # noqa: E402
 from roboarm_nmp.envs.datasets.format import QueryScenes  # noqa: E402
+from roboarm_nmp.envs.robots.panda import PANDA  # noqa: E402
 from roboarm_nmp.envs.scenes.files import save_scene  # noqa: E402
 from roboarm_nmp.envs.scenes.primitives import to_array  # noqa: E402
 
@@ -77,8 +77,8 @@ def test_episodes_are_the_demonstrations_up_to_the_goal(demos, goal_type):
     assert len(dataset) == len(demos) and dataset.total_steps == steps
     for demo, episode in zip(demos, dataset, strict=True):
         states = demo.states.astype(float)
-        positions = panda.forward_kinematics(panda.denormalise(states))
-        goal_state, goal_position = panda.normalise(demo.goal), panda.forward_kinematics(demo.goal)
+        positions = PANDA.forward_kinematics(PANDA.denormalise(states))
+        goal_state, goal_position = PANDA.normalise(demo.goal), PANDA.forward_kinematics(demo.goal)
         ee_distance = np.linalg.norm(positions - goal_position, axis=1)
         config_distance = np.linalg.norm(states - goal_state, axis=1)
         inside = config_distance < 0.05 if goal_type == "config" else ee_distance < 0.02

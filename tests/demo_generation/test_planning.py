@@ -23,9 +23,9 @@ from roboarm_nmp.demo_generation.planning import (
     Planner,
     PlanningError,
 )
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
@@ -48,16 +48,16 @@ def worlds():
 
 def interpolate(path, step):
     """Configurations (rad) along a path, at most `step` apart in the normalised space."""
-    corners = panda.normalise(path.astype(np.float64))
+    corners = PANDA.normalise(path.astype(np.float64))
     points = [corners[0]]
     for here, there in zip(corners[:-1], corners[1:], strict=True):
         pieces = int(np.linalg.norm(there - here) / step) + 1
         points += [here + (there - here) * i / pieces for i in range(1, pieces + 1)]
-    return panda.denormalise(np.array(points))
+    return PANDA.denormalise(np.array(points))
 
 
 def length(path):
-    return np.linalg.norm(np.diff(panda.normalise(path), axis=0), axis=1).sum()
+    return np.linalg.norm(np.diff(PANDA.normalise(path), axis=0), axis=1).sum()
 
 
 def is_path_of(path, start, goal):
@@ -75,7 +75,7 @@ def test_paths_have_the_exact_ends_of_the_query_and_no_collision(worlds):
     for seed, (start, goal, _) in enumerate(queries[:12], 1):
         path = planner.plan(start, goal, seed=seed)
         assert is_path_of(path, start, goal)
-        assert ((path >= panda.LOWER) & (path <= panda.UPPER)).all()
+        assert ((path >= PANDA.lower) & (path <= PANDA.upper)).all()
         assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
         direct = np.stack([start, goal])
         bent += any(env.in_collision(point) for point in interpolate(direct, 0.01))
@@ -84,8 +84,8 @@ def test_paths_have_the_exact_ends_of_the_query_and_no_collision(worlds):
 
 def test_query_at_the_joint_limits_gets_a_path(worlds):
     start, goal = READY.copy(), READY.copy()
-    start[[0, 6]] = panda.UPPER[0], panda.LOWER[6]
-    goal[[0, 3, 6]] = panda.LOWER[0], panda.UPPER[3], panda.UPPER[6]
+    start[[0, 6]] = PANDA.upper[0], PANDA.lower[6]
+    goal[[0, 3, 6]] = PANDA.lower[0], PANDA.upper[3], PANDA.upper[6]
     assert is_path_of(Planner(worlds["no_obstacles"]).plan(start, goal, seed=1), start, goal)
 
 
@@ -203,8 +203,8 @@ def test_own_planner_checks_configurations_and_gives_the_path(worlds, simplify):
     env, asked = worlds["wall"], []
 
     def over_the_top(is_valid, start, goal, rng):
-        top = panda.normalise([0.0, -0.3, 0.0, -0.2, 0.0, 1.5, 0.0])
-        asked.extend([is_valid(top), is_valid(panda.normalise(INTO_THE_WALL)), rng.integers(2**40)])
+        top = PANDA.normalise([0.0, -0.3, 0.0, -0.2, 0.0, 1.5, 0.0])
+        asked.extend([is_valid(top), is_valid(PANDA.normalise(INTO_THE_WALL)), rng.integers(2**40)])
         assert is_valid.checks == 2 and not is_valid.exhausted()
         return [start, top, goal]
 
@@ -352,7 +352,7 @@ def test_other_planner_solves_a_query_that_rrt_connect_alone_does_not(monkeypatc
 def test_path_longer_than_an_episode_is_searched_again():
     env = envs.make("double_walls", horizon=200)
     start, goal, _ = load_queries("double_walls")[0]
-    there = panda.denormalise(np.random.default_rng(0).uniform(-1, 1, (6, 7))).astype(np.float32)
+    there = PANDA.denormalise(np.random.default_rng(0).uniform(-1, 1, (6, 7))).astype(np.float32)
     long, longer = np.stack([start, *there, goal]), np.stack([start, *there, start, goal])
     short = np.stack([start, goal])
     assert length(longer) > length(long) > 200 * 0.03 > length(short)
@@ -362,7 +362,7 @@ def test_path_longer_than_an_episode_is_searched_again():
         left = list(paths)
 
         def search(is_valid, start, goal, rng):
-            return panda.normalise(left.pop(0))
+            return PANDA.normalise(left.pop(0))
 
         return Planner(env, search, simplify=0).plan(start, goal, seed=1), len(left)
 
@@ -439,9 +439,9 @@ def box():
 
 def distance(env, configuration):
     """Of the arm from the box, m, by PyBullet's query for closest points; at most 0.2."""
-    panda.set_configuration(env.client, env.robot, configuration)
-    (body,) = {0, 1} - {env.robot}
-    points = p.getClosestPoints(env.robot, body, 0.2, physicsClientId=env.client)
+    PANDA.set_configuration(env.client, env.body, configuration)
+    (body,) = {0, 1} - {env.body}
+    points = p.getClosestPoints(env.body, body, 0.2, physicsClientId=env.client)
     return min((point[8] for point in points), default=0.2)
 
 
@@ -479,8 +479,8 @@ def test_query_that_nearly_collides_is_planned(worlds):
     checker = CollisionChecker(env.scene)
     planned = 0
     while planned < 3:
-        start = rng.uniform(panda.LOWER, panda.UPPER).astype(np.float32)
-        near = checker.signed_distances(panda.normalise(start)).distance.min()
+        start = rng.uniform(PANDA.lower, PANDA.upper).astype(np.float32)
+        near = checker.signed_distances(PANDA.normalise(start)).distance.min()
         if not env.in_collision(start) and near < 0.001:
             goal = env.sample_feasible(rng)
             path = Planner(env).plan(start, goal, seed=1)

@@ -14,12 +14,12 @@ from paths import ROOT
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.roadmaps import Args, Roadmap, collect
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.datasets.shards import shard_path
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, to_array
 
 SMALL = {"scenes": 5, "paths_per_scene": 6, "num_nodes": 150, "shard_size": 2, "workers": 1}
@@ -119,7 +119,7 @@ def test_queries_that_a_planner_solves_have_paths():
     near, found = [], 0
     for i in range(8):
         start, goal, scene = queries[i]
-        start, goal = panda.normalise(start), panda.normalise(goal)
+        start, goal = PANDA.normalise(start), PANDA.normalise(goal)
         near.append(distances(scene, np.stack([start, goal])).min())
         roadmap = Roadmap(scene, np.random.default_rng(i), num_nodes=600)
         (path,) = roadmap.paths([start], [goal], np.random.default_rng(i))

@@ -8,8 +8,8 @@ from paths import ROOT
 from trainers import PATHS, load
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.scene_embedding_train import collect
 
 
@@ -54,7 +54,7 @@ def test_reward_of_the_page_charges_contacts_in_steps_and_in_batches():
         observation, _ = env.reset_specific(*query)
         ended = False
         while not ended:
-            action = panda.normalise(query.goal) - observation["observation"][:7]
+            action = PANDA.normalise(query.goal) - observation["observation"][:7]
             observation, reward, *ends, info = env.step(action)
             goals = observation["achieved_goal"], observation["desired_goal"]
             transitions.append((*goals, reward, info))

@@ -16,8 +16,9 @@ from gymnasium.utils.env_checker import check_env
 from paths import ROOT
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, from_array, to_array
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
@@ -39,30 +40,30 @@ def env():
 
 def test_normalisation_is_the_papers_formula_both_ways():
     rng = np.random.default_rng(0)
-    c = rng.uniform(panda.LOWER, panda.UPPER, (50, 7))
-    m, M = panda.LOWER, panda.UPPER
-    np.testing.assert_allclose(panda.normalise(c), (2 * c - (M + m)) / (M - m), atol=1e-12)
-    np.testing.assert_allclose(panda.denormalise(panda.normalise(c)), c, atol=1e-12)
-    for one in panda.normalise(c):  # the same to the last bit
-        assert panda.denormalise_one(one.tolist()) == panda.denormalise(one).tolist()
-    np.testing.assert_allclose(panda.normalise(m), -np.ones(7), atol=1e-12)
-    np.testing.assert_allclose(panda.normalise(M), np.ones(7), atol=1e-12)
+    c = rng.uniform(PANDA.lower, PANDA.upper, (50, 7))
+    m, M = PANDA.lower, PANDA.upper
+    np.testing.assert_allclose(PANDA.normalise(c), (2 * c - (M + m)) / (M - m), atol=1e-12)
+    np.testing.assert_allclose(PANDA.denormalise(PANDA.normalise(c)), c, atol=1e-12)
+    for one in PANDA.normalise(c):  # the same to the last bit
+        assert PANDA.denormalise_one(one.tolist()) == PANDA.denormalise(one).tolist()
+    np.testing.assert_allclose(PANDA.normalise(m), -np.ones(7), atol=1e-12)
+    np.testing.assert_allclose(PANDA.normalise(M), np.ones(7), atol=1e-12)
 
 
 def test_limits_are_the_urdfs(env):
-    for joint in panda.ARM_JOINTS:
-        info = p.getJointInfo(env.robot, joint, physicsClientId=env.client)
-        assert info[8:10] == (panda.LOWER[joint], panda.UPPER[joint])
-        assert info[10] == panda.MAX_TORQUE[joint]
+    for joint in PANDA.joint_indices:
+        info = p.getJointInfo(env.body, joint, physicsClientId=env.client)
+        assert info[8:10] == (PANDA.lower[joint], PANDA.upper[joint])
+        assert info[10] == PANDA.effort[joint]
 
 
 def test_forward_kinematics_equals_pybullets(env):
     rng = np.random.default_rng(1)
-    configurations = rng.uniform(panda.LOWER, panda.UPPER, (30, 7))
-    positions = panda.forward_kinematics(configurations)
+    configurations = rng.uniform(PANDA.lower, PANDA.upper, (30, 7))
+    positions = PANDA.forward_kinematics(configurations)
     for c, position in zip(configurations, positions, strict=True):
-        panda.set_configuration(env.client, env.robot, c)
-        link = p.getLinkState(env.robot, 11, computeForwardKinematics=1, physicsClientId=env.client)
+        PANDA.set_configuration(env.client, env.body, c)
+        link = p.getLinkState(env.body, 11, computeForwardKinematics=1, physicsClientId=env.client)
         np.testing.assert_allclose(position, link[4], atol=1e-6)
 
 
@@ -70,11 +71,11 @@ def test_forward_kinematics_equals_pybullets(env):
 def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
     env = envs.make("no_obstacles", action_mode=mode)
     env.reset_specific(HOME, NEAR_HOME)
-    s = 2 * (HOME.astype(float) - panda.LOWER) / (panda.UPPER - panda.LOWER) - 1
+    s = 2 * (HOME.astype(float) - PANDA.lower) / (PANDA.upper - PANDA.lower) - 1
     commanded = []
-    command = panda.command
+    command = PANDA.command
     monkeypatch.setattr(
-        panda, "command", lambda c, r, q, gains: (commanded.append(q), command(c, r, q, gains))
+        Robot, "command", lambda _, c, body, q: (commanded.append(q), command(c, body, q))
     )
     rng = np.random.default_rng(0)
     direction = rng.normal(size=7)
@@ -83,13 +84,13 @@ def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
         env.reset_specific(HOME, NEAR_HOME)
         displacement = direction * length
         env.step((displacement if mode == "relative" else s + displacement).astype(np.float32))
-        target = 2 * (np.array(commanded[-1]) - panda.LOWER) / (panda.UPPER - panda.LOWER) - 1
+        target = 2 * (np.array(commanded[-1]) - PANDA.lower) / (PANDA.upper - PANDA.lower) - 1
         np.testing.assert_allclose(target - s, direction * expected, atol=1e-6)
 
 
 def test_the_arm_follows_commands_and_holds_still(env):
     env.reset_specific(HOME, NEAR_HOME)
-    before = panda.normalise(HOME)
+    before = PANDA.normalise(HOME)
     action = np.zeros(7, np.float32)
     action[0] = 1.0
     observation, *_ = env.step(action)
@@ -109,13 +110,13 @@ def test_contacts_do_not_depend_on_where_the_arm_was_before():
 
     def nearest():
         assert not env.in_collision(goal)
-        contacts = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
+        contacts = p.getContactPoints(bodyA=env.body, physicsClientId=env.client)
         return min(contact[8] for contact in contacts)
 
     alone = nearest()
     for _ in range(6000):
         near = goal + rng.normal(size=7) * [0.3, 0.3, 0.3, 0.3, 0.01, 0.01, 0.01]
-        near = np.clip(near, panda.LOWER, panda.UPPER)
+        near = np.clip(near, PANDA.lower, PANDA.upper)
         if env.in_collision(near):
             for _ in range(2):
                 p.stepSimulation(physicsClientId=env.client)
@@ -128,18 +129,18 @@ def test_goal_types_rewards_and_termination_on_batches(goal_type, size):
     env = envs.make("no_obstacles", goal_type=goal_type)
     observation, info = env.reset_specific(HOME, NEAR_HOME)
     expected = {
-        "ee": panda.forward_kinematics(NEAR_HOME),
-        "config": panda.normalise(NEAR_HOME),
+        "ee": PANDA.forward_kinematics(NEAR_HOME),
+        "config": PANDA.normalise(NEAR_HOME),
         "combined": np.r_[
-            panda.normalise(NEAR_HOME),
-            panda.forward_kinematics(NEAR_HOME),
+            PANDA.normalise(NEAR_HOME),
+            PANDA.forward_kinematics(NEAR_HOME),
         ],
     }[goal_type]
     np.testing.assert_allclose(observation["desired_goal"], expected, atol=1e-6)
     assert observation["achieved_goal"].shape == (size,)
     np.testing.assert_allclose(
         info["ee_distance"],
-        np.linalg.norm(panda.forward_kinematics(HOME) - panda.forward_kinematics(NEAR_HOME)),
+        np.linalg.norm(PANDA.forward_kinematics(HOME) - PANDA.forward_kinematics(NEAR_HOME)),
         atol=1e-6,
     )
 
@@ -160,7 +161,7 @@ def test_goal_types_rewards_and_termination_on_batches(goal_type, size):
 
 def test_step_agrees_with_the_batch_functions_and_stops_at_the_goal(env):
     observation, _ = env.reset_specific(HOME, NEAR_HOME)
-    goal = panda.normalise(NEAR_HOME)
+    goal = PANDA.normalise(NEAR_HOME)
     steps, terminated = 0, False
     while not terminated:
         action = (goal - observation["observation"][:7]).astype(np.float32)
@@ -195,8 +196,8 @@ def test_velocities_in_the_observation():
     action = np.zeros(7, np.float32)
     action[2] = 1.0
     observation, *_ = env.step(action)
-    speeds = [p.getJointState(env.robot, j, physicsClientId=env.client)[1] for j in range(7)]
-    expected = 2 * np.array(speeds) / (panda.UPPER - panda.LOWER)
+    speeds = [p.getJointState(env.body, j, physicsClientId=env.client)[1] for j in range(7)]
+    expected = 2 * np.array(speeds) / (PANDA.upper - PANDA.lower)
     np.testing.assert_allclose(observation["observation"][7:14], expected, rtol=1e-5)
     assert observation["observation"].shape == (17,) and expected[2] > 0
 
@@ -261,7 +262,7 @@ def test_sink_state_absorbs_until_the_horizon(ending):
 def test_feasible_means_free_and_inside_the_limits(env):
     assert env.is_feasible(HOME)
     assert not env.is_feasible(FOLDED)
-    assert not env.is_feasible(panda.UPPER + 0.01)
+    assert not env.is_feasible(PANDA.upper + 0.01)
     through_the_table = np.array([0, 1.8, 0, -0.5, 0, 1.0, 0], dtype=np.float32)
     assert not env.is_feasible(through_the_table)
     assert envs.RoboArmEnv(Scene(table=None, floor=None)).is_feasible(through_the_table)
@@ -275,7 +276,7 @@ def test_sampled_queries_are_feasible_and_not_already_solved():
         start, goal = env.sample_query(rng)
         assert start.dtype == np.float32
         assert env.is_feasible(start, hold_steps=24) and env.is_feasible(goal, hold_steps=24)
-        apart = np.subtract(*panda.forward_kinematics(np.stack([start, goal])))
+        apart = np.subtract(*PANDA.forward_kinematics(np.stack([start, goal])))
         assert np.linalg.norm(apart) > 0.02
 
 
@@ -465,10 +466,10 @@ def test_draw_shows_the_arm_and_the_episode_goes_on():
         one.reset(seed=0)
         for _ in range(10):
             one.step(np.ones(7))
-    hidden = visible_bodies(env) == env.robot
+    hidden = visible_bodies(env) == env.body
     env.world.draw()
-    shown = visible_bodies(env) == env.robot
-    np.testing.assert_array_equal(shown, visible_bodies(drawn) == drawn.robot)
+    shown = visible_bodies(env) == env.body
+    np.testing.assert_array_equal(shown, visible_bodies(drawn) == drawn.body)
     assert shown.any() and not np.array_equal(shown, hidden)  # a part is behind the wall
     for _ in range(20):
         pair = [one.step(np.ones(7))[0]["observation"] for one in (env, drawn)]
@@ -520,7 +521,7 @@ def test_wrong_options_are_rejected_and_the_episode_goes_on(env, options, messag
 def test_gymnasium_make_reaches_reset_specific():
     env = gym.make("RoboArmNMP/Wall-v0")
     observation, _ = env.reset_specific(HOME, NEAR_HOME, SHELF)
-    np.testing.assert_allclose(observation["observation"][:7], panda.normalise(HOME), atol=1e-6)
+    np.testing.assert_allclose(observation["observation"][:7], PANDA.normalise(HOME), atol=1e-6)
     assert env.step(np.zeros(7, np.float32))[4]["elapsed_steps"] == 1 and env.scene == SHELF
     with pytest.raises(RuntimeError, match="no episode: call reset"):
         gym.make("RoboArmNMP/Wall-v0").step(np.zeros(7, np.float32))
@@ -535,7 +536,7 @@ def test_options_pass_through_gymnasiums_wrappers_and_time_limit_counts_from_the
     for _ in range(6):
         env.step(np.zeros(7, np.float32))
     observation, _ = env.reset(options=QUERY | {"scene": SHELF})
-    np.testing.assert_allclose(observation["observation"][:7], panda.normalise(HOME), atol=1e-6)
+    np.testing.assert_allclose(observation["observation"][:7], PANDA.normalise(HOME), atol=1e-6)
     assert env.unwrapped.scene == SHELF
     truncated, steps = False, 0
     while not truncated:
@@ -549,7 +550,7 @@ def test_options_reach_every_env_of_a_vector_env(vector_env):
     vector = vector_env([lambda: gym.make("RoboArmNMP/NoObstacles-v0")] * 2)
     observation, _ = vector.reset(options=QUERY)
     for state in observation["observation"][:, :7]:
-        np.testing.assert_allclose(state, panda.normalise(HOME), atol=1e-6)
+        np.testing.assert_allclose(state, PANDA.normalise(HOME), atol=1e-6)
     with pytest.raises(ValueError, match="unknown options"):
         vector.reset(options={"begin": HOME})
     vector.close(terminate=True) if vector_env is gym.vector.AsyncVectorEnv else vector.close()
@@ -684,7 +685,7 @@ def test_bad_query_is_rejected_and_the_episode_goes_on(env, start, goal, message
         env.reset_specific(start, goal)
     observation, *_, info = env.step(np.zeros(7, np.float32))
     assert info["elapsed_steps"] == 1
-    np.testing.assert_allclose(observation["observation"][:7], panda.normalise(HOME), atol=1e-3)
+    np.testing.assert_allclose(observation["observation"][:7], PANDA.normalise(HOME), atol=1e-3)
 
 
 def test_episode_in_contact_goes_on_bit_for_bit_after_refused_queries():

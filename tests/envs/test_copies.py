@@ -37,7 +37,7 @@ def leaves(value):
 def contacts(env):
     """Links, points, distances and forces of the arm's contacts; not the numbers of the bodies."""
     env = env.unwrapped
-    points = p.getContactPoints(bodyA=env.robot, physicsClientId=env.client)
+    points = p.getContactPoints(bodyA=env.body, physicsClientId=env.client)
     return [point[3:] for point in points]
 
 

@@ -15,13 +15,14 @@ from PIL import Image
 from torch import nn
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda, show
+from roboarm_nmp.envs import show
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, write_queries
 from roboarm_nmp.envs.datasets.trajectories import load_joint_path
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import TASKS, Task
 from roboarm_nmp.envs.utils.bullet import pybullet as p
@@ -84,7 +85,7 @@ def test_environment_without_render_mode_is_drawn_for_images():
 
 
 def test_image_shows_the_goal_as_a_ball_and_a_goal_configuration_as_a_ghost_too(env):
-    ball = panda.forward_kinematics(AT_THE_SIDE).astype(np.float32)
+    ball = PANDA.forward_kinematics(AT_THE_SIDE).astype(np.float32)
     with_ghost = show.render_query(env, Query(BENT, AT_THE_SIDE, Scene()), (160, 120))
     position = env_of("no_obstacles", "ee")
     ball_only = show.render_query(position, Query(BENT, ball, Scene()), (160, 120))
@@ -126,7 +127,7 @@ def test_camera_is_as_near_as_the_whole_scene_allows(env):
             camera.target.tolist(), camera.distance, camera.yaw, camera.pitch, 0, 2
         )
         for configuration in (BENT, AT_THE_SIDE):
-            points.append(panda.forward_kinematics(configuration))
+            points.append(PANDA.forward_kinematics(configuration))
         homogeneous = np.column_stack([points, np.ones(len(points))])
         projected = homogeneous @ np.reshape(view, (4, 4))
         projected = projected[:, :2] / -projected[:, 2:3] / slopes
@@ -139,14 +140,14 @@ def test_camera_is_where_it_is_told_to_be(env):
 
     def ball(camera):
         """Row and column of the goal's ball in an image of 192 x 144 pixels; its pixels."""
-        goal = panda.forward_kinematics(AT_THE_SIDE).astype(np.float32)
+        goal = PANDA.forward_kinematics(AT_THE_SIDE).astype(np.float32)
         image = show.render_query(position, Query(BENT, goal, Scene()), (192, 144), (), camera)
         places = np.argwhere(green(image))
         return places.mean(0), len(places)
 
     position = env_of("no_obstacles", "ee")
     # The goal is to the arm's left (+y), in front of it (+x) only a little.
-    x, y, z = panda.forward_kinematics(AT_THE_SIDE)
+    x, y, z = PANDA.forward_kinematics(AT_THE_SIDE)
     assert y > 0.3 > x > -0.1
     (_, front), _ = ball("front")
     (_, side), _ = ball("side")
@@ -373,7 +374,7 @@ def test_saved_trajectory_plays_as_the_episode(tmp_path, capsys, monkeypatch):
         assert durations == before
         # The same arm; the ghost stands at the end of the file, a little off the goal.
         assert np.mean(np.abs(played.astype(int) - shown.astype(int)).max(-1) > 20) < 0.02
-        times, configurations = load_joint_path(file)
+        times, configurations = load_joint_path(file, PANDA)
         query = load_queries("wall")[2]
         np.testing.assert_allclose(configurations[0], query.start, atol=1e-6)
         np.testing.assert_allclose(times, np.arange(steps + 1) / 30)

@@ -10,11 +10,11 @@ from paths import ROOT
 from stable_baselines3 import SAC, HerReplayBuffer
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.encoders import OracleEncoder
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 from roboarm_nmp.envs.perception.sensors import Camera
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.wrappers import LinkDistancesWrapper, SceneEncodingWrapper, SensorWrapper
 
@@ -33,7 +33,7 @@ def all_wrappers():
 
 
 def test_options_and_reset_specific_pass_through_all_wrappers():
-    expected = CollisionChecker(SHELF).link_distances(panda.normalise(HOME))
+    expected = CollisionChecker(SHELF).link_distances(PANDA.normalise(HOME))
     for begin in (
         lambda env: env.reset(options={"start": HOME, "goal": NEAR_HOME, "scene": SHELF}),
         lambda env: env.reset_specific(HOME, NEAR_HOME, SHELF),
@@ -75,8 +75,8 @@ def test_wrappers_have_the_attributes_of_the_environment_and_no_others():
 
 def test_link_distances_have_a_row_per_link():
     env = envs.make("wall", append_link_distances=True, **DISTANCES)
-    shape = (len(panda.COLLISION_LINKS), 1 + panda.NUM_JOINTS)
-    assert shape == panda.LINK_DISTANCES_SHAPE == (10, 8)
+    shape = (len(PANDA.collision_links), 1 + PANDA.num_joints)
+    assert shape == PANDA.link_distances_shape == (10, 8)
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     assert observation["link_distances"].shape == shape
@@ -84,7 +84,7 @@ def test_link_distances_have_a_row_per_link():
     np.testing.assert_array_equal(
         observation["observation"][10:], observation["link_distances"].ravel()
     )
-    expected = CollisionChecker(env.scene).link_distances(panda.normalise(env.goal_configuration))
+    expected = CollisionChecker(env.scene).link_distances(PANDA.normalise(env.goal_configuration))
     np.testing.assert_allclose(observation["goal_link_distances"], expected, atol=1e-4)
     env.close()
 

@@ -12,6 +12,7 @@ from paths import ROOT
 from roboarm_nmp.envs import show
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.datasets.trajectories import load_joint_path
+from roboarm_nmp.envs.robots.panda import PANDA
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
@@ -42,7 +43,7 @@ def test_planned_path_is_checked_exported_and_can_be_shown(file, tmp_path, capsy
     output = run("plan_check_export.py", tmp_path, "--query", 2, "--output", file)
     free, motions = re.search(r"(\d+) of (\d+) motions are free", output).groups()
     assert free == motions and "goal reached" in output and "collision-free" in output
-    times, configurations = load_joint_path(tmp_path / file)
+    times, configurations = load_joint_path(tmp_path / file, PANDA)
     query = load_queries("double_walls")[2]
     np.testing.assert_allclose(configurations[[0, -1]], [query.start, query.goal], atol=1e-6)
     np.testing.assert_allclose(np.diff(times), 1 / 30)

@@ -1,5 +1,6 @@
 """Trainers as modules and as commands, for the tests."""
 
+import functools
 import importlib.util
 import runpy
 import signal
@@ -9,6 +10,8 @@ from unittest.mock import patch
 import pytest
 import torch
 from paths import ROOT
+
+from roboarm_nmp import envs
 
 PATHS = {
     "sac_her_mp": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
@@ -36,6 +39,12 @@ def load(trainer):
     sys.modules[trainer] = module
     spec.loader.exec_module(module)
     return module
+
+
+@functools.cache
+def panda_env(goal_type="ee"):
+    """An environment that gives networks their sizes."""
+    return envs.make("no_obstacles", goal_type=goal_type)
 
 
 def command(trainer, folder, *flags):

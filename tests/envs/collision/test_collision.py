@@ -15,7 +15,6 @@ from paths import ROOT
 
 import roboarm_nmp
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision import checker as collision
 from roboarm_nmp.envs.collision.checker import (
     ARM,
@@ -26,12 +25,13 @@ from roboarm_nmp.envs.collision.checker import (
 )
 from roboarm_nmp.envs.collision.kernels import BULLET_MARGIN
 from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.panda import COLLISION_LINKS
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 # Stretched out, upwards and to the front, and far from itself.
-STATE = panda.normalise([0.3, 0.4, 0.2, -0.9, 0.3, 1.2, 0.4])
+LINKS = PANDA.collision_links
+STATE = PANDA.normalise([0.3, 0.4, 0.2, -0.9, 0.3, 1.2, 0.4])
 EMPTY = Scene(table=None, floor=None)
 
 
@@ -44,14 +44,14 @@ def env():
 
 @pytest.fixture(scope="module")
 def hulls(env):
-    """Vertices (n, 3) of each of `COLLISION_LINKS` at `STATE`, in the base's frame, by PyBullet."""
-    panda.set_configuration(env.client, env.robot, panda.denormalise(STATE))
+    """Vertices (n, 3) of each of `LINKS` at `STATE`, in the base's frame, by PyBullet."""
+    PANDA.set_configuration(env.client, env.body, PANDA.denormalise(STATE))
     hulls = []
-    for link in COLLISION_LINKS:
+    for link in LINKS:
         flags = p.MESH_DATA_SIMULATION_MESH
-        mesh = p.getMeshData(env.robot, link, flags=flags, physicsClientId=env.client)[1]
+        mesh = p.getMeshData(env.body, link, flags=flags, physicsClientId=env.client)[1]
         state = p.getLinkState(
-            env.robot, link, computeForwardKinematics=1, physicsClientId=env.client
+            env.body, link, computeForwardKinematics=1, physicsClientId=env.client
         )
         rotation = np.array(p.getMatrixFromQuaternion(state[1])).reshape(3, 3)
         hulls.append(np.array(mesh) @ rotation.T + state[0])  # meshes are about the mass centre
@@ -116,7 +116,7 @@ def test_random_scenes_agree_with_pybullet(env, seed):
     env.set_scene(scene)
     checker = CollisionChecker(scene)
     for states in (rng.uniform(-1, 1, (300, 7)), near_contact(checker, rng, 300)):
-        theirs = [not env.in_collision(c) for c in panda.denormalise(states)]
+        theirs = [not env.in_collision(c) for c in PANDA.denormalise(states)]
         np.testing.assert_array_equal(checker.is_free(states), theirs)
         assert 0.05 < np.mean(theirs) < 0.95
     # The states near contact distinguish a millimetre.
@@ -137,7 +137,7 @@ def test_tasks_agree_with_pybullet(task):
         env.set_scene(scene)
         checker = CollisionChecker(scene)
         states = np.concatenate([rng.uniform(-1, 1, (150, 7)), near_contact(checker, rng, 150)])
-        theirs = [not env.in_collision(c) for c in panda.denormalise(states)]
+        theirs = [not env.in_collision(c) for c in PANDA.denormalise(states)]
         np.testing.assert_array_equal(checker.is_free(states), theirs)
     env.close()
 
@@ -147,7 +147,7 @@ def test_starts_and_goals_of_queries_are_free():
         queries = load_queries(task, "validation")
         for i in range(0, 40, 4):
             checker = CollisionChecker(queries[i].scene)
-            ends = np.clip(panda.normalise([queries[i].start, queries[i].goal]), -1, 1)
+            ends = np.clip(PANDA.normalise([queries[i].start, queries[i].goal]), -1, 1)
             assert checker.is_free(ends).all(), (task, i)
 
 
@@ -162,10 +162,10 @@ def test_distances_agree_with_pybullet(env):
         near = CollisionChecker(scene).signed_distances(states, self_collisions=False)
         assert (near.geometry == 0).all()
         for state, distances in zip(states, near.distance, strict=True):
-            panda.set_configuration(env.client, env.robot, panda.denormalise(state))
-            for link, distance in zip(COLLISION_LINKS, distances, strict=True):
+            PANDA.set_configuration(env.client, env.body, PANDA.denormalise(state))
+            for link, distance in zip(LINKS, distances, strict=True):
                 points = p.getClosestPoints(
-                    env.robot, body, 2.0, linkIndexA=link, physicsClientId=env.client
+                    env.body, body, 2.0, linkIndexA=link, physicsClientId=env.client
                 )
                 if distance > 1e-4:  # where shapes overlap, Bullet's depth is rougher
                     further.append(points[0][8] - distance)
@@ -181,7 +181,7 @@ def test_distances_agree_with_pybullet(env):
 
 
 def outermost(hulls):
-    """The vertex that is farthest to the front, and its link's index in `COLLISION_LINKS`."""
+    """The vertex that is farthest to the front, and its link's index in `LINKS`."""
     link = int(np.argmax([hull[:, 0].max() for hull in hulls]))
     return link, hulls[link][hulls[link][:, 0].argmax()]
 
@@ -264,7 +264,7 @@ def test_nearest_or_deepest_of_several_obstacles_counts():
 
 def test_coinciding_centres_have_a_depth(hulls):
     """GJK has no initial direction there."""
-    for link in range(len(COLLISION_LINKS)):
+    for link in range(len(LINKS)):
         centre = (hulls[link].min(0) + hulls[link].max(0)) / 2
         scene = Scene((Sphere(tuple(centre), 0.001),), table=None, floor=None)
         near = CollisionChecker(scene).signed_distances(STATE, self_collisions=False)
@@ -294,9 +294,9 @@ def test_distance_grows_along_the_normal(env):
 def test_geometry_is_the_nearest_obstacle_table_floor_or_arm():
     scene = Scene((Sphere((5.0, 0, 0), 0.1), Sphere((0.9, 0, 0.5), 0.1)))
     states = np.zeros((3, 7))
-    states[0] = panda.normalise([1.0, 1.1, 0.0, -1.6, 0.0, 2.0, 0.0])  # low over the table
-    states[1] = panda.normalise([0.0, 0.5, 0.0, -1.2, 0.0, 1.5, 0.0])  # to the sphere
-    states[2] = panda.normalise([1.0, -0.5, 0.0, -2.6, 0.0, 0.3, 0.0])  # folded together
+    states[0] = PANDA.normalise([1.0, 1.1, 0.0, -1.6, 0.0, 2.0, 0.0])  # low over the table
+    states[1] = PANDA.normalise([0.0, 0.5, 0.0, -1.2, 0.0, 1.5, 0.0])  # to the sphere
+    states[2] = PANDA.normalise([1.0, -0.5, 0.0, -2.6, 0.0, 0.3, 0.0])  # folded together
     geometry = CollisionChecker(scene).signed_distances(states).geometry
     assert (geometry[0] == TABLE).any() and (geometry[1] == 1).any()
     assert (geometry[2] == ARM).any() and not (geometry == 0).any()
@@ -314,14 +314,14 @@ def test_self_distances_agree_with_pybullet(env):
     checker = CollisionChecker(EMPTY)
     for state in rng.uniform(-1, 1, (60, 7)):
         near = checker.signed_distances(state)
-        panda.set_configuration(env.client, env.robot, panda.denormalise(state))
-        expected = dict.fromkeys(COLLISION_LINKS, 10.0)
-        for a, b in panda.SELF_COLLISION_PAIRS:
-            points = p.getClosestPoints(env.robot, env.robot, 3.0, a, b, physicsClientId=env.client)
+        PANDA.set_configuration(env.client, env.body, PANDA.denormalise(state))
+        expected = dict.fromkeys(LINKS, 10.0)
+        for a, b in PANDA.self_collision_pairs:
+            points = p.getClosestPoints(env.body, env.body, 3.0, a, b, physicsClientId=env.client)
             for link in (a, b):
                 if link in expected:
                     expected[link] = min(expected[link], points[0][8])
-        for link, distance in zip(COLLISION_LINKS, near.distance, strict=True):
+        for link, distance in zip(LINKS, near.distance, strict=True):
             if expected[link] > 1e-4 and expected[link] < 10:
                 assert distance == pytest.approx(expected[link], abs=1e-5)
                 seen += 1
@@ -390,7 +390,7 @@ def test_each_motion_may_have_its_own_endpoint_margins():
 
 # The first joint turns from one side of a thin board, which stands upright, to the other.
 BOARD = Scene((Box((0.6, 0.0, 0.5), (0.4, 0.004, 0.9)),))
-LEFT, RIGHT = (panda.normalise([s * 0.7, 0.4, 0, -1.6, 0, 2.0, 0]) for s in (1, -1))
+LEFT, RIGHT = (PANDA.normalise([s * 0.7, 0.4, 0, -1.6, 0, 2.0, 0]) for s in (1, -1))
 
 
 def test_motion_through_a_thin_board_is_not_free():
@@ -474,7 +474,7 @@ def test_batches_of_one_and_of_ten_thousand_agree():
         assert checker.is_free(states[i]) == free[i]
         assert checker.is_free(states[i : i + 1]).shape == (1,)
     shaped = checker.signed_distances(states.reshape(10, 1000, 7))
-    np.testing.assert_array_equal(shaped.distance.reshape(-1, len(COLLISION_LINKS)), near.distance)
+    np.testing.assert_array_equal(shaped.distance.reshape(-1, len(LINKS)), near.distance)
 
 
 ELSEWHERE = """
@@ -629,7 +629,7 @@ def test_empty_scene_has_only_the_arm():
     assert not near.normal.any() and not near.witness.any()
     # Clearance counts from obstacles only, a margin from the other links, too.
     assert checker.is_free(STATE, clearance=0.4) and not checker.is_free(STATE, margin=0.4)
-    folded = panda.normalise([1.0, -0.5, 0.0, -1.8, 0.0, -0.08, 0.0])
+    folded = PANDA.normalise([1.0, -0.5, 0.0, -1.8, 0.0, -0.08, 0.0])
     assert checker.is_free([STATE, folded]).tolist() == [True, False]  # the arm itself
 
 
@@ -637,8 +637,8 @@ def test_empty_batches_have_empty_answers(wall):
     assert wall.is_free(np.empty((0, 7))).shape == (0,)
     assert wall.is_free(np.empty((2, 0, 7))).shape == (2, 0)
     assert wall.is_motion_free(np.empty((0, 7)), np.empty((0, 7))).shape == (0,)
-    assert wall.signed_distances(np.empty((0, 7))).normal.shape == (0, len(COLLISION_LINKS), 3)
-    assert wall.link_distances(np.empty((2, 0, 7))).shape == (2, 0, len(COLLISION_LINKS), 8)
+    assert wall.signed_distances(np.empty((0, 7))).normal.shape == (0, len(LINKS), 3)
+    assert wall.link_distances(np.empty((2, 0, 7))).shape == (2, 0, len(LINKS), 8)
 
 
 @pytest.mark.parametrize("self_collisions", [False, True])
@@ -658,7 +658,7 @@ def test_link_distances_are_clipped_signed_distances(wall, self_collisions):
 
 
 def test_limits_rounded_to_float32_are_accepted(wall):
-    states = np.float32(panda.normalise(np.float32([panda.LOWER, panda.UPPER])))
+    states = np.float32(PANDA.normalise(np.float32([PANDA.lower, PANDA.upper])))
     assert wall.is_free(states).shape == (2,)
 
 

@@ -17,7 +17,6 @@ from paths import ROOT
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import make_queries
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets import format as dataset_format
 from roboarm_nmp.envs.datasets.format import SPLITS, DatasetError
 from roboarm_nmp.envs.datasets.queries import (
@@ -27,6 +26,7 @@ from roboarm_nmp.envs.datasets.queries import (
     validate,
     write_queries,
 )
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
@@ -36,7 +36,7 @@ def random_splits(seed=0, test=30, validation=10):
     rng = np.random.default_rng(seed)
     return {
         split: tuple(
-            (panda.LOWER + (panda.UPPER - panda.LOWER) * rng.uniform(0.01, 0.99, (n, 7))).astype(
+            (PANDA.lower + (PANDA.upper - PANDA.lower) * rng.uniform(0.01, 0.99, (n, 7))).astype(
                 np.float32
             )
             for _ in range(2)
@@ -76,7 +76,7 @@ def test_round_trip_is_exact(tmp_path):
         for array, expected in (
             (queries.start, start),
             (queries.goal, goal),
-            (queries.goal_position, panda.forward_kinematics(goal).astype(np.float32)),
+            (queries.goal_position, PANDA.forward_kinematics(goal).astype(np.float32)),
         ):
             assert array.dtype == np.float32
             np.testing.assert_array_equal(array, expected)
@@ -425,12 +425,12 @@ KILLED_IN_THE_MIDDLE = """
 WRITES_AGAIN_AND_AGAIN = """
     import sys
     import numpy as np
-    from roboarm_nmp.envs import panda
+    from roboarm_nmp.envs.robots.panda import PANDA
     from roboarm_nmp.envs.datasets.queries import write_queries
 
     rng = np.random.default_rng(1)
     test, validation = (
-        [rng.uniform(0.9 * panda.LOWER, 0.9 * panda.UPPER, (n, 7)).astype(np.float32)] * 2
+        [rng.uniform(0.9 * PANDA.lower, 0.9 * PANDA.upper, (n, 7)).astype(np.float32)] * 2
         for n in (3000, 10)
     )
     for seed in range(10, 10_000):
@@ -537,9 +537,9 @@ def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path):
     splits = validate(path, "three_shelves", simulate=True)
     low, high = np.array(region[::2]), np.array(region[1::2])
     for queries in splits.values():
-        goals = panda.forward_kinematics(queries.goal)
+        goals = PANDA.forward_kinematics(queries.goal)
         assert (low <= goals).all() and (goals <= high).all()
-        starts = panda.forward_kinematics(queries.start)
+        starts = PANDA.forward_kinematics(queries.start)
         assert not ((low <= starts) & (starts <= high)).all()  # only goals are restricted
     with h5py.File(path) as file:
         assert json.loads(file.attrs["parameters"])["goal_region"] == list(region)
@@ -553,8 +553,8 @@ def test_goal_region_without_room_is_an_error_that_counts(tmp_path, monkeypatch)
         ("wall",), goal_region=inside_a_wall, output=tmp_path / "no.h5", workers=1
     )
     sampler = make_queries.Sampler("wall", False, goal_region=inside_a_wall)
-    goals = np.random.default_rng(1).uniform(panda.LOWER, panda.UPPER, (20_000, 7))
-    positions = panda.forward_kinematics(goals)
+    goals = np.random.default_rng(1).uniform(PANDA.lower, PANDA.upper, (20_000, 7))
+    positions = PANDA.forward_kinematics(goals)
     inside = (np.abs(positions - (0.6, 0, 0.4)) <= (0.3, 0.015, 0.3)).all(axis=1).sum()
     with pytest.raises(RuntimeError) as error:
         sampler((0, "test", 0))

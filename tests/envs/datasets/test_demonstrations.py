@@ -11,7 +11,6 @@ import pytest
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets import demonstrations
 from roboarm_nmp.envs.datasets import format as dataset_format
 from roboarm_nmp.envs.datasets.demonstrations import (
@@ -23,6 +22,7 @@ from roboarm_nmp.envs.datasets.demonstrations import (
 )
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.subgoals import MAX_STEP, SUBGOAL_SPACING, subgoals
 
@@ -78,7 +78,7 @@ def hand_made():
     return {
         "task": "no_obstacles",
         "seed": 0,
-        "plans": [panda.denormalise(configurations(n)).astype(np.float32) for n in (2, 3, 4)],
+        "plans": [PANDA.denormalise(configurations(n)).astype(np.float32) for n in (2, 3, 4)],
         "executions": [configurations(rows).astype(np.float32) for rows in (3, 2, 4)],
         "columns": {"plan_seed": [1, 2, 3], "digest": [4, 5, 6], "collided": [0, 1, 0]},
         "made_by": "made by a test",
@@ -149,7 +149,7 @@ def test_demonstrations_are_indexed_like_queries(path):
 
 def test_configurations_of_a_demonstration_are_radians_like_those_of_queries(path):
     demo = load_demos(path)[0]
-    middle, half = (panda.UPPER + panda.LOWER) / 2, (panda.UPPER - panda.LOWER) / 2
+    middle, half = (PANDA.upper + PANDA.lower) / 2, (PANDA.upper - PANDA.lower) / 2
     np.testing.assert_allclose(demo.configurations, middle + half * demo.states, atol=1e-6)
     # As start and goal, up to the resolution of the stored states and the arrival's tolerance.
     np.testing.assert_allclose(demo.configurations[0], demo.start, atol=1e-3)
@@ -158,8 +158,8 @@ def test_configurations_of_a_demonstration_are_radians_like_those_of_queries(pat
 
 def naive_subgoals(plan):
     """Sub-goals (normalised) by the book: each straight piece in the fewest equal steps."""
-    corners = (2 * plan.astype(np.float64) - panda.UPPER - panda.LOWER) / (
-        panda.UPPER - panda.LOWER
+    corners = (2 * plan.astype(np.float64) - PANDA.upper - PANDA.lower) / (
+        PANDA.upper - PANDA.lower
     )
     points = [corners[0]]
     for here, there in zip(corners[:-1], corners[1:], strict=True):
@@ -190,16 +190,16 @@ def test_actions_lead_to_the_next_subgoal_and_are_clipped(path):
 def test_subgoals_are_close_and_contain_the_waypoints(made):
     plans, executions, _ = made
     for plan in plans:
-        points = subgoals(plan)
+        points = subgoals(plan, PANDA)
         assert points.dtype == np.float64
         np.testing.assert_allclose(points, naive_subgoals(plan), rtol=0, atol=1e-12)
         assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() <= SUBGOAL_SPACING + 1e-12
-        waypoints = panda.normalise(plan.astype(np.float64))
+        waypoints = PANDA.normalise(plan.astype(np.float64))
         for waypoint in waypoints:
             assert np.abs(points - waypoint).max(1).min() < 1e-12
         np.testing.assert_allclose(points[[0, -1]], waypoints[[0, -1]], rtol=0, atol=1e-12)
     assert SUBGOAL_SPACING < MAX_STEP == 0.03
-    assert subgoals(plans[0][[0, 0]]).shape == (2, 7)  # standing still
+    assert subgoals(plans[0][[0, 0]], PANDA).shape == (2, 7)  # standing still
 
 
 def test_same_contents_same_bytes(path, made, tmp_path):
@@ -212,7 +212,7 @@ def test_statistics_equal_those_by_hand(tmp_path):
     arguments["parameters"] = {"counts": {"queries_given_up": 1, "attempts": 5, "collided": 2}}
     write_demos(tmp_path / "demos.h5", **arguments)
     numbers = describe(load_demos(tmp_path / "demos.h5"))
-    half = (panda.UPPER - panda.LOWER) / 2
+    half = (PANDA.upper - PANDA.lower) / 2
     lengths, detours = [], []
     for states, plan in zip(arguments["executions"], arguments["plans"], strict=True):
         moves = np.diff(states.astype(np.float64), axis=0)
@@ -264,7 +264,7 @@ def test_following_the_plan_gives_the_digest(path):
         execution = follow(env, demo.plan)
         assert execution.reached and not execution.collided
         assert execution.digest == demo.digest
-        ends = panda.normalise(np.stack([demo.start, demo.goal]))
+        ends = PANDA.normalise(np.stack([demo.start, demo.goal]))
         assert np.linalg.norm(demo.states[0] - ends[0]) <= QUANTUM * np.sqrt(7)
         assert np.linalg.norm(demo.states[-1] - ends[1]) <= 0.05
     env.close()

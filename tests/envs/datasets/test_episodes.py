@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.episodes import DemoQueriesWrapper, demo_episode, load_demos_for
 from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.robots.panda import PANDA
 
 
 def test_resets_draw_queries_of_demonstrations_and_a_seed_repeats_them():
@@ -34,7 +34,7 @@ def test_episode_has_the_observations_of_the_environment():
     episode = demo_episode(demo, env)
     assert len(episode.observation) == len(episode.action) + 1
     for t in [*range(0, len(episode.action), 10), len(episode.action)]:
-        there = panda.denormalise(demo.states[t]).astype(np.float32)
+        there = PANDA.denormalise(demo.states[t]).astype(np.float32)
         observation, info = env.reset_specific(there, demo.goal)
         for name, value in observation.items():
             found = getattr(episode, name) if name == "desired_goal" else getattr(episode, name)[t]

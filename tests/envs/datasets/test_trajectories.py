@@ -5,7 +5,6 @@ import csv
 import numpy as np
 import pytest
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.trajectories import (
     STEP_SECONDS,
@@ -15,6 +14,7 @@ from roboarm_nmp.envs.datasets.trajectories import (
     timed,
 )
 from roboarm_nmp.envs.policies.rollout import Trajectory
+from roboarm_nmp.envs.robots.panda import PANDA
 
 PATH = np.array([[0, -0.3, 0, -1.8, 0, 1.6, 0], [0.5, -0.3, 0, -1.8, 0, 1.6, 0.1]])
 Q = ",".join(f"q{i}" for i in range(1, 8))
@@ -23,18 +23,18 @@ Q = ",".join(f"q{i}" for i in range(1, 8))
 @pytest.mark.parametrize("name", ["a.csv", "a.npz", "a.CSV"])
 def test_joint_path_is_read_as_it_was_written(name, tmp_path):
     save_joint_path(tmp_path / name, PATH, [0.5, 2.0])
-    times, configurations = load_joint_path(tmp_path / name)
+    times, configurations = load_joint_path(tmp_path / name, PANDA)
     assert times.tolist() == [0.5, 2.0]
     np.testing.assert_array_equal(configurations, PATH)
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.npz"])
 def test_file_of_an_episode_has_its_states_actions_contacts_and_times(name, tmp_path):
-    states = panda.normalise(PATH).astype(np.float32)
+    states = PANDA.normalise(PATH).astype(np.float32)
     action = np.linspace(-0.01, 0.02, 7)[None]
     episode = Trajectory(states, action, np.array([True]), np.array([0.25]), success=False)
     save_trajectory(tmp_path / name, episode)
-    times, configurations = load_joint_path(tmp_path / name)
+    times, configurations = load_joint_path(tmp_path / name, PANDA)
     np.testing.assert_allclose(times, [0, 1 / 30])
     np.testing.assert_allclose(configurations, PATH, atol=1e-6)
     if name == "a.npz":
@@ -58,12 +58,12 @@ def test_file_of_an_episode_has_its_states_actions_contacts_and_times(name, tmp_
 
 def test_waypoints_without_times_are_passed_at_the_speed_of_the_environment(tmp_path):
     np.savez(tmp_path / "a.npz", configurations=PATH.astype(np.float32))
-    times, configurations = load_joint_path(tmp_path / "a.npz")
-    steps = np.linalg.norm(np.diff(panda.normalise(configurations), axis=0), axis=1)
+    times, configurations = load_joint_path(tmp_path / "a.npz", PANDA)
+    steps = np.linalg.norm(np.diff(PANDA.normalise(configurations), axis=0), axis=1)
     assert steps.max() <= 0.03 < 2 * steps.min()
     np.testing.assert_allclose(times, np.arange(len(steps) + 1) * STEP_SECONDS)
     np.testing.assert_allclose(configurations[[0, -1]], PATH, atol=1e-6)
-    for one, other in zip(timed(PATH), (times, configurations), strict=True):
+    for one, other in zip(timed(PATH, PANDA), (times, configurations), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
 
 
@@ -84,7 +84,7 @@ def test_waypoints_without_times_are_passed_at_the_speed_of_the_environment(tmp_
 def test_bad_csv_file_is_named_with_the_reason(text, message, tmp_path):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(DatasetError, match=f"a.csv: .*{message}"):
-        load_joint_path(tmp_path / "a.csv")
+        load_joint_path(tmp_path / "a.csv", PANDA)
 
 
 def test_bad_npz_file_is_named_with_the_reason(tmp_path):
@@ -98,12 +98,12 @@ def test_bad_npz_file_is_named_with_the_reason(tmp_path):
     ):
         np.savez(path, **arrays)
         with pytest.raises(DatasetError, match=f"a.npz: .*{message}"):
-            load_joint_path(path)
+            load_joint_path(path, PANDA)
     whole = path.read_bytes()
     for contents in (b"", b"PK", whole[: len(whole) // 2]):
         path.write_bytes(contents)
         with pytest.raises(DatasetError, match="a.npz: not a joint path"):
-            load_joint_path(path)
+            load_joint_path(path, PANDA)
 
 
 def test_shapes_and_endings_are_checked_before_writing(tmp_path):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.policies.registry import make_policy
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip, rollout
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
 
 BENT = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
@@ -22,7 +22,7 @@ def env():
 
 
 def straight(query):
-    goal = panda.normalise(query.goal)
+    goal = PANDA.normalise(query.goal)
     return lambda observation: goal - observation["observation"][:7]
 
 
@@ -56,8 +56,8 @@ def test_episode_ends_as_soon_as_the_goal_is_reached(env):
     query = Query(BENT, AT_THE_SIDE, Scene())
     trajectory = rollout(env, query, straight(query))
     assert trajectory.success and not trajectory.collides and len(trajectory) > 10
-    positions = panda.forward_kinematics(trajectory.configurations)
-    to_goal = np.linalg.norm(positions - panda.forward_kinematics(AT_THE_SIDE), axis=1)
+    positions = PANDA.forward_kinematics(trajectory.configurations)
+    to_goal = np.linalg.norm(positions - PANDA.forward_kinematics(AT_THE_SIDE), axis=1)
     assert to_goal[-1] <= env.ee_tolerance + 1e-6 and (to_goal[:-1] > env.ee_tolerance).all()
 
 

@@ -7,7 +7,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE, CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception.geometry_source import observed_checker
@@ -26,6 +25,7 @@ from roboarm_nmp.envs.policies.safety_filter import (
     VIRTUAL_RADIUS_SHARE,
     SafetyFilter,
 )
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
 
 GROUND_TRUTH = {"link_distances": True, "geometry_source": "ground_truth"}
@@ -87,7 +87,7 @@ def test_observed_link_distances_are_those_of_the_geometry_source(geometry_sourc
     query = load_queries("random_boxes_hard")[0]
     observation, _ = env.reset_specific(*query)
     checker = find(query.scene)
-    least = checker.signed_distances(panda.normalise(query.start), False).distance.min()
+    least = checker.signed_distances(PANDA.normalise(query.start), False).distance.min()
     assert observation["link_distances"][:, 0].min() == pytest.approx(least, abs=1e-6)
     env.close()
 
@@ -262,7 +262,7 @@ def test_options_come_from_a_policys_metadata():
 
 def run(env, query, safety_filter, seed=0):
     """Straight to the goal, with a safety filter or without: states, and the last info."""
-    target = panda.normalise(query.goal)
+    target = PANDA.normalise(query.goal)
 
     def act(observation):
         return target - observation["observation"][:7]
@@ -297,12 +297,12 @@ def test_filter_keeps_the_margin_between_links():
     env = envs.make("no_obstacles", goal_type="config", **GROUND_TRUTH)
     start, goal = np.zeros(7), np.zeros(7)
     start[[1, 3, 5]], goal[[1, 3, 5]] = (-0.8, -0.5, -0.5), (-0.8, -0.95, -0.95)
-    assert not env.in_collision(panda.denormalise(start))
-    assert env.in_collision(panda.denormalise(goal))
+    assert not env.in_collision(PANDA.denormalise(start))
+    assert env.in_collision(PANDA.denormalise(goal))
     alone = CollisionChecker(Scene(table=None, floor=None))
     least = {}
     for safety_filter in (None, SafetyFilter(escape=False)):
-        observation, _ = env.reset_specific(panda.denormalise(start), panda.denormalise(start))
+        observation, _ = env.reset_specific(PANDA.denormalise(start), PANDA.denormalise(start))
         act = lambda observation: goal - observation["observation"][:7]  # noqa: E731
         if safety_filter is not None:
             act = safety_filter.filter_policy(act, env, np.random.default_rng(0))

@@ -9,13 +9,13 @@ import pytest
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import collect, make_queries, verify
 from roboarm_nmp.demo_generation.planning import Planner, PlanningError
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.datasets import format as dataset_format
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import (
     Box,
     Cylinder,
@@ -292,7 +292,7 @@ def test_changing_the_scene_changes_its_obstacles():
 def test_spheres_collide():
     # The fingers point down: around their tips, and below them by more than the radius.
     reaching = np.array([0.0, 0.6, 0.0, -1.6, 0.0, 2.2, 0.785])
-    hand = panda.forward_kinematics(reaching)
+    hand = PANDA.forward_kinematics(reaching)
     env = RoboArmEnv()
     for offset, hit in [((0.0, 0.0, 0.0), True), ((0.0, 0.0, -0.13), False)]:
         env.set_scene(Scene((Sphere(tuple(hand + offset), 0.1),)))
@@ -364,7 +364,7 @@ def test_missing_split_is_reported(tmp_path, scenes):
 def test_damaged_scenes_are_rejected(tmp_path, scenes):
     write(tmp_path / "queries.h5", scenes)
     path = tmp_path / "queries.h5"
-    attributes, arrays = dataset_format.read_file(path, dataset_format.QUERY_SCHEMA, HARD)
+    _, arrays, base = dataset_format.read_file(path, dataset_format.QUERY_SCHEMA, HARD)
     for name, change, complaint in [
         ("test/scene", lambda a: a + 1, "does not fit"),
         ("test/obstacle_count", lambda a: a + 1, "does not fit"),
@@ -373,7 +373,7 @@ def test_damaged_scenes_are_rejected(tmp_path, scenes):
     ]:
         damaged = arrays | {name: change(arrays[name]).astype(arrays[name].dtype)}
         with pytest.raises(DatasetError, match=complaint):
-            dataset_format.read_scenes(path, attributes, damaged, "test/")
+            dataset_format.read_scenes(path, base, damaged, "test/")
 
 
 def test_obstacle_arrays_round_trip():

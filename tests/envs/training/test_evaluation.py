@@ -20,11 +20,11 @@ from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import evaluate as command
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.policies.registry import make_policy
 from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.tasks import Task
@@ -122,9 +122,9 @@ def test_metrics_of_an_evaluation_equal_those_of_its_episodes(queries):
         observation, info = env.reset_specific(start, goal)
         path, ended = [start.astype(float)], False
         while not ended:
-            action = panda.normalise(goal) - observation["observation"][:7]
+            action = PANDA.normalise(goal) - observation["observation"][:7]
             observation, _, terminated, truncated, info = env.step(action)
-            path.append(panda.denormalise(observation["observation"][:7]))
+            path.append(PANDA.denormalise(observation["observation"][:7]))
             ended = terminated or truncated
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
         rows.append((info["is_success"], info["collision_so_far"], len(path) - 1, length))
@@ -234,7 +234,7 @@ def _queries(*pairs, **more):
 
 
 def test_via_points_go_around_the_wall():
-    x, y, z = panda.forward_kinematics((LEFT + RIGHT) / 2)
+    x, y, z = PANDA.forward_kinematics((LEFT + RIGHT) / 2)
     assert 0.25 < x < 0.95 and abs(y) < 0.02 and 0 < z < 0.775
     behind = _queries((LEFT, RIGHT))
     straight = evaluate("go-to-goal", "wall", queries=behind)
@@ -272,8 +272,8 @@ def test_planner_solves_double_walls_and_follows_its_plan():
     planner = Planner(env)
     for index, query in enumerate(queries):
         path = planner.plan(*query, seed=[2, index], time_limit=60.0)
-        states = panda.denormalise(follow(env, path).states)
-        to_goal = panda.forward_kinematics(states) - panda.forward_kinematics(query.goal)
+        states = PANDA.denormalise(follow(env, path).states)
+        to_goal = PANDA.forward_kinematics(states) - PANDA.forward_kinematics(query.goal)
         steps = int(np.argmax(np.linalg.norm(to_goal, axis=1) <= env.ee_tolerance))
         rows.append((steps, evaluation.path_length(states[: steps + 1])))
     env.close()

@@ -203,6 +203,18 @@ def test_files_are_found_from_another_working_directory(parse, tmp_path, monkeyp
     assert args.files == (Path("missing.h5"),)  # its reader reports it
 
 
+def test_robot_of_a_task_is_found_from_another_working_directory(parse, tmp_path, monkeypatch):
+    for folder in ("here", "there"):
+        (tmp_path / folder).mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    Path("boxes").mkdir()  # no file of the task of this name
+    Path("ur5.urdf").touch()
+    run = runs.run_folder(parse("--name", "boxes@ur5.urdf", "--runs-dir", "runs"), "a").absolute()
+    assert parse("--resume", run).name == "boxes@ur5.urdf"
+    monkeypatch.chdir(tmp_path / "there")
+    assert parse("--resume", run).name == f"boxes@{tmp_path}/here/ur5.urdf"
+
+
 def test_leftovers_of_a_kill_are_removed(parse, tmp_path):
     run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
     left = run / ".checkpoint.pt.0123abcd.tmp"

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.viewer.app import camera
 
@@ -140,7 +140,7 @@ def test_arm_moves_and_the_goal_can_be_dragged_with_the_mouse(browser, tmp_path)
         page.get_by_role("button", name="Pause").click()
 
         # Drag the vertical arrow at the goal upwards.
-        goal = panda.forward_kinematics(load_queries("no_obstacles")[0].goal)
+        goal = PANDA.forward_kinematics(load_queries("no_obstacles")[0].goal)
         assert np.abs(goal_of(page) - goal).max() < 1e-3
         view = canvas, *camera(1)
         start = pixel(goal + [0, 0, 0.14], *view)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import roboarm_nmp
-from roboarm_nmp.envs import panda
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import load_queries
@@ -14,6 +13,7 @@ from roboarm_nmp.envs.datasets.roadmap_paths import shard_bytes
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
 from roboarm_nmp.envs.viewer.simulation import (
@@ -126,7 +126,7 @@ def test_contacts_name_links_and_points_on_the_arm(simulation):
     assert apart.max() < 0.01
     checker = CollisionChecker(shown.query.scene)
     distances = checker.signed_distances(arm.state).distance
-    nearest = panda.COLLISION_LINKS[int(np.argmin(distances))]
+    nearest = PANDA.collision_links[int(np.argmin(distances))]
     assert nearest in arm.contacts.links
 
 
@@ -135,21 +135,21 @@ def test_arm_goes_on_from_where_it_is_when_the_goal_moves(simulation):
     arm = shown.arms[0]
     for _ in range(10):
         shown.step()
-    state, position = arm.state, panda.forward_kinematics(shown.query.goal)
+    state, position = arm.state, PANDA.forward_kinematics(shown.query.goal)
     there = position + [0.05, -0.1, 0.1]
     shown.move_goal(there)
     assert shown.edited and arm.kinematic and arm.steps == 0
     assert np.abs(arm.state - state).max() < 1e-6
-    assert np.abs(panda.forward_kinematics(shown.query.goal) - there).max() < 1e-3
+    assert np.abs(PANDA.forward_kinematics(shown.query.goal) - there).max() < 1e-3
     shown.step()
     assert 0.02 < np.linalg.norm(arm.state - state) < 0.031  # a step, not a jump
     run(shown)
-    reached = panda.forward_kinematics(panda.denormalise(arm.state))
+    reached = PANDA.forward_kinematics(PANDA.denormalise(arm.state))
     assert arm.success and np.linalg.norm(reached - there) < 0.02
     # From the start, in the physics.
     shown.restart()
     assert not arm.kinematic
-    assert np.abs(panda.denormalise(arm.state) - shown.query.start).max() < 1e-6
+    assert np.abs(PANDA.denormalise(arm.state) - shown.query.start).max() < 1e-6
 
 
 def test_obstacle_moved_into_the_arm_is_a_contact_that_does_not_stop_it(simulation):
@@ -157,7 +157,7 @@ def test_obstacle_moved_into_the_arm_is_a_contact_that_does_not_stop_it(simulati
     arm = shown.arms[0]
     shown.step()
     assert not arm.in_contact
-    hand = panda.forward_kinematics(panda.denormalise(arm.state))
+    hand = PANDA.forward_kinematics(PANDA.denormalise(arm.state))
     shown.add_obstacle(Sphere(tuple(hand), 0.06))
     assert arm.problem is None
     before = arm.state
@@ -181,7 +181,7 @@ def test_point_cloud_policy_observes_an_obstacle_that_was_moved(simulation):
         position = (box.position[0] + x, *box.position[1:])
         shown.replace_obstacle(0, replace(box, position=position))
         env = roboarm_nmp.make("random_boxes_hard", **find_policy(PRETRAINED)[1])
-        query = shown.query._replace(start=panda.denormalise(arm.state))
+        query = shown.query._replace(start=PANDA.denormalise(arm.state))
         expected = env.reset_specific(*query)[0]
         env.close()
         found = arm.env.get_wrapper_attr("link_distances_at")(arm.state)
@@ -196,7 +196,7 @@ def test_planner_plans_again_after_an_edit(simulation):
     arm = shown.arms[0]
     for _ in range(5):
         shown.step()
-    shown.move_goal(panda.forward_kinematics(shown.query.goal) + [0.0, 0.0, 0.03])
+    shown.move_goal(PANDA.forward_kinematics(shown.query.goal) + [0.0, 0.0, 0.03])
     assert arm.problem is None
     run(shown)
     assert arm.success and arm.contact_steps == 0
@@ -204,7 +204,7 @@ def test_planner_plans_again_after_an_edit(simulation):
 
 def test_goal_in_collision_is_a_problem_and_ends_planning(simulation):
     shown = simulation("no_obstacles", "planner", "go-to-goal")
-    shown.add_obstacle(Sphere(tuple(panda.forward_kinematics(shown.query.goal)), 0.05))
+    shown.add_obstacle(Sphere(tuple(PANDA.forward_kinematics(shown.query.goal)), 0.05))
     assert [arm.problem for arm in shown.arms] == ["the goal is in collision"] * 2
     assert [arm.ended for arm in shown.arms] == [True, False]
 
@@ -222,8 +222,8 @@ def test_demonstrations_are_replayed_configuration_by_configuration():
     assert shown.arms[0].success and shown.arms[0].contact_steps == 0
     # In a scene with an obstacle in the way there are contacts.
     shown.restart()
-    middle = panda.denormalise(demo.states[len(demo.states) // 2])
-    shown.add_obstacle(Sphere(tuple(panda.forward_kinematics(middle)), 0.05))
+    middle = PANDA.denormalise(demo.states[len(demo.states) // 2])
+    shown.add_obstacle(Sphere(tuple(PANDA.forward_kinematics(middle)), 0.05))
     assert run(shown).arms[0].contact_steps > 0
     shown.close()
 
@@ -277,11 +277,11 @@ def test_task_without_query_file_has_random_queries_of_a_seed(tmp_path):
 
 def test_inverse_kinematics_stays_within_limits_and_near_the_goal():
     for query in [load_queries("no_obstacles")[i] for i in range(20)]:
-        here = panda.forward_kinematics(query.goal)
-        near = inverse_kinematics(here, query.goal)
+        here = PANDA.forward_kinematics(query.goal)
+        near = inverse_kinematics(PANDA, here, query.goal)
         assert np.allclose(near, query.goal)
-        moved = inverse_kinematics(0.9 * here, query.goal)
-        assert np.all(moved >= panda.LOWER) and np.all(moved <= panda.UPPER)
-        assert np.abs(panda.forward_kinematics(moved) - 0.9 * here).max() < 1e-3
-        beyond = inverse_kinematics([0.0, 0.0, 3.0], query.goal)
-        assert np.isfinite(beyond).all() and np.all(np.abs(panda.normalise(beyond)) <= 1 + 1e-9)
+        moved = inverse_kinematics(PANDA, 0.9 * here, query.goal)
+        assert np.all(moved >= PANDA.lower) and np.all(moved <= PANDA.upper)
+        assert np.abs(PANDA.forward_kinematics(moved) - 0.9 * here).max() < 1e-3
+        beyond = inverse_kinematics(PANDA, [0.0, 0.0, 3.0], query.goal)
+        assert np.isfinite(beyond).all() and np.all(np.abs(PANDA.normalise(beyond)) <= 1 + 1e-9)

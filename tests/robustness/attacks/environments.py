@@ -11,11 +11,12 @@ import torch
 
 from attacks.children import RAN, REFUSED
 from roboarm_nmp import envs
-from roboarm_nmp.envs import arm_env, panda
+from roboarm_nmp.envs import arm_env
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception import sensors
 from roboarm_nmp.envs.perception.sensors import SensorWorld
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes import primitives as scenes
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
@@ -151,7 +152,7 @@ def build(rng):
     except (TypeError, ValueError):
         return REFUSED
     world = World(scene)
-    world.in_collision(panda.denormalise(np.zeros(7)))
+    world.in_collision(PANDA.denormalise(np.zeros(7)))
     world.close()
     checker = CollisionChecker(scene)
     assert np.isfinite(checker.signed_distances(np.zeros((1, 7))).distance).all()
@@ -212,7 +213,7 @@ def add_filter(rng):
         safety_filter = SafetyFilter(margin, escape)
     except (TypeError, ValueError):
         return REFUSED
-    move = safety_filter(np.full(7, 0.01), np.zeros(panda.LINK_DISTANCES_SHAPE), max_step=0.03)
+    move = safety_filter(np.full(7, 0.01), np.zeros(PANDA.link_distances_shape), max_step=0.03)
     assert np.isfinite(move).all()
     return RAN
 
@@ -229,9 +230,7 @@ def _environment():
 
 
 def _joints(env):
-    return [
-        state[:2] for state in p.getJointStates(env.robot, range(7), physicsClientId=env.client)
-    ]
+    return [state[:2] for state in p.getJointStates(env.body, range(7), physicsClientId=env.client)]
 
 
 KINDS = (

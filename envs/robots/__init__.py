@@ -1,0 +1,1 @@
+"""What an arm is: `PANDA`, and any arm that a URDF describes."""

@@ -1,0 +1,61 @@
+"""How an arm is driven: the physics step, and the position controllers' gains."""
+
+import dataclasses
+
+import numpy as np
+
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+
+# One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
+# controller; docs/guide/environment.md has the measured tracking error.
+TIME_STEP = 1.0 / 120.0
+SUBSTEPS = 4
+# Gains that `calibrate` tries, the Panda's among them.
+GAINS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+NUM_POSES, NUM_STEPS, STEP = 16, 12, 0.03  # of a calibration; length of a step (normalised)
+
+
+def calibrate(robot, gains=GAINS, seed=0):
+    """Gains with which an arm executes commanded steps best, one for all joints.
+
+    From random configurations, without contacts, the arm is
+    commanded steps of 0.03 (normalised) in random directions, as in an environment.
+
+    Returns:
+        gain, and the share of the commanded displacement that was executed with it (1: all of it).
+    """
+    shares = [_executed(robot, gain, np.random.default_rng(seed)) for gain in gains]
+    best = int(np.argmin(np.abs(np.array(shares) - 1.0)))
+    return gains[best], shares[best]
+
+
+def _executed(robot, gain, rng):
+    client = p.connect(p.DIRECT)
+    try:
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=client
+        )
+        p.setGravity(0, 0, -9.81, physicsClientId=client)
+        robot = dataclasses.replace(robot, gains=(gain,) * robot.num_joints)
+        body = robot.load(client, drawn=False)
+        for link in range(-1, p.getNumJoints(body, physicsClientId=client)):
+            p.setCollisionFilterGroupMask(body, link, 0, 0, physicsClientId=client)
+        commanded = executed = 0.0
+        for _ in range(NUM_POSES):
+            state = rng.uniform(-0.7, 0.7, robot.num_joints)
+            direction = rng.normal(size=robot.num_joints)
+            direction *= STEP / np.linalg.norm(direction)
+            robot.set_configuration(client, body, robot.denormalise(state))
+            for step in range(NUM_STEPS):
+                robot.command(client, body, robot.denormalise(state + direction).tolist())
+                for _ in range(SUBSTEPS):
+                    p.stepSimulation(physicsClientId=client)
+                joints = p.getJointStates(body, robot.joint_indices, physicsClientId=client)
+                after = robot.normalise([joint[0] for joint in joints])
+                if step >= NUM_STEPS // 2:  # at speed
+                    executed += (after - state) @ direction / STEP
+                    commanded += STEP
+                state = after
+        return executed / commanded
+    finally:
+        p.disconnect(client)

@@ -1,0 +1,108 @@
+"""Robots by name or file: `panda`, a URDF, or a YAML file that says what a URDF lacks.
+
+urdf: kuka_iiwa/model.urdf       # relative to this file, or package:pybullet_data/kuka_iiwa/…
+name: iiwa                       # everything below may be left out
+joints: [lbr_iiwa_joint_1, …]
+end_effector: lbr_iiwa_link_7    # a link, and a position in its frame (m)
+end_effector_position: [0, 0, 0.05]
+fixed: {finger_joint: 0.04}      # where other joints are held (rad or m)
+limits: {joint_1: [-3.0, 3.0]}   # position limits (rad or m)
+srdf: iiwa.srdf
+packages: {iiwa_description: ../iiwa_description}
+base_position: [0, 0, 0]
+base_orientation: [0, 0, 0, 1]
+gain: 0.6
+"""
+
+import functools
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import yaml
+
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.urdf import RobotError, robot_from_urdf
+
+ROBOT_FILES = (".urdf", ".yaml", ".yml")
+MAX_FILE = 100_000  # bytes
+KEYS = {
+    "urdf": str,
+    "name": str,
+    "joints": list,
+    "end_effector": str,
+    "end_effector_position": list,
+    "fixed": dict,
+    "limits": dict,
+    "srdf": str,
+    "packages": dict,
+    "base_position": list,
+    "base_orientation": list,
+    "gain": float,
+}
+
+
+def load_robot(name_or_path):
+    """The `Robot` called `panda`, or of a URDF, or of a YAML file. It is made once per process.
+
+    Raises RobotError: there is none, or the file cannot be used.
+    """
+    if str(name_or_path) == PANDA.name:
+        return PANDA
+    path = Path(name_or_path)
+    if path.suffix not in ROBOT_FILES:
+        raise RobotError(f"a robot is {PANDA.name!r} or a file (.urdf, .yaml), got {path}")
+    try:
+        path = path.resolve(strict=True)
+        return replace(_load(path, path.stat().st_mtime_ns), source=str(path))
+    except OSError as error:
+        raise RobotError(f"{path}: {error.strerror}") from error
+
+
+@functools.lru_cache(16)
+def _load(path, _):
+    if path.suffix == ".urdf":
+        return robot_from_urdf(path)
+    options = _read(path)
+    if "urdf" not in options:
+        raise RobotError(f"{path}: lacks `urdf`")
+    urdf = _located(path, options.pop("urdf"))
+    if "srdf" in options:
+        options["srdf"] = _located(path, options["srdf"])
+    if "packages" in options:
+        if not all(isinstance(f, str) for f in options["packages"].values()):
+            raise RobotError(f"{path}: packages must name folders, got {options['packages']}")
+        options["packages"] = {n: _located(path, f) for n, f in options["packages"].items()}
+    return robot_from_urdf(urdf, **{"name": path.stem} | options)
+
+
+def _read(path):
+    if not path.is_file() or path.stat().st_size > MAX_FILE:
+        raise RobotError(f"{path}: no file, or more than {MAX_FILE // 1000} kB")
+    text = path.read_bytes()
+    if b"&" in text or b"*" in text:  # they expand without limit
+        raise RobotError(f"{path}: anchors and aliases (& and *) are not allowed")
+    try:
+        options = yaml.safe_load(text.decode())
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise RobotError(f"{path}: no YAML: {error}".replace("\n", " ")) from error
+    if not isinstance(options, dict):
+        raise RobotError(f"{path}: must be a mapping with the key `urdf`")
+    for key, value in options.items():
+        if key not in KEYS:
+            raise RobotError(f"{path}: unknown key {key!r}: known are {', '.join(KEYS)}")
+        kind = KEYS[key]
+        if not (isinstance(value, kind) or kind is float and isinstance(value, int)):
+            raise RobotError(f"{path}: {key} must be a {kind.__name__}, got {value!r}")
+    return options
+
+
+def _located(path, file):
+    """The path of a file that a robot's file names."""
+    if file.startswith("package:"):  # of an installed Python package
+        package, _, rest = file.removeprefix("package:").partition("/")
+        found = importlib.util.find_spec(package) if package.isidentifier() else None
+        if found is None or not found.submodule_search_locations:
+            raise RobotError(f"{path}: the Python package {package!r} is not installed")
+        return Path(found.submodule_search_locations[0], rest)
+    return path.parent / file

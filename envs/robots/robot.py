@@ -1,0 +1,449 @@
+"""What an arm is: joints, limits, kinematics, links that may collide, and its PyBullet body.
+
+A configuration `c` is an arm's n joint angles in rad (m for a prismatic joint); `s` is the same in
+the normalised configuration space [-1, 1]^n (paper, appendix "Extended NMP goal-conditioned MDP
+description"). `PANDA` (`envs.robots.panda`) is the paper's arm; `Robot.from_urdf` makes others.
+"""
+
+import contextlib
+import copy
+import functools
+import hashlib
+import importlib
+import json
+import tempfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class Frame(NamedTuple):
+    """A frame that a joint moves: about its z axis, or along it.
+
+    Attributes:
+        parent: index of another frame of the robot; -1 for the base.
+        joint: index of the joint, 0 to n - 1.
+        position: m, of the frame in its parent's, with the joint at 0.
+        rotation: row-major (9,), likewise.
+        is_prismatic: whether the joint moves the frame along z instead of about it.
+        multiplier, offset: of a mimic joint: its value is multiplier * joint + offset.
+    """
+
+    parent: int
+    joint: int
+    position: tuple
+    rotation: tuple
+    is_prismatic: bool = False
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+class Link(NamedTuple):
+    """A link that may collide.
+
+    Attributes:
+        index: PyBullet's, -1 for the base.
+        frame: index of the frame that moves it; -1 for the base.
+        placements: ((position (3,), rotation (9,)), ...): transforms from the link's own frame to
+            that frame, to be applied one after the other.
+    """
+
+    index: int
+    frame: int
+    placements: tuple = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """An arm. Equal robots have the same numbers and the same files.
+
+    Attributes:
+        name: for messages and files.
+        urdf: path of the URDF.
+        joint_names, joint_indices: of the n actuated joints, from base to end effector, in the URDF
+            and in PyBullet.
+        lower, upper: position limits (n,), rad or m.
+        velocity, acceleration, jerk: limits (n,), rad/s, rad/s^2, rad/s^3 (or m); None if unknown.
+        effort: limits of the torques (n,), N m (or N).
+        held_indices, held_positions, held_effort: the other movable joints, for example fingers:
+            PyBullet's indices, where a controller holds them, and its largest force (N, or N m).
+        mimics: PyBullet's (index, joint, multiplier, offset) of joints that follow one of the n.
+        frames: the `Frame`s that the joints move, parents first.
+        links: the `Link`s that may collide. Those that no joint moves come first: they collide
+            with the arm only. The others are in the order of the rows of link distances.
+        self_collision_pairs: pairs of PyBullet's link indices that may collide.
+        end_effector_link: PyBullet's index of the link that has the end effector.
+        end_effector_offset: m, (3,), the end effector's position in that link's frame.
+        end_effector_frame: index of the frame that moves it.
+        end_effector_position: m, (3,), the end effector's position in that frame.
+        base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
+        mesh_digest: SHA-256 (hex) of the meshes of the links that may collide; empty for `PANDA`.
+        source: the file that names the robot, for scene files; empty for `PANDA`.
+        xml: the URDF's text, with absolute paths of meshes; empty if PyBullet can read the file.
+        gains: of the position controllers (n,).
+        contact_free: a configuration without contacts (n,).
+        observed_pose: the configuration (n,) in which sensors observe a scene: always the same, so
+            that an encoded scene depends on the scene alone.
+    """
+
+    name: str
+    urdf: str
+    joint_names: tuple
+    joint_indices: tuple
+    lower: np.ndarray
+    upper: np.ndarray
+    velocity: np.ndarray | None
+    acceleration: np.ndarray | None
+    jerk: np.ndarray | None
+    effort: np.ndarray
+    held_indices: tuple
+    held_positions: tuple
+    held_effort: tuple
+    mimics: tuple
+    frames: tuple
+    links: tuple
+    self_collision_pairs: tuple
+    end_effector_link: int
+    end_effector_offset: tuple
+    end_effector_frame: int
+    end_effector_position: tuple
+    gains: tuple
+    contact_free: tuple
+    observed_pose: tuple
+    base_position: tuple = (0.0, 0.0, 0.0)
+    base_orientation: tuple = (0.0, 0.0, 0.0, 1.0)
+    mesh_digest: str = ""
+    source: str = ""
+    xml: str = ""
+
+    def __post_init__(self):
+        for name in ("lower", "upper", "velocity", "acceleration", "jerk", "effort"):
+            if getattr(self, name) is not None:
+                array = np.array(getattr(self, name), dtype=np.float64)
+                array.flags.writeable = False
+                object.__setattr__(self, name, array)
+
+    def __eq__(self, other):
+        return isinstance(other, Robot) and self.fingerprint == other.fingerprint
+
+    def __hash__(self):
+        return hash(self.fingerprint)
+
+    def __repr__(self):
+        return f"Robot({self.name!r}, {self.fingerprint[:12]})"
+
+    @functools.cached_property
+    def fingerprint(self):
+        """SHA-256 (hex) of the description: all that simulation and kinematics depend on."""
+        content = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name in ("urdf", "source", "xml"):
+            content.pop(name)
+        text = json.dumps(content, default=np.ndarray.tolist, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @classmethod
+    def from_urdf(cls, path, **options):
+        """The arm that a URDF describes, as PyBullet loads it.
+
+        The kinematic chain, axes, limits and collision shapes are the URDF's. Joints that mimic
+        another one follow it.
+
+        Args:
+            path: of the URDF.
+            joints: names of the n actuated joints; by default all movable joints between the base
+                and the end effector.
+            end_effector: name of the link that has the end effector; by default the link at the end
+                of the longest chain of turning joints.
+            end_effector_position: m, (3,), in that link's frame.
+            fixed: dict from names of other joints, such as fingers, to where they are held (rad or
+                m); by default 0, or the limit that is nearest to it.
+            limits: dict from names of joints to (lower, upper), rad or m, where the URDF has none,
+                or others.
+            srdf: path of an SRDF, whose `disable_collisions` pairs of links do not collide. More
+                pairs are left out by sampling (`envs.robots.self_collisions`).
+            packages: dict from names of packages to folders, for `package://` paths of meshes.
+            name: of the robot; by default the URDF's.
+            base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
+            gain: of the position controllers; by default from a calibration
+                (`envs.robots.control`).
+
+        Raises:
+            RobotError: the file cannot be used; a ValueError that names it and the reason.
+        """
+        # By name, because that module is built on this one.
+        urdf = importlib.import_module("roboarm_nmp.envs.robots.urdf")
+        return urdf.robot_from_urdf(path, **options)
+
+    # --- Sizes and normalisation
+
+    @property
+    def num_joints(self):
+        """n."""
+        return len(self.joint_indices)
+
+    @property
+    def collision_links(self):
+        """PyBullet's indices of the moving links that may collide: the rows of link distances."""
+        return tuple(link.index for link in self.links if link.frame >= 0)
+
+    @property
+    def link_distances_shape(self):
+        """Of link distances: for each link, its signed distance (m) and the gradient of that."""
+        return len(self.collision_links), 1 + self.num_joints
+
+    @functools.cached_property
+    def reach(self):
+        """m: the end effector's largest distance from the base, of 10,000 random configurations."""
+        rng = np.random.default_rng(0)
+        configurations = rng.uniform(self.lower, self.upper, (10_000, self.num_joints))
+        positions = self.forward_kinematics(configurations) - np.array(self.base_position)
+        return float(np.linalg.norm(positions, axis=1).max())
+
+    @functools.cached_property
+    def _mid_and_range(self):
+        return self.upper + self.lower, self.upper - self.lower
+
+    @functools.cached_property
+    def _mid_and_range_lists(self):
+        return list(zip(*(x.tolist() for x in self._mid_and_range), strict=True))
+
+    def normalise(self, configuration):
+        """Joint angles in rad, (..., n) -> normalised configuration in [-1, 1], same shape."""
+        mid, span = self._mid_and_range
+        return (2.0 * np.asarray(configuration) - mid) / span
+
+    def denormalise(self, state):
+        """Normalised configuration, (..., n) -> joint angles in rad, same shape."""
+        mid, span = self._mid_and_range
+        return (np.asarray(state) * span + mid) / 2.0
+
+    def denormalise_one(self, state):
+        """`denormalise` of one configuration, n floats, as a list: faster than NumPy."""
+        pairs = zip(state, self._mid_and_range_lists, strict=True)
+        return [(value * width + mid) / 2.0 for value, (mid, width) in pairs]
+
+    # --- Kinematics
+
+    def forward_kinematics(self, configuration):
+        """Joint angles in rad, (..., n) -> end-effector position in m in the world, (..., 3)."""
+        position, rotation = self.frame_poses(configuration)[self.end_effector_frame]
+        return position + rotation @ np.array(self.end_effector_position)
+
+    def frame_poses(self, configuration):
+        """Joint angles in rad, (..., n) -> per frame position (..., 3), m, and axes (..., 3, 3).
+
+        The axes are columns; a joint turns about the third, or moves along it.
+        """
+        configuration = np.asarray(configuration, dtype=np.float64)
+        batch = configuration.shape[:-1]
+        base = np.broadcast_to(np.array(self.base_position), (*batch, 3))
+        base = base, np.broadcast_to(matrix(self.base_orientation), (*batch, 3, 3))
+        poses = []
+        for frame in self.frames:
+            position, rotation = base if frame.parent < 0 else poses[frame.parent]
+            position = position + rotation @ np.array(frame.position)
+            value = configuration[..., frame.joint]
+            if (frame.multiplier, frame.offset) != (1.0, 0.0):
+                value = frame.multiplier * value + frame.offset
+            placed = np.reshape(frame.rotation, (3, 3))
+            if frame.is_prismatic:
+                rotation = rotation @ placed
+                position = position + value[..., None] * rotation[..., :, 2]
+            else:
+                c, s = np.cos(value)[..., None], np.sin(value)[..., None]
+                x, y = placed[:, 0], placed[:, 1]
+                z = np.broadcast_to(placed[:, 2], (*batch, 3))
+                rotation = rotation @ np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
+            poses.append((position, rotation))
+        return poses
+
+    # --- The body in PyBullet
+
+    def load(self, client, drawn=True):
+        """Load the arm with its base fixed in its pose; returns its body id.
+
+        Other joints stay where they are held. Without `drawn` it has no visual shapes, which take
+        50 MB for the Panda.
+        """
+        flags = p.URDF_USE_SELF_COLLISION
+        if not drawn:
+            flags |= p.URDF_IGNORE_VISUAL_SHAPES
+        with self._readable_urdf() as urdf:
+            body = p.loadURDF(
+                urdf,
+                self.base_position,
+                self.base_orientation,
+                useFixedBase=True,
+                flags=flags,
+                physicsClientId=client,
+            )
+        links = range(-1, p.getNumJoints(body, physicsClientId=client))
+        for a in links:
+            for b in range(a + 1, links.stop):
+                may_collide = int((a, b) in self.self_collision_pairs)
+                p.setCollisionFilterPair(body, body, a, b, may_collide, physicsClientId=client)
+        if self.held_indices:
+            p.setJointMotorControlArray(
+                body,
+                self.held_indices,
+                p.POSITION_CONTROL,
+                targetPositions=self.held_positions,
+                forces=self.held_effort,
+                physicsClientId=client,
+            )
+        return body
+
+    def load_coarse(self, client, colour):
+        """Load the arm for images only: its collision shapes, in one colour. Returns its body id.
+
+        `colour`: (red, green, blue, alpha) in [0, 1].
+        """
+        root = self.parsed_urdf()
+        for link in root.iter("link"):
+            for visual in link.findall("visual"):
+                link.remove(visual)
+            for collision in link.findall("collision"):
+                visual = copy.deepcopy(collision)
+                visual.tag = "visual"
+                link.append(visual)
+        with temporary_urdf(ElementTree.tostring(root, "unicode")) as urdf:
+            body = p.loadURDF(
+                urdf,
+                self.base_position,
+                self.base_orientation,
+                useFixedBase=True,
+                physicsClientId=client,
+            )
+        for link in range(-1, p.getNumJoints(body, physicsClientId=client)):
+            p.changeVisualShape(body, link, rgbaColor=colour, physicsClientId=client)
+        return body
+
+    def parsed_urdf(self):
+        """The URDF's XML element, with absolute paths of meshes."""
+        root = ElementTree.fromstring(self.xml or Path(self.urdf).read_text())
+        for mesh in root.iter("mesh"):
+            mesh.set("filename", resolve(mesh.get("filename"), self.urdf))
+        return root
+
+    def collision_elements(self, link):
+        """The URDF's `collision` elements of a link, by its name."""
+        links = self.parsed_urdf().findall("link")
+        return next(one for one in links if one.get("name") == link).findall("collision")
+
+    @contextlib.contextmanager
+    def _readable_urdf(self):
+        if self.xml:
+            with temporary_urdf(self.xml) as urdf:
+                yield urdf
+        else:
+            yield self.urdf
+
+    @functools.cached_property
+    def _reset(self):
+        """Indices of all movable joints, the values of those that are held, and zeros."""
+        indices = (*self.joint_indices, *self.held_indices, *(mimic[0] for mimic in self.mimics))
+        return indices, [[x] for x in self.held_positions], [[0.0]] * len(indices)
+
+    @property
+    def reset_indices(self):
+        """PyBullet's indices of all movable joints."""
+        return self._reset[0]
+
+    def _followers(self, configuration):
+        return [scale * configuration[joint] + offset for _, joint, scale, offset in self.mimics]
+
+    def set_configuration(self, client, body, configuration):
+        """Teleport the arm to joint angles (n, rad), at rest."""
+        indices, held, at_rest = self._reset
+        p.resetJointStatesMultiDof(
+            body,
+            indices,
+            [[angle] for angle in configuration]
+            + held
+            + [[value] for value in self._followers(configuration)],
+            at_rest,
+            physicsClientId=client,
+        )
+
+    @functools.cached_property
+    def _commanded(self):
+        """Indices, largest forces and gains of the position controllers."""
+        joints = [mimic[1] for mimic in self.mimics]
+        effort = self.effort.tolist()
+        return (
+            (*self.joint_indices, *(mimic[0] for mimic in self.mimics)),
+            effort + [effort[joint] for joint in joints],
+            [*self.gains, *(self.gains[joint] for joint in joints)],
+        )
+
+    def command(self, client, body, configuration):
+        """Set the targets of the position controllers: joint angles (list of n, rad)."""
+        indices, forces, gains = self._commanded
+        p.setJointMotorControlArray(
+            body,
+            indices,
+            p.POSITION_CONTROL,
+            targetPositions=[*configuration, *self._followers(configuration)],
+            forces=forces,
+            positionGains=gains,
+            physicsClientId=client,
+        )
+
+    def read_end_effector(self, client, body):
+        """The end effector's position, float64 (3,), m, as PyBullet has it."""
+        link = p.getLinkState(
+            body, self.end_effector_link, computeForwardKinematics=1, physicsClientId=client
+        )
+        position = np.array(link[4])
+        if any(self.end_effector_offset):
+            position = position + matrix(link[5]) @ np.array(self.end_effector_offset)
+        return position
+
+
+def matrix(quaternion):
+    """A quaternion (xyzw) of norm 1 as a rotation matrix (3, 3)."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def resolve(filename, urdf, packages=None):
+    """The absolute path of a mesh in a URDF, `package://name/...` or relative to the URDF.
+
+    Args:
+        filename: as the URDF has it.
+        urdf: path of the URDF.
+        packages: dict from names to folders. Any other name may be that of a folder above the
+            URDF, or be missing.
+    """
+    folder = Path(urdf).absolute().parent
+    for scheme in ("package://", "model://"):
+        if filename.startswith(scheme):
+            name, _, rest = filename.removeprefix(scheme).partition("/")
+            if name in (packages or {}):
+                return str(Path(packages[name]).absolute() / rest)
+            above = [up for up in (folder, *folder.parents) if up.name == name]
+            candidates = [*(up / rest for up in above), folder / name / rest, folder / rest]
+            return str(next((path for path in candidates if path.exists()), candidates[0]))
+    return str(folder / filename.removeprefix("file://"))
+
+
+@contextlib.contextmanager
+def temporary_urdf(text):
+    """A context: the path of a file with this text."""
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
+        file.write(text)
+        file.flush()
+        yield file.name

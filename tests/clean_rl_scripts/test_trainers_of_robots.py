@@ -1,0 +1,156 @@
+"""Trainers, policies and evaluations of another arm than the Panda: xArm6, 6 joints."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from paths import ROOT
+from trainers import PATHS, load, panda_env, refusal, run_here, run_script
+
+from roboarm_nmp import envs
+from roboarm_nmp.clean_rl_scripts import evaluate as evaluate_command
+from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
+from roboarm_nmp.envs.datasets.demonstrations import demo_path
+from roboarm_nmp.envs.datasets.queries import query_path
+from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.policies.export import save_policy
+from roboarm_nmp.envs.policies.registry import PolicyError, find_policy, make_policy
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.training.evaluation import EvaluationError, evaluate
+
+EXAMPLE = ROOT / "examples" / "robots" / "xarm6.yaml"
+PANDAS = "sac-ee-wall-p1-s1"  # a pretrained policy
+SHORT = {
+    "sac_her_mp": ["--total-timesteps", "400", "--goal-type", "combined", "--velocities"],
+    "td3_her_mp": ["--total-timesteps", "400", "--link-distances"],
+    "bc": ["--total-updates", "300", "--eval-every", "300", "--num-modes", "2"],
+    "dagger": ["--task", "no_obstacles"],
+}
+SHORT["td3_her_mp"] += ["--geometry-source", "ground_truth", "--demo-prob", "1"]
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """The arm's file. Beside it are queries, demonstrations, and roadmap paths in two scenes."""
+    folder = tmp_path_factory.mktemp("xarm6")
+    file = shutil.copy(EXAMPLE, folder / "xarm6.yaml")
+    task = f"no_obstacles@{file}"
+    make_queries.make_queries(query_path(task), task, 0, 4, 3, progress=False)
+    args = collect.Args(task)
+    options = {name: getattr(args, name) for name in collect.OPTIONS}
+    collect.collect(demo_path(task), 3, options, progress=False)
+    sizes = {"scenes": 2, "paths_per_scene": 6, "num_nodes": 150, "workers": 1}
+    roadmaps.collect(roadmaps.Args(folder / "roadmaps", robot=file, **sizes), progress=False)
+    return file
+
+
+@pytest.mark.parametrize("trainer", SHORT)
+def test_trainer_trains_another_arm(trainer, file, tmp_path, monkeypatch, short_episodes):
+    monkeypatch.chdir(file.parent)
+    flags = ["--robot", "xarm6.yaml", *SHORT[trainer]]
+    flags += ["--encoder", "point_cloud"] if trainer == "dagger" else []
+    run = run_script(trainer, tmp_path, *flags)
+    args, result = (json.loads((run / f"{one}.json").read_text()) for one in ("args", "result"))
+    assert args["task"] == result["task"] == "no_obstacles@xarm6.yaml" and args["robot"] is None
+    assert result["robot"] == "xarm6" and run.name.startswith("no_obstacles@xarm6__")
+    robot = load_robot(file)
+    metadata = load_network(run / "policy.pt").metadata
+    assert metadata["robot"] == ["xarm6", robot.fingerprint]
+    # On its own task, and resumed, also from another folder.
+    assert evaluate(run, num_queries=2)["robot"] == "xarm6"
+    monkeypatch.chdir(ROOT)
+    run_here(PATHS[trainer], "--resume", run, "--test-queries", "1")
+    with pytest.raises(EvaluationError, match="trained for the robot 'xarm6' .*, not for 'panda'"):
+        evaluate(run, "no_obstacles", num_queries=2)
+
+
+def test_policy_of_the_panda_is_rejected_for_another_arm(file):
+    task = f"no_obstacles@{file}"
+    with pytest.raises(EvaluationError, match="trained for the robot 'panda' .*, not for 'xarm6'"):
+        evaluate(PANDAS, task)
+    policy, arguments = find_policy(PANDAS)
+    with pytest.raises(PolicyError, match=f"{PANDAS}.*'panda' .*, not for 'xarm6'"):
+        make_policy(policy, envs.make(task, **arguments))
+    assert "robot" not in load_network(policy).metadata
+
+
+def test_exported_policy_names_its_arm(file, tmp_path):
+    class GoToGoal(torch.nn.Module):
+        def forward(self, observation, achieved_goal, desired_goal):
+            return (desired_goal - observation[:, : desired_goal.shape[1]]).clamp(-1.0, 1.0)
+
+    task, path = f"no_obstacles@{file}", tmp_path / "policy.pt"
+    save_policy(path, GoToGoal(), task, goal_type="config")
+    assert load_network(path).metadata["robot"] == ["xarm6", load_robot(file).fingerprint]
+    assert evaluate(path)["success_rate"] == evaluate("go-to-goal", task)["success_rate"]
+    content = torch.load(path, weights_only=True)
+    content["metadata"]["robot"] = 7
+    torch.save(content, tmp_path / "bad.pt")
+    with pytest.raises(EvaluationError, match="bad.pt: it was trained for the robot 7"):
+        evaluate(tmp_path / "bad.pt")
+
+
+def test_target_entropy_is_minus_the_number_of_joints(file):
+    sac, cpu = load("sac_her_mp"), torch.device("cpu")
+    xarm6 = envs.make(f"no_obstacles@{file}")
+    for given, of_panda, of_xarm6 in (("auto", -7.0, -6.0), (-14.0, -14.0, -14.0), (None,) * 3):
+        args = sac.Args(target_entropy=given, hidden_size=16)
+        assert sac.SAC(args, panda_env(), cpu).target_entropy == of_panda
+        assert sac.SAC(args, xarm6, cpu).target_entropy == of_xarm6
+
+
+def test_evaluate_command_takes_a_robot(file, capsys):
+    flags = ["--policy", "go-to-goal", "--task", "no_obstacles", "--workers", "1"]
+    path = file.parent / "result.json"
+    command = [*flags, "--robot", str(file), "--json", str(path), "--safety-margin", "0.01"]
+    assert evaluate_command.main(command) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["robot", "xarm6"] in lines
+    assert json.loads(path.read_text())["robot"] == "xarm6"
+    assert evaluate_command.main([*flags, "--num-queries", "2"]) == 0
+    assert not any(
+        line.strip().startswith("robot ") for line in capsys.readouterr().out.splitlines()
+    )
+    for wrong, message in (
+        (["--policy", PANDAS], "--robot goes with --task"),
+        (["--policy", PANDAS, "--task", "no_obstacles"], "trained for the robot 'panda'"),
+        (["--policy", "random", "--task", f"no_obstacles@{file}"], "names a robot already"),
+        (["--policy", "random", "--task", "wall"], "wall is the Panda's"),
+    ):
+        assert evaluate_command.main([*wrong, "--robot", str(file)]) == 2
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("policy", "source"),
+    [
+        ("random", None),
+        ("via-points", "point_cloud"),
+        ("planner", "ground_truth"),
+        ("planner", "point_cloud"),
+    ],
+)
+def test_baselines_move_another_arm(policy, source, file):
+    task, rng = f"random_boxes_hard@{file}", np.random.default_rng(0)
+    scene = envs.get_task(task).scene.sample(rng)
+    env = envs.make(task)
+    env.set_scene(scene)
+    start, goal = np.stack([env.sample_query(rng) for _ in range(3)], axis=1)
+    queries = type("Queries", (), {"start": start, "goal": goal, "scenes": [scene] * 3})
+    result = evaluate(policy, task, queries=queries, geometry_source=source)
+    assert result["num_queries"] == 3 and result["robot"] == "xarm6"
+    if source == "ground_truth":
+        assert result["collision_free_success_rate"] == 1.0
+
+
+def test_robot_that_cannot_be_used_is_rejected(file, capsys, tmp_path):
+    message = refusal("sac_her_mp", capsys, tmp_path, "--robot", "nothing.yaml")
+    assert "--task: nothing.yaml: No such file" in message
+    both = ["--robot", str(file), "--task", f"no_obstacles@{file}"]
+    assert "names a robot already" in refusal("sac_her_mp", capsys, tmp_path, *both)
+    message = refusal("bc", capsys, tmp_path, "--robot", str(file), "--task", "boxes")
+    assert "--task: boxes is the Panda's" in message
+    message = refusal("dagger", capsys, tmp_path, "--paths", str(file.parent / "roadmaps"))
+    assert "--paths: " in message and "made for the robot 'xarm6' " in message

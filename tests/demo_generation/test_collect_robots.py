@@ -1,0 +1,123 @@
+"""Queries, demonstrations and roadmaps of another arm than the Panda, from the command line."""
+
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
+from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
+from roboarm_nmp.demo_generation.verify import verify
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.envs.datasets.queries import load_queries, query_path, validate
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.tasks import task_with_robot
+
+ROBOTS = ROOT / "examples" / "robots"
+
+
+@pytest.fixture(params=["xarm6", "iiwa"])
+def file(request, tmp_path):
+    """The file of an arm in a folder of its own."""
+    return shutil.copy(ROBOTS / f"{request.param}.yaml", tmp_path / f"{request.param}.yaml")
+
+
+def roboarm(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "roboarm_nmp", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+
+
+def test_queries_and_demonstrations_of_another_arm_are_made_and_verified(file):
+    task = task_with_robot("random_boxes_hard", file)
+    flags = ["--task", "random_boxes_hard", "--robot", file, "--workers", 1]
+    sizes = ["--num-test", 4, "--num-validation", 2]
+    made = roboarm("queries", *flags, *sizes, "--solvable")
+    assert made.returncode == 0, made.stderr
+    assert set(validate(query_path(task), task, simulate=True)) == {"test", "validation"}
+    made = roboarm("collect", *flags, "--num", 4)
+    assert made.returncode == 0, made.stderr
+    demos, robot = load_demos(task), load_robot(file)
+    assert len(demos) == 4 and demos.plan.shape[1] == robot.num_joints
+    assert demos.scenes.base.robot == robot and not demos.collided.any()
+    verified = roboarm("verify", "random_boxes_hard", "--robot", file, "--workers", 1)
+    assert verified.returncode == 0, verified.stderr
+    assert "4 good, 0 changed, 0 missed, 0 collided, 0 refused" in verified.stdout
+    by_path = roboarm("verify", demo_path(task), "--workers", 1)
+    assert by_path.returncode == 1 and "name the robot's file, as TASK@" in by_path.stderr
+
+
+def test_interrupted_collection_of_another_arm_continues_to_the_same_bytes(tmp_path, monkeypatch):
+    task = f"no_obstacles@{ROBOTS / 'xarm6.yaml'}"
+    args = collect.Args(task)
+    options = {name: getattr(args, name) for name in collect.OPTIONS}
+    whole, again = tmp_path / "whole.h5", tmp_path / "again.h5"
+    collect.collect(whole, 3, options, progress=False)
+    append = collect.Journal.append
+
+    def die(journal, entry):
+        if journal.entries:
+            raise OSError("the disk is full")
+        append(journal, entry)
+
+    monkeypatch.setattr(collect.Journal, "append", die)
+    with pytest.raises(OSError, match="disk is full"):
+        collect.collect(again, 3, options, progress=False)
+    monkeypatch.undo()
+    changed = tmp_path / "xarm6.yaml"
+    changed.write_text((ROBOTS / "xarm6.yaml").read_text() + "base_position: [0, 0, 0.1]\n")
+    other = options | {"task": f"no_obstacles@{changed}"}
+    with pytest.raises(ValueError, match="the journal of something else .*another scene"):
+        collect.collect(again, 3, other, progress=False)
+    collect.collect(again, 3, options, progress=False)
+    assert again.read_bytes() == whole.read_bytes()
+    assert verify(again, progress=False, task=task)["good"] == 3
+
+
+def test_all_tasks_of_a_robot_are_those_of_any_robot():
+    robot = ROBOTS / "xarm6.yaml"
+    pairs = make_queries._check(make_queries.Args(("all",), robot=robot, overwrite=True))
+    names = ("no_obstacles", *(f"random_boxes_{size}" for size in ("easy", "medium", "hard")))
+    assert pairs == [(f"{name}@{robot}", query_path(f"{name}@{robot}")) for name in names]
+    with pytest.raises(ValueError, match="wall is the Panda's"):
+        make_queries._check(make_queries.Args(("wall",), robot=robot))
+
+
+def test_goal_region_is_that_of_the_arm(tmp_path):
+    task, region = f"no_obstacles@{ROBOTS / 'xarm6.yaml'}", (0.2, 0.6, -0.4, 0.4, 0.2, 0.6)
+    path = tmp_path / "queries.h5"
+    make_queries.make_queries(path, task, 0, 3, 1, progress=False, goal_region=region)
+    goals = load_queries(path, task=task).goal_position
+    low, high = np.reshape(region, (3, 2)).T
+    assert goals.shape == (3, 3) and (low <= goals).all() and (goals <= high).all()
+
+
+def test_roadmaps_and_examples_have_the_joints_of_the_arm(tmp_path):
+    args = roadmaps.Args(
+        tmp_path / "roadmaps",
+        robot=ROBOTS / "xarm6.yaml",
+        scenes=2,
+        paths_per_scene=6,
+        num_nodes=150,
+        shard_size=1,
+        workers=1,
+    )
+    paths = roadmaps.collect(args, progress=False)
+    assert len(paths) == 2 and paths.points.shape[1] == 6
+    scene = int(np.argmax(np.diff(paths.path_offsets)))  # the goals of one have no room around them
+    assert len(paths.of_scene(scene)) == 6
+    checker = CollisionChecker(paths.scenes[scene])
+    for path in paths.of_scene(scene):
+        assert checker.is_motion_free(path[:-1], path[1:]).all()
+    examples = RoadmapExamples(paths, CollisionChecker, seed=1).draw(0, 8, 0.03)
+    links = checker.link_distances(paths.points[:1]).shape[1:]
+    assert examples["observation"].shape == (8, 9) and examples["direction"].shape == (8, 6)
+    assert examples["link_distances"].shape == (8, *links) and links[1] == 7

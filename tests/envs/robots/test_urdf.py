@@ -1,0 +1,400 @@
+"""Robots from URDFs: what they contain, compared with PyBullet, and what is refused."""
+
+import dataclasses
+import itertools
+import os
+import pickle
+import resource
+import time
+
+import numpy as np
+import pybullet as p
+import pytest
+
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.collision.hulls import arm_hulls
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.urdf import RobotError
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.world import World
+
+INERTIAL = (
+    '<inertial><origin xyz="0.02 0 0.1" rpy="0.3 0.2 0.1"/><mass value="1"/>'
+    '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+def link(name, *shapes):
+    """A URDF link with shapes, each (xyz, rpy, geometry)."""
+    collisions = "".join(
+        f'<collision><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{geometry}</geometry></collision>'
+        for xyz, rpy, geometry in shapes
+    )
+    return f'<link name="{name}">{INERTIAL}{collisions}</link>'
+
+
+def joint(name, parent, child, kind="revolute", axis="0 0 1", xyz="0 0 0.3", more=None):
+    """A URDF joint; `more` replaces its limit."""
+    limit = '<limit lower="-1.5" upper="1.5" effort="50" velocity="2"/>' if more is None else more
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="0.2 0.1 -0.4"/><axis xyz="{axis}"/>{limit}</joint>'
+    )
+
+
+BAR = "0 0 0.15", "0.1 0 0", '<box size="0.05 0.06 0.2"/>'
+# A box and a cylinder, a capsule and a sphere; a sliding joint, one that mimics the first, a finger
+# that is held.
+ARM = "".join(
+    [
+        link("base", BAR, ("0.1 0 0", "0 0 0.5", '<cylinder radius="0.05" length="0.1"/>')),
+        link("one", BAR, ("0 0.05 0.1", "1 0 0", '<cylinder radius="0.03" length="0.2"/>')),
+        link("two", ("0 0 0.1", "0.4 0 0", '<capsule radius="0.03" length="0.1"/>')),
+        link("three", ("0 0.02 0.1", "0 0 0", '<sphere radius="0.05"/>'), BAR),
+        link("four", BAR),
+        link("tool"),
+        link("finger", ("0 0 0.02", "0 0 0", '<box size="0.01 0.02 0.05"/>')),
+        joint("turn", "base", "one", axis="0 2 0"),
+        joint("slide", "one", "two", "prismatic", "1 1 0"),
+        joint("roll", "two", "three", axis="0 0 1"),
+        joint(
+            "follow",
+            "three",
+            "four",
+            axis="1 0 0",
+            more='<limit lower="-3" upper="3" effort="50" velocity="2"/>'
+            '<mimic joint="turn" multiplier="-0.5" offset="0.2"/>',
+        ),
+        joint("weld", "four", "tool", "fixed"),
+        joint("grip", "four", "finger", "prismatic", "0 1 0", "0 0 0.3"),
+    ]
+)
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory):
+    """A function from URDF elements to a file."""
+    folder, numbers = tmp_path_factory.mktemp("urdf"), itertools.count()
+
+    def write(elements, name="arm"):
+        path = folder / f"{next(numbers)}.urdf"
+        path.write_text(f'<robot name="{name}">{elements}</robot>')
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def arm(urdf):
+    return Robot.from_urdf(urdf(ARM), end_effector="tool", fixed={"grip": 0.02})
+
+
+def test_joints_limits_and_held_joints_are_those_of_the_file(arm):
+    assert arm.joint_names == ("turn", "slide", "roll")
+    assert arm.lower.tolist() == [-1.5] * 3 and arm.upper.tolist() == [1.5] * 3
+    assert arm.effort.tolist() == [50] * 3 and arm.velocity.tolist() == [2] * 3
+    assert arm.held_positions == (0.02,)
+    [(_, leader, multiplier, offset)] = arm.mimics
+    assert (leader, multiplier, offset) == (0, -0.5, 0.2)
+
+
+def test_forward_kinematics_agree_with_pybullet(arm):
+    world = World(Scene(table=None, floor=None, robot=arm), drawn=False)
+    for configuration in np.random.default_rng(0).uniform(-1.5, 1.5, (50, 3)):
+        arm.set_configuration(world.client, world.body, configuration.tolist())
+        position = world.read_arm()[2]
+        np.testing.assert_allclose(arm.forward_kinematics(configuration), position, atol=1e-6)
+    world.close()
+
+
+def scene_of(rng, robot):
+    def place():
+        return tuple(rng.uniform(-0.5, 0.5, 3).tolist())
+
+    obstacles = [Box(place(), tuple(rng.uniform(0.05, 0.4, 3).tolist())) for _ in range(3)]
+    obstacles += [Cylinder(place(), 0.1, 0.3), Sphere(place(), 0.15)]
+    return Scene(tuple(obstacles), robot=robot)
+
+
+@pytest.mark.parametrize("name", ["of the test", "iiwa", "xarm6"])
+def test_compiled_checks_agree_with_pybullet(arm, name):
+    files = {"iiwa": "kuka_iiwa/model.urdf", "xarm6": "xarm/xarm6_robot.urdf"}
+    robot = arm if name not in files else load_robot(pybullet_file(files[name]))
+    rng, different, free = np.random.default_rng(1), 0, 0
+    for _ in range(10):
+        scene = scene_of(rng, robot)
+        world, checker = World(scene, drawn=False), CollisionChecker(scene)
+        states = rng.uniform(-1, 1, (100, robot.num_joints))
+        for state, is_free in zip(states, checker.is_free(states), strict=True):
+            expected = not world.in_collision(robot.denormalise(state).tolist())
+            free += expected
+            if is_free != expected:  # PyBullet's box against box has sharp edges
+                different += 1
+                assert abs(checker.signed_distances(state).distance.min()) < 2e-3
+        world.close()
+    assert 100 < free < 900
+    assert different <= (5 if robot is arm else 0)
+
+
+def pybullet_file(name):
+    import pybullet_data
+
+    return f"{pybullet_data.getDataPath()}/{name}"
+
+
+def test_gradients_of_link_distances_agree_with_differences(arm):
+    """Also of a sliding joint, and of one that another joint follows."""
+    rng = np.random.default_rng(2)
+    checker = CollisionChecker(scene_of(rng, arm))
+    states = rng.uniform(-0.9, 0.9, (40, 3))
+    found = checker.signed_distances(states, self_collisions=False)
+    step, agree = 1e-5, []
+    for number in range(3):
+        ahead, behind = states.copy(), states.copy()
+        ahead[:, number] += step
+        behind[:, number] -= step
+        ends = [
+            checker.signed_distances(s, self_collisions=False).distance for s in (ahead, behind)
+        ]
+        slope = (ends[0] - ends[1]) / (2 * step)
+        agree.append(np.abs(slope - found.gradient[..., number]) < 1e-3)
+    # Elsewhere the nearest obstacle changes between the two ends.
+    assert np.mean(agree) > 0.97
+
+
+def test_bodies_of_a_link_are_its_shapes(arm):
+    _, bodies, _, _, _ = arm_hulls(arm)
+    # Base two; one two; two one; three two; four and its finger, which no joint moves, one each.
+    assert len(bodies) == 9 and (bodies[:2, 9] == -1).all()
+    assert sorted(bodies[2:, 9].tolist()) == [0, 0, 1, 2, 2, 3, 4]
+
+
+def test_panda_from_its_urdf_is_the_panda():
+    robot = Robot.from_urdf(
+        PANDA.urdf, end_effector="panda_grasptarget", fixed={"panda_finger_joint1": 0.04}
+    )
+    configurations = np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (100, 7))
+    np.testing.assert_allclose(
+        robot.forward_kinematics(configurations),
+        PANDA.forward_kinematics(configurations),
+        atol=1e-9,
+    )
+    assert set(robot.self_collision_pairs) <= set(PANDA.self_collision_pairs)
+    assert robot.collision_links == PANDA.collision_links
+    for ours, theirs in zip(arm_hulls(robot)[1], arm_hulls(PANDA)[1], strict=True):
+        np.testing.assert_allclose(ours[4:], theirs[4:], atol=1e-6)  # radius, edges, rounding, row
+
+
+def test_robots_are_values(arm):
+    again = pickle.loads(pickle.dumps(arm))
+    assert again == arm and hash(again) == hash(arm) and arm != PANDA
+    assert dataclasses.replace(arm, lower=[-1.0] * 3) != arm
+    with pytest.raises(ValueError):
+        arm.lower[0] = 0
+
+
+def test_srdf_disables_pairs(tmp_path):
+    path, srdf = pybullet_file("kuka_iiwa/model.urdf"), tmp_path / "iiwa.srdf"
+    disabled = "<robot name='iiwa'><disable_collisions link1='{}' link2='lbr_iiwa_link_0'/></robot>"
+    srdf.write_text(disabled.format("lbr_iiwa_link_6"))
+    robot, less = load_robot(path), Robot.from_urdf(path, srdf=srdf)
+    assert set(robot.self_collision_pairs) - set(less.self_collision_pairs) == {(-1, 5)}
+    srdf.write_text(disabled.format("hand"))
+    with pytest.raises(ValueError, match="the URDF has no link 'hand'"):
+        Robot.from_urdf(path, srdf=srdf)
+
+
+TWO = link("a", BAR) + link("b", BAR)
+LOOP = TWO + link("c") + joint("1", "a", "b") + joint("2", "b", "c") + joint("3", "c", "b")
+MESH = "0 0 0", "0 0 0", '<mesh filename="{}"/>'
+
+
+@pytest.mark.parametrize(
+    ("elements", "reason"),
+    [
+        ("", "no links"),
+        (TWO + joint("1", "a", "b", "fixed"), "no joint can move"),
+        (LOOP, "kinematic loop"),
+        (TWO + joint("1", "a", "c"), "no child link 'c'"),
+        (TWO, "2 links without a parent"),
+        (TWO + joint("1", "a", "b", "continuous", more=""), "has no limits: give some"),
+        (TWO + joint("1", "a", "b", more='<limit lower="1" upper="-1"/>'), "limits from 1.0 to -1"),
+        (TWO + joint("1", "a", "b", more='<limit lower="nan" upper="1"/>'), "not finite numbers"),
+        (TWO + joint("1", "a", "b", axis="0 0 0"), "has no direction"),
+        (TWO + joint("1", "a", "b", "floating"), "has type 'floating'"),
+        (TWO + joint("1", "a", "b", more='<mimic joint="9"/>'), "mimics '9'"),
+        (link("a", ("0 0 0", "0 0 0", '<box size="1 1 inf"/>')), "not finite numbers"),
+        (link("a", (*MESH[:2], MESH[2].format("missing.stl"))), "no such file"),
+        (link("a", (*MESH[:2], MESH[2].format("/etc/passwd"))), "outside of"),
+        (link("a", (*MESH[:2], MESH[2].format("../../../x.stl"))), "outside of"),
+        (link("a") + link("a"), "two links"),
+        (link("a", ("0 0 0", "0 0 0", '<sphere radius="0"/>')), "must be positive"),
+        (link("a", ("0 0", "0 0 0", '<sphere radius="1"/>')), "2 numbers"),
+        (link("a" * 300), "has at most 200 letters"),
+        (link("a", *[BAR] * 600), "601 collision shapes|600 collision shapes"),
+        ("<link name='a'>" * 40 + "</link>" * 40, "nested more than"),
+        ("<link name='a'>" * 300_000, "nested more than"),
+    ],
+)
+def test_unusable_urdf_is_rejected_with_its_reason(urdf, elements, reason):
+    path = urdf(elements)
+    with pytest.raises(RobotError, match=reason) as error:
+        Robot.from_urdf(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("contents", "reason"),
+    [
+        (b"", "malformed XML"),
+        (b"<sdf/>", "no URDF"),
+        (b"\xff\xfe", "not text"),
+        (b"<robot>", "malformed XML"),
+        (b'<!DOCTYPE r [<!ENTITY a "aaaa">]><robot name="&a;"/>', "entities"),
+        (b"<robot name='a'>" + b" " * 5_000_000 + b"</robot>", "more than 5 MB"),
+        (b'<robot name="x" xmlns:xacro="u"><xacro:macro name="m"/></robot>', "run `xacro`"),
+    ],
+)
+def test_malformed_file_is_rejected_with_its_reason(tmp_path, contents, reason):
+    path = tmp_path / "bad.urdf"
+    path.write_bytes(contents)
+    began = time.monotonic()
+    with pytest.raises(RobotError, match=reason):
+        Robot.from_urdf(path)
+    assert time.monotonic() - began < 5
+
+
+def test_pipe_is_rejected_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.urdf")
+    with pytest.raises(RobotError, match="no regular file"):
+        Robot.from_urdf(tmp_path / "pipe.urdf")
+
+
+@pytest.mark.parametrize(
+    "contents", [b"", b"solid", b"v 0 0 0", bytes(84), b"\xff" * 1000, b"f 9 9 9\nv 1 1 1"]
+)
+@pytest.mark.parametrize("ending", ["stl", "obj", "dae"])
+def test_mesh_without_triangles_is_rejected(urdf, contents, ending):
+    path = urdf(TWO + joint("1", "a", "b") + link("c", (*MESH[:2], MESH[2].format(f"x.{ending}"))))
+    text = path.read_text().replace("</robot>", joint("2", "b", "c") + "</robot>")
+    path.write_text(text)
+    (path.parent / f"x.{ending}").write_bytes(contents)
+    with pytest.raises(RobotError, match="PyBullet cannot"):
+        Robot.from_urdf(path)
+
+
+def test_mesh_of_many_vertices_ends_in_an_error_within_time_and_memory(urdf):
+    path = urdf(link("a", (*MESH[:2], MESH[2].format("many.obj"))))
+    with open(path.parent / "many.obj", "w") as file:
+        file.writelines(f"v {i % 977} {i % 991} {i % 997}\n" for i in range(900_000))
+        file.writelines(f"f {i} {i + 1} {i + 2}\n" for i in range(1, 300_000))
+    began = time.process_time(), time.monotonic()
+    with pytest.raises(RobotError):
+        Robot.from_urdf(path)
+    assert time.process_time() - began[0] < 5
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 1_000_000  # kB
+
+
+def test_prefixes_of_other_programs_and_long_lines_are_accepted(urdf):
+    path = urdf(ARM.replace('effort="50"', 'effort="50" drake:acceleration="1"'))
+    text = path.read_text().replace("</robot>", "<drake:x y='1'/></robot>")
+    path.write_text(text.replace("<link ", f"<!-- {'x' * 9000} --><link ", 1))
+    robot = Robot.from_urdf(path, end_effector="tool")
+    assert robot.effort.tolist() == [50] * 3 and len(arm_hulls(robot)[1]) == 9
+
+
+def test_frame_without_inertial_is_light(urdf):
+    """PyBullet would take 1 kg."""
+    robot = Robot.from_urdf(
+        urdf(ARM.replace(link("tool"), '<link name="tool"/>')), end_effector="tool"
+    )
+    client = p.connect(p.DIRECT)
+    body = robot.load(client)
+    assert p.getDynamicsInfo(body, robot.end_effector_link, physicsClientId=client)[0] < 0.01
+    p.disconnect(client)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gain": float("nan")},
+        {"gain": -1},
+        {"base_position": (0, 0)},
+        {"base_orientation": (0, 0, 0, 2)},
+        {"end_effector_position": (0, 0, float("inf"))},
+        {"fixed": {"grip": None}},
+        {"limits": {"turn": 5}},
+        {"limits": {"turn": (float("nan"), 1)}},
+        {"joints": [5]},
+    ],
+)
+def test_options_of_other_types_are_rejected(urdf, options):
+    with pytest.raises(RobotError, match="these options cannot be used"):
+        Robot.from_urdf(urdf(ARM), end_effector="tool", **options)
+
+
+def test_huge_mesh_is_rejected_before_it_is_read(urdf, tmp_path):
+    path = urdf(link("a", ("0 0 0", "0 0 0", '<mesh filename="huge.stl"/>')))
+    with open(path.parent / "huge.stl", "wb") as file:
+        file.truncate(500_000_000)  # 10^7 vertices
+    with pytest.raises(RobotError, match="more than 20 MB"):
+        Robot.from_urdf(path)
+
+
+def test_ambiguous_end_effector_lists_the_choices(urdf):
+    elements = TWO + link("c") + joint("1", "a", "b") + joint("2", "a", "c")
+    with pytest.raises(RobotError, match="name one: b, c"):
+        Robot.from_urdf(urdf(elements))
+
+
+def test_options_that_do_not_fit_are_rejected(urdf):
+    path = urdf(ARM)
+    with pytest.raises(RobotError, match="no link 'hand'"):
+        Robot.from_urdf(path, end_effector="hand")
+    with pytest.raises(RobotError, match="'grip' is no movable joint between"):
+        Robot.from_urdf(path, end_effector="tool", joints=["turn", "grip"])
+    with pytest.raises(RobotError, match="fixed: 'turn' is none of the other joints"):
+        Robot.from_urdf(path, end_effector="tool", fixed={"turn": 0.0})
+
+
+def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
+    path = urdf(ARM)
+    file = tmp_path / "arm.yaml"
+    file.write_text(
+        f"urdf: {path}\nend_effector: tool\nend_effector_position: [0, 0, 0.1]\n"
+        "fixed: {grip: 0.01}\nlimits: {roll: [-1, 1]}\ngain: 0.5\n"
+    )
+    robot = load_robot(file)
+    assert robot.name == "arm" and robot.gains == (0.5,) * 3 and robot.held_positions == (0.01,)
+    assert robot.upper.tolist() == [1.5, 1.5, 1.0] and robot.end_effector_offset == (0, 0, 0.1)
+    assert load_robot(file) == robot
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[]", "must be a mapping"),
+        ("name: x", "lacks `urdf`"),
+        ("urdf: x.urdf\ncolour: red", "unknown key 'colour'"),
+        ("urdf: [1]", "urdf must be a str"),
+        ("urdf: x.urdf", "No such file"),
+        ("a: &a [1]\nb: *a", "anchors"),
+        ("urdf: package:no_such_package/x.urdf", "not installed"),
+        ("{", "no YAML"),
+    ],
+)
+def test_malformed_robot_file_is_rejected_with_its_reason(tmp_path, text, reason):
+    file = tmp_path / "robot.yaml"
+    file.write_text(text)
+    with pytest.raises(RobotError, match=reason):
+        load_robot(file)
+
+
+def test_pybullet_is_left_without_connections(urdf):
+    before = [p.isConnected(client) for client in range(20)]
+    with pytest.raises(RobotError):
+        Robot.from_urdf(urdf(LOOP))
+    Robot.from_urdf(urdf(ARM), end_effector="tool")
+    assert [p.isConnected(client) for client in range(20)] == before

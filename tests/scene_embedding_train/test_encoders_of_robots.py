@@ -1,0 +1,52 @@
+"""Observations and encoders of another arm than the Panda: xArm6."""
+
+import subprocess
+
+import pytest
+from encoder_trainers import command
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.scene_embedding_train import collect
+
+XARM6 = ROOT / "examples" / "robots" / "xarm6.yaml"
+
+
+@pytest.fixture(scope="module")
+def observations(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("observations")
+    options = {"num": 12, "sensors": "clouds", "num_samples": 400, "workers": 1}
+    made = collect.collect(collect.Args(output=folder, robot=XARM6, **options), progress=False)
+    sensors = cardinal(PointCloud, load_robot(XARM6), num_samples=400)
+    assert made.sensors["front_cloud"] == sensors["front"]
+    return folder
+
+
+def test_observations_are_of_their_arm(observations):
+    robot = load_robot(XARM6)
+    found = Observations(observations, robot)
+    assert len(found) == 12 and found.read(0, "configuration").shape == (12, 6)
+    assert all(scene.robot == robot for scene in found.scenes(0))
+    with pytest.raises(DatasetError, match="made for the robot 'xarm6' .*, not for 'panda'"):
+        Observations(observations)
+
+
+def test_encoder_is_for_its_arm(observations, tmp_path):
+    flags = ["--width", "8", "--latent-size", "8"]
+    without = subprocess.run(
+        command("field", observations, tmp_path, *flags), capture_output=True, text=True
+    )
+    assert without.returncode == 1 and "made for the robot 'xarm6' " in without.stderr
+    flags += ["--robot", str(XARM6)]
+    subprocess.run(command("field", observations, tmp_path, *flags), check=True)
+    encoder = next(tmp_path.glob("*/encoder.pt"))
+    assert load_network(encoder).metadata["robot"] == ["xarm6", load_robot(XARM6).fingerprint]
+    env = envs.make(f"random_boxes_hard@{XARM6}", encoder=encoder)
+    assert env.reset(seed=0)[0]["observation"].shape == (6 + 3 + 8,)
+    with pytest.raises(ValueError, match="trained for the robot 'xarm6' .*, not for 'panda'"):
+        envs.make("random_boxes_hard", encoder=encoder)
