@@ -193,13 +193,6 @@ def test_round_labels_states_that_the_policy_visits(folder):
 # --- Runs
 
 
-def finish(run):
-    done = subprocess.run(
-        [sys.executable, PATHS["dagger"], "--resume", run], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-
-
 def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_path, folder):
     flags = ["--paths", str(folder), "--encoder", "point_cloud", "--num-points", "8"]
     flags += ["--safety-margin", "0.012"]
@@ -222,7 +215,7 @@ def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_
     process.wait()
     (killed,) = (tmp_path / "killed").iterdir()
     assert not (killed / "result.json").exists()
-    finish(killed)
+    run_here(PATHS["dagger"], "--resume", killed)
     one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed))
     for name in ("actor", "actor_average", "visited"):
         assert one[name].keys() == other[name].keys() and one[name]

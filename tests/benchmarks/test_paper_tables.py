@@ -14,6 +14,7 @@ import psutil
 import pytest
 from paths import ROOT
 from PIL import Image
+from trainers import succeeds_here
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.networks.exported_networks import load_network
@@ -209,7 +210,23 @@ def test_a_trainer_does_not_outlive_the_command(tmp_path):
                 one.kill()
 
 
-def test_a_run_is_kept_and_not_done_again(tmp_path, monkeypatch, capfd):
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Scripts that `paper_tables` starts run in this process, which saves seconds of imports."""
+    run = subprocess.run
+
+    def run_script(command, **options):
+        if command[0] != sys.executable:  # git
+            return run(command, **options)
+        assert options == {"check": True}
+        return succeeds_here(*command[1:])
+
+    monkeypatch.setattr(paper_tables.subprocess, "run", run_script)
+
+
+def test_a_run_is_kept_and_not_done_again(
+    tmp_path, monkeypatch, capfd, in_this_process, short_episodes
+):
     monkeypatch.setattr(paper_tables, "POLICIES", tmp_path / "policies")
     few = ["--eval-queries", "2", "--num-demos", "20", "--eval-every", "30"]
     monkeypatch.setitem(paper_tables.RECIPES, "bc", few)

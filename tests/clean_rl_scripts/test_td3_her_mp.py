@@ -3,14 +3,14 @@
 import numpy as np
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import load, panda_env, run_script
+from trainers import ONE_EVALUATION, load, panda_env, run_script
 
 td3 = load("td3_her_mp")
 
 
 def test_policy_and_targets_are_updated_with_delay(tmp_path):
     """With a delay longer than the run, they move once, at the first update."""
-    common = ["--updates-per-step", "0.05", "--policy-average", "1", "--tau", "1"]
+    common = ["--updates-per-step", "0.05", "--policy-average", "1", "--tau", "1", *ONE_EVALUATION]
     often = run_script("td3_her_mp", tmp_path / "often", *common, "--policy-frequency", "1")
     once = run_script("td3_her_mp", tmp_path / "once", *common, "--policy-frequency", "1000")
     for run, same in ((often, True), (once, False)):
@@ -24,7 +24,8 @@ def test_policy_and_targets_are_updated_with_delay(tmp_path):
 
 
 def test_losses_are_logged(tmp_path):
-    run = run_script("td3_her_mp", tmp_path, "--updates-per-step", "1", "--goal-type", "config")
+    flags = ["--updates-per-step", "1", "--goal-type", "config", *ONE_EVALUATION]
+    run = run_script("td3_her_mp", tmp_path, *flags)
     events = EventAccumulator(str(run))
     events.Reload()
     for tag in ("qf1_values", "qf1_loss", "qf2_loss", "qf_loss", "actor_loss"):
@@ -33,7 +34,7 @@ def test_losses_are_logged(tmp_path):
 
 
 def test_exploration_noise_has_the_given_size(tmp_path):
-    flags = ["--updates-per-step", "0", "--exploration-noise", "0.2"]
+    flags = ["--updates-per-step", "0", "--exploration-noise", "0.2", *ONE_EVALUATION]
     run = run_script("td3_her_mp", tmp_path, *flags)
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     actor = td3.Actor(td3.Args(hidden_size=16, bf16=False), panda_env()).eval()
@@ -50,7 +51,7 @@ def test_penalty_keeps_the_tanh_from_saturating(tmp_path):
     sizes = {}
     for penalty in ("0", "100"):
         flags = ["--updates-per-step", "0.5", "--preactivation-penalty", penalty]
-        run = run_script("td3_her_mp", tmp_path / penalty, *flags)
+        run = run_script("td3_her_mp", tmp_path / penalty, *flags, *ONE_EVALUATION)
         state = torch.load(run / "checkpoint.pt", weights_only=True)
         actor = td3.Actor(td3.Args(hidden_size=16, bf16=False), panda_env()).eval()
         actor.load_state_dict(state["actor"])

@@ -167,8 +167,14 @@ QUICK = [
 
 
 @pytest.mark.parametrize("command", QUICK)
-def test_quick_command_runs(command, tmp_path):
-    run(command, tmp_path)
+def test_quick_command_runs(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    try:
+        code = __main__.main(shlex.split(command)[1:])
+    except SystemExit as end:
+        code = end.code
+    assert not code and capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -2,13 +2,11 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 from paths import ROOT
-from trainers import PATHS, TINY, load
+from trainers import PATHS, TINY, load, run_here, succeeds_here
 
 from roboarm_nmp import envs
 
@@ -23,15 +21,13 @@ def test_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
     source = source.replace('    exp_name: str = "sac_her_mp"\n', name).replace(before, after)
     script.write_text(source)
 
-    command = [sys.executable, str(script), "--runs-dir", str(tmp_path / "runs"), *TINY.split()]
-    subprocess.run([*command, "--task", "wall"], check=True, capture_output=True)
+    run_here(script, "--runs-dir", tmp_path / "runs", *TINY.split(), "--task", "wall")
     (run,) = (tmp_path / "runs").glob("wall__sac_final_mp__1__*")
-    again = [sys.executable, str(script), "--resume", str(run), "--total-timesteps", "1800"]
-    subprocess.run(again, check=True, capture_output=True)
+    run_here(script, "--resume", run, "--total-timesteps", "1800")
     assert json.loads((run / "result.json").read_text())["steps"] == 1800
-    evaluate = [sys.executable, str(ROOT / "clean_rl_scripts" / "evaluate.py"), "--task", "wall"]
-    evaluate += ["--policy", str(run), "--num-queries", "3", "--json", tmp_path / "result.json"]
-    subprocess.run(evaluate, check=True, capture_output=True)
+    flags = ["--task", "wall", "--policy", run, "--num-queries", "3"]
+    flags += ["--json", tmp_path / "result.json"]
+    succeeds_here(ROOT / "clean_rl_scripts" / "evaluate.py", *flags)
     assert json.loads((tmp_path / "result.json").read_text())["num_queries"] == 3
 
 

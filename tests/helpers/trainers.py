@@ -30,6 +30,8 @@ TINY_BC += " --test-queries 4 --total-updates 1200"
 TINY_DAGGER = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --pool-size 100"
 TINY_DAGGER += " --examples-per-update 10 --total-updates 40 --round-every 15 --round-queries 1"
 TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1"
+# For tests of what training leaves in the checkpoint: one evaluation, on one query.
+ONE_EVALUATION = ["--eval-every", "1200", "--eval-queries", "1", "--test-queries", "0"]
 
 
 def load(trainer):
@@ -78,9 +80,25 @@ def run_here(script, *arguments):
             torch.set_rng_state(state)
 
 
+def succeeds_here(script, *arguments):
+    """Run a script, which may end with exit code 0, in this process."""
+    try:
+        run_here(script, *arguments)
+    except SystemExit as end:
+        assert not end.code, end.code
+
+
+def error_here(capsys, script, *arguments):
+    """The message of a script that ends with an exit code other than 0, in this process."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        run_here(script, *arguments)
+    assert end.value.code not in (None, 0)
+    return f"{capsys.readouterr().err}{end.value.code}"
+
+
 def refusal(trainer, capsys, folder, *flags):
     """The message of such a run that rejects its flags before it has made a file."""
-    with pytest.raises(SystemExit) as end:
-        run_here(*command(trainer, folder, *flags)[1:])
-    assert end.value.code not in (None, 0) and not list(folder.iterdir())
-    return f"{capsys.readouterr().err}{end.value.code}"
+    message = error_here(capsys, *command(trainer, folder, *flags)[1:])
+    assert not list(folder.iterdir())
+    return message

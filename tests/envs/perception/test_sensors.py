@@ -253,12 +253,12 @@ def test_sensors_work_in_a_vector_environment():
 def test_memory_does_not_grow_with_the_number_of_scenes():
     env = SensorWrapper(envs.make("random_boxes_hard"), cardinal(size=(16, 16)))
     rng, sizes = np.random.default_rng(0), []
-    for number in range(2400):
+    for number in range(1200):
         env.unwrapped.sample_scene(rng)
         env._world.show(env.unwrapped.scene, HOME)
         for sensor in env.sensors.values():
             sensor.observe(env._world)
-        if number % 800 == 799:
+        if number % 400 == 399:
             sizes.append(psutil.Process().memory_info().rss)
-    assert sizes[-1] - sizes[0] < 20e6
+    assert sizes[-1] - sizes[0] < 10e6
     env.close()

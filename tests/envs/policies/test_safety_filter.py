@@ -257,39 +257,7 @@ def test_options_come_from_a_policys_metadata():
             SafetyFilter.from_metadata({"safety_filter": options})
 
 
-# --- In episodes
-
-
-def run(env, query, safety_filter, seed=0):
-    """Straight to the goal, with a safety filter or without: states, and the last info."""
-    target = PANDA.normalise(query.goal)
-
-    def act(observation):
-        return target - observation["observation"][:7]
-
-    if safety_filter is not None:
-        act = safety_filter.filter_policy(act, env, np.random.default_rng(seed))
-    observation, info = env.reset_specific(*query)
-    states, done = [observation["observation"][:7]], info["is_success"]
-    while not done:
-        observation, _, terminated, truncated, info = env.step(act(observation))
-        states.append(observation["observation"][:7])
-        done = terminated or truncated
-    return np.array(states), info
-
-
-def test_filter_reduces_collisions_and_escapes_raise_success():
-    queries = load_queries("random_boxes_hard", "validation")[:30]
-    env = envs.make("random_boxes_hard", goal_type="combined", **GROUND_TRUTH)
-    successes, collisions = [], []
-    for safety_filter in (None, SafetyFilter(escape=False), SafetyFilter()):
-        infos = [run(env, query, safety_filter)[1] for query in queries]
-        successes.append(sum(info["is_success"] for info in infos))
-        collisions.append(sum(info["collision_so_far"] for info in infos))
-    env.close()
-    without, filtered, escaping = successes
-    assert without < filtered < escaping
-    assert collisions[1] < 0.75 * collisions[0]
+# --- In episodes (their collisions and successes: test_evaluation.py)
 
 
 def test_filter_keeps_the_margin_between_links():
