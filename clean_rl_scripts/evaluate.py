@@ -87,7 +87,7 @@ class Args:
     """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); by default the one that the
     policy was trained on"""
     robot: Path | None = None
-    """another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE"""
+    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
     goal_type: Literal["ee", "config", "combined"] | None = None
     """what the goal is; by default the policy's own, otherwise `ee`"""
     split: Literal["test", "validation", "original"] = "test"

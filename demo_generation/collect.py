@@ -50,7 +50,7 @@ class Args:
     task: str
     """Name of a task, or path of a scene file."""
     robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
+    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     num: PositiveInt = 10_000
     """Number of demonstrations."""
     seed: Seed = 0

@@ -66,7 +66,7 @@ class Args:
     task: tuple[str, ...]
     """Names of tasks, paths of scene files, or `all`."""
     robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
+    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     solvable: bool = False
     """Accept only queries that the planner solves."""
     queries_per_scene: PositiveInt = 1

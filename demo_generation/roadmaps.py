@@ -459,7 +459,7 @@ class Args:
     """Name of a task, `mixed_scenes`, or path of a scene file. Each scene has a roadmap of its own,
     also where scenes do not vary."""
     robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
+    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     scenes: PositiveInt = 6000
     """Number of scenes."""
     paths_per_scene: PositiveInt = 300

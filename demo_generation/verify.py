@@ -39,7 +39,7 @@ class Args:
     task: str | None = None
     """The task that the files are for. Files of an arm other than the Panda need it."""
     robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
+    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     workers: Workers = CORES
     """Number of processes, by default that of the cores."""
     repair: bool = False

@@ -24,7 +24,7 @@ def make(
 
     Args:
         task: name of a task (`TASKS`), or path of a scene file (docs/customise/scene.md). With
-            another arm `TASK@ROBOT`, where ROBOT is a robot's file (docs/guide/robots.md).
+            another arm `TASK@ROBOT`, where ROBOT is a robot's file (docs/customise/robot.md).
         encoder: appends the encoded scene to `observation`: `oracle`, `point_cloud`, or the name or
             path of an encoder's network (`envs.perception.encoders`); None for nothing.
         num_points: of the encoder `point_cloud`.

@@ -83,7 +83,7 @@ class Args:
     task: tyro.conf.Positional[str]
     """The task's name, or the path of a scene file (.yaml)."""
     robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
+    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     output: Path | None = None
     """Write this file instead of opening a window: an image (.png) or an animation (.gif)."""
     policy: str = "go-to-goal"

@@ -33,7 +33,7 @@ class Args:
     task: str = "random_boxes_hard"
     """Name of a task, or path of a scene file."""
     robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE."""
+    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     num: PositiveInt = 20_000
     """Number of scenes."""
     sensors: Literal["images", "clouds", "both"] = "both"

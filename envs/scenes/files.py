@@ -2,7 +2,7 @@
 
 All lengths in metres, in the frame of the robot's base (x forward, y left, z up):
 
-    robot: ur5.yaml # the arm: a file, relative to this one (docs/guide/robots.md); the Panda if
+    robot: ur5.yaml # the arm: a file, relative to this one (docs/customise/robot.md); the Panda if
                     # left out
     table: true     # true (as if left out): the standard table; false: none; or one of your own,
                     # {position: [x, y, z], size: [x, y, z]}, turned like a box

@@ -47,7 +47,7 @@ class PolicyFlags(RunFlags):
     task: str = "no_obstacles"
     """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
     robot: Path | None = None
-    """another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE"""
+    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
     eval_queries: PositiveInt = 200
     """validation queries per evaluation"""
     test_queries: NonNegativeInt = 1_000

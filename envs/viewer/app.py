@@ -78,7 +78,7 @@ class Args:
     task: tyro.conf.Positional[str]
     """the task's name, the path of a scene file (.yaml), or a folder of roadmap paths"""
     robot: Path | None = None
-    """another arm: a robot's file (.urdf, .yaml; docs/guide/robots.md); same as TASK@FILE"""
+    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
     policy: tuple[str, ...] = ()
     """the policies, side by side: `go-to-goal`, `random`, `via-points`, `planner`, a policy
     network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy; without
