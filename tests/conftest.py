@@ -10,6 +10,7 @@ import pytest
 import torch
 from trainers import GPU
 
+from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
 from roboarm_nmp.envs.training import protocol
 
 # Ctrl-C can be tested also where it is ignored, as in the background of a shell.
@@ -86,6 +87,21 @@ def torch_default(request):
             torch.set_default_device(None)
 
     return context
+
+
+@pytest.fixture(scope="session")
+def few_demos(tmp_path_factory):
+    """A file of 20 demonstrations of `random_boxes_hard`: all 10,000 take seconds to load."""
+    path, demos = tmp_path_factory.mktemp("demos") / "few.h5", load_demos("random_boxes_hard")
+    ends = zip(demos.plan_offsets, demos.plan_offsets[1:21], strict=False)
+    plans = [demos.plan[first:last] for first, last in ends]
+    first = [demos[i] for i in range(20)]
+    columns = {name: getattr(demos, name)[:20] for name in ("plan_seed", "digest", "collided")}
+    scenes = {"scenes_of": [demo.scene for demo in first]}
+    states = [demo.states for demo in first]
+    given = (demos.task, demos.seed, plans, states, columns, "a test", demos.parameters)
+    write_demos(path, *given, **scenes)
+    return path
 
 
 @pytest.fixture

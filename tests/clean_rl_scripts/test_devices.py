@@ -31,9 +31,9 @@ def num_updates(state):
 @pytest.mark.parametrize("encoded", [False, True])
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_update_evaluation_and_resume_on_another_device(
-    trainer, encoded, tmp_path, another_device, short_episodes
+    trainer, encoded, tmp_path, another_device, short_episodes, few_demos
 ):
-    more = ENCODED if encoded else ["--goal-type", "ee"]
+    more = [*ENCODED, "--demos", few_demos] if encoded else ["--goal-type", "ee"]
     if encoded and trainer != "bc":
         more = [*more, "--demo-prob", "1"]
     run_here(*command(trainer, tmp_path, *flags(trainer), "--device", another_device, *more)[1:])

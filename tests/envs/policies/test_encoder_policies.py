@@ -102,15 +102,19 @@ def test_appended_link_distances_in_observations_buffer_and_demonstrations():
     env.close()
 
 
-def flags(trainer):
+def flags(trainer, demos):
     more = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
+    more += ["--goal-type", "combined", "--demos", demos, "--eval-queries", "1"]
     distances = ["--link-distances", "--geometry-source", "ground_truth"]
     return more if trainer == "bc" else [*more, "--demo-prob", "1", *distances]
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_policy_with_an_encoder_is_trained_resumed_and_evaluated(trainer, tmp_path, short_episodes):
-    run = run_script(trainer, tmp_path / "whole", *flags(trainer), "--goal-type", "combined")
+def test_policy_with_an_encoder_is_trained_resumed_and_evaluated(
+    trainer, tmp_path, short_episodes, few_demos
+):
+    given = flags(trainer, few_demos)
+    run = run_script(trainer, tmp_path / "whole", *given)
     network = torch.load(run / "policy.pt", weights_only=True)
     assert network["metadata"]["env"]["encoder"] == "oracle"
     arguments = ["--policy", run, "--num-queries", "3", "--task", HARD]
@@ -125,8 +129,7 @@ def test_policy_with_an_encoder_is_trained_resumed_and_evaluated(trainer, tmp_pa
         subprocess.run(show, check=True, capture_output=True, cwd=ROOT)
         assert (tmp_path / "rollout.gif").stat().st_size > 0
         return
-    part = [*flags(trainer), "--goal-type", "combined", "--total-timesteps", "600"]
-    again = run_script(trainer, tmp_path / "part", *part)
+    again = run_script(trainer, tmp_path / "part", *given, "--total-timesteps", "600")
     run_here(PATHS[trainer], "--resume", again, "--total-timesteps", "1200")
     one, other = (
         torch.load(path / "checkpoint.pt", weights_only=True)["actor"] for path in (run, again)
