@@ -62,7 +62,7 @@ def _add_files(command):
     command.add_argument(
         "--robot",
         metavar="FILE",
-        help="another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE",
+        help="another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md), as TASK@FILE",
     )
 
 
