@@ -171,7 +171,14 @@ class RoboArmEnv(gym.Env):
         self.render_mode = render_mode
         self.render_size = render_size
 
-        joints = (Scene() if scene is None else scene).robot.num_joints
+        window = render_mode == "human"
+        if window and (problem := why_no_window()):
+            gym.logger.warn(f"render_mode='human' needs a display ({problem}): no window")
+            window = False
+        self.world = World(scene, window, drawn=render_mode is not None)
+        """The simulated `World`. Change its scene by `set_scene` of the environment."""
+
+        joints = self.robot.num_joints
         size = goal_size(goal_type, joints)
         self._observation_size = joints * (2 if velocities else 1) + 3
         unbounded = [
@@ -184,12 +191,6 @@ class RoboArmEnv(gym.Env):
         )
         self.action_space = gym.spaces.Box(-1.0, 1.0, (joints,), np.float32)
 
-        window = render_mode == "human"
-        if window and (problem := why_no_window()):
-            gym.logger.warn(f"render_mode='human' needs a display ({problem}): no window")
-            window = False
-        self.world = World(scene, window, drawn=render_mode is not None)
-        """The simulated `World`. Change its scene by `set_scene` of the environment."""
         self.start_configuration = None
         """Start of this episode, float32 (n,), rad; None before the first reset."""
         self.goal_configuration = None

@@ -245,7 +245,8 @@ def main(args):
 
 if __name__ == "__main__":
     if sys.argv[1:2] != ["check"]:
-        sys.exit("usage: roboarm robot check FILE [--help]")
+        print("usage: roboarm robot check FILE [--help]")
+        sys.exit(0 if sys.argv[1:2] in (["-h"], ["--help"]) else 2)
     args = tyro.cli(Args, args=sys.argv[2:], prog="roboarm robot check", description=__doc__)
     try:
         check(args)

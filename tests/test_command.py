@@ -15,9 +15,9 @@ from paths import ROOT
 
 from roboarm_nmp import __main__ as command
 
-NAMES = [*(name for name in command.COMMANDS if name != "train")]
+NAMES = [*(name for name in command.COMMANDS if name not in ("train", "robot")), "robot check"]
 NAMES += [f"train {name}" for name in command.TRAINERS]
-WITHOUT_GROUPS = ("data", "policies")  # which have few flags
+WITHOUT_GROUPS = ("robot check", "data", "policies")  # which have few flags
 
 
 def run(*arguments):

@@ -12,7 +12,8 @@ import pytest
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.planning import Planner
-from roboarm_nmp.envs.perception.sensors import POSE, Camera, PointCloud, SensorWorld
+from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
@@ -199,7 +200,7 @@ def test_world_is_copied_when_its_goal_was_marked_in_an_earlier_scene(make_copy)
 
 def test_sensor_world_and_its_copy_observe_the_same(make_copy):
     world = SensorWorld()
-    world.show(envs.TASKS["boxes"].scene, POSE)
+    world.show(envs.TASKS["boxes"].scene, PANDA.observed_pose)
     twin = make_copy(world)
     camera = Camera((1.6, 0.0, 0.8), size=(32, 32), outputs=("rgb", "depth", "segmentation"))
     assert leaves(camera.observe(world)) == leaves(camera.observe(twin))

@@ -77,7 +77,7 @@ def test_command_shows_another_arm(tmp_path, capsys):
 
 
 def test_robot_check_prints_the_pairs_and_draws_them(tmp_path, capsys, monkeypatch):
-    image = tmp_path / "check.png"
+    image, connected = tmp_path / "check.png", [p.isConnected(client) for client in range(100)]
     arguments = ["check", str(XARM6), "--configurations", "200", "--image", str(image)]
     monkeypatch.setattr(sys, "argv", ["robot", *arguments])
     with pytest.raises(SystemExit) as ended:
@@ -90,4 +90,4 @@ def test_robot_check_prints_the_pairs_and_draws_them(tmp_path, capsys, monkeypat
     orange = (np.abs(pixels - (235, 120, 40)) < 5).all(-1)
     half = pixels.shape[1] // 2
     assert orange[300:, half:].sum() > 1000  # pairs
-    assert not p.isConnected(0)
+    assert connected == [p.isConnected(client) for client in range(100)]

@@ -177,7 +177,7 @@ def look(rng):
     if pixels > 10**6:  # allowed, and slow
         return RAN
     world = SensorWorld()
-    world.show(scenes.Scene(), sensors.POSE)
+    world.show(scenes.Scene(), PANDA.observed_pose)
     for output, space in sensor.space.spaces.items():
         assert space.contains(sensor.observe(world)[output]), output
     world.close()

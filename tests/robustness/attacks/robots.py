@@ -121,10 +121,11 @@ def hostile(rng):
 
 def attempts(seed, folder):
     """A function from a number to the outcome of loading such a robot and checking a state."""
-    urdf.sample_pairs = functools.partial(self_collisions.sample_pairs, samples=200)
-    control.NUM_POSES = 2
 
     def attempt(number):
+        # In the attempt's own process, so that robots elsewhere stay as they are.
+        urdf.sample_pairs = functools.partial(self_collisions.sample_pairs, samples=200)
+        control.NUM_POSES = 2
         here = folder / str(number)
         here.mkdir()
         for name, contents in hostile(random.Random(f"{seed} {number}")).items():
