@@ -177,8 +177,10 @@ def test_result_does_not_depend_on_the_number_of_workers(queries):
 
 
 def test_random_actions_depend_on_seed_and_query_only():
+    env = envs.make("no_obstacles")
+
     def actions(seed, index):
-        act, _ = make_policy("random", None, seed)(index, None)
+        act, _ = make_policy("random", env, seed)(index, None)
         return np.array([act({}) for _ in range(5)])
 
     assert np.array_equal(actions(1, 4), actions(1, 4))
