@@ -31,6 +31,14 @@ from roboarm_nmp.envs.scenes.primitives import Scene
 GROUND_TRUTH = {"link_distances": True, "geometry_source": "ground_truth"}
 ESCAPE_JOINTS = PANDA.num_joints - TURNING_JOINTS
 
+
+def fake_env(max_step, link_distances_at):
+    """What `filter_policy` needs of an environment of the Panda."""
+    return SimpleNamespace(
+        robot=PANDA, max_step=max_step, get_wrapper_attr=lambda name: link_distances_at
+    )
+
+
 # --- Link distances
 
 
@@ -296,9 +304,7 @@ def test_distances_at_the_end_of_the_step_count_too():
         there[3, :2] = 0.01 - 0.5 * (state[0] - 0.02), -0.5  # nearer than 1 cm beyond 0.02
         return there
 
-    env = SimpleNamespace(
-        robot=PANDA, max_step=0.03, get_wrapper_attr=lambda name: link_distances_at
-    )
+    env = fake_env(0.03, link_distances_at)
     act = SafetyFilter(escape=False).filter_policy(lambda _: action(0.03), env, None)
     # (An open pose, without links near each other.)
     state = np.concatenate([[0.0, 0.0, 0.0, -0.3, 0.0, 0.3, 0.0], np.zeros(3)])
@@ -336,9 +342,7 @@ def test_escape_is_a_seeded_random_direction_followed_by_momentum():
         return np.zeros(7)
 
     nothing = link_distances(*[(ACTIVATION_DISTANCE,)] * 10)
-    env = SimpleNamespace(
-        robot=PANDA, max_step=0.01, get_wrapper_attr=lambda name: lambda state: nothing
-    )
+    env = fake_env(0.01, lambda state: nothing)
 
     def walk(seed):
         state, moves = np.zeros(10), []
@@ -374,9 +378,7 @@ def test_virtual_obstacle_keeps_the_arm_from_a_local_minimum(to_goal, radius):
         return np.clip(begin - observation["observation"][:7], -0.01, 0.01)
 
     rows = link_distances(*[(ACTIVATION_DISTANCE,)] * 10)
-    env = SimpleNamespace(
-        robot=PANDA, max_step=0.03, get_wrapper_attr=lambda name: lambda state: rows
-    )
+    env = fake_env(0.03, lambda state: rows)
     act = SafetyFilter().filter_policy(back, env, np.random.default_rng(1))
     state, away = begin.copy(), []
     for _ in range(PATIENCE + ESCAPE_STEPS + MOMENTUM_STEPS):  # (without a second escape)
@@ -394,9 +396,7 @@ def test_slow_arrival_is_no_local_minimum(share, arrives):
     """Near the goal, progress is the share of the remaining distance that ten steps cover."""
     begin = np.array([0.0, 0.0, 0.0, -0.3, 0.0, 0.3, 0.0])
     goal, rows = begin + 0.03, link_distances(*[(ACTIVATION_DISTANCE,)] * 10)
-    env = SimpleNamespace(
-        robot=PANDA, max_step=0.03, get_wrapper_attr=lambda name: lambda state: rows
-    )
+    env = fake_env(0.03, lambda state: rows)
     act = SafetyFilter().filter_policy(
         lambda observation: share * (goal - observation["observation"][:7]),
         env,
@@ -421,9 +421,7 @@ def test_gain_grows_near_the_goal(away, cbf_gain):
     goal = state + np.array([away, 0, 0, 0, 0, 0, 0])
     # A wall 15 mm ahead of the first joint, so 5 mm to the margin.
     rows = link_distances((0.015, -1.0), *[(ACTIVATION_DISTANCE,)] * 9)
-    env = SimpleNamespace(
-        robot=PANDA, max_step=0.03, get_wrapper_attr=lambda name: lambda state: rows
-    )
+    env = fake_env(0.03, lambda state: rows)
     act = SafetyFilter(0.01).filter_policy(lambda _: goal - state, env, np.random.default_rng(0))
     observation = {"observation": np.concatenate([state, np.zeros(3)]), "link_distances": rows}
     there = link_distances(*[(ACTIVATION_DISTANCE,)] * 10)
