@@ -35,11 +35,11 @@ NAMES = {
     "point_cloud": "none: observed points",
     "oracle": "none: ground-truth obstacles (privileged)",
 }
-ENCODER_MEASURES = {
-    "vae": "squared error, foreground",
-    "vqvae": "squared error, foreground",
-    "pointnet2": "IoU of obstacles",
-    "field": "distance error below 10 cm (cm)",
+# Per encoder, the score that its curve shows: key and label.
+CURVES = {
+    "vae": ("error_foreground", "squared error, foreground"),
+    "vqvae": ("error_foreground", "squared error, foreground"),
+    "pointnet2": ("iou_obstacle", "IoU of obstacles"),
 }
 
 
@@ -292,14 +292,17 @@ def draw_dagger(path):
 
 
 def draw_encoders(path):
-    """The validation error of each encoder over updates."""
+    """A score on validation scenes over updates; the points are the pretrained encoders."""
     rows = columns("encoder_curves.csv")
-    figure, axes = plt.subplots(1, 4, figsize=(10.5, 2.6), layout="constrained")
-    for panel, (name, measure) in zip(axes, ENCODER_MEASURES.items(), strict=True):
+    figure, axes = plt.subplots(1, len(CURVES), figsize=(8.4, 2.6), layout="constrained")
+    for panel, (name, (key, measure)) in zip(axes, CURVES.items(), strict=True):
         own = [row for row in rows if row["encoder"] == name]
         updates = [int(row["updates"]) / 1000 for row in own]
-        panel.plot(updates, [float(row["value"]) for row in own], "tab:blue", linewidth=1.2)
-        panel.set_title(f"{NAMES[name]}:\n{measure}", fontsize=9)
+        panel.plot(updates, [float(row["value"]) for row in own], linewidth=1.2)
+        pretrained = read(ENCODERS / f"{name}.json")
+        panel.plot(pretrained["updates"] / 1000, pretrained[key], "o", color="tab:orange")
+        panel.set_title(NAMES[name], fontsize=9)
+        panel.set_ylabel(measure, fontsize=8)
         panel.set_ylim(bottom=0)
         panel.grid(alpha=0.3)
     figure.supxlabel("thousand updates", fontsize=10)
