@@ -135,7 +135,7 @@ def describe(robot):
         name, low, high, fastest, effort = row
         fastest = "unknown" if fastest is None else f"{fastest:.2f}"
         lines.append(f"{name:<28}{low:>9.3f}{high:>9.3f}{fastest:>10}{effort:>9.0f}")
-    names = link_names(robot)
+    _, names = robot.bullet_names
     still = [names[link.index] for link in robot.links if link.frame < 0]
     offset = ", ".join(f"{x:g}" for x in robot.end_effector_offset)
     lines += [
@@ -148,19 +148,6 @@ def describe(robot):
         others = [names[pair[1]] for pair in robot.self_collision_pairs if pair[0] == a]
         lines.append(f"  {names[a]:<26}{', '.join(others)}")
     return "\n".join(lines)
-
-
-def link_names(robot):
-    """Names of the links by PyBullet's index."""
-    client = p.connect(p.DIRECT)
-    try:
-        body = robot.load(client, drawn=False)
-        number = p.getNumJoints(body, physicsClientId=client)
-        infos = [p.getJointInfo(body, i, physicsClientId=client) for i in range(number)]
-        base = p.getBodyInfo(body, physicsClientId=client)[0].decode()
-    finally:
-        p.disconnect(client)
-    return {-1: base} | {info[0]: info[12].decode() for info in infos}
 
 
 def draw(robot, rng):
@@ -195,7 +182,7 @@ def _behind(robot, rng):
 
 def draw_pairs(robot, size):
     """An image of the links as rows and columns: uint8 (height, width, 3)."""
-    names = link_names(robot)
+    _, names = robot.bullet_names
     links = sorted(link.index for link in robot.links)
     image, font = Image.new("RGB", size, "white"), ImageFont.load_default(12)
     painter, left = ImageDraw.Draw(image), size[0] // 3

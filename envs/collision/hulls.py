@@ -1,10 +1,8 @@
 """The shapes of the arm and of a scene as the arrays that `kernels` takes."""
 
-import contextlib
 import functools
 import itertools
 import math
-import tempfile
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,7 +18,7 @@ from roboarm_nmp.envs.collision.kernels import (
     ROW,
     SPHERE,
 )
-from roboarm_nmp.envs.robots.robot import matrix, temporary_urdf
+from roboarm_nmp.envs.robots.robot import matrix, temporary_file
 from roboarm_nmp.envs.scenes.primitives import Cylinder, Sphere, to_array
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
@@ -99,9 +97,9 @@ def _shapes(client, robot, body, link):
     shapes = p.getCollisionShapeData(body, link, physicsClientId=client)
     if len(shapes) > 1 or any(len(_objects(shape[4].decode())) > 1 for shape in shapes):
         # PyBullet returns the vertices of all hulls as one, so each is loaded alone.
-        for element in robot.collision_elements(_name(client, body, link)):
+        for element in robot.collision_elements(robot.bullet_names[1][link]):
             for one in _one_by_one(element):
-                with temporary_urdf(_ONE_SHAPE.format(one)) as urdf:
+                with temporary_file(_ONE_SHAPE.format(one), ".urdf") as urdf:
                     alone = p.loadURDF(urdf, physicsClientId=client)
                 yield from _shapes(client, robot, alone, -1)
                 p.removeBody(alone, physicsClientId=client)
@@ -144,14 +142,6 @@ def _objects(file):
     return ["\n".join([*vertices, *faces]) for faces in objects if faces]
 
 
-@contextlib.contextmanager
-def _temporary_obj(text):
-    with tempfile.NamedTemporaryFile("w", suffix=".obj") as file:
-        file.write(text)
-        file.flush()
-        yield file.name
-
-
 def _one_by_one(element):
     """A URDF's `collision` element, or one for each object of its OBJ file, as text."""
     mesh = element.find("geometry/mesh")
@@ -160,15 +150,9 @@ def _one_by_one(element):
         yield ElementTree.tostring(element, "unicode")
         return
     for text in objects:
-        with _temporary_obj(text) as file:
+        with temporary_file(text, ".obj") as file:
             mesh.set("filename", file)
             yield ElementTree.tostring(element, "unicode")
-
-
-def _name(client, body, link):
-    if link < 0:
-        return p.getBodyInfo(body, physicsClientId=client)[0].decode()
-    return p.getJointInfo(body, link, physicsClientId=client)[12].decode()
 
 
 def _primitive(shape):

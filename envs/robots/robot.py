@@ -141,11 +141,14 @@ class Robot:
 
     @functools.cached_property
     def fingerprint(self):
-        """SHA-256 (hex) of the description: all that simulation and kinematics depend on."""
+        """SHA-256 (hex) of the description: all that kinematics and collisions depend on.
+
+        Numbers are rounded to 1e-9: the last bits of sines and cosines differ between machines.
+        """
         content = {f.name: getattr(self, f.name) for f in fields(self)}
         for name in ("urdf", "source", "xml"):
             content.pop(name)
-        text = json.dumps(content, default=np.ndarray.tolist, sort_keys=True)
+        text = json.dumps(_rounded(content), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     @classmethod
@@ -276,14 +279,7 @@ class Robot:
         if not drawn:
             flags |= p.URDF_IGNORE_VISUAL_SHAPES
         with self._readable_urdf() as urdf:
-            body = p.loadURDF(
-                urdf,
-                self.base_position,
-                self.base_orientation,
-                useFixedBase=True,
-                flags=flags,
-                physicsClientId=client,
-            )
+            body = self._load(client, urdf, flags)
         links = range(-1, p.getNumJoints(body, physicsClientId=client))
         for a in links:
             for b in range(a + 1, links.stop):
@@ -313,17 +309,35 @@ class Robot:
                 visual = copy.deepcopy(collision)
                 visual.tag = "visual"
                 link.append(visual)
-        with temporary_urdf(ElementTree.tostring(root, "unicode")) as urdf:
-            body = p.loadURDF(
-                urdf,
-                self.base_position,
-                self.base_orientation,
-                useFixedBase=True,
-                physicsClientId=client,
-            )
+        with temporary_file(ElementTree.tostring(root, "unicode"), ".urdf") as urdf:
+            body = self._load(client, urdf)
         for link in range(-1, p.getNumJoints(body, physicsClientId=client)):
             p.changeVisualShape(body, link, rgbaColor=colour, physicsClientId=client)
         return body
+
+    def _load(self, client, urdf, flags=0):
+        return p.loadURDF(
+            urdf,
+            self.base_position,
+            self.base_orientation,
+            useFixedBase=True,
+            flags=flags,
+            physicsClientId=client,
+        )
+
+    @functools.cached_property
+    def bullet_names(self):
+        """Names of joints and of links by PyBullet's index, two dicts; -1 is the base link."""
+        client = p.connect(p.DIRECT)
+        try:
+            body = self.load(client, drawn=False)
+            number = p.getNumJoints(body, physicsClientId=client)
+            infos = [p.getJointInfo(body, i, physicsClientId=client) for i in range(number)]
+            base = p.getBodyInfo(body, physicsClientId=client)[0].decode()
+        finally:
+            p.disconnect(client)
+        joints = {info[0]: info[1].decode() for info in infos}
+        return joints, {-1: base} | {info[0]: info[12].decode() for info in infos}
 
     def parsed_urdf(self):
         """The URDF's XML element, with absolute paths of meshes."""
@@ -340,7 +354,7 @@ class Robot:
     @contextlib.contextmanager
     def _readable_urdf(self):
         if self.xml:
-            with temporary_urdf(self.xml) as urdf:
+            with temporary_file(self.xml, ".urdf") as urdf:
                 yield urdf
         else:
             yield self.urdf
@@ -407,6 +421,14 @@ class Robot:
         return position
 
 
+def _rounded(value):
+    if isinstance(value, dict):
+        return {name: _rounded(one) for name, one in value.items()}
+    if isinstance(value, (tuple, list, np.ndarray)):
+        return [_rounded(one) for one in value]
+    return round(float(value), 9) + 0.0 if isinstance(value, float) else value  # no -0.0
+
+
 def matrix(quaternion):
     """A quaternion (xyzw) of norm 1 as a rotation matrix (3, 3)."""
     x, y, z, w = quaternion
@@ -441,9 +463,9 @@ def resolve(filename, urdf, packages=None):
 
 
 @contextlib.contextmanager
-def temporary_urdf(text):
+def temporary_file(text, suffix):
     """A context: the path of a file with this text."""
-    with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
+    with tempfile.NamedTemporaryFile("w", suffix=suffix) as file:
         file.write(text)
         file.flush()
         yield file.name

@@ -8,7 +8,7 @@ import sys
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from roboarm_nmp.envs.robots.robot import temporary_urdf
+from roboarm_nmp.envs.robots.robot import temporary_file
 
 MAX_FILE, MAX_DEPTH = 5_000_000, 30  # bytes, nested elements
 MAX_HULL = 100_000  # vertices of the convex hulls of all collision meshes
@@ -99,7 +99,7 @@ def bullet_indices(path, xml):
         RobotError: PyBullet cannot load it, or needs too much time, memory or vertices.
     """
     trial = f"SECONDS, MEMORY, LARGEST = {MAX_SECONDS}, {MAX_MEMORY}, {LARGEST}\n{TRIAL}"
-    with temporary_urdf(xml) as urdf:
+    with temporary_file(xml, ".urdf") as urdf:
         command = [sys.executable, "-c", trial, urdf]
         done = subprocess.run(command, capture_output=True, env=os.environ | ONE_THREAD)
     try:

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import math
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -246,7 +247,7 @@ class _Tree:
                 axis = joint.find("axis")
                 if axis is None:
                     axis = ElementTree.SubElement(joint, "axis", xyz="1 0 0")  # URDF's default
-                axis.set("xyz", " ".join(map(repr, self._axis(name).tolist())))
+                axis.set("xyz", " ".join(map(repr, self.axis(name).tolist())))
         self._add_masses()
 
     def _add_masses(self):
@@ -316,8 +317,13 @@ class _Tree:
                             f"than {most}"
                         )
                     mesh.set("filename", str(file))
+                    contents = file.read_bytes()
+                    if file.suffix.lower() == ".obj" and not _has_its_vertices(contents):
+                        raise RobotError(
+                            f"{self.path}: link {link.get('name')!r}: a face of mesh {file} has a "
+                            f"vertex that is not there"
+                        )
                     if kind == "collision":
-                        contents = file.read_bytes()
                         shapes += contents.count(b"\no ") + contents.count(b"\ng ")
                         digest.update(contents)
             shapes += len(link.findall("collision"))
@@ -338,7 +344,8 @@ class _Tree:
             raise RobotError(f"{where}: no such file ({file})")
         return file
 
-    def _axis(self, joint):
+    def axis(self, joint):
+        """The direction (3,), of length 1, about or along which a joint moves."""
         axis = self.joints[joint].find("axis")
         axis = np.array([float(x) for x in axis.get("xyz", "1 0 0").split()])
         norm = np.linalg.norm(axis)
@@ -458,6 +465,18 @@ def _read(path):
     return root
 
 
+def _has_its_vertices(obj):
+    """Whether an OBJ file's faces have vertices of the file; PyBullet would read beyond them."""
+    count = len(re.findall(rb"^[ \t]*v[ \t]", obj, re.MULTILINE))
+    faces = re.findall(rb"^[ \t]*f[ \t]([^#\r\n]*)", obj, re.MULTILINE)
+    corners = re.sub(rb"/[^ \t]*", b"", b" ".join(faces)).split()  # textures and normals
+    try:
+        numbers = np.array(corners, dtype="S20").astype(np.int64)
+    except ValueError:
+        return False
+    return bool(((numbers != 0) & (np.abs(numbers) <= count)).all())
+
+
 def _rotation_x(angle):
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
@@ -498,7 +517,7 @@ def _frames(tree, joints, positions, mimics):
         at, turn = tree.origin(name)
         position, rotation = position + rotation @ at, rotation @ turn
         kind = joint.get("type")
-        axis = tree._axis(name) if kind in MOVABLE else None
+        axis = tree.axis(name) if kind in MOVABLE else None
         if name in joints or name in mimics:
             leader, multiplier, offset = mimics.get(name, (name, 1.0, 0.0))
             aligned = _aligning(axis)

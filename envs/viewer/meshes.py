@@ -7,8 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from roboarm_nmp.envs.utils.bullet import pybullet as p
-
 # Visual meshes are reduced by merging the vertices in each cube of this size (m, of the Panda).
 # Ghosts and recordings have the larger one: browsers without a GPU render slowly.
 MESH_CELL, COARSE_MESH_CELL = 0.005, 0.013
@@ -199,19 +197,9 @@ def _rounded(vertices):
     return np.round(vertices, 4).astype(np.float32)
 
 
-@functools.cache
 def _bullet_indices(robot):
     """PyBullet's indices of joints and of links by their names, two dicts; -1 is the base."""
-    client = p.connect(p.DIRECT)
-    try:
-        body = robot.load(client, drawn=False)
-        number = p.getNumJoints(body, physicsClientId=client)
-        infos = [p.getJointInfo(body, i, physicsClientId=client) for i in range(number)]
-        base = p.getBodyInfo(body, physicsClientId=client)[0].decode()
-    finally:
-        p.disconnect(client)
-    joints = {info[1].decode(): info[0] for info in infos}
-    return joints, {base: -1} | {info[12].decode(): info[0] for info in infos}
+    return [{name: index for index, name in names.items()} for names in robot.bullet_names]
 
 
 def _numbers(element, name, default=None):

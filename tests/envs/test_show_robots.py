@@ -70,8 +70,9 @@ def test_command_shows_another_arm(tmp_path, capsys):
     csv = tmp_path / "episode.csv"
     assert show.main([*task, "--save-trajectory", str(csv)]) == 0
     assert csv.read_text().splitlines()[0].startswith("time,q1,q2,q3,q4,q5,q6,action1")
+    path.unlink()
     assert show.main([*task, "--trajectory", str(csv), "--output", str(path), *size]) == 0
-    assert "collision-free" in capsys.readouterr().out or path.exists()
+    assert path.exists()
     assert show.main(["no_obstacles@a.yaml", "--robot", "b.yaml", "--output", str(path)]) == 2
     assert "names a robot already" in capsys.readouterr().err
 

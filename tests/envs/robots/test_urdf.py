@@ -284,6 +284,22 @@ def test_mesh_without_triangles_is_rejected(urdf, contents, ending):
         Robot.from_urdf(path)
 
 
+@pytest.mark.parametrize("kind", ["collision", "visual"])
+@pytest.mark.parametrize("face", ["1 2 9", "1 2 0", "1/1/1 2/2/2 9/3/3", "-1 -2 -9", "1 2 x"])
+def test_face_with_a_missing_vertex_is_rejected(urdf, face, kind):
+    path = urdf(TWO + joint("1", "a", "b") + link("c", (*MESH[:2], MESH[2].format("x.obj"))))
+    text = path.read_text().replace("</robot>", joint("2", "b", "c") + "</robot>")
+    path.write_text(text.replace("collision", kind))
+    tetrahedron = (
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1/1 3/2 4/3\nf -1 -2 -3\n"
+    )
+    (path.parent / "x.obj").write_text(f"{tetrahedron}f {face}\n")
+    with pytest.raises(RobotError, match="has a vertex that is not there"):
+        Robot.from_urdf(path)
+    (path.parent / "x.obj").write_text(tetrahedron)
+    assert Robot.from_urdf(path).num_joints == 2
+
+
 LOAD = """
 import re, resource, sys, time
 from roboarm_nmp.envs.robots.robot import Robot
