@@ -57,6 +57,15 @@ def test_help_of_a_script_has_the_scripts_name():
     assert "usage: evaluate.py [-h]" in done.stdout, done.stderr
 
 
+def test_robot_without_check_prints_its_usage():
+    for arguments, code in ((["--help"], 0), ([], 2), (["chekc"], 2)):
+        done = run("robot", *arguments)
+        assert (done.returncode, done.stdout) == (
+            code,
+            "usage: roboarm robot check FILE [--help]\n",
+        )
+
+
 def test_help_is_quick_and_lists_all_subcommands():
     began = time.perf_counter()
     done = run("--help")

@@ -1,4 +1,4 @@
-"""docs/customise/{sensor,encoder,reward}.md: their code is executed."""
+"""docs/customise/{robot,sensor,encoder,reward}.md: their code is executed."""
 
 import re
 
@@ -25,6 +25,13 @@ def executed(code):
     for block in code:
         exec(block, names)
     return names
+
+
+def test_plan_of_the_page_about_robots_is_followed_without_contact(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)  # the page's paths are relative to it
+    names = executed(blocks("robot"))
+    assert capsys.readouterr().out.endswith("True False\n")
+    assert names["env"].robot.name == "iiwa" and names["path"].shape[1] == 7
 
 
 def test_sensor_of_the_page_observes_heights_of_obstacles():

@@ -192,6 +192,9 @@ def test_robots_are_values(arm):
     again = pickle.loads(pickle.dumps(arm))
     assert again == arm and hash(again) == hash(arm) and arm != PANDA
     assert dataclasses.replace(arm, lower=[-1.0] * 3) != arm
+    rounded = dataclasses.replace(arm, lower=arm.lower * (1 + 1e-15))  # as on another machine
+    assert (rounded.lower != arm.lower).any() and rounded == arm and hash(rounded) == hash(arm)
+    assert dataclasses.replace(arm, lower=arm.lower * (1 + 1e-6)) != arm
     with pytest.raises(ValueError):
         arm.lower[0] = 0
 
