@@ -43,8 +43,8 @@ from roboarm_nmp.envs.datasets.trajectories import (
 )
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
+from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Scene, to_array
-from roboarm_nmp.envs.scenes.random_boxes import scale_of
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeInt, Pixels, PositiveInt, Seed

@@ -15,8 +15,7 @@ from dataclasses import replace
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, POINT_RADIUS, observed_points
-from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.random_boxes import scale_of
+from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.utils.names import suggest
 
 GROUND_TRUTH = "ground_truth"

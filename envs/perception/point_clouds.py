@@ -12,7 +12,7 @@ import functools
 import numpy as np
 
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, cardinal, observe_scene
-from roboarm_nmp.envs.scenes.random_boxes import scale_of
+from roboarm_nmp.envs.robots.panda import scale_of
 
 POINT_CLOUD = "point_cloud"
 """Its name as an encoder and as a geometry source."""

@@ -13,9 +13,8 @@ from dataclasses import asdict, dataclass
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
-from roboarm_nmp.envs.scenes.random_boxes import scale_of
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
 

@@ -86,3 +86,8 @@ PANDA = Robot(
     observed_pose=(0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8),
     contact_free=tuple((low + high) / 2 for low, high in zip(_LOWER, _UPPER, strict=True)),
 )
+
+
+def scale_of(robot):
+    """A robot's reach as a share of the Panda's: what its random scenes and sensors scale with."""
+    return 1.0 if robot == PANDA else robot.reach / PANDA.reach

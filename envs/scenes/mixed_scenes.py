@@ -8,8 +8,9 @@ tasks' own, except for the random boxes (docs/guide/tasks.md).
 import math
 from dataclasses import dataclass, replace
 
+from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
-from roboarm_nmp.envs.scenes.random_boxes import FRICTION, TURN, RandomBoxes, rounded, scale_of
+from roboarm_nmp.envs.scenes.random_boxes import FRICTION, TURN, RandomBoxes, rounded
 
 FEWEST, MOST_BOXES = 2, 8
 # m. Walls stand on the table, edge-on to the robot. In two of three scenes the second wall is

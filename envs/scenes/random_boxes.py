@@ -8,7 +8,7 @@ lengths are multiplied by the ratio of their reaches.
 import math
 from dataclasses import dataclass, replace
 
-from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
 # Positions and sizes are multiples of this (m), about a millimetre, and yaws of a 256th of a turn,
@@ -54,11 +54,6 @@ class RandomBoxes:
             if _distance_to_robot(box, scale) >= KEEP_CLEAR * scale:
                 boxes.append(box)
         return replace(self.base, obstacles=tuple(boxes))
-
-
-def scale_of(robot):
-    """A robot's reach as a share of the Panda's."""
-    return 1.0 if robot == PANDA else robot.reach / PANDA.reach
 
 
 def _sample_box(rng, azimuth, scale):

@@ -36,9 +36,8 @@ import tyro
 from roboarm_nmp import envs
 from roboarm_nmp.envs.policies.baselines import BASELINES
 from roboarm_nmp.envs.policies.registry import policy_file, pretrained_policies
-from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Sphere
-from roboarm_nmp.envs.scenes.random_boxes import scale_of
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, Seed
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically

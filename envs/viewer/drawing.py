@@ -8,8 +8,8 @@ import numpy as np
 
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, find_geometry_source
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
+from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder
-from roboarm_nmp.envs.scenes.random_boxes import scale_of
 from roboarm_nmp.envs.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, arm_joints, link_meshes
 
 # m, for the Panda; for other arms in proportion to their reach.

@@ -18,9 +18,8 @@ from roboarm_nmp.envs.perception.sensors import (
     observe_scene,
 )
 from roboarm_nmp.envs.robots.files import load_robot
-from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
-from roboarm_nmp.envs.scenes.random_boxes import scale_of
 
 XARM6 = ROOT / "examples" / "robots" / "xarm6.yaml"
 TASK = f"random_boxes_hard@{XARM6}"
