@@ -75,8 +75,9 @@ def make(
         from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
         from roboarm_nmp.envs.wrappers import LinkDistancesWrapper
 
-        source = find_geometry_source(geometry_source, env.robot)
-        env = LinkDistancesWrapper(env, source, append_link_distances, goal_link_distances)
+        sources = [find_geometry_source(geometry_source, env.robot, fine) for fine in (False, True)]
+        options = append_link_distances, goal_link_distances, sources[1]
+        env = LinkDistancesWrapper(env, sources[0], *options)
     return env
 
 

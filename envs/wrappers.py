@@ -140,11 +140,20 @@ class LinkDistancesWrapper(_ObservingWrapper):
         append: whether `observation` contains `link_distances`, too, flat, before an encoded scene.
         goal_link_distances: whether observations contain `goal_link_distances`, if the goal type
             is not `ee`.
+        fine_geometry_source: another one for approach paths (`envs.policies.approach_path`).
     """
 
-    def __init__(self, env, geometry_source, append=False, goal_link_distances=True):
+    def __init__(
+        self,
+        env,
+        geometry_source,
+        append=False,
+        goal_link_distances=True,
+        fine_geometry_source=None,
+    ):
         super().__init__(env)
         self._geometry_source, self.appends_link_distances = geometry_source, append
+        self._fine_geometry_source = fine_geometry_source or geometry_source
         self._of_goals = goal_link_distances and self.goal_type != "ee"
         names = ["link_distances"] + ["goal_link_distances"] * self._of_goals
         shape = self.unwrapped.robot.link_distances_shape
@@ -163,6 +172,10 @@ class LinkDistancesWrapper(_ObservingWrapper):
         """
         checker = self._geometry_source(self.unwrapped.scene if scene is None else scene)
         return checker.link_distances(states)
+
+    def fine_link_distances_at(self, states):
+        """As `link_distances_at`, from the geometry source for approach paths."""
+        return self._fine_geometry_source(self.unwrapped.scene).link_distances(states)
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         """As `RoboArmEnv.compute_reward`; warns if goals are relabelled."""

@@ -290,3 +290,16 @@ class CollisionChecker:
             -1 if states.ndim > 2 else 1, *endpoint_margins.shape[-2:]
         )
         return np.array([margin, clearance, growth, resolution]), endpoint_margins
+
+
+def self_distances(robot, states, within):
+    """Link distances of a `Robot` from its other links: float32 (..., l, 1 + n).
+
+    `states`: (..., n), normalised. `within`: m, as for `CollisionChecker.link_distances`.
+    """
+    return _arm_alone(robot).link_distances(states, self_collisions=True, within=within)
+
+
+@functools.cache
+def _arm_alone(robot):
+    return CollisionChecker(Scene(table=None, floor=None, robot=robot))

@@ -14,21 +14,29 @@ import functools
 from dataclasses import replace
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, POINT_RADIUS, observed_points
+from roboarm_nmp.envs.perception.point_clouds import (
+    FINE_POINT_RADIUS,
+    POINT_CLOUD,
+    POINT_RADIUS,
+    fine_observed_points,
+    observed_points,
+)
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.utils.names import suggest
 
 GROUND_TRUTH = "ground_truth"
 CACHED_CHECKERS = 64  # about 60 kB each
+CACHED_FINE_CHECKERS = 4  # about 1 MB each
 DECODED_RADIUS = 0.0  # m, of the ball around a decoded point
 
 
-def find_geometry_source(name, robot=PANDA):
+def find_geometry_source(name, robot=PANDA, fine=False):
     """A function from a `Scene` to a `CollisionChecker` of its obstacles as the source has them.
 
     Args:
         name: `ground_truth`, `point_cloud`, or the name or path of an encoder with a decoder.
         robot: the `Robot` of the scenes.
+        fine: with `point_cloud`: more points, for approach paths.
 
     Raises:
         ValueError: it is none of these, or an encoder for another robot.
@@ -37,7 +45,7 @@ def find_geometry_source(name, robot=PANDA):
     if name == GROUND_TRUTH:
         return ground_truth_checker
     if name == POINT_CLOUD:
-        return observed_checker
+        return fine_observed_checker if fine else observed_checker
     from roboarm_nmp.envs.perception.encoders import encoder_with_decoder  # PyTorch takes seconds
 
     try:
@@ -62,6 +70,13 @@ def observed_checker(scene):
     """A `CollisionChecker` of table, floor, and the observed points of a `Scene`'s obstacles."""
     radius = scale_of(scene.robot) * POINT_RADIUS
     return CollisionChecker(replace(scene, obstacles=()), observed_points(scene), radius)
+
+
+@functools.lru_cache(CACHED_FINE_CHECKERS)
+def fine_observed_checker(scene):
+    """As `observed_checker`, with more points and smaller balls."""
+    radius = scale_of(scene.robot) * FINE_POINT_RADIUS
+    return CollisionChecker(replace(scene, obstacles=()), fine_observed_points(scene), radius)
 
 
 @functools.lru_cache(CACHED_CHECKERS)

@@ -23,6 +23,8 @@ CELL = 0.025
 another reach than the Panda's, it is scaled, and so is `POINT_RADIUS`."""
 POINT_RADIUS = 0.01
 """m. The ball around a point in collision checks: with this radius surfaces have hardly a hole."""
+FINE_CELL, FINE_POINT_RADIUS = 0.006, 0.005
+"""The same for approach paths, which lead closer to surfaces: more points, smaller balls."""
 CACHED_SCENES = 500  # about 20 kB each
 _remembered = {}  # scene -> points
 
@@ -30,7 +32,7 @@ _remembered = {}  # scene -> points
 def observed_points(scene):
     """Points of a `Scene`'s obstacles: float32 (n, 3), m, in the base's frame; not to be changed.
 
-    None, (0, 3), where no obstacle is visible. The last scenes are cached.
+    One per cube of `CELL`; none, (0, 3), where no obstacle is visible. The last scenes are cached.
     """
     points = _remembered.get(scene)
     return _observe(scene) if points is None else points
@@ -41,11 +43,20 @@ def remember_points(scene):
     _remembered[scene] = observed_points(scene)
 
 
+def fine_observed_points(scene):
+    """As `observed_points`, one per cube of `FINE_CELL`."""
+    return one_per_cell(_clouds(scene), scale_of(scene.robot) * FINE_CELL)
+
+
 @functools.lru_cache(CACHED_SCENES)
 def _observe(scene):
+    return one_per_cell(_clouds(scene), scale_of(scene.robot) * CELL)
+
+
+@functools.lru_cache(1)  # 500 kB; the coarse and the fine points of a scene are needed together
+def _clouds(scene):
     clouds = observe_scene(scene, cardinal(PointCloud, scene.robot)).values()
-    points = np.concatenate([one["points"][one["labels"] == OBSTACLE] for one in clouds])
-    return one_per_cell(points, scale_of(scene.robot) * CELL)
+    return np.concatenate([one["points"][one["labels"] == OBSTACLE] for one in clouds])
 
 
 def one_per_cell(points, cell=CELL):

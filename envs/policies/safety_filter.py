@@ -26,15 +26,15 @@ Such a filter stands still in local minima. Where the arm has hardly moved for s
 walk escapes (Barraquand and Latombe, 1991), and a virtual obstacle then keeps the arm from there.
 """
 
-import functools
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.collision.checker import self_distances
 from roboarm_nmp.envs.collision.kernels import project
-from roboarm_nmp.envs.scenes.primitives import Scene, is_number
+from roboarm_nmp.envs.policies.approach_path import ApproachPaths
+from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 
 # Of the filter's behaviour, recorded in results. 1: other escapes, no virtual obstacles. 2: slow
@@ -73,32 +73,37 @@ class SafetyFilter:
     Attributes:
         margin: m, minimum distance of every link from the scene and from other links.
         escape: whether to escape from local minima.
+        approach: whether to follow approach paths, which need no margin, out of a start and into a
+            goal in a tight place (`envs.policies.approach_path`).
 
     Raises:
-        ValueError: `margin` is not in [0, `ACTIVATION_DISTANCE`), or `escape` is not a bool.
+        ValueError: `margin` is not in [0, `ACTIVATION_DISTANCE`), or another one is not a bool.
     """
 
     margin: float = 0.01
     escape: bool = True
+    approach: bool = False
 
     def __post_init__(self):
         if not (is_number(self.margin) and 0 <= self.margin < ACTIVATION_DISTANCE):
             raise ValueError(f"margin must be in [0, {ACTIVATION_DISTANCE}) m, got {self.margin!r}")
-        if not isinstance(self.escape, bool):
-            raise ValueError(f"escape must be a bool, got {self.escape!r}")
+        for name in ("escape", "approach"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be a bool, got {getattr(self, name)!r}")
 
     @classmethod
     def from_metadata(cls, metadata):
         """The `SafetyFilter` of a policy, from its file's metadata; None if it has none.
 
-        Its options are in `safety_filter`, a dict with `margin` and `escape`. Raises ValueError if
-        they are invalid.
+        Its options are in `safety_filter`, a dict with `margin`, `escape` and possibly `approach`.
+        Raises ValueError if they are invalid.
         """
         options = metadata.get("safety_filter")
         if options is None:
             return None
         try:
-            return cls(float(options["margin"]), bool(options["escape"]))
+            flags = bool(options["escape"]), bool(options.get("approach", False))
+            return cls(float(options["margin"]), *flags)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"invalid safety_filter in its metadata: {options!r}") from error
 
@@ -144,6 +149,11 @@ class SafetyFilter:
         Returns:
             A function like `act`.
         """
+        act_safely = self._filter_actions(act, env, rng)
+        return ApproachPaths(act_safely, env) if self.approach else act_safely
+
+    def _filter_actions(self, act, env, rng):
+        """`filter_policy` without approach paths."""
         link_distances_at, max_step = env.get_wrapper_attr("link_distances_at"), env.max_step
         robot, joints = env.robot, env.robot.num_joints
         local_minima, goal_distances = _LocalMinima(rng, max_step, joints), None
@@ -264,11 +274,6 @@ def check_env(env):
         )
 
 
-@functools.cache
-def _arm_alone(robot):
-    return CollisionChecker(Scene(table=None, floor=None, robot=robot))
-
-
 def _self_distances(robot, state):
     """Link distances from the other links, (l, 1 + n)."""
-    return _arm_alone(robot).link_distances(state, self_collisions=True, within=ACTIVATION_DISTANCE)
+    return self_distances(robot, state, ACTIVATION_DISTANCE)

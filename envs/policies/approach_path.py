@@ -1,0 +1,141 @@
+"""Approach paths: out of a start, and into a goal, that is a few millimetres from obstacles.
+
+    path = approach_path(robot, goal, checker.link_distances)    # (k, n), the goal first
+
+From a configuration in a tight place, the path climbs the smallest link distances until `CLEARANCE`
+is free. A policy that follows such a path needs no safety filter there, whose margin would keep it
+away: between its start's path and its goal's path it acts as usual, and the goal that it observes
+is the free end of the goal's path (as a pre-grasp and an approach in grasp planning).
+
+The climb is local and does not search. One step moves along the gradient of the softmin of all
+rows of link distances. Between two boards, the nearest of which alternates, steps would only go
+back and forth, so the direction is averaged over steps. The constraints of the safety filter keep
+every row from becoming smaller (`envs.policies.safety_filter`).
+"""
+
+import numpy as np
+
+from roboarm_nmp.envs.collision.checker import self_distances
+from roboarm_nmp.envs.collision.kernels import project
+
+# Chosen on validation queries: docs/lab_notebook.md, "Approach paths".
+CLEARANCE = 0.05  # m, where the path ends
+SELF_CLEARANCE = 0.01  # m, less than that is needed between links
+MAX_STEPS = 320  # of a path; it also ends there
+STEP = 0.003  # L2, normalised; with 0.012, paths jump through obstacles
+SOFTMIN = 0.006  # m: a row weighs exp(-(distance - smallest) / SOFTMIN)
+MOMENTUM = 0.9
+PROJECTION_SWEEPS = 12
+# L2, normalised. A path is followed STRIDE points at a time. The next ones are due when the arm is
+# nearer than TRACKING; the goal's path begins when the arm is nearer than REACHED to its free end.
+STRIDE, TRACKING, REACHED = 3, 0.006, 0.01
+
+
+def approach_path(robot, state, link_distances_at):
+    """A path from a configuration to a place with `CLEARANCE`, normalised, float64 (k, n).
+
+    Without enough room nearby, it ends after `MAX_STEPS`. Where there is room, k is 1.
+
+    Args:
+        robot: the `Robot`.
+        state: (n,), normalised.
+        link_distances_at: a function like `CollisionChecker.link_distances`.
+    """
+    path = [np.clip(np.asarray(state, np.float64), -1.0, 1.0)]
+    direction = np.zeros(len(path[0]))
+    while len(path) <= MAX_STEPS:
+        rows = _rows(robot, path[-1], link_distances_at)
+        distances = rows[:, 0]
+        if distances.min() >= CLEARANCE:
+            break
+        gradient = np.exp((distances.min() - distances) / SOFTMIN) @ rows[:, 1:]
+        length = np.linalg.norm(gradient)
+        if length < 1e-9:
+            break
+        direction = MOMENTUM * direction + gradient / length
+        length = np.linalg.norm(direction)
+        wanted, least = STEP * direction / length, np.minimum(distances, CLEARANCE)
+        move = _project(wanted, rows, least)
+        # Again with the distances at the end of the step, extrapolated back to its start.
+        there = _rows(robot, np.clip(path[-1] + move, -1.0, 1.0), link_distances_at)
+        there[:, 0] -= there[:, 1:] @ move
+        move = _project(wanted, np.concatenate([rows, there]), np.concatenate([least, least]))
+        direction = move * length / max(np.linalg.norm(move), 1e-9)
+        path.append(np.clip(path[-1] + move, -1.0, 1.0))
+    return np.array(path)
+
+
+def _rows(robot, state, link_distances_at):
+    """Link distances from the scene and, more than `SELF_CLEARANCE` apart, from other links."""
+    scene, links = link_distances_at(state), self_distances(robot, state, CLEARANCE)
+    rows = np.concatenate([scene, links]).astype(np.float64)
+    rows[len(scene) :, 0] += CLEARANCE - SELF_CLEARANCE
+    return rows
+
+
+def _project(move, rows, least):
+    """The nearest move (n,) after which no row is below `least`, to first order."""
+    moves, rows = move[None].copy(), np.ascontiguousarray(rows[None])
+    project(moves, rows, least[None].copy(), STEP, 1.0, np.inf, np.inf, PROJECTION_SWEEPS)
+    return moves[0]
+
+
+class ApproachPaths:
+    """A policy with approach paths, for one episode: a function from an observation to an action.
+
+    The goal's path needs a goal that is a configuration; with other goals, only the start has one.
+
+    Args:
+        act: the policy, a function from an observation to an action (n,).
+        env: the `RoboArmEnv` of the episode, with link distances.
+    """
+
+    def __init__(self, act, env):
+        self._act, self._env, self._robot = act, env, env.robot
+        self._retreat = self._approach = None  # `_Following`, from the first observation on
+        self._free_end = {}  # what is observed of the goal until the arm is at its path's free end
+
+    def __call__(self, observation):
+        state = observation["observation"][: self._robot.num_joints].astype(np.float64)
+        if self._retreat is None:
+            self._plan(state, observation)
+        action = self._retreat(state)
+        if action is not None:
+            return action
+        if self._approach is not None and self._approach.may_begin(state):
+            return self._approach(state)
+        return self._act(observation | self._free_end)
+
+    def _plan(self, state, observation):
+        robot, fine_at = self._robot, self._env.get_wrapper_attr("fine_link_distances_at")
+        self._retreat = _Following(approach_path(robot, state, fine_at))
+        if "goal_link_distances" not in observation:
+            return
+        goal = observation["desired_goal"]
+        path = approach_path(robot, goal[: robot.num_joints], fine_at)[::-1]
+        if len(path) == 1:
+            return
+        self._approach = _Following(path, stays=True)
+        position = robot.forward_kinematics(robot.denormalise(path[0]))
+        free_end = np.concatenate([path[0], position]).astype(np.float32)[: len(goal)]
+        at = self._env.get_wrapper_attr("link_distances_at")
+        self._free_end = {"desired_goal": free_end, "goal_link_distances": at(path[0])}
+
+
+class _Following:
+    """Actions along a path (k, n), normalised; at its end None, or if it `stays`, to its end."""
+
+    def __init__(self, path, stays=False):
+        self._path, self._stays, self._due = path, stays, 0
+
+    def may_begin(self, state):
+        """Whether the arm is at the beginning of the path, or was."""
+        return self._due > 0 or np.linalg.norm(state - self._path[0]) < REACHED
+
+    def __call__(self, state):
+        last = len(self._path) - 1
+        if np.linalg.norm(state - self._path[self._due]) < TRACKING or self._due == 0:
+            if self._due == last and not self._stays:
+                return None
+            self._due = min(self._due + STRIDE, last)
+        return (self._path[self._due] - state).astype(np.float32)
