@@ -109,6 +109,9 @@ class Args:
     default the filter that the policy includes, if any"""
     escape: bool = True
     """the safety filter escapes local minima, in a random direction"""
+    approach: bool | None = None
+    """approach paths out of starts and into goals in tight places, where the filter's margin does
+    not hold (docs/guide/safety_filter.md); by default as the policy's filter, otherwise not"""
     seed: Seed = 0
     """of random numbers: `random`, `via-points`, `planner`, escapes"""
     tries: PositiveInt = TRIES
@@ -136,7 +139,7 @@ def main(arguments=None):
             raise ValueError("--robot goes with --task")
         options = vars(args) | {"safety_filter": _safety_filter(args)}
         options["task"] = task_with_robot(args.task, args.robot)
-        for name in ("robot", "safety_margin", "escape", "json", "image"):
+        for name in ("robot", "safety_margin", "escape", "approach", "json", "image"):
             del options[name]
         result = evaluate(**options, progress=True)
     except ValueError as error:
@@ -157,18 +160,21 @@ def main(arguments=None):
 
 
 def _safety_filter(args):
-    """The flags' safety filter as for `evaluate`. Raises ValueError: --no-escape without one."""
+    """The flags' safety filter as for `evaluate`. Raises ValueError: there is none to change."""
     from roboarm_nmp.envs.policies.registry import find_policy, own_safety_filter
     from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 
     if args.safety_margin is not None:
-        return SafetyFilter(args.safety_margin, args.escape) if args.safety_margin else False
-    if args.escape:
+        options = args.safety_margin, args.escape, bool(args.approach)
+        return SafetyFilter(*options) if args.safety_margin else False
+    if args.escape and args.approach is None:
         return None
     own = own_safety_filter(find_policy(args.policy)[0])
     if own is None:
-        raise ValueError("--no-escape: the policy has no safety filter; --safety-margin adds one")
-    return replace(own, escape=False)
+        flag = "--approach" if args.escape else "--no-escape"
+        raise ValueError(f"{flag}: the policy has no safety filter; --safety-margin adds one")
+    approach = own.approach if args.approach is None else args.approach
+    return replace(own, escape=args.escape and own.escape, approach=approach)
 
 
 def _settings(result):
@@ -182,6 +188,7 @@ def _settings(result):
     if safety_filter is not None:
         escape = "escapes local minima" if safety_filter["escape"] else "no escape"
         margin = f"margin {safety_filter['margin']:g} m, {escape}"
+        margin += ", approach paths" * ("approach" in safety_filter)
     limit = result["time_limit"]
     return {
         "robot": None if result["robot"] == PANDA.name else result["robot"],

@@ -2,8 +2,8 @@
 
     path = approach_path(robot, goal, checker.link_distances)    # (k, n), the goal first
 
-From a configuration in a tight place, the path climbs the smallest link distances until `CLEARANCE`
-is free. A policy that follows such a path needs no safety filter there, whose margin would keep it
+From a configuration in a tight place, the path climbs the smallest link distances until a few
+centimetres are free. A policy that follows such a path needs no safety filter there, whose margin would keep it
 away: between its start's path and its goal's path it acts as usual, and the goal that it observes
 is the free end of the goal's path (as a pre-grasp and an approach in grasp planning).
 
@@ -19,8 +19,8 @@ from roboarm_nmp.envs.collision.checker import self_distances
 from roboarm_nmp.envs.collision.kernels import project
 
 # Chosen on validation queries: docs/lab_notebook.md, "Approach paths".
-CLEARANCE = 0.05  # m, where the path ends
-SELF_CLEARANCE = 0.01  # m, less than that is needed between links
+START_CLEARANCE, GOAL_CLEARANCE = 0.02, 0.05  # m, where a start's and a goal's path end
+SELF_CLEARANCE = 0.01  # m, of links from other links
 MAX_STEPS = 320  # of a path; it also ends there
 STEP = 0.003  # L2, normalised; with 0.012, paths jump through obstacles
 SOFTMIN = 0.006  # m: a row weighs exp(-(distance - smallest) / SOFTMIN)
@@ -31,8 +31,8 @@ PROJECTION_SWEEPS = 12
 STRIDE, TRACKING, REACHED = 3, 0.006, 0.01
 
 
-def approach_path(robot, state, link_distances_at):
-    """A path from a configuration to a place with `CLEARANCE`, normalised, float64 (k, n).
+def approach_path(robot, state, link_distances_at, clearance=GOAL_CLEARANCE):
+    """A path from a configuration to a place with more clearance, normalised, float64 (k, n).
 
     Without enough room nearby, it ends after `MAX_STEPS`. Where there is room, k is 1.
 
@@ -40,13 +40,14 @@ def approach_path(robot, state, link_distances_at):
         robot: the `Robot`.
         state: (n,), normalised.
         link_distances_at: a function like `CollisionChecker.link_distances`.
+        clearance: m, at the path's end.
     """
     path = [np.clip(np.asarray(state, np.float64), -1.0, 1.0)]
     direction = np.zeros(len(path[0]))
     while len(path) <= MAX_STEPS:
-        rows = _rows(robot, path[-1], link_distances_at)
+        rows = _rows(robot, path[-1], link_distances_at, clearance)
         distances = rows[:, 0]
-        if distances.min() >= CLEARANCE:
+        if distances.min() >= clearance:
             break
         gradient = np.exp((distances.min() - distances) / SOFTMIN) @ rows[:, 1:]
         length = np.linalg.norm(gradient)
@@ -54,10 +55,11 @@ def approach_path(robot, state, link_distances_at):
             break
         direction = MOMENTUM * direction + gradient / length
         length = np.linalg.norm(direction)
-        wanted, least = STEP * direction / length, np.minimum(distances, CLEARANCE)
+        wanted, least = STEP * direction / length, np.minimum(distances, clearance)
         move = _project(wanted, rows, least)
         # Again with the distances at the end of the step, extrapolated back to its start.
-        there = _rows(robot, np.clip(path[-1] + move, -1.0, 1.0), link_distances_at)
+        end = np.clip(path[-1] + move, -1.0, 1.0)
+        there = _rows(robot, end, link_distances_at, clearance)
         there[:, 0] -= there[:, 1:] @ move
         move = _project(wanted, np.concatenate([rows, there]), np.concatenate([least, least]))
         direction = move * length / max(np.linalg.norm(move), 1e-9)
@@ -65,11 +67,11 @@ def approach_path(robot, state, link_distances_at):
     return np.array(path)
 
 
-def _rows(robot, state, link_distances_at):
+def _rows(robot, state, link_distances_at, clearance):
     """Link distances from the scene and, more than `SELF_CLEARANCE` apart, from other links."""
-    scene, links = link_distances_at(state), self_distances(robot, state, CLEARANCE)
+    scene, links = link_distances_at(state), self_distances(robot, state, clearance)
     rows = np.concatenate([scene, links]).astype(np.float64)
-    rows[len(scene) :, 0] += CLEARANCE - SELF_CLEARANCE
+    rows[len(scene) :, 0] += clearance - SELF_CLEARANCE
     return rows
 
 
@@ -92,13 +94,22 @@ class ApproachPaths:
 
     def __init__(self, act, env):
         self._act, self._env, self._robot = act, env, env.robot
+        self._at = env.get_wrapper_attr("link_distances_at")
+        self._fine_at = env.get_wrapper_attr("fine_link_distances_at")
         self._retreat = self._approach = None  # `_Following`, from the first observation on
         self._free_end = {}  # what is observed of the goal until the arm is at its path's free end
+        self._planned_for = None  # scene and goal: both may change during an episode
 
     def __call__(self, observation):
         state = observation["observation"][: self._robot.num_joints].astype(np.float64)
         if self._retreat is None:
-            self._plan(state, observation)
+            path = approach_path(self._robot, state, self._fine_at, START_CLEARANCE)
+            self._retreat = _Following(path)
+        if "goal_link_distances" in observation:
+            planned_for = self._env.scene, observation["desired_goal"].tobytes()
+            if planned_for != self._planned_for:
+                self._planned_for = planned_for
+                self._plan_approach(observation["desired_goal"])
         action = self._retreat(state)
         if action is not None:
             return action
@@ -106,27 +117,22 @@ class ApproachPaths:
             return self._approach(state)
         return self._act(observation | self._free_end)
 
-    def _plan(self, state, observation):
-        robot, fine_at = self._robot, self._env.get_wrapper_attr("fine_link_distances_at")
-        self._retreat = _Following(approach_path(robot, state, fine_at))
-        if "goal_link_distances" not in observation:
-            return
-        goal = observation["desired_goal"]
-        path = approach_path(robot, goal[: robot.num_joints], fine_at)[::-1]
+    def _plan_approach(self, goal):
+        robot, self._approach, self._free_end = self._robot, None, {}
+        path = approach_path(robot, goal[: robot.num_joints], self._fine_at)[::-1]
         if len(path) == 1:
             return
         self._approach = _Following(path, stays=True)
         position = robot.forward_kinematics(robot.denormalise(path[0]))
         free_end = np.concatenate([path[0], position]).astype(np.float32)[: len(goal)]
-        at = self._env.get_wrapper_attr("link_distances_at")
-        self._free_end = {"desired_goal": free_end, "goal_link_distances": at(path[0])}
+        self._free_end = {"desired_goal": free_end, "goal_link_distances": self._at(path[0])}
 
 
 class _Following:
     """Actions along a path (k, n), normalised; at its end None, or if it `stays`, to its end."""
 
     def __init__(self, path, stays=False):
-        self._path, self._stays, self._due = path, stays, 0
+        self._path, self._stays, self._due, self._ended = path, stays, 0, False
 
     def may_begin(self, state):
         """Whether the arm is at the beginning of the path, or was."""
@@ -134,8 +140,7 @@ class _Following:
 
     def __call__(self, state):
         last = len(self._path) - 1
-        if np.linalg.norm(state - self._path[self._due]) < TRACKING or self._due == 0:
-            if self._due == last and not self._stays:
-                return None
+        if self._due == 0 or np.linalg.norm(state - self._path[self._due]) < TRACKING:
+            self._ended = self._ended or (self._due == last and not self._stays)
             self._due = min(self._due + STRIDE, last)
-        return (self._path[self._due] - state).astype(np.float32)
+        return None if self._ended else (self._path[self._due] - state).astype(np.float32)

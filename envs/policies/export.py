@@ -54,8 +54,7 @@ def save_policy(path, module, task, safety_filter=None, **env_arguments):
     metadata["env"] |= env_arguments
     metadata |= robot_metadata(robot)
     if safety_filter is not None:
-        margin, escape = safety_filter.margin, safety_filter.escape
-        metadata["safety_filter"] = {"margin": margin, "escape": escape}
+        metadata["safety_filter"] = safety_filter.to_metadata()
     with torch.no_grad():
         action = copy.deepcopy(module).cpu().eval()(**example)
     shape = (len(observations), robot.num_joints)

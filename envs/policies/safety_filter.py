@@ -107,6 +107,12 @@ class SafetyFilter:
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"invalid safety_filter in its metadata: {options!r}") from error
 
+    def to_metadata(self):
+        """The options as `from_metadata` reads them."""
+        return {"margin": self.margin, "escape": self.escape} | (
+            {"approach": True} if self.approach else {}
+        )
+
     def __call__(self, actions, link_distances, margins=None, max_step=MAX_STEP, cbf_gain=CBF_GAIN):
         """Actions (..., n), float32, that satisfy the constraints of all rows, to first order.
 

@@ -13,7 +13,7 @@ import math
 import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -431,7 +431,9 @@ def _summary(job, outcomes):
         "geometry_source": options.geometry_source,
         "privileged": is_privileged(options.env)
         or (plans and options.geometry_source == GROUND_TRUTH),
-        "safety_filter": asdict(safety_filter) | {"version": VERSION} if safety_filter else None,
+        "safety_filter": safety_filter.to_metadata() | {"version": VERSION}
+        if safety_filter
+        else None,
         "seed": options.seed if random else None,
         "tries": options.tries if job.policy == "via-points" else None,
         "time_limit": options.time_limit if job.policy == "planner" else None,

@@ -36,7 +36,7 @@ GROUPS = {
         *("action_mode", "max_step", "horizon", "stop_on_collision"),
     ),
     "observation": (*("encoder", "num_points", "velocities", "geometry_source", "link_distances"),),
-    "safety_filter": ("safety_margin", "escape"),
+    "safety_filter": ("safety_margin", "escape", "approach"),
     "data": ("demo_prob", "demos", "num_demos", "paths", "observations", "validation_share"),
     OTHERS: (),
     "evaluation": (

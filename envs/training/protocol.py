@@ -382,8 +382,7 @@ class PolicyRun(Run):
         metadata = {"kind": "policy", "task": args.task, "env": self.env_arguments}
         metadata |= robot_metadata(self.eval_envs[0].unwrapped.robot)
         if self.safety_filter is not None:
-            margin, escape = self.safety_filter.margin, self.safety_filter.escape
-            metadata["safety_filter"] = {"margin": margin, "escape": escape}
+            metadata["safety_filter"] = self.safety_filter.to_metadata()
         metadata |= {"script": args.exp_name, "seed": args.seed, "step": self.step}
         example = stack([env.reset(seed=0)[0] for env in self.eval_envs[:2]], self.device)
         if size := recurrent_size(policy):

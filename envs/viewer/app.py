@@ -343,7 +343,7 @@ class _Page:
             if arm.ms_per_action is not None:
                 cells.append(f"{arm.ms_per_action:.1f} ms per action")
             if arm.escaping:
-                cells.append("the filter escapes from a local minimum")
+                cells.append("an escape from a local minimum, or an approach path")
             elif arm.correction is not None:
                 cells.append(f"correction by the filter {arm.correction:.3f}")
             lines.append(f"{cells[0]}: {'; '.join(cells[1:])}.")

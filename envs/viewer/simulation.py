@@ -188,9 +188,9 @@ class _Arm:
         ms_per_action: mean over the episode; None before the first action.
         action: the last action (n,).
         wanted: the policy's last action (n,), before the safety filter; None without a filter, and
-            while the filter escapes from a local minimum.
+            while the filter escapes from a local minimum or follows an approach path.
         correction: the filter's change of it, L2, normalised; None where `wanted` is None.
-        escaping: whether the filter escapes from a local minimum.
+        escaping: whether the filter escapes, or follows an approach path, without the policy.
     """
 
     def __init__(self, name):
