@@ -3,9 +3,9 @@
     path = approach_path(robot, goal, checker.link_distances)    # (k, n), the goal first
 
 From a configuration in a tight place, the path climbs the smallest link distances until a few
-centimetres are free. A policy that follows such a path needs no safety filter there, whose margin would keep it
-away: between its start's path and its goal's path it acts as usual, and the goal that it observes
-is the free end of the goal's path (as a pre-grasp and an approach in grasp planning).
+centimetres are free. A policy that follows such a path needs no safety filter there, whose margin
+would stop it. Between its start's path and its goal's path it acts as usual. There the goal that it
+observes is the free end of the goal's path, like a pre-grasp in grasp planning.
 
 The climb is local and does not search. One step moves along the gradient of the softmin of all
 rows of link distances. Between two boards, the nearest of which alternates, steps would only go

@@ -257,6 +257,13 @@ def test_invalid_margin_is_rejected(margin):
         SafetyFilter(margin)
 
 
+def test_metadata_has_approach_paths_only_where_they_are_on():
+    for safety_filter in (SafetyFilter(0.012, False), SafetyFilter(approach=True)):
+        metadata = safety_filter.to_metadata()
+        assert ("approach" in metadata) == safety_filter.approach
+        assert SafetyFilter.from_metadata({"safety_filter": metadata}) == safety_filter
+
+
 def test_options_come_from_a_policys_metadata():
     metadata = {"safety_filter": {"margin": 0.012, "escape": False}}
     assert SafetyFilter.from_metadata(metadata) == SafetyFilter(0.012, escape=False)
