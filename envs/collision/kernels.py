@@ -1,4 +1,4 @@
-"""All that Numba compiles: collision checks, signed distances, the safety filter's projection.
+"""All that Numba compiles: collision checks, signed distances, point clouds, the safety filter.
 
 One file holds all of it, because Numba's cache on disk does not notice changes in other files.
 
@@ -839,6 +839,133 @@ def link_distances_batch(states, rows, self_collisions, within, arm, world):
             for j in range(states.shape[1]):
                 rows[i, link, 1 + j] = gradient[i, link, j]
     return True
+
+
+# --- Point clouds of a user's own
+
+
+@compiled
+def near_arm(q, points, distance, arm, near):
+    """Write to `near` (n,) whether points (n, 3), m, are less than `distance` (m) from the arm.
+
+    `q`: its normalised configuration. The base counts, too.
+    """
+    chain, bodies, _, vertices, cells = arm
+    frames, centres, pose, s, ball = _memory(chain, bodies)
+    ball[0, 0] = SPHERE
+    _place(q, chain, bodies, frames, centres)
+    for j in range(points.shape[0]):
+        near[j] = False
+        for k in range(bodies.shape[0]):
+            gap = distance + bodies[k, ROUNDING]
+            x, y, z = (
+                points[j, 0] - centres[k, 0],
+                points[j, 1] - centres[k, 1],
+                points[j, 2] - centres[k, 2],
+            )
+            reach = bodies[k, RADIUS] + gap
+            if x * x + y * y + z * z >= reach * reach:
+                continue
+            if _box_gap(bodies, k, frames, centres, points, j, pose) >= gap:
+                continue
+            _begin(ball, 0, pose, s)
+            if _gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
+                near[j] = True
+                break
+
+
+@compiled
+def _slot(table, cells, x, y, z):
+    """Where a cell is in a hash table, or the empty place where it belongs."""
+    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
+    mixed *= 0x1E3779B97F4A7C15
+    slot = (mixed ^ (mixed >> 29)) & (table.shape[0] - 1)
+    while True:
+        n = table[slot]
+        if n < 0 or (cells[n, 0] == x and cells[n, 1] == y and cells[n, 2] == z):
+            return slot
+        slot = (slot + 1) & (table.shape[0] - 1)
+
+
+@compiled
+def first_in_cells(points, cell):
+    """The first of the points (n, 3), m, in each cube with edges of `cell`, m, of their type.
+
+    Returns int64 (m,) each, for the m cubes in the order of their first points: the index of that
+    point; how many points the cube has; how many it and the 26 cubes around it have.
+    """
+    table = np.full(1024, -1, np.int64)  # of indices of cubes; twice as many as fit into `cells`
+    cells, first, count = (
+        np.empty((512, 3), np.int64),
+        np.empty(512, np.int64),
+        np.zeros(512, np.int64),
+    )
+    m = 0
+    for i in range(points.shape[0]):
+        x = int(math.floor(points[i, 0] / cell))
+        y = int(math.floor(points[i, 1] / cell))
+        z = int(math.floor(points[i, 2] / cell))
+        slot = _slot(table, cells, x, y, z)
+        if table[slot] < 0:
+            if m == first.shape[0]:
+                cells = np.concatenate((cells, np.empty_like(cells)))
+                first = np.concatenate((first, np.empty_like(first)))
+                count = np.concatenate((count, np.zeros_like(count)))
+                table = np.full(4 * m, -1, np.int64)
+                for n in range(m):
+                    table[_slot(table, cells, cells[n, 0], cells[n, 1], cells[n, 2])] = n
+                slot = _slot(table, cells, x, y, z)
+            cells[m, 0], cells[m, 1], cells[m, 2], first[m] = x, y, z, i
+            table[slot] = m
+            m += 1
+        count[table[slot]] += 1
+    around = np.zeros(m, np.int64)
+    for n in range(m):
+        for i in range(27):
+            x, y, z = (
+                cells[n, 0] + i // 9 - 1,
+                cells[n, 1] + i // 3 % 3 - 1,
+                cells[n, 2] + i % 3 - 1,
+            )
+            found = table[_slot(table, cells, x, y, z)]
+            if found >= 0:
+                around[n] += count[found]
+    return first[:m], count[:m], around
+
+
+@compiled
+def decompress_lzf(compressed, result):
+    """Write the bytes of LZF data (uint8) to `result`; returns how many, -1 if it is damaged."""
+    i, n = 0, 0
+    while i < compressed.shape[0]:
+        control = int(compressed[i])
+        i += 1
+        if control < 32:  # so many bytes, and one more, as they are
+            length = control + 1
+            if i + length > compressed.shape[0] or n + length > result.shape[0]:
+                return -1
+            for _ in range(length):
+                result[n] = compressed[i]
+                i += 1
+                n += 1
+            continue
+        length = control >> 5  # of a copy of what is already there
+        if length == 7:
+            if i >= compressed.shape[0]:
+                return -1
+            length += int(compressed[i])
+            i += 1
+        if i >= compressed.shape[0]:
+            return -1
+        begin = n - ((control & 31) << 8) - int(compressed[i]) - 1
+        i += 1
+        if begin < 0 or n + length + 2 > result.shape[0]:
+            return -1
+        for _ in range(length + 2):
+            result[n] = result[begin]
+            begin += 1
+            n += 1
+    return n
 
 
 # --- The safety filter

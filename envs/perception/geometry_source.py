@@ -4,7 +4,7 @@
     checker = geometry_source(scene)             # a CollisionChecker of the observed points alone
 
 - `ground_truth`: the obstacles themselves (privileged);
-- `point_cloud`: points that four sensors observe of them;
+- `point_cloud`: points that four sensors observe of them, or those of an `ObservedScene`;
 - the name or path of an encoder with a decoder: points decoded from its latent code.
 
 Table and floor are known to all of them.
@@ -16,6 +16,7 @@ from dataclasses import replace
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, POINT_RADIUS, observed_points
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
+from roboarm_nmp.envs.scenes.primitives import ObservedScene
 from roboarm_nmp.envs.utils.names import suggest
 
 GROUND_TRUTH = "ground_truth"
@@ -60,6 +61,8 @@ def ground_truth_checker(scene):
 @functools.lru_cache(CACHED_CHECKERS)
 def observed_checker(scene):
     """A `CollisionChecker` of table, floor, and the observed points of a `Scene`'s obstacles."""
+    if isinstance(scene, ObservedScene):
+        return CollisionChecker(replace(scene, obstacles=()))
     radius = scale_of(scene.robot) * POINT_RADIUS
     return CollisionChecker(replace(scene, obstacles=()), observed_points(scene), radius)
 

@@ -1,18 +1,34 @@
-"""The point cloud that four sensors observe of a scene's obstacles.
+"""Point clouds: of a scene's obstacles as four sensors observe them, and of your own.
 
     points = observed_points(scene)              # float32 (n, 3), m
     tokens = farthest_points(points, 64)         # for a network
 
+    points, removed = prepare_cloud(load_cloud("table.ply"), configuration=configuration)
+    scene = ObservedScene(points=points)         # for environments, policies and planners
+
 The sensors (paper, section 4) label points of the arm, the table and obstacles. The arm's own
-configuration, the table and the floor are known, so only points of obstacles are used.
+configuration, the table and the floor are known, so only points of obstacles are used. Of a cloud
+without labels, `prepare_cloud` removes the others by their distance.
 """
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
+from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
+from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls
+from roboarm_nmp.envs.collision.kernels import first_in_cells, near_arm
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, cardinal, observe_scene
-from roboarm_nmp.envs.robots.panda import scale_of
+from roboarm_nmp.envs.robots.panda import PANDA, scale_of
+from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.scenes.primitives import (
+    FLOOR,
+    POINT_RADIUS,  # noqa: F401 (scaled like `CELL`; used from here)
+    TABLE,
+    ObservedScene,
+    floor_box,
+)
 
 POINT_CLOUD = "point_cloud"
 """Its name as an encoder and as a geometry source."""
@@ -21,8 +37,12 @@ NUM_POINTS = 64
 CELL = 0.025
 """m. One point of each cube of this size is used: about 1,500 on `random_boxes_hard`. For an arm of
 another reach than the Panda's, it is scaled, and so is `POINT_RADIUS`."""
-POINT_RADIUS = 0.01
-"""m. The ball around a point in collision checks: with this radius surfaces have hardly a hole."""
+KNOWN_DISTANCE = 0.01
+"""m. Points nearer to the table or the floor than this are theirs."""
+ARM_DISTANCE = 0.02
+"""m. Points nearer to the arm than this are its own."""
+MIN_POINTS = 3
+"""Points that a cube of `CELL` and the 26 around it need, or they are outliers."""
 CACHED_SCENES = 500  # about 20 kB each
 _remembered = {}  # scene -> points
 
@@ -30,8 +50,11 @@ _remembered = {}  # scene -> points
 def observed_points(scene):
     """Points of a `Scene`'s obstacles: float32 (n, 3), m, in the base's frame; not to be changed.
 
-    None, (0, 3), where no obstacle is visible. The last scenes are cached.
+    None, (0, 3), where no obstacle is visible. The last scenes are cached. Those of an
+    `ObservedScene` are its own.
     """
+    if isinstance(scene, ObservedScene):
+        return scene.points
     points = _remembered.get(scene)
     return _observe(scene) if points is None else points
 
@@ -53,8 +76,98 @@ def one_per_cell(points, cell=CELL):
 
     Use it with points of your own: the pretrained policies were trained with such clouds.
     """
-    _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
-    return points[np.sort(first)]
+    numbers = points if points.dtype in (np.float32, np.float64) else points.astype(np.float64)
+    return points[first_in_cells(numbers, numbers.dtype.type(cell))[0]]
+
+
+class PreparedCloud(NamedTuple):
+    """What `prepare_cloud` returns.
+
+    points: float32 (n, 3), m.
+    removed: dict from a step's name to the number of points that it removed.
+    """
+
+    points: np.ndarray
+    removed: dict
+
+
+def prepare_cloud(
+    points,
+    robot=PANDA,
+    configuration=None,
+    *,
+    workspace=None,
+    table=TABLE,
+    floor=FLOOR,
+    cell=None,
+    min_points=MIN_POINTS,
+    arm_distance=ARM_DISTANCE,
+):
+    """The points of obstacles in a cloud, as collision checks and policies take them.
+
+    In this order, points are removed that
+
+    - are not finite;
+    - are outside the workspace;
+    - are less than `KNOWN_DISTANCE` from table or floor, or inside them, as both are known;
+    - are less than `arm_distance` from the arm, whose convex hulls collision checks use, too;
+    - are outliers: with the 26 cubes around it, their cube of `cell` has less than `min_points`;
+    - are not the first of their cube of `cell`.
+
+    The same points in the same order give the same result.
+
+    Args:
+        points: m, (n, 3), in the base's frame.
+        robot: the `Robot`.
+        configuration: the arm's when the cloud was recorded, rad, (n,); None: it has no points of
+            the arm.
+        workspace: corners (2, 3), m: lower and upper. By default a cube around the base, from where
+            no point can change a link distance.
+        table, floor: as of a `Scene`; None if unknown: then their points stay, as obstacles.
+        cell: m, `CELL` by default, scaled with the robot's reach.
+        min_points: 0 to keep outliers.
+        arm_distance: m.
+
+    Raises ValueError: an argument is out of its range, or of another shape.
+    """
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise ValueError(f"points must be numbers of shape (n, 3), got {points.shape}")
+    cell = scale_of(robot) * CELL if cell is None else cell
+    if not 1e-4 <= cell <= 1.0:
+        raise ValueError(f"cell must be in [0.0001, 1] m, got {cell!r}")
+    if not 0 <= arm_distance < MAX_MARGIN:
+        raise ValueError(f"arm_distance must be in [0, {MAX_MARGIN}) m, got {arm_distance!r}")
+    if workspace is None:
+        reach = robot.reach + LINK_DISTANCE_RANGE
+        workspace = np.add(np.array(robot.base_position), [[-reach] * 3, [reach] * 3])
+    low, high = np.array(workspace, dtype=np.float32)
+    removed = {}
+
+    def keep(kept, step):
+        removed[step] = len(kept) - int(np.count_nonzero(kept))
+        return points[kept] if removed[step] else points
+
+    points = keep(np.isfinite(points).all(1), "not finite").astype(np.float32, copy=False)
+    points = keep(((points >= low) & (points <= high)).all(1), "outside the workspace")
+    known = [table] if table is not None else []
+    known += [] if floor is None else [floor_box(floor)]
+    inside = np.zeros(len(points), bool)
+    for box in known:
+        rotation = matrix(box.orientation).astype(np.float32)
+        local = np.abs((points - np.array(box.position, np.float32)) @ rotation)
+        inside |= (local < np.array(box.size, np.float32) / 2 + KNOWN_DISTANCE).all(1)
+    points = keep(~inside, "of table or floor")
+    if configuration is not None:
+        state = np.clip(robot.normalise(configuration), -1.0, 1.0)
+        near = np.empty(len(points), bool)
+        near_arm(state, points, float(arm_distance), arm_hulls(robot), near)
+        points = keep(~near, "of the arm")
+    first, count, around = first_in_cells(points, np.float32(cell))
+    dense = around >= min_points
+    removed["outliers"] = int(count[~dense].sum())
+    removed["thinned out"] = int(count[dense].sum() - dense.sum())
+    return PreparedCloud(points[first[dense]], removed)
 
 
 def farthest_points(points, number):
