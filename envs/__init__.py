@@ -46,8 +46,8 @@ def make(
             or a file that is no encoder of this robot.
     """
     for name, value in (("task", task), ("encoder", encoder), ("geometry_source", geometry_source)):
-        is_scene = name == "task" and isinstance(value, Scene)
-        if not (isinstance(value, (str, Path)) or is_scene) and (value is not None or name == "task"):
+        kinds = (str, Path, Scene) if name == "task" else (str, Path)
+        if not isinstance(value, kinds) and (value is not None or name == "task"):
             raise ValueError(f"{name} must be a name or a path, got {value!r}")
     for name, value in (
         ("link_distances", link_distances),

@@ -844,33 +844,50 @@ def link_distances_batch(states, rows, self_collisions, within, arm, world):
 # --- Point clouds of a user's own
 
 
-@compiled
-def near_arm(q, points, distance, arm, near):
-    """Write to `near` (n,) whether points (n, 3), m, are less than `distance` (m) from the arm.
+NOT_FINITE, OUTSIDE, KNOWN, OF_ARM, OF_OBSTACLE = range(5)
+"""Labels of points, in the order in which they are tried."""
 
-    `q`: its normalised configuration. The base counts, too.
+
+@compiled
+def label_points(points, low, high, rows, known_distance, q, arm_distance, arm, labels):
+    """Write the labels of points (n, 3), m, to `labels` (n,).
+
+    `low`, `high` (3,): the workspace. `rows`: shapes, of which points less than `known_distance`
+    (m) away are `KNOWN`. Those less than `arm_distance` (m) from the arm, its base included, in the
+    normalised configuration `q` are `OF_ARM`; if `q` is empty, there is no arm.
     """
     chain, bodies, _, vertices, cells = arm
     frames, centres, pose, s, ball = _memory(chain, bodies)
     ball[0, 0] = SPHERE
-    _place(q, chain, bodies, frames, centres)
+    num_bodies = 0
+    if q.shape[0] > 0:
+        num_bodies = bodies.shape[0]
+        _place(q, chain, bodies, frames, centres)
     for j in range(points.shape[0]):
-        near[j] = False
-        for k in range(bodies.shape[0]):
-            gap = distance + bodies[k, ROUNDING]
-            x, y, z = (
-                points[j, 0] - centres[k, 0],
-                points[j, 1] - centres[k, 1],
-                points[j, 2] - centres[k, 2],
-            )
+        x, y, z = points[j, 0], points[j, 1], points[j, 2]
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+            labels[j] = NOT_FINITE
+            continue
+        if (x < low[0] or y < low[1] or z < low[2]) or (x > high[0] or y > high[1] or z > high[2]):
+            labels[j] = OUTSIDE
+            continue
+        labels[j] = OF_OBSTACLE
+        for i in range(rows.shape[0]):
+            gap = known_distance + rows[i, 16]
+            if _sphere_gap(rows, i, points, j) < gap * gap:
+                labels[j] = KNOWN
+                break
+        for k in range(num_bodies if labels[j] == OF_OBSTACLE else 0):
+            gap = arm_distance + bodies[k, ROUNDING]
+            u, v, w = x - centres[k, 0], y - centres[k, 1], z - centres[k, 2]
             reach = bodies[k, RADIUS] + gap
-            if x * x + y * y + z * z >= reach * reach:
+            if u * u + v * v + w * w >= reach * reach:
                 continue
             if _box_gap(bodies, k, frames, centres, points, j, pose) >= gap:
                 continue
             _begin(ball, 0, pose, s)
             if _gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
-                near[j] = True
+                labels[j] = OF_ARM
                 break
 
 

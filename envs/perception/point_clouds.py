@@ -17,11 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
-from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls
-from roboarm_nmp.envs.collision.kernels import first_in_cells, near_arm
+from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
+from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, first_in_cells, label_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, cardinal, observe_scene
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
-from roboarm_nmp.envs.robots.robot import matrix
 from roboarm_nmp.envs.scenes.primitives import (
     FLOOR,
     POINT_RADIUS,  # noqa: F401 (scaled like `CELL`; used from here)
@@ -43,6 +42,8 @@ ARM_DISTANCE = 0.02
 """m. Points nearer to the arm than this are its own."""
 MIN_POINTS = 3
 """Points that a cube of `CELL` and the 26 around it need, or they are outliers."""
+STEPS = ("not finite", "outside the workspace", "of table or floor", "of the arm")
+"""What `prepare_cloud` removes before outliers, in its order."""
 CACHED_SCENES = 500  # about 20 kB each
 _remembered = {}  # scene -> points
 
@@ -141,32 +142,24 @@ def prepare_cloud(
     if workspace is None:
         reach = robot.reach + LINK_DISTANCE_RANGE
         workspace = np.add(np.array(robot.base_position), [[-reach] * 3, [reach] * 3])
-    low, high = np.array(workspace, dtype=np.float32)
-    removed = {}
-
-    def keep(kept, step):
-        removed[step] = len(kept) - int(np.count_nonzero(kept))
-        return points[kept] if removed[step] else points
-
-    points = keep(np.isfinite(points).all(1), "not finite").astype(np.float32, copy=False)
-    points = keep(((points >= low) & (points <= high)).all(1), "outside the workspace")
+    low, high = np.array(workspace, dtype=np.float64)
     known = [table] if table is not None else []
     known += [] if floor is None else [floor_box(floor)]
-    inside = np.zeros(len(points), bool)
-    for box in known:
-        rotation = matrix(box.orientation).astype(np.float32)
-        local = np.abs((points - np.array(box.position, np.float32)) @ rotation)
-        inside |= (local < np.array(box.size, np.float32) / 2 + KNOWN_DISTANCE).all(1)
-    points = keep(~inside, "of table or floor")
+    state = np.empty(0)
     if configuration is not None:
         state = np.clip(robot.normalise(configuration), -1.0, 1.0)
-        near = np.empty(len(points), bool)
-        near_arm(state, points, float(arm_distance), arm_hulls(robot), near)
-        points = keep(~near, "of the arm")
+    with np.errstate(over="ignore"):
+        points = np.ascontiguousarray(points, dtype=np.float32)
+    labels = np.empty(len(points), np.uint8)
+    shapes, arm = shape_rows(known), arm_hulls(robot)
+    label_points(points, low, high, shapes, KNOWN_DISTANCE, state, arm_distance, arm, labels)
+    counts = np.bincount(labels, minlength=OF_OBSTACLE + 1).tolist()
+    removed = dict(zip(STEPS, counts, strict=False))
+    points = points[labels == OF_OBSTACLE]
     first, count, around = first_in_cells(points, np.float32(cell))
     dense = around >= min_points
     removed["outliers"] = int(count[~dense].sum())
-    removed["thinned out"] = int(count[dense].sum() - dense.sum())
+    removed["thinned out"] = len(points) - removed["outliers"] - int(dense.sum())
     return PreparedCloud(points[first[dense]], removed)
 
 
