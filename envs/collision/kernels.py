@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.numba_cache import compiled
+from roboarm_nmp.envs.utils.numba_cache import compiled
 
 BULLET_MARGIN = 0.001
 """m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
