@@ -908,9 +908,11 @@ def _slot(table, cells, x, y, z):
 def first_in_cells(points, cell):
     """The first of the points (n, 3), m, in each cube with edges of `cell`, m, of their type.
 
-    Returns int64 (m,) each, for the m cubes in the order of their first points: the index of that
-    point; how many points the cube has; how many it and the 26 cubes around it have.
+    Returns, for the m cubes in the order of their first points: int64 (m,), the index of that
+    point; int32 (n,), the cube of each point; int64 (m,), how many points the cube and the 26
+    around it have.
     """
+    cubes = np.empty(points.shape[0], np.int32)
     table = np.full(1024, -1, np.int64)  # of indices of cubes; twice as many as fit into `cells`
     cells, first, count = (
         np.empty((512, 3), np.int64),
@@ -935,7 +937,8 @@ def first_in_cells(points, cell):
             cells[m, 0], cells[m, 1], cells[m, 2], first[m] = x, y, z, i
             table[slot] = m
             m += 1
-        count[table[slot]] += 1
+        cubes[i] = table[slot]
+        count[cubes[i]] += 1
     around = np.zeros(m, np.int64)
     for n in range(m):
         for i in range(27):
@@ -947,7 +950,7 @@ def first_in_cells(points, cell):
             found = table[_slot(table, cells, x, y, z)]
             if found >= 0:
                 around[n] += count[found]
-    return first[:m], count[:m], around
+    return first[:m], cubes, around
 
 
 @compiled

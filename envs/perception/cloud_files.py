@@ -129,7 +129,7 @@ def _pose(frame):
 
 
 def _checked_intrinsics(intrinsics):
-    numbers = tuple(intrinsics)
+    numbers = tuple(map(float, intrinsics))
     if len(numbers) != 4 or not all(map(is_number, numbers)) or min(numbers[:2]) <= 0:
         raise ValueError(f"intrinsics must be fx > 0, fy > 0, cx, cy (pixels), got {numbers}")
     return numbers
@@ -316,13 +316,13 @@ class _Table:
 
 def _numbers(text, columns, most, line):
     """The columns of a text's lines: float64 (at most `most`, 3). `line`: those before the text."""
-    if text.isspace():
+    rows = [row for row in text.split("\n") if row and not row.isspace()][:most]
+    if not rows:
         return np.empty((0, 3))
-    options = {"usecols": columns, "ndmin": 2, "comments": None, "max_rows": most}
     try:
-        return np.loadtxt(io.StringIO(text), **options)
+        return np.loadtxt(rows, usecols=columns, ndmin=2, comments=None)
     except ValueError as error:
-        for number, row in enumerate(text.splitlines(), line + 1):
+        for number, row in enumerate(text.split("\n"), line + 1):
             words = row.split()
             try:
                 _ = words and [float(words[column]) for column in columns]

@@ -112,7 +112,7 @@ def prepare_cloud(
     - are outside the workspace;
     - are less than `KNOWN_DISTANCE` from table or floor, or inside them, as both are known;
     - are less than `arm_distance` from the arm, whose convex hulls collision checks use, too;
-    - are outliers: with the 26 cubes around it, their cube of `cell` has less than `min_points`;
+    - are outliers: with the 26 cubes around it, their cube of `CELL` has less than `min_points`;
     - are not the first of their cube of `cell`.
 
     The same points in the same order give the same result.
@@ -156,11 +156,13 @@ def prepare_cloud(
     counts = np.bincount(labels, minlength=OF_OBSTACLE + 1).tolist()
     removed = dict(zip(STEPS, counts, strict=False))
     points = points[labels == OF_OBSTACLE]
-    first, count, around = first_in_cells(points, np.float32(cell))
-    dense = around >= min_points
-    removed["outliers"] = int(count[~dense].sum())
-    removed["thinned out"] = len(points) - removed["outliers"] - int(dense.sum())
-    return PreparedCloud(points[first[dense]], removed)
+    # Not the cubes of `cell`: of a fine one, most points of a surface would be alone.
+    _, cubes, around = first_in_cells(points, np.float32(scale_of(robot) * CELL))
+    dense = points[(around >= min_points)[cubes]]
+    thin = one_per_cell(dense, cell)
+    removed["outliers"] = len(points) - len(dense)
+    removed["thinned out"] = len(dense) - len(thin)
+    return PreparedCloud(thin, removed)
 
 
 def farthest_points(points, number):
