@@ -23,6 +23,7 @@ import warnings
 import zipfile
 import zlib
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 from PIL import Image
@@ -168,8 +169,10 @@ def _read_npy(file, size):
     if tuple(magic[6:]) not in readers:
         raise ValueError(f"version {magic[6]}.{magic[7]} of .npy is unknown")
     try:
-        shape, columns_first, dtype = readers[tuple(magic[6:])](file)
-    except (SyntaxError, TypeError, RecursionError, MemoryError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)  # a header of Python 2
+            shape, columns_first, dtype = readers[tuple(magic[6:])](file)
+    except (SyntaxError, TypeError, RecursionError, UserWarning, TokenError) as error:
         raise ValueError(f"its header is damaged: {error}") from error
     if dtype.hasobject:
         raise ValueError("it has pickled objects, which are not read")

@@ -44,6 +44,7 @@ MIN_POINTS = 3
 """Points that a cube of `CELL` and the 26 around it need, or they are outliers."""
 STEPS = ("not finite", "outside the workspace", "of table or floor", "of the arm")
 """What `prepare_cloud` removes before outliers, in its order."""
+_AS_COMPILED = "CW"  # contiguous and writeable, or Numba compiles once more
 CACHED_SCENES = 500  # about 20 kB each
 _remembered = {}  # scene -> points
 
@@ -77,7 +78,8 @@ def one_per_cell(points, cell=CELL):
 
     Use it with points of your own: the pretrained policies were trained with such clouds.
     """
-    numbers = points if points.dtype in (np.float32, np.float64) else points.astype(np.float64)
+    kind = points.dtype if points.dtype in (np.float32, np.float64) else np.float64
+    numbers = np.require(points, kind, _AS_COMPILED)
     return points[first_in_cells(numbers, numbers.dtype.type(cell))[0]]
 
 
@@ -149,7 +151,7 @@ def prepare_cloud(
     if configuration is not None:
         state = np.clip(robot.normalise(configuration), -1.0, 1.0)
     with np.errstate(over="ignore"):
-        points = np.ascontiguousarray(points, dtype=np.float32)
+        points = np.require(points, np.float32, _AS_COMPILED)
     labels = np.empty(len(points), np.uint8)
     shapes, arm = shape_rows(known), arm_hulls(robot)
     label_points(points, low, high, shapes, KNOWN_DISTANCE, state, arm_distance, arm, labels)
