@@ -162,7 +162,7 @@ def _back_projected(depth, fx, fy, cx, cy):
 def _read_npy(file, size):
     """The numbers in an open .npy file of `size` bytes. Raises ValueError."""
     magic = file.read(8)
-    if not magic.startswith(b"\x93NUMPY"):
+    if len(magic) < 8 or not magic.startswith(b"\x93NUMPY"):
         raise ValueError("not a .npy file (pickled arrays are not read)")
     readers = {(1, 0): np.lib.format.read_array_header_1_0}
     readers[2, 0] = np.lib.format.read_array_header_2_0

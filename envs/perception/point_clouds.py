@@ -144,17 +144,21 @@ def prepare_cloud(
     if workspace is None:
         reach = robot.reach + LINK_DISTANCE_RANGE
         workspace = np.add(np.array(robot.base_position), [[-reach] * 3, [reach] * 3])
-    low, high = np.array(workspace, dtype=np.float64)
+    workspace = np.array(workspace, dtype=np.float64)
+    if workspace.shape != (2, 3):
+        raise ValueError(f"workspace must be two corners, (2, 3), got {workspace.shape}")
     known = [table] if table is not None else []
     known += [] if floor is None else [floor_box(floor)]
     state = np.empty(0)
     if configuration is not None:
+        if np.shape(configuration) != (robot.num_joints,):
+            raise ValueError(f"configuration must be {robot.num_joints} joint angles")
         state = np.clip(robot.normalise(configuration), -1.0, 1.0)
     with np.errstate(over="ignore"):
         points = np.require(points, np.float32, _AS_COMPILED)
     labels = np.empty(len(points), np.uint8)
     shapes, arm = shape_rows(known), arm_hulls(robot)
-    label_points(points, low, high, shapes, KNOWN_DISTANCE, state, arm_distance, arm, labels)
+    label_points(points, *workspace, shapes, KNOWN_DISTANCE, state, arm_distance, arm, labels)
     counts = np.bincount(labels, minlength=OF_OBSTACLE + 1).tolist()
     removed = dict(zip(STEPS, counts, strict=False))
     points = points[labels == OF_OBSTACLE]

@@ -34,7 +34,7 @@ from tqdm import tqdm
 
 # How many attempts, and how many of them share a process.
 SIZES = {
-    **{"networks": 10_000, "files": 20_000, "robots": 2_000, "clouds": 2_000, "flags": 2_000},
+    **{"networks": 10_000, "files": 20_000, "robots": 2_000, "clouds": 10_000, "flags": 2_000},
     **{"environments": 20_000, "kills": 50},
 }
 PER_CHILD = {
@@ -60,7 +60,7 @@ class Args:
     ] = tuple(SIZES)
     """these attacks"""
     number: int | None = None
-    """attempts of each; by default 10,000, 20,000, 2,000, 2,000, 2,000, 20,000, 50 (of four
+    """attempts of each; by default 10,000, 20,000, 2,000, 10,000, 2,000, 20,000, 50 (of four
     kills)"""
     seed: int = 0
     """of everything random"""
