@@ -138,8 +138,10 @@ def _checked_intrinsics(intrinsics):
 
 def _placed(points, scale, rotation, position):
     """Points in units of `scale` (m) as float32, m, rotated and moved."""
-    placed = np.empty(points.shape, np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite ones are dropped later
+        if scale == 1.0 and (rotation == np.eye(3)).all() and not position.any():
+            return np.require(points, np.float32, "CW")
+        placed = np.empty(points.shape, np.float32)
         for begin in range(0, len(points), _BLOCK):
             block = points[begin : begin + _BLOCK].astype(np.float64)
             placed[begin : begin + _BLOCK] = (scale * block) @ rotation.T + position

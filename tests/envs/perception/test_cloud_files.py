@@ -224,7 +224,7 @@ DAMAGED = {
     "no_points.pcd": (b"VERSION 0.7\nFIELDS x y z\nDATA ascii\n", "must have as many words"),
     "cut.pcd": (pcd_binary()[:-5], "announces 3 points, and has room for 2"),
     "count.pcd": (PCD_TEXT.replace("COUNT 3", "COUNT a").encode(), "'a' is not a number"),
-    "data.pcd": (PCD_TEXT.replace("DATA ascii", "DATA 'zip' is unknown").encode(), "DATA zip"),
+    "data.pcd": (PCD_TEXT.replace("DATA ascii", "DATA zip").encode(), "DATA 'zip' is unknown"),
     "cut_compressed.pcd": (pcd_compressed()[:-1], "compressed sizes do not fit"),
     "lzf.pcd": (pcd_compressed().replace(b"\xc0\x03", b"\xc0\xff"), "damaged"),
     "shape.npy": (npy(np.zeros((3, 4))), r"shape \(3, 4\), not"),
