@@ -6,9 +6,9 @@
 The clouds are those of validation queries: four sensors with 160 x 160 rays observe the scene, the
 arm at the start, table and floor, 102,400 points without labels. Each is prepared and planned in
 with one `Planner`, as a process does that receives cloud after cloud. Milliseconds are wall-clock
-time and, where other processes run, the processor's. Paths are judged by the ground-truth obstacles:
-followed in the simulator, they reach the goal, with or without contact. With `--policy`, the
-policy's computing time of an episode is reported, too.
+time and, where other processes run, the processor's. Paths are judged by the ground-truth
+obstacles: followed in the simulator, they reach the goal, with or without contact. With `--policy`,
+the policy's computing time of an episode is reported, too.
 """
 
 import argparse
