@@ -54,7 +54,7 @@ class EvaluationOptions:
     """The options of `evaluate`.
 
     Attributes:
-        goal_type: `ee`, `config`, `combined`; None for the policy's own, otherwise `ee`.
+        goal_type: `ee`, `config`, `combined`, `pose`; None for the policy's own, otherwise `ee`.
         queries: queries instead of the task's own: the path of a query file, or an object with
             `start` and `goal`, float32 (m, n), rad, and `scenes`, a sequence of m `Scene`s, like
             `envs.datasets.queries.Queries`. Without `scenes` they are in the task's scene, which

@@ -88,7 +88,7 @@ class Args:
     """number of the first query, from 0"""
     split: Literal["test", "validation", "original"] = "test"
     """which of the task's queries; without a query file, random queries are shown"""
-    goal_type: Literal["ee", "config", "combined"] | None = None
+    goal_type: Literal["ee", "config", "combined", "pose"] | None = None
     """what the goal is; by default the policy's own, otherwise `ee`"""
     geometry_source: str | None = None
     """where `planner`, `via-points`, the safety filter and the policy's observations take the

@@ -284,7 +284,7 @@ class PolicyArm(_Arm):
     Args:
         task: name of a task, or path of a scene file.
         policy: as for `envs.policies.registry.find_policy`.
-        goal_type: `ee`, `config`, `combined`; None for the policy's own, otherwise `ee`.
+        goal_type: `ee`, `config`, `combined`, `pose`; None for the policy's own, otherwise `ee`.
         geometry_source: where the policy, its observations and its safety filter take the obstacles
             from (`envs.perception.geometry_source`); None for the policy's own, otherwise
             `ground_truth`.
