@@ -146,7 +146,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
 
     def __init__(self, env, geometry_source, append=False, goal_link_distances=True):
         super().__init__(env)
-        self._geometry_source, self.appends_link_distances = geometry_source, append
+        self.geometry_source, self.appends_link_distances = geometry_source, append
         self._of_goals = goal_link_distances and self.goal_type in ("config", "combined")
         names = ["link_distances"] + ["goal_link_distances"] * self._of_goals
         shape = self.unwrapped.robot.link_distances_shape
@@ -163,7 +163,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
 
         `scene`: a `Scene`, by default that of the environment.
         """
-        checker = self._geometry_source(self.unwrapped.scene if scene is None else scene)
+        checker = self.geometry_source(self.unwrapped.scene if scene is None else scene)
         return checker.link_distances(states)
 
     def compute_reward(self, achieved_goal, desired_goal, info):
