@@ -528,6 +528,18 @@ class Simulation:
         """
         self.set_goal(inverse_kinematics(self.robot, position, self.query.goal))
 
+    def turn_goal(self, pose):
+        """Another goal with a pose (7,) of the end effector, near the present goal.
+
+        Where the arm does not reach the pose, the goal stays.
+        """
+        # Here, because Numba takes a while to import.
+        from roboarm_nmp.envs.robots import inverse_kinematics as poses
+
+        found = poses.inverse_kinematics(self.robot, pose, near=self.query.goal)
+        if len(found):
+            self.set_goal(found[0])
+
     def replace_obstacle(self, index, obstacle):
         """Another obstacle in the place of one. Raises ValueError: its numbers are invalid."""
         obstacles = list(self.query.scene.obstacles)
