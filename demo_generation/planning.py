@@ -278,7 +278,7 @@ class Planner:
         joints = self.env.robot.num_joints
         if np.shape(goal) == (3,) != (joints,):  # a position, with which an episode may begin
             raise ValueError(f"goal must have {joints} numbers, got shape (3,)")
-        rng, deadline = np.random.default_rng(seed), time.monotonic() + time_limit
+        rng = np.random.default_rng(seed)
         # Bad queries are rejected here, as an episode would reject them.
         if goal_pose is None and np.ndim(goal) != 2:
             self.env.reset_specific(start, goal, scene)
@@ -291,6 +291,7 @@ class Planner:
                 goals = self._goals_of_pose(start, goal_pose, seed)
             else:
                 goals = self._free_goals(start, goal)
+        deadline = time.monotonic() + time_limit
         self.checks, best = 0, None
         for _ in range(SEARCHES):
             path = self._search(start, goals, int(rng.integers(1, 2**32)), deadline)
