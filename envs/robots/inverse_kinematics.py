@@ -70,7 +70,7 @@ def inverse_kinematics(
             raise ValueError(f"near must be {joints} finite numbers, got {near}")
         states[:, 0] = np.clip(robot.normalise(near), -1.0, 1.0)
     origin = states[:, 0].copy()
-    rotations = [matrix(quaternion / norm) for quaternion, norm in zip(poses[:, 3:], norms)]
+    rotations = [matrix(quaternion) for quaternion in poses[:, 3:] / norms[:, None]]
     targets = np.hstack([poses[:, :3], np.reshape(rotations, (-1, 9))])
     solved = np.empty(states.shape[:2], dtype=np.bool_)
     limits = _STOP * MAX_DISTANCE, _STOP * MAX_ANGLE
@@ -104,13 +104,12 @@ def _chain(robot):
     middle, half = (robot.upper + robot.lower) / 2, (robot.upper - robot.lower) / 2
     chain = np.zeros((len(frames) + 2, CHAIN_COLUMNS))
     chain[(0, -1), 0] = -1.0  # base and end effector do not move
-    chain[0, POSITION:ROTATION], chain[0, ROTATION:] = (
-        robot.base_position,
-        matrix(robot.base_orientation).ravel(),
-    )
+    chain[0, POSITION:ROTATION] = robot.base_position
+    chain[0, ROTATION:] = matrix(robot.base_orientation).ravel()
     for row, frame in zip(chain[1:-1], frames, strict=True):
-        value = frame.multiplier * middle[frame.joint] + frame.offset
-        row[:POSITION] = frame.joint, frame.is_prismatic, value, frame.multiplier * half[frame.joint]
+        joint, scale = frame.joint, frame.multiplier
+        value = scale * middle[joint] + frame.offset
+        row[:POSITION] = joint, frame.is_prismatic, value, scale * half[joint]
         row[POSITION:] = *frame.position, *frame.rotation
     chain[-1, POSITION:ROTATION] = robot.end_effector_position
     chain[-1, ROTATION:] = robot.end_effector_rotation.ravel()

@@ -1,10 +1,11 @@
 """What Numba compiles of inverse kinematics: Levenberg-Marquardt in the box of the joint limits.
 
 One file holds all of it, because Numba's cache on disk does not notice changes in other files.
-States are normalised configurations. `chain`: float64 (f, `CHAIN_COLUMNS`), the base, the
-frames from there to the end effector, in this order, and the end effector in the last of them. No
-joint moves the first and the last row (joint -1). Columns: joint, whether it is prismatic, the joint's value at 0 and its
-change per unit of state, position 3 and rotation 9 (row-major) in the frame before.
+States are normalised configurations. `chain`: float64 (f, `CHAIN_COLUMNS`), the base, the frames
+from there to the end effector, in this order, and the end effector in the last of them. No joint
+moves the first and the last row (joint -1). Columns: joint, whether it is prismatic, the joint's
+value at 0 and its change per unit of state, position 3 and rotation 9 (row-major) in the frame
+before.
 """
 
 import math
@@ -17,7 +18,7 @@ JOINT, PRISMATIC, MIDDLE, SCALE, POSITION, ROTATION, CHAIN_COLUMNS = 0, 1, 2, 3,
 # An error of 1 rad counts like one of this many metres, about the size of a hand.
 METRES_PER_RADIAN = 0.3
 # Damping: this share of the squared error, and a constant (Sugihara, 2011).
-DAMPING_SHARE, LEAST_DAMPING = 1e-2, 1e-8
+DAMPING_SHARE, LEAST_DAMPING = 0.3, 1e-8
 # A search is given up after so many iterations without an error below this share of the best one.
 STALLED, STALLED_SHARE = 8, 0.9
 

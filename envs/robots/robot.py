@@ -264,7 +264,8 @@ class Robot:
             quaternion = self.read_end_effector_pose(client, body)[3:]
         finally:
             p.disconnect(physicsClientId=client)
-        return self.frame_poses(self.contact_free)[self.end_effector_frame][1].T @ matrix(quaternion)
+        _, axes = self.frame_poses(self.contact_free)[self.end_effector_frame]
+        return axes.T @ matrix(quaternion)
 
     def frame_poses(self, configuration):
         """Joint angles in rad, (..., n) -> per frame position (..., 3), m, and axes (..., 3, 3).
