@@ -32,7 +32,7 @@ from roboarm_nmp.envs.training.flags import (
 from roboarm_nmp.envs.utils.files import check_writable
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
-MAX_GOALS = 8  # configurations with the goal's pose that are tried, the nearest first
+MAX_GOALS = 8  # configurations with the goal's pose that the planner may reach, the nearest first
 
 
 @dataclass
@@ -178,22 +178,18 @@ def _check_end(flag, configuration, checker):
 
 
 def _planned(args, scene, start, goals):
-    """A path (k, n), rad, of the planner, and its computing time (s).
+    """A path (k, n), rad, of the planner to one of the goals, and its computing time (s).
 
-    Raises PlanningError: there is none to any goal.
+    Raises PlanningError: there is none.
     """
-    from roboarm_nmp.demo_generation.planning import Planner, PlanningError
+    from roboarm_nmp.demo_generation.planning import Planner
     from roboarm_nmp.envs.arm_env import RoboArmEnv
 
     planner = Planner(RoboArmEnv(scene))
     began = time.perf_counter()
-    for number, goal in enumerate(goals):
-        try:
-            path = planner.plan(start, goal, seed=args.seed, time_limit=args.time_limit)
-            return path, time.perf_counter() - began
-        except PlanningError:
-            if number + 1 == len(goals):
-                raise
+    goal = goals if len(goals) > 1 else goals[0]
+    path = planner.plan(start, goal, seed=args.seed, time_limit=args.time_limit)
+    return path, time.perf_counter() - began
 
 
 def _rolled_out(args, scene, start, goal):
