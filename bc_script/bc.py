@@ -23,6 +23,7 @@ import torch.nn.functional as F
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.episodes import observed
 from roboarm_nmp.envs.datasets.format import DatasetError
+from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training import flags, protocol, runs
 
@@ -32,8 +33,8 @@ class Args(protocol.PolicyFlags):
     # More flags are in `envs/training/protocol.py` (task) and `envs/training/runs.py` (run).
     exp_name: str = "bc"
     """name of the experiment, part of the name of the run's folder"""
-    goal_type: Literal["ee", "config", "combined"] = "combined"
-    """what the goal is: end-effector position, configuration, or both"""
+    goal_type: Literal["ee", "config", "combined", "pose"] = "combined"
+    """what the goal is: end-effector position, configuration, both, or end-effector pose"""
     demos: tuple[Path, ...] = ()
     """demonstration files of the task; by default the task's own"""
     num_demos: flags.PositiveInt | None = None
@@ -129,7 +130,10 @@ class Features(nn.Module):
             joints = self.num_joints
             angles = observation[:, :joints] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
-            if self.goal_type != "config":  # end-effector positions
+            if self.goal_type == "pose":
+                poses = observation[:, joints : joints + 7]
+                inputs.append(5.0 * pose_difference(poses, desired_goal))
+            elif self.goal_type != "config":  # end-effector positions
                 inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, joints : joints + 3]))
         return torch.cat(inputs, dim=1)
 
@@ -172,7 +176,7 @@ class Actor(nn.Module):
 
 # ALGO LOGIC: demonstrations
 def transitions(demos, goal_type, num_demos=None):
-    """Observations, goals and actions of demonstrations: float32 (m, n + 3), (m, g), (m, n).
+    """Observations, goals and actions of demonstrations: float32 (m, o), (m, g), (m, n).
 
     And the index of each one's demonstration: int64 (m,). n is the number of joints. A
     demonstration is used to its end, also after its goal counts as reached. Actions are in units of

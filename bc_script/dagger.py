@@ -24,9 +24,11 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
+from roboarm_nmp.envs.arm_env import end_effector_size
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
+from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, ground_truth_checker
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
@@ -43,8 +45,9 @@ class Args(protocol.PolicyFlags):
     """name of the experiment, part of the name of the run's folder"""
     task: str = "random_boxes_hard"
     """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
-    goal_type: Literal["config", "combined"] = "combined"
-    """what the goal is: configuration, or that and the end-effector's position"""
+    goal_type: Literal["config", "combined", "pose"] = "combined"
+    """what the goal is: configuration, that and the end-effector's position, or end-effector
+    pose"""
     paths: Path = Path("roadmaps")
     """folder of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any task of the
     same robot"""
@@ -145,7 +148,7 @@ class Block(nn.Module):
 
 
 class Actor(nn.Module):
-    """The unit vector to the goal, plus a learned direction.
+    """The unit vector to the goal, plus a learned direction; of a goal pose, the latter alone.
 
     The encoded scene is a set of tokens, a row each: obstacles, points, or a single latent code. A
     row of zeros is no token. Each token is processed together with the features of the arm, and
@@ -156,12 +159,15 @@ class Actor(nn.Module):
         super().__init__()
         robot, self.token_size = env.unwrapped.robot, env.encoder.token_size  # numbers per token
         self.num_joints = joints = robot.num_joints
+        self.goal_is_pose = args.goal_type == "pose"
+        self.arm_size = joints + end_effector_size(args.goal_type)  # in the observation
         low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = env.observation_space["desired_goal"].shape[0]
-        # Observation, goal, sines and cosines of both, link distances at both.
-        size = joints + 3 + goal_size + 4 * joints + 2 * math.prod(robot.link_distances_shape)
+        # Sines, cosines and link distances; here and, unless it is a pose, at the goal.
+        size = 2 * joints + math.prod(robot.link_distances_shape)
+        size = self.arm_size + goal_size + (size + 6 if self.goal_is_pose else 2 * size)
         self.token_in = nn.Linear(self.token_size, args.token_width)
         self.arm_in = nn.Linear(size, args.token_width)
         self.fuse = Bf16Linear(args.token_width, args.token_width, args.bf16)
@@ -169,41 +175,51 @@ class Actor(nn.Module):
         blocks = (Block(args.hidden_size, args.bf16) for _ in range(args.num_blocks))
         self.blocks = nn.Sequential(*blocks)
         self.head = nn.Linear(args.hidden_size, joints + 1)
-        nn.init.zeros_(self.head.weight)  # the initial policy is go-to-goal
-        nn.init.zeros_(self.head.bias)
+        if not self.goal_is_pose:
+            nn.init.zeros_(self.head.weight)  # the initial policy is go-to-goal
+            nn.init.zeros_(self.head.bias)
 
-    def features(self, observation, desired_goal, link_distances, goal_link_distances):
+    def features(self, observation, desired_goal, link_distances, goal_link_distances=None):
         """Features of the arm and of the goal (N, size)."""
-        joints = self.num_joints
-        states = torch.cat([observation[:, :joints], desired_goal[:, :joints]], dim=1)
-        angles = (states.unflatten(1, (2, joints)) * self.half_range + self.middle).flatten(1)
-        distances = torch.stack([link_distances, goal_link_distances], dim=1)
+        joints, arm = self.num_joints, observation[:, : self.arm_size]
+        states, distances = arm[:, :joints], link_distances.unsqueeze(1)
+        inputs = [arm, desired_goal]
+        if self.goal_is_pose:
+            inputs.append(5.0 * pose_difference(arm[:, joints:], desired_goal))
+        else:
+            states = torch.cat([states, desired_goal[:, :joints]], dim=1)
+            distances = torch.stack([link_distances, goal_link_distances], dim=1)
+        angles = (states.unflatten(1, (-1, joints)) * self.half_range + self.middle).flatten(1)
         # The distances themselves, the first number of each link, are small.
         distances = torch.cat([10.0 * distances[..., :1], distances[..., 1:]], dim=-1)
-        inputs = observation[:, : joints + 3], desired_goal, torch.sin(angles), torch.cos(angles)
-        return torch.cat([*inputs, distances.flatten(1)], dim=1)
+        inputs += [torch.sin(angles), torch.cos(angles), distances.flatten(1)]
+        return torch.cat(inputs, dim=1)
 
-    def outputs(self, observation, desired_goal, link_distances, goal_link_distances):
+    def outputs(self, observation, desired_goal, link_distances, goal_link_distances=None):
         """The direction (N, n), of any length, and the remaining length of the path (N,)."""
         features = self.features(observation, desired_goal, link_distances, goal_link_distances)
         joints = self.num_joints
-        tokens = observation[:, joints + 3 :].unflatten(1, (-1, self.token_size))
+        tokens = observation[:, self.arm_size :].unflatten(1, (-1, self.token_size))
         fused = F.relu(self.token_in(tokens) + self.arm_in(features).unsqueeze(1))
         fused = F.relu(self.fuse(fused))
         is_token = (tokens != 0.0).any(dim=2, keepdim=True)
         pooled = (fused * is_token).amax(1)  # (no number is below zero)
         x = self.blocks(F.relu(self.first(torch.cat([features, pooled], dim=1))))
         outputs = self.head(x)
+        if self.goal_is_pose:
+            return outputs[:, :joints], F.softplus(outputs[:, joints])
         to_goal = desired_goal[:, :joints] - observation[:, :joints]
         direction = F.normalize(to_goal, dim=1) + outputs[:, :joints]
         return direction, to_goal.norm(dim=1) + F.softplus(outputs[:, joints])
 
     def forward(
-        self, observation, achieved_goal, desired_goal, link_distances, goal_link_distances
+        self, observation, achieved_goal, desired_goal, link_distances, goal_link_distances=None
     ):
         """The action (N, n); policy.pt contains this function."""
-        direction, _ = self.outputs(observation, desired_goal, link_distances, goal_link_distances)
-        joints = self.num_joints
+        given = observation, desired_goal, link_distances, goal_link_distances
+        (direction, length), joints = self.outputs(*given), self.num_joints
+        if self.goal_is_pose:
+            return F.normalize(direction, dim=1) * length.unsqueeze(1).clamp(max=MAX_STEP)
         to_goal = (desired_goal[:, :joints] - observation[:, :joints]).norm(dim=1, keepdim=True)
         return F.normalize(direction, dim=1) * to_goal.clamp(max=MAX_STEP)
 

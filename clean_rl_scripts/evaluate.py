@@ -88,7 +88,7 @@ class Args:
     policy was trained on"""
     robot: Path | None = None
     """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
-    goal_type: Literal["ee", "config", "combined"] | None = None
+    goal_type: Literal["ee", "config", "combined", "pose"] | None = None
     """what the goal is; by default the policy's own, otherwise `ee`"""
     split: Literal["test", "validation", "original"] = "test"
     """which of the task's queries; few tasks have `original` ones"""

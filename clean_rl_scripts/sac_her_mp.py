@@ -21,6 +21,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
+from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.training import flags, protocol, runs
 
 
@@ -128,9 +129,9 @@ class Features(nn.Module):
         low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        # The configuration, velocities (or not) and the end-effector position.
-        end = self.num_joints * (1 + args.velocities) + 3
-        self.ee = slice(end - 3, end)
+        # The configuration, velocities (or not) and the end effector's position or pose.
+        end = env.unwrapped.observation_space["observation"].shape[0]
+        self.ee = slice(self.num_joints * (1 + args.velocities), end)
         # Link distances follow, the first number of each link is the distance.
         links, numbers = robot.link_distances_shape
         near = slice(end, end + links * numbers, numbers)
@@ -145,9 +146,11 @@ class Features(nn.Module):
             joints = self.num_joints
             angles = observation[:, :joints] * self.half_range + self.middle
             inputs += [torch.sin(angles), torch.cos(angles)]
-            if self.goal_type != "config":
+            if self.goal_type == "pose":
+                inputs.append(5.0 * pose_difference(observation[:, self.ee], desired_goal))
+            if self.goal_type in ("ee", "combined"):
                 inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
-            if self.goal_type != "ee":
+            if self.goal_type in ("config", "combined"):
                 inputs.append(5.0 * (desired_goal[:, :joints] - observation[:, :joints]))
         if self.distances is not None:
             inputs.append(10.0 * observation[:, self.distances])  # they are small numbers

@@ -47,7 +47,7 @@ class Args:
     """Name of a task with a fixed scene: export its pretrained demonstrations."""
     file: Path | None = None
     """Demonstration file to export instead."""
-    goal_type: Literal["ee", "config", "combined"] = "ee"
+    goal_type: Literal["ee", "config", "combined", "pose"] = "ee"
     """Kind of the goals."""
     dataset_id: str | None = None
     """Minari's name for the dataset. The default is `roboarm-nmp/<task>/<goal type>-v0`."""
@@ -141,7 +141,7 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
 
     Args:
         demos: an `envs.datasets.demonstrations.Demos`.
-        goal_type: `ee`, `config` or `combined`.
+        goal_type: `ee`, `config`, `combined` or `pose`.
         dataset_id: a name with a version, `namespace/name-v0`; None for the default.
         exact: follow the plans again, see above.
         overwrite: replace a dataset of this name. The old one stays until the new one is complete.

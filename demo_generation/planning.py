@@ -7,6 +7,7 @@
     env = roboarm_nmp.make("double_walls")
     query = load_queries("double_walls")[0]  # start, goal, scene
     path = Planner(env).plan(*query, seed=1)  # float32 (k, n), rad
+    path = Planner(env).plan(query.start, goal_pose=pose, seed=1)  # of the end effector, (7,)
 
 Collisions are checked by `envs.collision.checker`. It agrees with PyBullet within a fraction of a
 millimetre and is about twenty times faster. The environment itself decides whether start and goal
@@ -23,6 +24,7 @@ from ompl import geometric as og
 from ompl import util as ou
 
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
+from roboarm_nmp.envs.robots.inverse_kinematics import NUM_SEEDS, inverse_kinematics
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.envs.utils.names import suggest
 
@@ -44,6 +46,8 @@ PLANNERS = tuple(
 # A configuration this close (m) to a collision counts as one, which absorbs most of the
 # controller's lag: without the margin, two of three plans on `double_walls` collide when followed.
 MARGIN = 0.003
+# The distance (m) by which the checks and PyBullet may disagree.
+EXACTNESS = 0.001
 # Where start or goal is nearer than that, the margin is the distance there. It grows by this much
 # (m) per unit of normalised distance from them: the full margin holds again about three steps away.
 MARGIN_GROWTH = 0.03
@@ -61,6 +65,9 @@ OTHER_PLANNER, FIRST_TURN = "LBKPIECE1", 8_000
 SEARCHES = 3
 # Steps by which the arm may arrive later than its last sub-goal.
 LAG = 10
+# A goal pose is a set of configurations, at most this many. Inverse kinematics begins from
+# `NUM_SEEDS` states; if it finds nothing free, again from 4, 16 and 64 times as many.
+MAX_GOALS, IK_ROUNDS = 16, 4
 # Shortcuts tried in one round of simplification, and how many may fail in a row. A limit of
 # iterations is deterministic, unlike the seconds of OMPL's simplifyMax.
 SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS = 50, 25
@@ -178,7 +185,8 @@ class Planner:
             the query, so reset before the next step.
         planner: one of `PLANNERS`, or your own: a function `(is_valid, start, goal, rng)` that
             returns a path (k, n) from start to goal, or None. `is_valid` is a `Validity`, start
-            and goal are normalised configurations (n,), float64, `rng` is a NumPy Generator.
+            and goal are normalised configurations (n,), float64, `rng` is a NumPy Generator. With
+            several goals it is called for one after the other, until it returns a path.
             `RRTConnect` alternates with `OTHER_PLANNER` where it takes long.
         clearance: metres that a path keeps from the scene, in addition to `MARGIN`. A query that
             starts or ends nearer is planned without it. `MARGIN_SCHEDULE` scales both in a long
@@ -229,7 +237,7 @@ class Planner:
         self.checks = 0
         """Collision checks of the last plan."""
 
-    def plan(self, start, goal, scene=None, *, seed, time_limit=5.0):
+    def plan(self, start, goal=None, scene=None, *, seed, time_limit=5.0, goal_pose=None):
         """A path from start to goal: float32 (k, n), rad; its ends are exactly start and goal.
 
         The same seed gives the same path on every machine, whatever was planned before, as long as
@@ -237,33 +245,56 @@ class Planner:
         the path takes longer than an episode, there are up to `SEARCHES` searches, and the shortest
         path is returned.
 
+        The path to a set of goals ends at one of them, whichever is reached first: searches prefer
+        those nearest to the start. For a goal pose, the set are up to `MAX_GOALS` collision-free
+        configurations from inverse kinematics.
+
         Args:
-            start, goal: joint angles (n, rad).
+            start: joint angles (n, rad).
+            goal: joint angles (n, rad), or a set of goals (m, n), of which those in collision, or
+                outside the limits, are ignored.
             scene: a `Scene` to change the environment to first.
             seed: int >= 0 or a sequence of such ints, as for `np.random.default_rng`.
             time_limit: seconds for all searches; `math.inf` for no limit. The plan may take a
                 little longer.
+            goal_pose: instead of `goal`, a pose of the end effector (7,), as of
+                `Robot.end_effector_pose`. Only the geometry source decides which configurations
+                are free there.
 
         Raises:
-            ValueError: start or goal is not n numbers inside the limits, or is in collision; seed
-                or time_limit is out of range; your own planner returned something that is not a
-                path from start to goal.
-            PlanningError: no path within `time_limit` and `max_checks`.
+            ValueError: start or goal is not n numbers inside the limits, or is in collision, or so
+                are all goals of a set; both or none of `goal` and `goal_pose` are given; seed or
+                time_limit is out of range; your own planner returned something that is not a path
+                from start to goal.
+            PlanningError: no path within `time_limit` and `max_checks`, or no free configuration
+                has the goal pose.
         """
         if seed is None:
             raise ValueError("seed must be an int or a sequence of ints, got None")
         if not time_limit > 0:
             raise ValueError(f"time_limit must be positive, got {time_limit!r}")
+        if (goal is None) == (goal_pose is None):
+            raise ValueError("either goal or goal_pose is needed, and not both")
         joints = self.env.robot.num_joints
         if np.shape(goal) == (3,) != (joints,):  # a position, with which an episode may begin
             raise ValueError(f"goal must have {joints} numbers, got shape (3,)")
-        rng, deadline = np.random.default_rng(seed), time.monotonic() + time_limit
+        rng = np.random.default_rng(seed)
         # Bad queries are rejected here, as an episode would reject them.
-        self.env.reset_specific(start, goal, scene)
-        start, goal = (np.asarray(end, dtype=np.float32) for end in (start, goal))
+        if goal_pose is None and np.ndim(goal) != 2:
+            self.env.reset_specific(start, goal, scene)
+            start, goals = (np.asarray(x, dtype=np.float32) for x in (start, [goal]))
+        else:
+            if scene is not None:
+                self.env.set_scene(scene)
+            start = self.env.check_configuration("start", start)
+            if goal_pose is not None:
+                goals = self._goals_of_pose(start, goal_pose, seed)
+            else:
+                goals = self._free_goals(start, goal)
+        deadline = time.monotonic() + time_limit
         self.checks, best = 0, None
         for _ in range(SEARCHES):
-            path = self._search(start, goal, int(rng.integers(1, 2**32)), deadline)
+            path = self._search(start, goals, int(rng.integers(1, 2**32)), deadline)
             if path is None:
                 break
             if best is None or self._steps(path) < self._steps(best):
@@ -277,38 +308,85 @@ class Planner:
             )
         return best
 
+    def _free_goals(self, start, goals):
+        """Those of a set of goals with which an episode can begin, nearest to the start first."""
+        joints, normalise = self.env.robot.num_joints, self.env.robot.normalise
+        if np.shape(goals)[1] != joints or not len(goals):
+            raise ValueError(f"a set of goals has shape (m, {joints}), got {np.shape(goals)}")
+        free, problem = [], None
+        for number, goal in enumerate(goals):
+            try:
+                free.append(self.env.check_configuration(f"goal {number}", goal))
+            except ValueError as error:
+                problem = problem or error
+        if not free:
+            raise ValueError(f"none of the {len(goals)} goals is possible: {problem}")
+        distances = np.linalg.norm(normalise(free) - normalise(start), axis=1)
+        return np.array(free)[np.argsort(distances, kind="stable")]
+
+    def _goals_of_pose(self, start, pose, seed):
+        """Free configurations with a pose, float32 (m, n), rad, nearest to the start first.
+
+        If some have the clearance that a path keeps, only those.
+        """
+        checker, robot = self._current_checker(), self.env.robot
+        for round_ in range(IK_ROUNDS):
+            number = NUM_SEEDS * 4**round_
+            given = {"seed": seed, "num_seeds": number, "checker": checker, "near": start}
+            goals = inverse_kinematics(robot, pose, **given).astype(np.float32)
+            if len(goals):
+                break
+        else:
+            raise PlanningError("no collision-free configuration has the goal pose")
+        states = np.clip(robot.normalise(goals), -1.0, 1.0)
+        for clearance in (MARGIN + self.clearance, MARGIN, EXACTNESS):
+            wide = checker.is_free(states, margin=EXACTNESS, clearance=clearance - EXACTNESS)
+            if wide.any():
+                goals = goals[wide]
+                break
+        return goals[:MAX_GOALS]
+
     def _steps(self, path):
         return len(subgoals(path, self.env.robot))
 
-    def _search(self, start, goal, seed, deadline):
+    def _search(self, start, goals, seed, deadline):
         """The path of one search, float32 (k, n), rad; None: there was none within the limits."""
-        is_valid, robot = self._validity(start, goal, deadline), self.env.robot
-        states = robot.normalise(start), robot.normalise(goal)
+        is_valid, robot = self._validity(start, goals, deadline), self.env.robot
+        start_state, goal_states = robot.normalise(start), robot.normalise(goals)
         # For the random number generators that OMPL makes from here on. Spaces make some, for the
         # projections of KPIECE1 and its kin; how many must not matter to the planner.
         ou.RNG.setSeed(seed)
         space = self._space(is_valid)
         ou.RNG.setSeed(seed)
         if callable(self.planner):
-            path = self.planner(is_valid, *states, np.random.default_rng(seed))
-            path = None if path is None else _checked(path, *states)
+            for state in goal_states:
+                path = self.planner(is_valid, start_state, state, np.random.default_rng(seed))
+                if path is not None:
+                    path = _checked(path, start_state, state)
+                    break
         else:
-            path = _solve(self._turns(), self.planner_range, space, is_valid, *states)
+            ends = start_state, goal_states
+            path = _solve(self._turns(), self.planner_range, space, is_valid, *ends)
         if path is not None and self.simplify:
             is_valid.restore_margins()
             path = _simplify(space, path, self.simplify)
         self.checks += is_valid.checks
         if path is None:
             return None
+        reached = np.linalg.norm(goal_states - path[-1], axis=1).argmin()
         path = robot.denormalise(path).astype(np.float32)
-        path[0], path[-1] = start, goal
+        path[0], path[-1] = start, goals[reached]
         return path
 
-    def _validity(self, start, goal, deadline):
-        """The `Validity` of one search."""
+    def _current_checker(self):
         if self._scene is not self.env.scene:
             self._scene, self._checker = self.env.scene, self._geometry_source(self.env.scene)
-        ends = np.clip(self.env.robot.normalise([start, goal]), -1.0, 1.0)
+        return self._checker
+
+    def _validity(self, start, goals, deadline):
+        """The `Validity` of one search."""
+        self._current_checker()
+        ends = np.clip(self.env.robot.normalise([start, *goals]), -1.0, 1.0)
         near = self._checker.signed_distances(ends).distance.min(-1)
         from_scene = self._checker.signed_distances(ends, self_collisions=False).distance.min(-1)
         clearance = self.clearance if from_scene.min() >= self.clearance else 0.0
@@ -370,14 +448,22 @@ def _state(space, values):
     return state
 
 
-def _solve(turns, planner_range, space, is_valid, start, goal):
+def _solve(turns, planner_range, space, is_valid, start, goals):
     """Normalised path (k, n) by OMPL's planners; None: there is none within the limits.
 
+    The path ends at one of `goals`, (m, n).
     `turns`: pairs of a planner's name and the number of checks at which the next planner takes
     over. A planner that had a turn before continues its search.
     """
     problem = ob.ProblemDefinition(space)
-    problem.setStartAndGoalStates(_state(space, start), _state(space, goal))
+    if len(goals) == 1:
+        problem.setStartAndGoalStates(_state(space, start), _state(space, goals[0]))
+    else:
+        problem.addStartState(_state(space, start))
+        several = ob.GoalStates(space)
+        for goal in goals:
+            several.addState(_state(space, goal))
+        problem.setGoal(several)
     planners = {}
     for name, checks in turns:
         if name not in planners:

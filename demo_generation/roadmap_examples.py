@@ -9,7 +9,8 @@ Examples are dicts of NumPy arrays, a row each:
 
 Of an arm with j joints and l links that may collide:
 
-- `observation` float32 (n, j + 3), without the encoded scene, and `desired_goal` float32 (n, g);
+- `observation` float32 (n, j + 3), for goal poses (n, j + 7), without the encoded scene, and
+  `desired_goal` float32 (n, g);
 - `link_distances` and `goal_link_distances` float32 (n, l, 1 + j), as of
   `envs.wrappers.LinkDistancesWrapper`;
 - `direction` float32 (n, j): the unit vector to continue in, in normalised configurations;
@@ -35,7 +36,7 @@ class RoadmapExamples:
         geometry_source: from a scene to what computes `link_distances`, of
             `envs.perception.geometry_source.find_geometry_source`.
         seed: of `draw`, >= 0.
-        goal_type: "config" or "combined".
+        goal_type: "config", "combined" or "pose".
     """
 
     def __init__(self, paths, geometry_source, seed, goal_type="combined"):

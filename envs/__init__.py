@@ -5,6 +5,7 @@ from pathlib import Path
 import gymnasium
 
 from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import TASKS, get_task
 
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
@@ -24,7 +25,8 @@ def make(
 
     Args:
         task: name of a task (`TASKS`), or path of a scene file (docs/customise/scene.md). With
-            another arm `TASK@ROBOT`, where ROBOT is a robot's file (docs/customise/robot.md).
+            another arm `TASK@ROBOT`, where ROBOT is a robot's file (docs/customise/robot.md). Or a
+            `Scene`, such as an `ObservedScene` with a point cloud (docs/customise/point_cloud.md).
         encoder: appends the encoded scene to `observation`: `oracle`, `point_cloud`, or the name or
             path of an encoder's network (`envs.perception.encoders`); None for nothing.
         num_points: of the encoder `point_cloud`.
@@ -44,7 +46,8 @@ def make(
             or a file that is no encoder of this robot.
     """
     for name, value in (("task", task), ("encoder", encoder), ("geometry_source", geometry_source)):
-        if not isinstance(value, (str, Path)) and (value is not None or name == "task"):
+        kinds = (str, Path, Scene) if name == "task" else (str, Path)
+        if not isinstance(value, kinds) and (value is not None or name == "task"):
             raise ValueError(f"{name} must be a name or a path, got {value!r}")
     for name, value in (
         ("link_distances", link_distances),
@@ -61,7 +64,7 @@ def make(
         )
     if geometry_source is not None and not link_distances and encoder != "point_cloud":
         raise ValueError("geometry_source goes with link_distances, or the encoder point_cloud")
-    env = RoboArmEnv(get_task(task).scene, **kwargs)
+    env = RoboArmEnv(task if isinstance(task, Scene) else get_task(task).scene, **kwargs)
     # PyTorch and Numba take long to import, so they are imported only where they are needed.
     if encoder is not None:
         from roboarm_nmp.envs.perception.encoders import make_encoder

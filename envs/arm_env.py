@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
+from roboarm_nmp.envs.robots.robot import rotation_angle, signed
 from roboarm_nmp.envs.scenes.primitives import Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.utils.bullet import pybullet as p
@@ -21,19 +22,26 @@ from roboarm_nmp.envs.world import (
     why_no_window,
 )
 
-GOAL_TYPES = "ee", "config", "combined"
+GOAL_TYPES = "ee", "config", "combined", "pose"
 ACTION_MODES = ("relative", "subgoal")
 # m, and L2 in the normalised space. Hardly any start is farther from its goal than these, so a
 # larger tolerance would leave no query.
 MAX_EE_TOLERANCE, MAX_CONFIG_TOLERANCE = 1.0, 2.0
+# rad. Turned by this much, the Panda's hand, 0.21 m from flange to fingertips, is 0.02 m away.
+ANGLE_TOLERANCE = 0.1
 HORIZON = 400
 STANDARD_RULES = {"max_step": MAX_STEP, "horizon": HORIZON, "stop_on_collision": False}
 """Results under other rules are not comparable."""
 
 
 def goal_size(goal_type, num_joints):
-    """Numbers of a goal: a position, a configuration, or a configuration and a position."""
-    return {"ee": 3, "config": num_joints, "combined": num_joints + 3}[goal_type]
+    """Numbers of a goal: a position, a configuration, a configuration and a position, or a pose."""
+    return {"ee": 3, "config": num_joints, "combined": num_joints + 3, "pose": 7}[goal_type]
+
+
+def end_effector_size(goal_type):
+    """Numbers of the end effector in `observation`: its position, or its pose."""
+    return 7 if goal_type == "pose" else 3
 
 
 def deviations(arguments):
@@ -48,9 +56,11 @@ class RoboArmEnv(gym.Env):
     Observations are a dict (the GoalEnv interface of Gymnasium-Robotics), all float32:
 
     - `observation`: normalised configuration (n), then joint velocities in normalised units per
-      second (n, only with `velocities=True`), then the end-effector position in metres (3);
+      second (n, only with `velocities=True`), then the end-effector position in metres (3), and,
+      with the goal type `pose`, its quaternion (4);
     - `achieved_goal`, `desired_goal`: `ee` the end-effector position (3, metres), `config` the
-      normalised configuration (n), `combined` both, configuration first (n + 3).
+      normalised configuration (n), `combined` both, configuration first (n + 3), `pose` the
+      end effector's position and quaternion (7, metres and xyzw, `Robot.end_effector_pose`).
 
     Actions are float32 in [-1, 1]^n: `relative`, a displacement of the normalised configuration, or
     `subgoal`, the next normalised configuration itself. Either way the displacement is clipped to
@@ -58,7 +68,8 @@ class RoboArmEnv(gym.Env):
 
     `info` carries `is_success`, `collision` (the arm was in contact in this step),
     `collision_so_far` (in this episode), `ee_distance` (m) and `config_distance` (normalised; NaN
-    if the goal was given as a position only), and `elapsed_steps`.
+    if the goal was given as a position or a pose), and `elapsed_steps`; with the goal type `pose`
+    also `ee_angle` (rad, to the goal's rotation).
 
     Copies (`copy.deepcopy`, pickle) are independent environments in the same state: the episode
     goes on the same, bit for bit, and so do later ones. A copy has no window.
@@ -69,15 +80,19 @@ class RoboArmEnv(gym.Env):
             Generator (`envs.scenes.random_boxes.RandomBoxes` is one). `reset` then draws a new one.
         episodes_per_scene: number of resets until another scene is drawn; a reset with a seed
             always draws one.
-        goal_type: `ee`, `config` or `combined` (reached like `ee`).
+        goal_type: `ee`, `config`, `combined` (reached like `ee`) or `pose`.
         ee_tolerance: goal radius in metres (paper: 0.02).
+        angle_tolerance: rad, from the goal's rotation, for `pose`. Of the Panda's hand, 0.21 m
+            long, 0.1 rad turn the fingertips away by as much as `ee_tolerance`. (Motion Policy
+            Networks, Fishman et al., 2022, has 0.26 rad and 0.01 m.)
         config_tolerance: goal radius in the normalised configuration space (paper: 0.05).
         action_mode: `relative` or `subgoal`.
         max_step: longest displacement per step, L2 in the normalised space (paper: 0.03).
         horizon: steps after which an episode is truncated (paper: 400).
         stop_on_collision: end the episode at the first contact (paper: False).
         reward: `sparse`, -1 per step and 0 on reaching the goal, or `dense`, minus the distance
-            to the goal in the goal's own metric (metres for `ee` and `combined`).
+            to the goal in the goal's own metric (metres for `ee` and `combined`). For `pose` that
+            is the distance in metres, plus the angle times `ee_tolerance / angle_tolerance`.
         sink_state: instead of terminating, stay where the episode ended, at reward 0 whatever the
             action, until the horizon.
         velocities: add joint velocities to `observation`.
@@ -103,6 +118,7 @@ class RoboArmEnv(gym.Env):
         goal_type="ee",
         ee_tolerance=0.02,
         config_tolerance=0.05,
+        angle_tolerance=ANGLE_TOLERANCE,
         action_mode="relative",
         max_step=MAX_STEP,
         horizon=HORIZON,
@@ -127,6 +143,7 @@ class RoboArmEnv(gym.Env):
         for name, value in [
             ("ee_tolerance", ee_tolerance),
             ("config_tolerance", config_tolerance),
+            ("angle_tolerance", angle_tolerance),
             ("max_step", max_step),
             ("horizon", horizon),
             ("episodes_per_scene", episodes_per_scene),
@@ -136,6 +153,7 @@ class RoboArmEnv(gym.Env):
         for name, value, most in [
             ("ee_tolerance", ee_tolerance, MAX_EE_TOLERANCE),
             ("config_tolerance", config_tolerance, MAX_CONFIG_TOLERANCE),
+            ("angle_tolerance", angle_tolerance, math.pi),
         ]:
             if value > most:
                 raise ValueError(f"{name} must be at most {most}, got {value!r}")
@@ -161,6 +179,7 @@ class RoboArmEnv(gym.Env):
         self._tolerance = config_tolerance if goal_type == "config" else ee_tolerance
         self.ee_tolerance = ee_tolerance
         self.config_tolerance = config_tolerance
+        self.angle_tolerance = angle_tolerance
         self.action_mode = action_mode
         self.max_step = max_step
         self.horizon = int(horizon)
@@ -180,7 +199,8 @@ class RoboArmEnv(gym.Env):
 
         joints = self.robot.num_joints
         size = goal_size(goal_type, joints)
-        self._observation_size = joints * (2 if velocities else 1) + 3
+        self._end_effector_size = end_effector_size(goal_type)
+        self._observation_size = joints * (2 if velocities else 1) + self._end_effector_size
         unbounded = [
             ("observation", self._observation_size),
             ("achieved_goal", size),
@@ -194,7 +214,7 @@ class RoboArmEnv(gym.Env):
         self.start_configuration = None
         """Start of this episode, float32 (n,), rad; None before the first reset."""
         self.goal_configuration = None
-        """Goal of this episode, float32 (n,), rad; None if it was given as a position."""
+        """Goal of this episode, float32 (n,), rad; None if it was given as a position or pose."""
 
     def __getstate__(self):
         # Generators are made at their first use: here at the latest, so that copies share them.
@@ -245,6 +265,29 @@ class RoboArmEnv(gym.Env):
         """As `World.sample_feasible`. Continue with a reset."""
         return self.world.sample_feasible(rng)
 
+    def check_configuration(self, name, configuration):
+        """Joint angles as float32 (n,), rad. The episode goes on.
+
+        Raises ValueError, with the name: wrong size, not finite, outside the joint limits or in
+        collision.
+        """
+        configuration = _vector(name, configuration, (self.robot.num_joints,))
+        self._check_limits(name, configuration)
+        self.world.check_free(**{name: configuration})
+        return configuration
+
+    def _check_limits(self, name, configuration):
+        robot = self.robot
+        # float32 may round a limit to just beyond it.
+        outside = np.abs(robot.normalise(configuration)) > 1.0 + 1e-6
+        if outside.any():
+            joint = int(np.argmax(outside))
+            raise ValueError(
+                f"{name} is outside the joint limits: joint {joint + 1} is "
+                f"{configuration[joint]:.4f} rad, limits {robot.lower[joint]} to "
+                f"{robot.upper[joint]}"
+            )
+
     def sample_query(self, rng):
         """A start and a goal that is not reached from the outset: two float32 (n,), rad."""
         start = self.sample_feasible(rng)
@@ -255,6 +298,9 @@ class RoboArmEnv(gym.Env):
             positions = self.robot.forward_kinematics(pair)
             if self.goal_type == "config":
                 if np.linalg.norm(states[0] - states[1]) > self.config_tolerance:
+                    return start, goal
+            elif self.goal_type == "pose":
+                if not self._compare(*self.robot.end_effector_pose(pair))[1]:
                     return start, goal
             elif np.linalg.norm(positions[0] - positions[1]) > self.ee_tolerance:
                 return start, goal
@@ -273,11 +319,11 @@ class RoboArmEnv(gym.Env):
 
         Args:
             seed: an int seeds the generator of scenes and queries.
-            options: a dict of `start`, `goal` and possibly `scene` starts an episode as
-                `reset_specific` does, through all wrappers and in vector environments.
+            options: a dict of `start`, `goal` (or `goal_pose`) and possibly `scene` starts an
+                episode as `reset_specific` does, through all wrappers and in vector environments.
 
         Raises:
-            ValueError: an unknown option, one of `start` and `goal` without the other, or as for
+            ValueError: an unknown option, one of start and goal without the other, or as for
                 `reset_specific`.
         """
         self.world.check_open()
@@ -291,7 +337,7 @@ class RoboArmEnv(gym.Env):
         self._episodes_in_scene += 1
         return self._begin(*self.sample_query(self.np_random))
 
-    def reset_specific(self, start, goal, scene=None):
+    def reset_specific(self, start, goal=None, scene=None, goal_pose=None):
         """Start an episode on a given query.
 
         Wrappers around this environment, such as Gymnasium's `TimeLimit`, do not notice the call:
@@ -300,57 +346,69 @@ class RoboArmEnv(gym.Env):
         Args:
             start: joint angles (n, rad).
             goal: joint angles (n, rad); or, with goal type `ee`, an end-effector position (3, m).
+                The goal type `pose` has the pose of these joint angles as its goal.
             scene: a `Scene` to change to first.
+            goal_pose: instead of `goal`, with goal type `pose`: position and quaternion (7, m and
+                xyzw) of the end effector. Whether the arm can reach it is not checked. The
+                quaternion is normalised.
 
         Raises:
-            ValueError: wrong size, not finite, outside the joint limits or in collision. A running
-                episode then goes on (unless the scene was changed).
+            ValueError: wrong size, not finite, outside the joint limits or in collision; a
+                quaternion of zeros; both or none of `goal` and `goal_pose`. A running episode then
+                goes on (unless the scene was changed).
         """
         self.world.check_open()
-        robot, joints = self.robot, self.robot.num_joints
+        joints = self.robot.num_joints
         start = _vector("start", start, (joints,))
-        goal = _vector("goal", goal, (joints, 3) if self.goal_type == "ee" else (joints,))
+        if (goal is None) == (goal_pose is None):
+            raise ValueError("either goal or goal_pose is needed, and not both")
+        if goal_pose is not None:
+            if self.goal_type != "pose":
+                raise ValueError(f"goal_pose is for the goal type 'pose', not {self.goal_type!r}")
+            goal_pose = _pose(goal_pose)
+        else:
+            goal = _vector("goal", goal, (joints, 3) if self.goal_type == "ee" else (joints,))
         for name, configuration in (("start", start), ("goal", goal)):
-            if configuration.size == joints:
-                # float32 may round a limit to just beyond it.
-                outside = np.abs(robot.normalise(configuration)) > 1.0 + 1e-6
-                if outside.any():
-                    joint = int(np.argmax(outside))
-                    raise ValueError(
-                        f"{name} is outside the joint limits: joint {joint + 1} is "
-                        f"{configuration[joint]:.4f} rad, limits {robot.lower[joint]} to "
-                        f"{robot.upper[joint]}"
-                    )
+            if configuration is not None and configuration.size == joints:
+                self._check_limits(name, configuration)
         if scene is not None:
             self.set_scene(scene)
         ends = {"goal": goal, "start": start}
-        self.world.check_free(**{name: end for name, end in ends.items() if end.size == joints})
-        return self._begin(start, goal)
+        ends = {name: e for name, e in ends.items() if e is not None and e.size == joints}
+        self.world.check_free(**ends)
+        return self._begin(start, goal, goal_pose)
 
-    def _begin(self, start, goal):
+    def _begin(self, start, goal, goal_pose=None):
         self.world.place(start)
         self.world.command(start.tolist())
         self.start_configuration = start
         joints = self.robot.num_joints
-        if goal.size == joints:
+        if goal is not None and goal.size == joints:
             self.goal_configuration = goal
             self._goal_state = self.robot.normalise(goal)
-            self._goal_position = self.robot.forward_kinematics(goal)
+            end_effector_of = self.robot.forward_kinematics
+            if self.goal_type == "pose":
+                end_effector_of = self.robot.end_effector_pose
+            self._goal_end_effector = end_effector_of(goal)
         else:
             self.goal_configuration = None
             self._goal_state = np.full(joints, np.nan)
-            self._goal_position = goal.astype(np.float64)
-        self._desired_goal = self._goal_vector(self._goal_state, self._goal_position)
+            self._goal_end_effector = goal.astype(np.float64) if goal_pose is None else goal_pose
+        self._desired_goal = self._goal_vector(self._goal_state, self._goal_end_effector)
         self._steps = 0
         self._collision_so_far = False
         self._in_sink = False
-        self._state, self._velocity, self._position = self.world.read_arm(self.velocities)
+        self._read_arm()
         if self.render_mode is not None:
-            self.world.mark_goal(self._goal_position, self.ee_tolerance)
+            self.world.mark_goal(self._goal_end_effector[:3], self.ee_tolerance)
         observation = self._observation()
-        distance = self._distance(observation["achieved_goal"], self._desired_goal)
-        self._is_success = bool(distance <= self._tolerance)
+        _, self._is_success = self._compare(observation["achieved_goal"], self._desired_goal)
+        self._is_success = bool(self._is_success)
         return observation, self._info(False, self._is_success)
+
+    def _read_arm(self):
+        arm = self.world.read_arm(self.velocities, pose=self.goal_type == "pose")
+        self._state, self._velocity, self._end_effector = arm
 
     def step(self, action):
         """One step: `(observation, reward, terminated, truncated, info)`.
@@ -378,41 +436,43 @@ class RoboArmEnv(gym.Env):
         if self.world.has_window:
             time.sleep(TIME_STEP * SUBSTEPS)  # as long as the simulated time
         self._collision_so_far = self._collision_so_far or collision
-        self._state, self._velocity, self._position = self.world.read_arm(self.velocities)
+        self._read_arm()
 
         observation = self._observation()
-        distance = self._distance(observation["achieved_goal"], self._desired_goal)
-        self._is_success = bool(distance <= self._tolerance)
+        distance, reached = self._compare(observation["achieved_goal"], self._desired_goal)
+        self._is_success = bool(reached)
         info = self._info(collision, self._is_success)
-        reward = float(self._reward(distance))
+        reward = float(self._reward(distance, reached))
         ended = self._is_success or (self.stop_on_collision and collision)
         self._in_sink = self.sink_state and ended
         terminated = ended and not self.sink_state
         return observation, reward, terminated, self._steps >= self.horizon and not terminated, info
 
-    def _goal_vector(self, state, position):
-        if self.goal_type == "ee":
-            return position.astype(np.float32)
+    def _goal_vector(self, state, end_effector):
+        if self.goal_type in ("ee", "pose"):
+            return end_effector.astype(np.float32)
         if self.goal_type == "config":
             return state.astype(np.float32)
-        return np.concatenate([state, position]).astype(np.float32)
+        return np.concatenate([state, end_effector]).astype(np.float32)
 
     def _observation(self):
         observation = np.empty(self._observation_size, np.float32)
         joints = len(self._state)
-        observation[:joints], observation[-3:] = self._state, self._position
+        observation[:joints] = self._state
+        observation[-self._end_effector_size :] = self._end_effector
         if self.velocities:
             observation[joints : 2 * joints] = self._velocity
         return {
             "observation": observation,
-            "achieved_goal": self._goal_vector(self._state, self._position),
+            "achieved_goal": self._goal_vector(self._state, self._end_effector),
             "desired_goal": self._desired_goal.copy(),
         }
 
     def _info(self, collision, is_success):
-        to_goal, apart = self._position - self._goal_position, self._state - self._goal_state
+        to_goal = self._end_effector[:3] - self._goal_end_effector[:3]
+        apart = self._state - self._goal_state
         ee_distance, config_distance = math.sqrt(to_goal @ to_goal), math.sqrt(apart @ apart)
-        return {
+        info = {
             "is_success": is_success,
             "collision": collision,
             "collision_so_far": self._collision_so_far,
@@ -420,19 +480,33 @@ class RoboArmEnv(gym.Env):
             "config_distance": config_distance,
             "elapsed_steps": self._steps,
         }
+        if self.goal_type == "pose":
+            angle = rotation_angle(self._end_effector[3:], self._goal_end_effector[3:])
+            info["ee_angle"] = float(angle)
+        return info
 
     # --- The goal-conditioned MDP on batches (for relabelling)
 
-    def _distance(self, achieved_goal, desired_goal):
-        apart = np.asarray(achieved_goal) - np.asarray(desired_goal)
+    def _compare(self, achieved_goal, desired_goal):
+        """The distance between goals in their own metric, and whether one reaches the other."""
+        achieved_goal, desired_goal = np.asarray(achieved_goal), np.asarray(desired_goal)
+        apart = achieved_goal - desired_goal
         if self.goal_type == "combined":
             apart = apart[..., -3:]  # reached like `ee`
-        return np.sqrt(np.square(apart).sum(-1))
+        elif self.goal_type == "pose":
+            apart = apart[..., :3]
+        distance = np.sqrt(np.square(apart).sum(-1))
+        reached = distance <= self._tolerance
+        if self.goal_type == "pose":
+            angle = rotation_angle(achieved_goal[..., 3:], desired_goal[..., 3:])
+            reached = reached & (angle <= self.angle_tolerance)
+            distance = distance + angle * (self.ee_tolerance / self.angle_tolerance)
+        return distance, reached
 
-    def _reward(self, distance):
+    def _reward(self, distance, reached):
         if self.reward == "dense":
             return -distance
-        reward = np.where(distance <= self._tolerance, 0.0, -1.0).astype(np.float32)
+        reward = np.where(reached, 0.0, -1.0).astype(np.float32)
         return reward[()]  # () makes a scalar of an array without dimensions
 
     def compute_reward(self, achieved_goal, desired_goal, info):
@@ -440,7 +514,7 @@ class RoboArmEnv(gym.Env):
 
         Returns an array of the batch shape, a NumPy scalar for single goals. `info` is not used.
         """
-        return self._reward(self._distance(achieved_goal, desired_goal))
+        return self._reward(*self._compare(achieved_goal, desired_goal))
 
     def compute_terminated(self, achieved_goal, desired_goal, info):
         """Whether an episode ends there: bool, of the batch shape; a NumPy scalar for single goals.
@@ -449,7 +523,7 @@ class RoboArmEnv(gym.Env):
         batch. With `stop_on_collision` its `collision`, False where it is missing, ends the
         episode, too.
         """
-        ended = self._distance(achieved_goal, desired_goal) <= self._tolerance
+        _, ended = self._compare(achieved_goal, desired_goal)
         if self.stop_on_collision:
             ended = ended | _entry(info, "collision", bool)
         return ended & (not self.sink_state)
@@ -501,9 +575,12 @@ def _query_of(options):
         raise ValueError(f"options must be a dict, got {options!r}")
     if not options:
         return None
-    if unknown := [name for name in options if name not in ("start", "goal", "scene")]:
-        raise ValueError(f"unknown options {unknown}: known are 'start', 'goal' and 'scene'")
-    if "start" not in options or "goal" not in options:
+    known = "start", "goal", "scene", "goal_pose"
+    if unknown := [name for name in options if name not in known]:
+        raise ValueError(
+            f"unknown options {unknown}: known are 'start', 'goal', 'scene' and 'goal_pose'"
+        )
+    if "start" not in options or not {"goal", "goal_pose"} & options.keys():
         raise ValueError(f"options must have both 'start' and 'goal', got {list(options)}")
     return options
 
@@ -537,6 +614,15 @@ def _vector(name, value, sizes):
     if not np.isfinite(vector).all():
         raise ValueError(f"{name} must be finite, got {vector}")
     return vector.copy()
+
+
+def _pose(value):
+    """A pose as float64 (7,), its quaternion normalised, its largest component positive."""
+    pose = _vector("goal_pose", value, (7,)).astype(np.float64)
+    norm = np.linalg.norm(pose[3:])
+    if norm < 1e-6:
+        raise ValueError(f"goal_pose: its quaternion is zero, got {value!r}")
+    return np.concatenate([pose[:3], signed(pose[3:] / norm)])
 
 
 def _entry(info, key, dtype):

@@ -92,7 +92,7 @@ class Args:
     network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy
     (docs/benchmark/results.md). `demo` replays the task's demonstrations; --query is then the
     number of a demonstration."""
-    goal_type: Literal["ee", "config", "combined"] | None = None
+    goal_type: Literal["ee", "config", "combined", "pose"] | None = None
     """What the goal is; by default the policy's own, otherwise `combined`. For `ee`, the goal is a
     position: there is no ghost of the arm."""
     query: NonNegativeInt = 0

@@ -365,12 +365,13 @@ class World:
                 contact = any(point[8] < 0.0 or point[9] > 0.0 for point in points)
         return contact
 
-    def read_arm(self, velocities=False):
+    def read_arm(self, velocities=False, pose=False):
         """The arm's state.
 
         Returns:
             Normalised configuration (n,), joint velocities (n,) in normalised units per second
-            (None without `velocities`), and end-effector position (3,), m; all float64.
+            (None without `velocities`), and end-effector position (3,), m, or, with `pose`, its
+            pose (7,), as of `Robot.end_effector_pose`; all float64.
         """
         self.check_open()
         robot = self.robot
@@ -379,7 +380,8 @@ class World:
         if velocities:
             speeds = np.array([joint[1] for joint in joints])
             velocity = 2.0 * speeds / (robot.upper - robot.lower)
-        return state, velocity, robot.read_end_effector(self.client, self.body)
+        read = robot.read_end_effector_pose if pose else robot.read_end_effector
+        return state, velocity, read(self.client, self.body)
 
     def mark_goal(self, position, radius):
         """Show a green ball, visual only, at a position (3,), m. There is only one."""

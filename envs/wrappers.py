@@ -54,9 +54,10 @@ class SensorWrapper(gym.Wrapper):
         """As `RoboArmEnv.reset`."""
         return self._begin(*self.env.reset(seed=seed, options=options))
 
-    def reset_specific(self, start, goal, scene=None):
+    def reset_specific(self, start, goal=None, scene=None, goal_pose=None):
         """As `RoboArmEnv.reset_specific`."""
-        return self.reset(options={"start": start, "goal": goal, "scene": scene})
+        query = {"start": start, "goal": goal, "scene": scene, "goal_pose": goal_pose}
+        return self.reset(options=query)
 
     def step(self, action):
         """As `RoboArmEnv.step`."""
@@ -87,9 +88,10 @@ class _ObservingWrapper(gym.Wrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         return self._extend(observation), info
 
-    def reset_specific(self, start, goal, scene=None):
+    def reset_specific(self, start, goal=None, scene=None, goal_pose=None):
         """As `RoboArmEnv.reset_specific`."""
-        return self.reset(options={"start": start, "goal": goal, "scene": scene})
+        query = {"start": start, "goal": goal, "scene": scene, "goal_pose": goal_pose}
+        return self.reset(options=query)
 
     def step(self, action):
         """As `RoboArmEnv.step`."""
@@ -139,7 +141,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
             (`envs.perception.geometry_source`).
         append: whether `observation` contains `link_distances`, too, flat, before an encoded scene.
         goal_link_distances: whether observations contain `goal_link_distances`, if the goal type
-            is not `ee`.
+            is `config` or `combined`.
         fine_geometry_source: another one for approach paths (`envs.policies.approach_path`).
     """
 
@@ -152,9 +154,9 @@ class LinkDistancesWrapper(_ObservingWrapper):
         fine_geometry_source=None,
     ):
         super().__init__(env)
-        self._geometry_source, self.appends_link_distances = geometry_source, append
+        self.geometry_source, self.appends_link_distances = geometry_source, append
         self._fine_geometry_source = fine_geometry_source or geometry_source
-        self._of_goals = goal_link_distances and self.goal_type != "ee"
+        self._of_goals = goal_link_distances and self.goal_type in ("config", "combined")
         names = ["link_distances"] + ["goal_link_distances"] * self._of_goals
         shape = self.unwrapped.robot.link_distances_shape
         space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
@@ -170,7 +172,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
 
         `scene`: a `Scene`, by default that of the environment.
         """
-        checker = self._geometry_source(self.unwrapped.scene if scene is None else scene)
+        checker = self.geometry_source(self.unwrapped.scene if scene is None else scene)
         return checker.link_distances(states)
 
     def fine_link_distances_at(self, states):

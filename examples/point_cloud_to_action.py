@@ -1,41 +1,32 @@
 """A point cloud of your own to an action: a pretrained policy with its safety filter.
 
     python examples/point_cloud_to_action.py
-    python examples/point_cloud_to_action.py --points cloud.npy
+    python examples/point_cloud_to_action.py --points cloud.ply
 
-`cloud.npy` is an array (N, 3), m, in the frame of the robot's base: x forward, y to the left, z up,
-the arm's own points removed. Without it, the points are those of a box in front of the arm. Prints
-the number of points used, whether they block the straight motion to the goal, the first action, and
-how an episode ends that uses nothing but the points.
+The file is a PLY, PCD, NPY or NPZ file, m, in the frame of the robot's base: x forward, y to the
+left, z up. Points of the table, the floor and the arm at its start are removed. Without a file, the
+points are those of a box in front of the arm. Prints the number of points used, whether they block
+the straight motion to the goal, the first action, and how an episode ends that uses nothing but the
+points.
 """
 
 import argparse
 
 import numpy as np
 
-from roboarm_nmp.envs import RoboArmEnv
+import roboarm_nmp
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import Query
-from roboarm_nmp.envs.perception.point_clouds import POINT_RADIUS, farthest_points, one_per_cell
+from roboarm_nmp.envs.perception.cloud_files import load_cloud
+from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
-from roboarm_nmp.envs.scenes.primitives import Scene
-from roboarm_nmp.envs.wrappers import LinkDistancesWrapper, SceneEncodingWrapper
+from roboarm_nmp.envs.scenes.primitives import ObservedScene
 
 POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
 # Joint angles, rad: from the arm's left to its right.
 START = np.array([1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)
 GOAL = np.array([-1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)
-
-
-class Cloud:
-    """The policy's input, in place of an encoder: as many points, as far apart as possible."""
-
-    def __init__(self, points, number):
-        self.size, self._z = 3 * number, farthest_points(points, number).ravel()
-
-    def __call__(self, scene):
-        return self._z
 
 
 def box_surface(centre, size, number=5000, seed=0):
@@ -49,21 +40,19 @@ def box_surface(centre, size, number=5000, seed=0):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--points", help="a .npy file (N, 3), m")
+    parser.add_argument("--points", help="a point cloud's file, m")
     args = parser.parse_args()
-    points = np.load(args.points) if args.points else box_surface((0.55, 0, 0.3), (0.2, 0.1, 0.6))
-    points = one_per_cell(np.asarray(points, np.float32))
+    read = load_cloud(args.points) if args.points else box_surface((0.55, 0, 0.3), (0.2, 0.1, 0.6))
+    points, _ = prepare_cloud(read, configuration=START)
 
     # The simulated arm stands among nothing but table and floor: all obstacles are points.
-    scene = Scene()
-    checker = CollisionChecker(scene, points, POINT_RADIUS)
+    scene = ObservedScene(points=points)
+    checker = CollisionChecker(scene)
     ends = scene.robot.normalise(np.stack([START, GOAL]))
     straight = "free" if checker.is_motion_free(*ends) else "blocked"
     print(f"{len(points)} points; the straight motion to the goal is {straight}")
     policy, arguments = find_policy(POLICY)
-    env = RoboArmEnv(scene, goal_type=arguments["goal_type"])
-    env = SceneEncodingWrapper(env, Cloud(points, arguments["num_points"]))
-    env = LinkDistancesWrapper(env, lambda scene: checker)
+    env = roboarm_nmp.make(scene, **arguments)
 
     query, begin = Query(START, GOAL, scene), make_policy(policy, env)  # its safety filter included
     observation, _ = env.reset_specific(*query)

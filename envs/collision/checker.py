@@ -39,7 +39,9 @@ from roboarm_nmp.envs.collision.kernels import (
     motion_batch,
     signed_distances_batch,
 )
-from roboarm_nmp.envs.scenes.primitives import Scene, floor_box
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes import primitives
+from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scene, floor_box
 
 RESOLUTION = 0.021
 """Motions are checked at points at most this far apart, L2 in the normalised space: less than one
@@ -83,7 +85,7 @@ class CollisionChecker:
     Args:
         scene: a `Scene`, whose robot has n joints.
         points: m, (n, 3), in the base's frame: the centres of additional balls, for example an
-            observed point cloud.
+            observed point cloud. An `ObservedScene` has its own points and radius instead.
         point_radius: m, of the balls, in [0, `MAX_MARGIN`).
 
     Raises:
@@ -100,6 +102,8 @@ class CollisionChecker:
             )
         self.scene, self.robot = scene, scene.robot
         self._arm = arm_hulls(scene.robot)
+        if isinstance(scene, ObservedScene):
+            points, point_radius = scene.points, scene.point_radius
         shapes, geometries = list(scene.obstacles), list(range(len(scene.obstacles)))
         if scene.table is not None:
             shapes.append(scene.table)
@@ -109,6 +113,27 @@ class CollisionChecker:
             geometries.append(FLOOR)
         self._geometries = np.array([*geometries, ARM, POINT, NOTHING])
         self._world = shape_rows(shapes), *group_points(points, point_radius)
+
+    @classmethod
+    def from_points(
+        cls,
+        points,
+        radius=POINT_RADIUS,
+        robot=PANDA,
+        table=primitives.TABLE,
+        floor=primitives.FLOOR,
+    ):
+        """The checker of a point cloud, as `envs.perception.point_clouds.prepare_cloud` returns it.
+
+        Args:
+            points: m, (n, 3), in the base's frame.
+            radius: m, of the ball around each point.
+            robot: the `Robot`.
+            table, floor: as of a `Scene`; None where the points are all there is.
+
+        Raises ValueError: as the class.
+        """
+        return cls(Scene(table=table, floor=floor, robot=robot), points, radius)
 
     def is_free(self, states, margin=0.0, clearance=0.0, endpoint_margins=None):
         """Whether the arm keeps a margin from the scene and from itself: bool (...).

@@ -251,16 +251,19 @@ def group_points(points, radius):
         raise ValueError(f"points must have shape (n, 3), got {points.shape}")
     if not (np.isfinite(points).all() and 0 <= radius < MAX_MARGIN):
         raise ValueError(f"points must be finite, with a radius in [0, {MAX_MARGIN}) m")
-    _, cell = np.unique(
-        np.floor(points / _GROUP_SIZE).astype(np.int64), axis=0, return_inverse=True
-    )
-    points = points[np.argsort(cell.ravel(), kind="stable")]
-    offsets = np.cumsum([0, *np.bincount(cell.ravel())])
-    groups = np.empty((len(offsets) - 1, 6))
-    for group, first, end in zip(groups, offsets[:-1], offsets[1:], strict=True):
-        middle = (points[first:end].min(0) + points[first:end].max(0)) / 2
-        reach = np.linalg.norm(points[first:end] - middle, axis=1).max()
-        group[:] = (*middle, reach, first, end)
+    cells = np.floor(points / _GROUP_SIZE).astype(np.int64)
+    order = np.lexsort(cells.T[::-1])  # stable
+    points, cells = points[order], cells[order]
+    begins = np.ones(len(points), np.bool_)
+    begins[1:] = (cells[1:] != cells[:-1]).any(1)
+    first = np.flatnonzero(begins)
+    groups = np.empty((len(first), 6))
+    if len(first):
+        size = np.diff(first, append=len(points))
+        middle = (np.minimum.reduceat(points, first) + np.maximum.reduceat(points, first)) / 2
+        away = np.linalg.norm(points - np.repeat(middle, size, axis=0), axis=1)
+        groups[:, :3], groups[:, 3] = middle, np.maximum.reduceat(away, first)
+        groups[:, 4], groups[:, 5] = first, first + size
     ball = np.zeros((1, ROW))
     ball[0, 0], ball[0, 16] = SPHERE, radius
     return points, groups, ball

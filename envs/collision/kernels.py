@@ -1,4 +1,4 @@
-"""All that Numba compiles: collision checks, signed distances, the safety filter's projection.
+"""All that Numba compiles: collision checks, signed distances, point clouds, the safety filter.
 
 One file holds all of it, because Numba's cache on disk does not notice changes in other files.
 
@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.numba_cache import compiled
+from roboarm_nmp.envs.utils.numba_cache import compiled
 
 BULLET_MARGIN = 0.001
 """m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
@@ -839,6 +839,153 @@ def link_distances_batch(states, rows, self_collisions, within, arm, world):
             for j in range(states.shape[1]):
                 rows[i, link, 1 + j] = gradient[i, link, j]
     return True
+
+
+# --- Point clouds of a user's own
+
+
+NOT_FINITE, OUTSIDE, KNOWN, OF_ARM, OF_OBSTACLE = range(5)
+"""Labels of points, in the order in which they are tried."""
+
+
+@compiled
+def label_points(points, low, high, rows, known_distance, q, arm_distance, arm, labels):
+    """Write the labels of points (n, 3), m, to `labels` (n,).
+
+    `low`, `high` (3,): the workspace. `rows`: shapes, of which points less than `known_distance`
+    (m) away are `KNOWN`. Those less than `arm_distance` (m) from the arm, its base included, in the
+    normalised configuration `q` are `OF_ARM`; if `q` is empty, there is no arm.
+    """
+    chain, bodies, _, vertices, cells = arm
+    frames, centres, pose, s, ball = _memory(chain, bodies)
+    ball[0, 0] = SPHERE
+    num_bodies = 0
+    if q.shape[0] > 0:
+        num_bodies = bodies.shape[0]
+        _place(q, chain, bodies, frames, centres)
+    for j in range(points.shape[0]):
+        x, y, z = points[j, 0], points[j, 1], points[j, 2]
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+            labels[j] = NOT_FINITE
+            continue
+        if (x < low[0] or y < low[1] or z < low[2]) or (x > high[0] or y > high[1] or z > high[2]):
+            labels[j] = OUTSIDE
+            continue
+        labels[j] = OF_OBSTACLE
+        for i in range(rows.shape[0]):
+            gap = known_distance + rows[i, 16]
+            if _sphere_gap(rows, i, points, j) < gap * gap:
+                labels[j] = KNOWN
+                break
+        for k in range(num_bodies if labels[j] == OF_OBSTACLE else 0):
+            gap = arm_distance + bodies[k, ROUNDING]
+            u, v, w = x - centres[k, 0], y - centres[k, 1], z - centres[k, 2]
+            reach = bodies[k, RADIUS] + gap
+            if u * u + v * v + w * w >= reach * reach:
+                continue
+            if _box_gap(bodies, k, frames, centres, points, j, pose) >= gap:
+                continue
+            _begin(ball, 0, pose, s)
+            if _gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
+                labels[j] = OF_ARM
+                break
+
+
+@compiled
+def _slot(table, cells, x, y, z):
+    """Where a cell is in a hash table, or the empty place where it belongs."""
+    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
+    mixed *= 0x1E3779B97F4A7C15
+    slot = (mixed ^ (mixed >> 29)) & (table.shape[0] - 1)
+    while True:
+        n = table[slot]
+        if n < 0 or (cells[n, 0] == x and cells[n, 1] == y and cells[n, 2] == z):
+            return slot
+        slot = (slot + 1) & (table.shape[0] - 1)
+
+
+@compiled
+def first_in_cells(points, cell):
+    """The first of the points (n, 3), m, in each cube with edges of `cell`, m, of their type.
+
+    Returns, for the m cubes in the order of their first points: int64 (m,), the index of that
+    point; int32 (n,), the cube of each point; int64 (m,), how many points the cube and the 26
+    around it have.
+    """
+    cubes = np.empty(points.shape[0], np.int32)
+    table = np.full(1024, -1, np.int64)  # of indices of cubes; twice as many as fit into `cells`
+    cells, first, count = (
+        np.empty((512, 3), np.int64),
+        np.empty(512, np.int64),
+        np.zeros(512, np.int64),
+    )
+    m = 0
+    for i in range(points.shape[0]):
+        x = int(math.floor(points[i, 0] / cell))
+        y = int(math.floor(points[i, 1] / cell))
+        z = int(math.floor(points[i, 2] / cell))
+        slot = _slot(table, cells, x, y, z)
+        if table[slot] < 0:
+            if m == first.shape[0]:
+                cells = np.concatenate((cells, np.empty_like(cells)))
+                first = np.concatenate((first, np.empty_like(first)))
+                count = np.concatenate((count, np.zeros_like(count)))
+                table = np.full(4 * m, -1, np.int64)
+                for n in range(m):
+                    table[_slot(table, cells, cells[n, 0], cells[n, 1], cells[n, 2])] = n
+                slot = _slot(table, cells, x, y, z)
+            cells[m, 0], cells[m, 1], cells[m, 2], first[m] = x, y, z, i
+            table[slot] = m
+            m += 1
+        cubes[i] = table[slot]
+        count[cubes[i]] += 1
+    around = np.zeros(m, np.int64)
+    for n in range(m):
+        for i in range(27):
+            x, y, z = (
+                cells[n, 0] + i // 9 - 1,
+                cells[n, 1] + i // 3 % 3 - 1,
+                cells[n, 2] + i % 3 - 1,
+            )
+            found = table[_slot(table, cells, x, y, z)]
+            if found >= 0:
+                around[n] += count[found]
+    return first[:m], cubes, around
+
+
+@compiled
+def decompress_lzf(compressed, result):
+    """Write the bytes of LZF data (uint8) to `result`; returns how many, -1 if it is damaged."""
+    i, n = 0, 0
+    while i < compressed.shape[0]:
+        control = int(compressed[i])
+        i += 1
+        if control < 32:  # so many bytes, and one more, as they are
+            length = control + 1
+            if i + length > compressed.shape[0] or n + length > result.shape[0]:
+                return -1
+            for _ in range(length):
+                result[n] = compressed[i]
+                i += 1
+                n += 1
+            continue
+        length = control >> 5  # of a copy of what is already there
+        if length == 7:
+            if i >= compressed.shape[0]:
+                return -1
+            length += int(compressed[i])
+            i += 1
+        if i >= compressed.shape[0]:
+            return -1
+        begin = n - ((control & 31) << 8) - int(compressed[i]) - 1
+        i += 1
+        if begin < 0 or n + length + 2 > result.shape[0]:
+            return -1
+        for _ in range(length + 2):
+            result[n] = result[begin]
+            begin += 1
+            n += 1
+    return n
 
 
 # --- The safety filter

@@ -2,7 +2,7 @@
 
 A demonstration (`envs.datasets.demonstrations.Demo`) is a motion between two configurations. Its
 observations, its achieved goals and the step that reaches the goal depend on the goal type: `ee`,
-`config` or `combined`. Trainers and the Minari export use these episodes.
+`config`, `combined` or `pose`. Trainers and the Minari export use these episodes.
 """
 
 from typing import NamedTuple
@@ -29,16 +29,27 @@ class Episode(NamedTuple):
     reached: np.ndarray
 
 
-def goal_of(goal_type, state, position):
+def end_effector_of(goal_type, configuration, robot):
+    """What `observation` has of the end effector: its position (..., 3), or for `pose` (..., 7).
+
+    `configuration`: joint angles (..., n), rad.
+    """
+    if goal_type == "pose":
+        return robot.end_effector_pose(configuration)
+    return robot.forward_kinematics(configuration)
+
+
+def goal_of(goal_type, state, end_effector):
     """The goal that an arm achieves: (..., 3) for `ee`, (..., n) `config`, (..., n + 3) `combined`.
 
-    `state` (..., n) is its normalised configuration, `position` (..., 3) its end effector's, m.
+    And (..., 7) for `pose`. `state` (..., n) is its normalised configuration, `end_effector` as of
+    `end_effector_of`.
     """
-    if goal_type == "ee":
-        return position
+    if goal_type in ("ee", "pose"):
+        return end_effector
     if goal_type == "config":
         return state
-    return np.concatenate([state, position], axis=-1)
+    return np.concatenate([state, end_effector], axis=-1)
 
 
 def observed(states, goal, goal_type, robot):
@@ -47,15 +58,16 @@ def observed(states, goal, goal_type, robot):
     Args:
         states: normalised configurations (m, n).
         goal: joint angles (..., n), rad.
-        goal_type: `ee`, `config` or `combined`.
+        goal_type: `ee`, `config`, `combined` or `pose`.
         robot: the `Robot`, with n joints.
 
     Returns:
-        float32 `observation` (m, n + 3), `achieved_goal` (m, g), `desired_goal` (..., g).
+        float32 `observation` (m, n + 3), for `pose` (m, n + 7), `achieved_goal` (m, g),
+        `desired_goal` (..., g).
     """
-    positions = robot.forward_kinematics(robot.denormalise(states))
-    goal = goal_of(goal_type, robot.normalise(goal), robot.forward_kinematics(goal))
-    arrays = np.hstack([states, positions]), goal_of(goal_type, states, positions), goal
+    end_effectors = end_effector_of(goal_type, robot.denormalise(states), robot)
+    goal = goal_of(goal_type, robot.normalise(goal), end_effector_of(goal_type, goal, robot))
+    arrays = np.hstack([states, end_effectors]), goal_of(goal_type, states, end_effectors), goal
     return tuple(array.astype(np.float32) for array in arrays)
 
 

@@ -4,7 +4,7 @@
     checker = geometry_source(scene)             # a CollisionChecker of the observed points alone
 
 - `ground_truth`: the obstacles themselves (privileged);
-- `point_cloud`: points that four sensors observe of them;
+- `point_cloud`: points that four sensors observe of them, or those of an `ObservedScene`;
 - the name or path of an encoder with a decoder: points decoded from its latent code.
 
 Table and floor are known to all of them.
@@ -22,6 +22,7 @@ from roboarm_nmp.envs.perception.point_clouds import (
     observed_points,
 )
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
+from roboarm_nmp.envs.scenes.primitives import ObservedScene
 from roboarm_nmp.envs.utils.names import suggest
 
 GROUND_TRUTH = "ground_truth"
@@ -68,13 +69,17 @@ def ground_truth_checker(scene):
 @functools.lru_cache(CACHED_CHECKERS)
 def observed_checker(scene):
     """A `CollisionChecker` of table, floor, and the observed points of a `Scene`'s obstacles."""
+    if isinstance(scene, ObservedScene):
+        return CollisionChecker(replace(scene, obstacles=()))
     radius = scale_of(scene.robot) * POINT_RADIUS
     return CollisionChecker(replace(scene, obstacles=()), observed_points(scene), radius)
 
 
 @functools.lru_cache(CACHED_FINE_CHECKERS)
 def fine_observed_checker(scene):
-    """As `observed_checker`, with more points and smaller balls."""
+    """As `observed_checker`, with more points and smaller balls; an `ObservedScene` has its own."""
+    if isinstance(scene, ObservedScene):
+        return observed_checker(scene)
     radius = scale_of(scene.robot) * FINE_POINT_RADIUS
     return CollisionChecker(replace(scene, obstacles=()), fine_observed_points(scene), radius)
 

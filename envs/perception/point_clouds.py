@@ -1,18 +1,33 @@
-"""The point cloud that four sensors observe of a scene's obstacles.
+"""Point clouds: of a scene's obstacles as four sensors observe them, and of your own.
 
     points = observed_points(scene)              # float32 (n, 3), m
     tokens = farthest_points(points, 64)         # for a network
 
+    points, removed = prepare_cloud(load_cloud("table.ply"), configuration=configuration)
+    scene = ObservedScene(points=points)         # for environments, policies and planners
+
 The sensors (paper, section 4) label points of the arm, the table and obstacles. The arm's own
-configuration, the table and the floor are known, so only points of obstacles are used.
+configuration, the table and the floor are known, so only points of obstacles are used. Of a cloud
+without labels, `prepare_cloud` removes the others by their distance.
 """
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
+from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
+from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
+from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, first_in_cells, label_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, cardinal, observe_scene
-from roboarm_nmp.envs.robots.panda import scale_of
+from roboarm_nmp.envs.robots.panda import PANDA, scale_of
+from roboarm_nmp.envs.scenes.primitives import (
+    FLOOR,
+    POINT_RADIUS,  # noqa: F401 (scaled like `CELL`; used from here)
+    TABLE,
+    ObservedScene,
+    floor_box,
+)
 
 POINT_CLOUD = "point_cloud"
 """Its name as an encoder and as a geometry source."""
@@ -21,10 +36,17 @@ NUM_POINTS = 64
 CELL = 0.025
 """m. One point of each cube of this size is used: about 1,500 on `random_boxes_hard`. For an arm of
 another reach than the Panda's, it is scaled, and so is `POINT_RADIUS`."""
-POINT_RADIUS = 0.01
-"""m. The ball around a point in collision checks: with this radius surfaces have hardly a hole."""
 FINE_CELL, FINE_POINT_RADIUS = 0.006, 0.005
-"""The same for approach paths, which lead closer to surfaces: more points, smaller balls."""
+"""m. The same as `CELL` and `POINT_RADIUS` for approach paths, which lead closer to surfaces."""
+KNOWN_DISTANCE = 0.01
+"""m. Points nearer to the table or the floor than this are theirs."""
+ARM_DISTANCE = 0.02
+"""m. Points nearer to the arm than this are its own."""
+MIN_POINTS = 3
+"""Points that a cube of `CELL` and the 26 around it need, or they are outliers."""
+STEPS = ("not finite", "outside the workspace", "of table or floor", "of the arm")
+"""What `prepare_cloud` removes before outliers, in its order."""
+_AS_COMPILED = "CW"  # contiguous and writeable, or Numba compiles once more
 CACHED_SCENES = 500  # about 20 kB each
 _remembered = {}  # scene -> points
 
@@ -33,7 +55,10 @@ def observed_points(scene):
     """Points of a `Scene`'s obstacles: float32 (n, 3), m, in the base's frame; not to be changed.
 
     One per cube of `CELL`; none, (0, 3), where no obstacle is visible. The last scenes are cached.
+    Those of an `ObservedScene` are its own.
     """
+    if isinstance(scene, ObservedScene):
+        return scene.points
     points = _remembered.get(scene)
     return _observe(scene) if points is None else points
 
@@ -64,8 +89,97 @@ def one_per_cell(points, cell=CELL):
 
     Use it with points of your own: the pretrained policies were trained with such clouds.
     """
-    _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
-    return points[np.sort(first)]
+    kind = points.dtype if points.dtype in (np.float32, np.float64) else np.float64
+    numbers = np.require(points, kind, _AS_COMPILED)
+    return points[first_in_cells(numbers, numbers.dtype.type(cell))[0]]
+
+
+class PreparedCloud(NamedTuple):
+    """What `prepare_cloud` returns.
+
+    points: float32 (n, 3), m.
+    removed: dict from a step's name to the number of points that it removed.
+    """
+
+    points: np.ndarray
+    removed: dict
+
+
+def prepare_cloud(
+    points,
+    robot=PANDA,
+    configuration=None,
+    *,
+    workspace=None,
+    table=TABLE,
+    floor=FLOOR,
+    cell=None,
+    min_points=MIN_POINTS,
+    arm_distance=ARM_DISTANCE,
+):
+    """The points of obstacles in a cloud, as collision checks and policies take them.
+
+    In this order, points are removed that
+
+    - are not finite;
+    - are outside the workspace;
+    - are less than `KNOWN_DISTANCE` from table or floor, or inside them, as both are known;
+    - are less than `arm_distance` from the arm, whose convex hulls collision checks use, too;
+    - are outliers: with the 26 cubes around it, their cube of `CELL` has less than `min_points`;
+    - are not the first of their cube of `cell`.
+
+    The same points in the same order give the same result.
+
+    Args:
+        points: m, (n, 3), in the base's frame.
+        robot: the `Robot`.
+        configuration: the arm's when the cloud was recorded, rad, (n,); None: it has no points of
+            the arm.
+        workspace: corners (2, 3), m: lower and upper. By default a cube around the base, from where
+            no point can change a link distance.
+        table, floor: as of a `Scene`; None if unknown: then their points stay, as obstacles.
+        cell: m, `CELL` by default, scaled with the robot's reach.
+        min_points: 0 to keep outliers.
+        arm_distance: m.
+
+    Raises ValueError: an argument is out of its range, or of another shape.
+    """
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise ValueError(f"points must be numbers of shape (n, 3), got {points.shape}")
+    cell = scale_of(robot) * CELL if cell is None else cell
+    if not 1e-4 <= cell <= 1.0:
+        raise ValueError(f"cell must be in [0.0001, 1] m, got {cell!r}")
+    if not 0 <= arm_distance < MAX_MARGIN:
+        raise ValueError(f"arm_distance must be in [0, {MAX_MARGIN}) m, got {arm_distance!r}")
+    if workspace is None:
+        reach = robot.reach + LINK_DISTANCE_RANGE
+        workspace = np.add(np.array(robot.base_position), [[-reach] * 3, [reach] * 3])
+    workspace = np.array(workspace, dtype=np.float64)
+    if workspace.shape != (2, 3):
+        raise ValueError(f"workspace must be two corners, (2, 3), got {workspace.shape}")
+    known = [table] if table is not None else []
+    known += [] if floor is None else [floor_box(floor)]
+    state = np.empty(0)
+    if configuration is not None:
+        if np.shape(configuration) != (robot.num_joints,):
+            raise ValueError(f"configuration must be {robot.num_joints} joint angles")
+        state = np.clip(robot.normalise(configuration), -1.0, 1.0)
+    with np.errstate(over="ignore"):
+        points = np.require(points, np.float32, _AS_COMPILED)
+    labels = np.empty(len(points), np.uint8)
+    shapes, arm = shape_rows(known), arm_hulls(robot)
+    label_points(points, *workspace, shapes, KNOWN_DISTANCE, state, arm_distance, arm, labels)
+    counts = np.bincount(labels, minlength=OF_OBSTACLE + 1).tolist()
+    removed = dict(zip(STEPS, counts, strict=False))
+    points = points[labels == OF_OBSTACLE]
+    # Not the cubes of `cell`: of a fine one, most points of a surface would be alone.
+    _, cubes, around = first_in_cells(points, np.float32(scale_of(robot) * CELL))
+    dense = points[(around >= min_points)[cubes]]
+    thin = one_per_cell(dense, cell)
+    removed["outliers"] = len(points) - len(dense)
+    removed["thinned out"] = len(dense) - len(thin)
+    return PreparedCloud(thin, removed)
 
 
 def farthest_points(points, number):

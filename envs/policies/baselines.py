@@ -7,6 +7,9 @@
   configuration, straight to the goal;
 - planner: follows a plan of OMPL's RRT-Connect, which may search for a limited time.
 
+Of a goal pose, the goal configuration is one that inverse kinematics finds, the nearest one to the
+start; `via-points` and `planner` need one without collisions.
+
 `via-points` and `planner` check collisions with the obstacles of a geometry source
 (`envs.perception.geometry_source`); with the ground truth they are privileged.
 """
@@ -18,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from roboarm_nmp.envs.policies.pose_goals import goal_configuration
 from roboarm_nmp.envs.subgoals import subgoals
 
 PLANNERS = ("via-points", "planner")
@@ -62,13 +66,15 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
         raise ValueError(f"{name} gives displacements, not actions of mode {env.action_mode!r}")
     if name == "go-to-goal":
         observes_goal = env.goal_type in ("config", "combined")
-        return lambda number, query: EpisodePolicy(_go_to_goal(query.goal, robot, observes_goal))
+        return lambda number, query: EpisodePolicy(
+            _go_to_goal(_goal(env, query), robot, observes_goal)
+        )
     # Here, because Numba takes a while to import.
     from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 
     source = find_geometry_source(geometry_source, robot)
     if name == "via-points":
-        return _via_points(robot, seed, tries, source)
+        return _via_points(env, seed, tries, source)
     return _planner(env, seed, time_limit, source)
 
 
@@ -80,7 +86,17 @@ def import_planning():
         raise ValueError(f"the policy planner needs OMPL: {error}") from error
 
 
+def _goal(env, query, checker=None):
+    """The goal's configuration (n,), rad; None if the goal is a pose, and there is none."""
+    if env.goal_type != "pose":
+        return query.goal
+    pose = env.robot.end_effector_pose(query.goal)
+    return goal_configuration(env.robot, pose, query.start, checker)
+
+
 def _go_to_goal(goal, robot, observes_goal=False):
+    if goal is None:
+        return None
     target = robot.normalise(goal)
 
     def act(observation):
@@ -98,22 +114,27 @@ def _random(rng, num_joints):
     return lambda observation: rng.uniform(-1.0, 1.0, num_joints)
 
 
-def _via_points(robot, seed, tries, geometry_source):
+def _via_points(env, seed, tries, geometry_source):
+    robot = env.robot
+
     # Without a margin, which would reject more than it saves: with 3 mm, collision-free success was
     # 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
     def begin(number, query):
         checker = geometry_source(query.scene)
+        configuration = _goal(env, query, checker)
+        if configuration is None:
+            return EpisodePolicy(None, plan_found=False)
         # float32 may round a limit to just beyond it.
-        start, goal = np.clip(robot.normalise([query.start, query.goal]), -1.0, 1.0)
+        start, goal = np.clip(robot.normalise([query.start, configuration]), -1.0, 1.0)
         if checker.is_motion_free(start, goal):
-            return EpisodePolicy(_go_to_goal(query.goal, robot), plan_found=True)
+            return EpisodePolicy(_go_to_goal(configuration, robot), plan_found=True)
         for via in np.random.default_rng([seed, number]).uniform(
             -1.0, 1.0, (tries, robot.num_joints)
         ):
             if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
                 path = robot.denormalise(np.stack([start, via, goal]))
                 return EpisodePolicy(_follow(path, robot), plan_found=True)
-        return EpisodePolicy(_go_to_goal(query.goal, robot), plan_found=False)
+        return EpisodePolicy(_go_to_goal(configuration, robot), plan_found=False)
 
     return begin
 
@@ -123,8 +144,12 @@ def _planner(env, seed, time_limit, geometry_source):
     planner = planning.Planner(env, geometry_source=geometry_source)
 
     def begin(number, query):
+        options, given = {"seed": [seed, number], "time_limit": time_limit}, query
+        if env.goal_type == "pose":
+            options["goal_pose"] = env.robot.end_effector_pose(query.goal)
+            given = query._replace(goal=None)
         try:
-            path = planner.plan(*query, seed=[seed, number], time_limit=time_limit)
+            path = planner.plan(*given, **options)
         except planning.PlanningError:
             return EpisodePolicy(None, plan_found=False)
         return EpisodePolicy(_follow(path, env.robot), plan_found=True)

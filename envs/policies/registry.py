@@ -22,6 +22,7 @@ from roboarm_nmp.envs.policies.baselines import (
     import_planning,
     make_baseline,
 )
+from roboarm_nmp.envs.policies.pose_goals import ConfigurationGoals
 from roboarm_nmp.envs.utils.names import suggest
 
 # The arguments of an environment that a policy's metadata may contain. Tolerances and horizon are
@@ -30,6 +31,8 @@ ENV_ARGUMENTS = (
     *("goal_type", "action_mode", "max_step", "velocities"),
     *("encoder", "num_points", "geometry_source", "link_distances", "append_link_distances"),
 )
+FOR_POSES = ("config", "combined")
+"""Goal types of policies that also take goal poses, by inverse kinematics."""
 PRETRAINED = Path(__file__).parent / "pretrained"
 MAX_RECURRENT_SIZE = 65_536  # numbers
 
@@ -137,6 +140,9 @@ def make_policy(
     It is called once per episode, before the environment's reset to the query: `planner` moves the
     arm.
 
+    In an environment with the goal type `pose`, the goal is the pose of the query's goal. Baselines
+    and policies for configurations then head for a configuration that inverse kinematics finds.
+
     Args:
         policy: one of `BASELINES`, the path of a policy network, or a function from an observation
             to an action (n,).
@@ -153,6 +159,7 @@ def make_policy(
     Raises:
         PolicyError: the policy cannot act in this environment.
     """
+    as_observed = None
     if callable(policy):
         begin = _same(policy)
     elif policy in BASELINES:
@@ -161,10 +168,12 @@ def make_policy(
         except ValueError as error:
             raise PolicyError(str(error)) from error
     else:
-        begin = _trained(policy, env)
+        begin, as_observed = _trained(policy, env)
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
-    return _filtered(begin, env, seed, safety_filter) if safety_filter else begin
+    if safety_filter:
+        begin = _filtered(begin, env, seed, safety_filter)
+    return begin if as_observed is None else _translated(begin, as_observed)
 
 
 def _same(act):
@@ -186,6 +195,18 @@ def _filtered(begin, env, seed, safety_filter):
         return EpisodePolicy(act and safety_filter.filter_policy(act, env, rng), plan_found)
 
     return begin_filtered
+
+
+def _translated(begin, goals):
+    """A policy for configurations in an environment of goal poses, by its `ConfigurationGoals`."""
+
+    def begin_translated(number, query):
+        if not goals.begin(query):
+            return EpisodePolicy(None, plan_found=False)
+        act, plan_found = begin(number, query)
+        return EpisodePolicy(lambda observation: act(goals(observation)), plan_found)
+
+    return begin_translated
 
 
 # --- Trained policies. PyTorch is imported only here: it takes seconds.
@@ -215,7 +236,7 @@ def _load(path):
 
 
 def _trained(path, env):
-    """`make_policy` of a policy network."""
+    """`make_policy` of a policy network, and its `ConfigurationGoals`, None if it needs none."""
     import torch
 
     from roboarm_nmp.envs.networks.exported_networks import check_robot
@@ -248,12 +269,17 @@ def _trained(path, env):
 
         return EpisodePolicy(act)
 
-    space = env.observation_space
-    unknown = set(network.inputs) - {*space, *(["recurrent_state"] if size else [])}
+    example = {name: np.zeros(one.shape, np.float32) for name, one in env.observation_space.items()}
+    as_observed = None
+    if env.goal_type == "pose" and trained["goal_type"] in FOR_POSES:
+        as_observed = ConfigurationGoals(env, trained["goal_type"])
+        as_observed.begin_anywhere()
+        example = as_observed(example)
+    unknown = set(network.inputs) - {*example, *(["recurrent_state"] if size else [])}
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
     try:
-        begin(0, None).act({name: np.zeros(one.shape, np.float32) for name, one in space.items()})
+        begin(0, None).act(example)
     except NetworkError as error:
         raise PolicyError(str(error)) from error
-    return begin
+    return begin, as_observed

@@ -239,6 +239,34 @@ class Robot:
         position, rotation = self.frame_poses(configuration)[self.end_effector_frame]
         return position + rotation @ np.array(self.end_effector_position)
 
+    def end_effector_pose(self, configuration):
+        """Joint angles in rad, (..., n) -> pose of the end effector in the world, (..., 7).
+
+        Position (m), then quaternion (xyzw), whose largest component is positive. The rotation is
+        that of the link `end_effector_link`, as PyBullet's `getLinkState` reports it (the URDF's
+        link frame): for the Panda that of `panda_hand`, whose z points from the wrist to the
+        fingertips and whose y is the direction in which the fingers open.
+        """
+        position, rotation = self.frame_poses(configuration)[self.end_effector_frame]
+        position = position + rotation @ np.array(self.end_effector_position)
+        return np.concatenate(
+            [position, quaternions(rotation @ self.end_effector_rotation)], axis=-1
+        )
+
+    @functools.cached_property
+    def end_effector_rotation(self):
+        """The end effector's axes (3, 3), columns, in the frame that moves it."""
+        # PyBullet is asked: a field would change the fingerprints in files.
+        client = p.connect(p.DIRECT)
+        try:
+            body = self.load(client, drawn=False)
+            self.set_configuration(client, body, self.contact_free)
+            quaternion = self.read_end_effector_pose(client, body)[3:]
+        finally:
+            p.disconnect(physicsClientId=client)
+        _, axes = self.frame_poses(self.contact_free)[self.end_effector_frame]
+        return axes.T @ matrix(quaternion)
+
     def frame_poses(self, configuration):
         """Joint angles in rad, (..., n) -> per frame position (..., 3), m, and axes (..., 3, 3).
 
@@ -412,13 +440,21 @@ class Robot:
 
     def read_end_effector(self, client, body):
         """The end effector's position, float64 (3,), m, as PyBullet has it."""
+        return self._read_link(client, body)[0]
+
+    def read_end_effector_pose(self, client, body):
+        """The end effector's pose, float64 (7,), as of `end_effector_pose`, as PyBullet has it."""
+        position, quaternion = self._read_link(client, body)
+        return np.concatenate([position, signed(np.array(quaternion))])
+
+    def _read_link(self, client, body):
         link = p.getLinkState(
             body, self.end_effector_link, computeForwardKinematics=1, physicsClientId=client
         )
         position = np.array(link[4])
         if any(self.end_effector_offset):
             position = position + matrix(link[5]) @ np.array(self.end_effector_offset)
-        return position
+        return position, link[5]
 
 
 def _rounded(value):
@@ -439,6 +475,42 @@ def matrix(quaternion):
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def quaternions(rotations):
+    """Rotation matrices (..., 3, 3) as quaternions (..., 4), xyzw; the largest number is positive.
+
+    Its row of 4 q q^T is q times a positive number.
+    """
+    m = rotations
+    x, y, z = (m[..., i, i] for i in range(3))
+    xy, xz, yz = (m[..., i, j] + m[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+    xw, yw, zw = (m[..., i, j] - m[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    rows = [
+        [1 + x - y - z, xy, xz, xw],
+        [xy, 1 - x + y - z, yz, yw],
+        [xz, yz, 1 - x - y + z, zw],
+        [xw, yw, zw, 1 + x + y + z],
+    ]
+    rows = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    largest = np.argmax(np.stack([rows[..., i, i] for i in range(4)], axis=-1), axis=-1)
+    row = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    return row / np.linalg.norm(row, axis=-1, keepdims=True)
+
+
+def signed(quaternion):
+    """A quaternion (4,) or its negative, the same rotation, whose largest number is positive."""
+    return -quaternion if quaternion[np.argmax(np.abs(quaternion))] < 0.0 else quaternion
+
+
+def rotation_angle(quaternion, other):
+    """The angle between rotations, quaternions (..., 4) of norm 1: rad, (...), from 0 to pi.
+
+    From the shorter one of two chords: accurate for small angles, unlike the arc cosine.
+    """
+    quaternion, other = (np.asarray(q, dtype=np.float64) for q in (quaternion, other))
+    chords = (np.square(quaternion + sign * other).sum(-1) for sign in (1.0, -1.0))
+    return 4.0 * np.arcsin(np.minimum(np.sqrt(np.minimum(*chords)) / 2.0, 1.0))
 
 
 def resolve(filename, urdf, packages=None):

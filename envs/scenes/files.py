@@ -38,6 +38,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     TABLE,
     Box,
     Cylinder,
+    ObservedScene,
     Scene,
     Sphere,
     unit_quaternion,
@@ -80,10 +81,13 @@ def save_scene(scene, path):
     Atomic: at every moment `path` is the old file or the whole new one.
 
     Raises:
-        SceneFileError: `load_scene` would reject the file, which is then not written.
+        SceneFileError: `load_scene` would reject the file, which is then not written; or the scene
+            is an `ObservedScene`, whose points a scene file cannot have.
         OSError: the file cannot be written; an old file is left as it was.
     """
     path = Path(path)
+    if isinstance(scene, ObservedScene):
+        raise SceneFileError(f"{path}: cannot be written, the scene has points: save them as .npy")
     text = _format_scene(scene)
     try:
         _parse(text.encode(), path.parent)

@@ -30,6 +30,7 @@ from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
 from roboarm_nmp.envs.policies.baselines import PLANNERS, TIME_LIMIT, TRIES
 from roboarm_nmp.envs.policies.registry import (
+    FOR_POSES,
     find_policy,
     make_policy,
     own_safety_filter,
@@ -54,7 +55,9 @@ class EvaluationOptions:
     """The options of `evaluate`.
 
     Attributes:
-        goal_type: `ee`, `config`, `combined`; None for the policy's own, otherwise `ee`.
+        goal_type: `ee`, `config`, `combined`, `pose`; None for the policy's own, otherwise `ee`.
+            Goal poses are those of the queries' goals. A policy for configurations may have them,
+            too (`envs.policies.pose_goals`).
         queries: queries instead of the task's own: the path of a query file, or an object with
             `start` and `goal`, float32 (m, n), rad, and `scenes`, a sequence of m `Scene`s, like
             `envs.datasets.queries.Queries`. Without `scenes` they are in the task's scene, which
@@ -229,7 +232,9 @@ def _prepare(policy, task, options):
         if not callable(policy):
             policy, trained = find_policy(policy)
             task = own_task(policy) if task is None else task
-            if trained and options.goal_type not in (None, trained["goal_type"]):
+            own = trained.get("goal_type")
+            by_kinematics = options.goal_type == "pose" and own in FOR_POSES
+            if trained and options.goal_type not in (None, own) and not by_kinematics:
                 raise EvaluationError(
                     f"{policy} was trained with the goal type {trained['goal_type']!r}, it cannot "
                     f"be evaluated with {options.goal_type!r}"

@@ -62,8 +62,8 @@ class PolicyFlags(RunFlags):
 class EnvFlags:
     """The arguments of `envs.make` among a trainer's flags: the paper's MDP, and observations."""
 
-    goal_type: Literal["ee", "config", "combined"] = "ee"
-    """what the goal is: end-effector position, configuration, or both"""
+    goal_type: Literal["ee", "config", "combined", "pose"] = "ee"
+    """what the goal is: end-effector position, configuration, both, or end-effector pose"""
     action_mode: Literal["relative", "subgoal"] = "relative"
     """action: a displacement of the normalised configuration, or the next one itself"""
     max_step: PositiveFloat = MAX_STEP

@@ -88,7 +88,7 @@ class Args:
     """number of the first query, from 0"""
     split: Literal["test", "validation", "original"] = "test"
     """which of the task's queries; without a query file, random queries are shown"""
-    goal_type: Literal["ee", "config", "combined"] | None = None
+    goal_type: Literal["ee", "config", "combined", "pose"] | None = None
     """what the goal is; by default the policy's own, otherwise `ee`"""
     geometry_source: str | None = None
     """where `planner`, `via-points`, the safety filter and the policy's observations take the
@@ -296,9 +296,9 @@ class _Page:
             self._file = gui.add_text("file", "my_scene.yaml")
             gui.add_button("Save the scene").on_click(lambda event: self.do(self._save))
         scene = self.server.scene
-        self._goal_gizmo = scene.add_transform_controls(
-            "/goal_gizmo", scale=0.2, disable_rotations=True, depth_test=False, position=position
-        )
+        self._turns = self.args.goal_type == "pose"
+        options = {"scale": 0.2, "disable_rotations": not self._turns, "depth_test": False}
+        self._goal_gizmo = scene.add_transform_controls("/goal_gizmo", position=position, **options)
         self._goal_gizmo.on_update(self._goal_dragged)
         self._obstacle_gizmo = scene.add_transform_controls(
             "/obstacle_gizmo", scale=0.25, depth_test=False, visible=False
@@ -315,6 +315,9 @@ class _Page:
         position = simulation.robot.forward_kinematics(simulation.query.goal)
         if "goal" not in self._dragging:
             _set(self._goal_gizmo, "position", position)
+            if self._turns:
+                x, y, z, w = simulation.robot.end_effector_pose(simulation.query.goal)[3:]
+                _set(self._goal_gizmo, "wxyz", np.array((w, x, y, z)))
         _set(self._goal, "value", tuple(float(x) for x in np.round(position, 4)))
         names = self._obstacle_names()
         if self._obstacle.options != names:
@@ -415,7 +418,12 @@ class _Page:
 
     def _goal_dragged(self, event):
         self._follow("goal", event.phase)
-        self._drag("goal", self.simulation.move_goal, np.array(event.target.position))
+        position = np.array(event.target.position)
+        if self._turns:
+            pose = np.r_[position, np.roll(event.target.wxyz, -1)]
+            self._drag("goal", self.simulation.turn_goal, pose)
+        else:
+            self._drag("goal", self.simulation.move_goal, position)
 
     def _obstacle_dragged(self, event):
         self._follow("obstacle", event.phase)

@@ -126,6 +126,7 @@ class _Place:
         self.start = ArmDrawing(scene, robot, f"{self.name}/start", ghost, START_COLOUR, 0.3)
         self.goal = ArmDrawing(scene, robot, f"{self.name}/goal", ghost, GOAL_COLOUR, 0.4)
         self.ball = scene.add_icosphere(f"{self.name}/ball", radius=0.02, color=GOAL_COLOUR)
+        self.axes = scene.add_frame(f"{self.name}/axes", axes_length=0.08, axes_radius=0.003)
         x, y, z = robot.base_position
         self.label = scene.add_label(
             f"{self.name}/label",
@@ -258,9 +259,11 @@ class Drawing:
         place.arm.colour(arm.contacts.links)
         place.start.visible = "start" in self.show
         place.start.set(query.start)
-        place.goal.visible = place.ball.visible = "goal" in self.show
+        place.goal.visible = place.ball.visible = place.axes.visible = "goal" in self.show
         place.goal.set(query.goal)
-        place.ball.position = robot.forward_kinematics(query.goal)
+        pose = robot.end_effector_pose(query.goal)
+        place.ball.position = place.axes.position = pose[:3]
+        place.axes.wxyz = _wxyz(pose[3:])
         text = f"{arm.name}{_label(arm)}"  # seldom another: a browser takes long to draw text
         if place.label.text != text:
             place.label.text = text

@@ -284,7 +284,7 @@ class PolicyArm(_Arm):
     Args:
         task: name of a task, or path of a scene file.
         policy: as for `envs.policies.registry.find_policy`.
-        goal_type: `ee`, `config`, `combined`; None for the policy's own, otherwise `ee`.
+        goal_type: `ee`, `config`, `combined`, `pose`; None for the policy's own, otherwise `ee`.
         geometry_source: where the policy, its observations and its safety filter take the obstacles
             from (`envs.perception.geometry_source`); None for the policy's own, otherwise
             `ground_truth`.
@@ -527,6 +527,18 @@ class Simulation:
         Where the arm does not reach that far, the end effector comes as near as it finds.
         """
         self.set_goal(inverse_kinematics(self.robot, position, self.query.goal))
+
+    def turn_goal(self, pose):
+        """Another goal with a pose (7,) of the end effector, near the present goal.
+
+        Where the arm does not reach the pose, the goal stays.
+        """
+        # Here, because Numba takes a while to import.
+        from roboarm_nmp.envs.robots import inverse_kinematics as poses
+
+        found = poses.inverse_kinematics(self.robot, pose, near=self.query.goal)
+        if len(found):
+            self.set_goal(found[0])
 
     def replace_obstacle(self, index, obstacle):
         """Another obstacle in the place of one. Raises ValueError: its numbers are invalid."""

@@ -257,6 +257,18 @@ def test_interrupted_run_continues_bit_for_bit(tmp_path, folder, monkeypatch, sh
         assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
 
 
+def test_goal_poses_are_imitated_saved_and_evaluated(tmp_path, folder, short_episodes):
+    flags = ["--paths", str(folder), "--goal-type", "pose", "--eval-queries", "1"]
+    run = run_script("dagger", tmp_path, *flags, "--encoder", "point_cloud", "--num-points", "8")
+    assert json.loads((run / "result.json").read_text())["goal_type"] == "pose"
+    path, arguments = find_policy(run)
+    env = envs.make(HARD, **arguments)
+    observation, _ = env.reset(seed=0)
+    act, _ = make_policy(path, env)(0, None)
+    assert 0.0 < np.linalg.norm(act(observation)) <= 0.03 + 1e-6
+    env.close()
+
+
 def test_run_on_another_device(tmp_path, folder, another_device, short_episodes):
     """Updates, a round, an evaluation and a resume, on another device."""
     few = ["--total-updates", "4", "--eval-every", "4", "--round-every", "2", "--eval-queries", "1"]

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainers import load, panda_env, run_script
 
@@ -71,7 +72,22 @@ def test_network_inputs(goal_type):
     np.testing.assert_array_equal(plain(*tensors), torch.cat(tensors, dim=1))
 
 
-@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+def test_network_inputs_of_goal_poses():
+    env = panda_env("pose")
+    features = sac.Features(sac.Args(goal_type="pose"), env)
+    configurations = np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (2, 7))
+    here, there = PANDA.end_effector_pose(configurations)
+    observation = np.hstack([PANDA.normalise(configurations[0]), here])
+    given = torch.tensor(observation).float()[None], torch.tensor(there).float()[None]
+    inputs = features(*given)[0].numpy()
+    turn = Rotation.from_quat(there[3:]) * Rotation.from_quat(here[3:]).inv()
+    axis = turn.as_rotvec() / turn.magnitude()
+    expected = [there[:3] - here[:3], axis * np.sin(turn.magnitude() / 2)]
+    np.testing.assert_allclose(inputs[-6:], 5 * np.hstack(expected), atol=1e-5)
+    np.testing.assert_allclose(inputs[:21], np.hstack([observation, there]), atol=1e-6)
+
+
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined", "pose"])
 @pytest.mark.parametrize("velocities", [False, True])
 @pytest.mark.parametrize("link_distances", [False, True])
 def test_networks_fit_every_observation(goal_type, velocities, link_distances):

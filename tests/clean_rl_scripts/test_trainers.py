@@ -28,6 +28,7 @@ from roboarm_nmp.envs.datasets.demonstrations import demo_path
 from roboarm_nmp.envs.networks.exported_networks import load_network
 from roboarm_nmp.envs.perception.encoders import SceneEncoder
 from roboarm_nmp.envs.training import protocol, runs
+from roboarm_nmp.envs.training.evaluation import evaluate
 
 
 @pytest.fixture(params=TRAINERS)
@@ -137,6 +138,21 @@ def test_running_average_of_the_policy_is_saved(tmp_path, trainer, short_episode
     )
     torch.testing.assert_close(saved, average(observation, goal, goal))
     assert (saved - actor(observation, goal, goal)).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("name", ["sac_her_mp", "bc"])
+def test_goal_poses_are_trained_saved_and_evaluated(name, tmp_path, short_episodes):
+    length = "--total-updates" if name == "bc" else "--total-timesteps"
+    few = [length, "600", "--eval-queries", "1", "--test-queries", "1"]
+    run = run_script(name, tmp_path, "--goal-type", "pose", *few)
+    assert json.loads((run / "result.json").read_text())["goal_type"] == "pose"
+    policy = load_network(run / "policy.pt")
+    observation, _ = envs.make("no_obstacles", **policy.metadata["env"]).reset(seed=0)
+    assert observation["desired_goal"].shape == (7,)
+    action = policy(**protocol.stack([observation], "cpu")).numpy()
+    assert action.shape == (1, 7) and np.isfinite(action).all()
+    result = evaluate(run, num_queries=1)
+    assert result["goal_type"] == "pose"
 
 
 def same(a, b):

@@ -26,7 +26,9 @@ from roboarm_nmp.demo_generation.planning import (
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import rotation_angle
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 # Configurations on `wall`: two without contact, and three in collision.
@@ -114,6 +116,81 @@ def test_planner_follows_a_change_of_scene(worlds):
     path = planner.plan(start, goal, seed=1)
     assert not any(worlds["wall"].in_collision(c) for c in interpolate(path, 0.01))
     env.close()
+
+
+# --- Sets of goals, goal poses
+
+
+def test_path_to_a_set_ends_at_a_goal_that_is_free(worlds):
+    goals = np.stack([INTO_THE_WALL, TURNED + np.float32(0.8), TURNED, INTO_THE_TABLE])
+    planner = Planner(worlds["wall"])
+    path = planner.plan(READY, goals, seed=1)
+    assert is_path_of(path, READY, goals[2]) or is_path_of(path, READY, goals[1])
+    assert path.tobytes() == planner.plan(READY, goals, seed=1).tobytes()
+    # A set of one is that goal; whatever comes first, the nearest goal is preferred.
+    alone = planner.plan(READY, goals[2:3], seed=1)
+    assert alone.tobytes() == planner.plan(READY, TURNED, seed=1).tobytes()
+    near, far = READY + np.float32(0.02), np.array([-1.5, -0.5, 0, -1.8, 0, 1.5, 0], np.float32)
+    assert is_path_of(planner.plan(READY, np.stack([far, near]), seed=2), READY, near)
+
+
+@pytest.mark.parametrize(
+    ("goals", "complaint"),
+    [
+        (np.stack([INTO_THE_WALL, INTO_ITSELF]), "none of the 2 goals is possible: goal 0 is in c"),
+        (READY[None] + 9, "none of the 1 goals is possible: goal 0 is outside the joint limits"),
+        (np.empty((0, 7)), "a set of goals has shape"),
+        (np.zeros((2, 6)), "a set of goals has shape"),
+    ],
+)
+def test_set_without_a_possible_goal_is_rejected(worlds, goals, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        Planner(worlds["wall"]).plan(READY, goals, seed=1)
+
+
+def test_path_to_a_goal_pose_is_followed_without_contact(worlds):
+    env, reached = worlds["wall"], 0
+    planner = Planner(env)
+    for seed, query in enumerate(load_queries("wall", "validation")[:10]):
+        pose = PANDA.end_effector_pose(query.goal)
+        path = planner.plan(query.start, seed=seed, goal_pose=pose)
+        assert path[0].tobytes() == query.start.tobytes()
+        end = PANDA.end_effector_pose(path[-1])
+        assert np.linalg.norm(end[:3] - pose[:3]) <= 1e-4
+        assert rotation_angle(end[3:], pose[3:]) <= 1e-3
+        env.reset_specific(query.start, path[-1])
+        for target in subgoals(path, PANDA)[1:]:
+            info = env.step(target - env.world.read_arm()[0])[-1]
+        reached += info["ee_distance"] < 0.02 and not info["collision_so_far"]
+    assert reached >= 9
+
+
+def test_own_planner_tries_one_goal_after_the_other(worlds):
+    asked = []
+
+    def only_the_second(is_valid, start, goal, rng):
+        asked.append(goal)
+        return np.stack([start, goal]) if len(asked) == 2 else None
+
+    goals = np.stack([TURNED, READY + np.float32(0.05)])
+    path = Planner(worlds["wall"], only_the_second, simplify=0).plan(READY, goals, seed=1)
+    assert is_path_of(path, READY, TURNED)  # the farther one
+
+
+def test_pose_without_a_free_configuration_is_a_planning_error(worlds):
+    planner = Planner(worlds["wall"])
+    into_the_wall = PANDA.end_effector_pose(INTO_THE_WALL)
+    for pose in (np.r_[3.0, into_the_wall[1:]], np.r_[into_the_wall[:2], -0.5, 0, 0, 0, 1]):
+        with pytest.raises(PlanningError, match="no collision-free configuration has the goal"):
+            planner.plan(READY, seed=1, goal_pose=pose)
+
+
+def test_goal_and_goal_pose_exclude_each_other(worlds):
+    for given in ({}, {"goal": TURNED, "goal_pose": np.ones(7)}):
+        with pytest.raises(ValueError, match="either goal or goal_pose"):
+            Planner(worlds["wall"]).plan(READY, seed=1, **given)
+    with pytest.raises(ValueError, match="start is in collision"):
+        Planner(worlds["wall"]).plan(INTO_THE_WALL, seed=1, goal_pose=np.ones(7))
 
 
 # --- The same path for a seed

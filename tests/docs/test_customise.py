@@ -1,6 +1,7 @@
-"""docs/customise/{robot,sensor,encoder,reward}.md: their code is executed."""
+"""docs/customise/{robot,point_cloud,sensor,encoder,reward}.md: their code is executed."""
 
 import re
+import shlex
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ from paths import ROOT
 from trainers import PATHS, load
 
 from roboarm_nmp import envs
+from roboarm_nmp.demo_generation import plan
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.training import flags
 from roboarm_nmp.scene_embedding_train import collect
 
 
@@ -32,6 +35,23 @@ def test_plan_of_the_page_about_robots_is_followed_without_contact(monkeypatch, 
     names = executed(blocks("robot"))
     assert capsys.readouterr().out.endswith("True False\n")
     assert names["env"].robot.name == "iiwa" and names["path"].shape[1] == 7
+
+
+def test_motions_of_the_page_about_point_clouds_avoid_the_points(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = executed(blocks("point_cloud"))
+    assert names["trajectory"].success and len(names["points"]) < 2000
+    states = np.clip(names["trajectory"].states, -1, 1)
+    assert names["checker"].is_free(states).all()
+    page = (ROOT / "docs/customise/point_cloud.md").read_text()
+    commands = re.findall(r"^roboarm plan --cloud table.npy (.*)$", page, re.M)
+    assert len(commands) == 3
+    for command in commands:
+        with pytest.raises(SystemExit) as end:
+            plan.main(flags.parse(plan.Args, ["--cloud", "table.npy", *shlex.split(command)]))
+        assert end.value.code == 0
+        assert "minimum clearance" in capsys.readouterr().out
+    assert (tmp_path / "path.csv").exists()
 
 
 def test_sensor_of_the_page_observes_heights_of_obstacles():

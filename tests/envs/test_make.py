@@ -108,7 +108,7 @@ def test_encoded_scene_follows_appended_link_distances():
             "an encoder with a decoder: vae has no decoder",
         ),
         ({"encoder": "point_cloud", "geometry_source": "vae"}, "vae has no decoder"),
-        ({"goal_type": "pose"}, "goal_type must be one of"),
+        ({"goal_type": "poses"}, "goal_type must be one of"),
     ],
 )
 def test_wrong_argument_is_rejected_with_the_reason(arguments, message):

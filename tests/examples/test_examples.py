@@ -60,4 +60,4 @@ def test_own_points_lead_to_actions_that_avoid_them(tmp_path):
     # Points of one's own, far from the arm.
     np.save(tmp_path / "cloud.npy", np.full((10, 3), 3.0))
     output = run("point_cloud_to_action.py", tmp_path, "--points", "cloud.npy")
-    assert "1 points; the straight motion to the goal is free" in output
+    assert "0 points; the straight motion to the goal is free" in output  # out of reach

@@ -9,7 +9,7 @@ import pytest
 from paths import ROOT
 
 MODULE = """
-from roboarm_nmp.envs.collision.numba_cache import compiled
+from roboarm_nmp.envs.utils.numba_cache import compiled
 
 @compiled
 def double(x):
@@ -125,7 +125,7 @@ def test_cache_is_in_the_user_folder_and_the_first_compilation_is_announced_once
     outputs = [process.communicate() for process in at_once]
     assert [process.returncode for process in at_once] == [0, 0], outputs
     said = "".join(error for _, error in outputs).splitlines()
-    assert said == ["compiling collision checks (once, about 30 s)"]
+    assert said == ["compiling collision checks and kinematics (once, about 30 s)"]
     assert begin(tmp_path, **variables).communicate() == ("12.0 12\n", "")
     assert list(cache.glob("numba/*/small.quadruple*.nbc"))
     assert not [path for path in tmp_path.rglob("*.nb?") if cache not in path.parents]

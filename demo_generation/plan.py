@@ -1,0 +1,288 @@
+"""Plan one motion among the points of a cloud, or in the scene of a task, and write it to a file.
+
+    roboarm plan --cloud table.ply --start "1 0.4 0 -1.8 0 2.2 0.8" --goal "-1 0.4 0 -1.8 0 2.2 0.8"
+    roboarm plan --cloud table.ply --start "…" --goal-pose "0.4 -0.3 0.3 1 0 0 0" --output path.csv
+    roboarm plan --task wall --start "…" --goal "…" --policy go-to-goal
+
+The points are prepared first (docs/customise/point_cloud.md): those of the table, the floor and the
+arm, outliers, and points outside the workspace are left out, and one point per cube stays. Without
+`--policy`, OMPL's RRT-Connect plans a path around a ball at each point. With it, the motion is an
+episode of that policy in the simulator, which observes the same points.
+
+Printed are what was left out, times, the length of the motion, and its minimum clearance. The exit
+code is 1 if there is no motion to the goal.
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS
+from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.training.flags import (
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    Seed,
+)
+from roboarm_nmp.envs.utils.files import check_writable
+from roboarm_nmp.envs.utils.signals import end_with_one_line
+
+MAX_GOALS = 8  # configurations with the goal's pose that the planner may reach, the nearest first
+
+
+@dataclass
+class Args:
+    start: str
+    """joint angles at the start, rad, separated by spaces"""
+    goal: str | None = None
+    """joint angles at the goal, rad"""
+    goal_pose: str | None = None
+    """instead: the end effector's pose at the goal, x y z (m) and a quaternion x y z w"""
+    cloud: Path | None = None
+    """the point cloud: a .ply, .pcd, .npy or .npz file, or a depth image (with --intrinsics)"""
+    task: str | None = None
+    """instead of a cloud: a task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml)"""
+    robot: Path | None = None
+    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md)"""
+    policy: str = "planner"
+    """`planner`, another baseline, a policy network, a run's folder, or the name of a pretrained
+    policy (`roboarm policies`)"""
+    units: Literal["m", "cm", "mm"] | None = None
+    """of the lengths in the file; by default m, and mm for a .png"""
+    frame: str | None = None
+    """pose of the cloud's frame, or of the camera, in the frame of the robot's base: x y z (m) and
+    a quaternion x y z w; by default the same frame"""
+    intrinsics: str | None = None
+    """of the depth image's camera: fx fy cx cy, pixels"""
+    recorded_at: str | None = None
+    """joint angles of the arm when the cloud was recorded, rad, whose points are left out; by
+    default the start"""
+    arm_distance: NonNegativeFloat | None = None
+    """m: points nearer to the arm than this are its own; by default 0.02"""
+    table: bool = True
+    """the standard table and floor are there, and their points are left out; otherwise all that is
+    there are points"""
+    workspace: str | None = None
+    """lower and upper corner, x y z x y z, m: points outside are left out; by default a cube that
+    the arm cannot leave"""
+    cell: PositiveFloat | None = None
+    """m: one point stays per cube of this size; by default 0.025, scaled with the arm's reach"""
+    min_points: NonNegativeInt | None = None
+    """a cube is an outlier if it and the 26 around it have fewer points; by default 3"""
+    point_radius: NonNegativeFloat = POINT_RADIUS
+    """m, of the ball around each point"""
+    seed: Seed = 0
+    """of random numbers"""
+    time_limit: PositiveFloat = 5.0
+    """seconds that the planner may search"""
+    output: Path | None = None
+    """write the motion to this file, .csv or .npz"""
+
+
+def _numbers(flag, text, number):
+    """So many finite numbers in the text of a flag, float64. Raises ValueError."""
+    try:
+        values = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError as error:
+        raise ValueError(f"{flag}: {error}") from error
+    if len(values) != number or not np.isfinite(values).all():
+        raise ValueError(f"{flag} must be {number} finite numbers, got {text!r}")
+    return values
+
+
+def _configuration(flag, text, robot):
+    """A configuration (n,), rad, in the text of a flag. Raises ValueError: outside the limits."""
+    configuration = _numbers(flag, text, robot.num_joints)
+    outside = np.abs(robot.normalise(configuration)) > 1.0 + 1e-6
+    if outside.any():
+        joint = int(outside.argmax())
+        limits = f"{robot.lower[joint]:.4f} to {robot.upper[joint]:.4f}"
+        raise ValueError(f"{flag}: joint {joint + 1} is outside its limits, {limits} rad")
+    return configuration
+
+
+def _task_scene(args):
+    """The `Scene` of the task, a random one where scenes are drawn."""
+    from roboarm_nmp.envs.tasks import get_task, task_with_robot
+
+    scene = get_task(task_with_robot(args.task, args.robot)).scene
+    return scene.sample(np.random.default_rng(args.seed)) if hasattr(scene, "sample") else scene
+
+
+def _observed_scene(args, robot):
+    """The `ObservedScene` of the cloud, which is prepared and described."""
+    from roboarm_nmp.envs.perception.cloud_files import load_cloud
+    from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
+    from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, ObservedScene
+
+    at = (
+        ("--start", args.start) if args.recorded_at is None else ("--recorded-at", args.recorded_at)
+    )
+    recorded_at = _configuration(*at, robot)
+    frame = args.frame and _numbers("--frame", args.frame, 7)
+    intrinsics = args.intrinsics and _numbers("--intrinsics", args.intrinsics, 4)
+    options = {"table": TABLE, "floor": FLOOR} if args.table else {"table": None, "floor": None}
+    given = {
+        name: getattr(args, name)
+        for name in ("cell", "min_points", "arm_distance")
+        if getattr(args, name) is not None
+    }
+    if args.workspace is not None:
+        given["workspace"] = _numbers("--workspace", args.workspace, 6).reshape(2, 3)
+    read = load_cloud(args.cloud, args.units, frame, intrinsics)
+    prepare_cloud(read[:0], robot, recorded_at)  # what happens once per arm, outside of the time
+    began = time.perf_counter()
+    points, removed = prepare_cloud(read, robot, recorded_at, **options, **given)
+    seconds = time.perf_counter() - began
+    out = ", ".join(f"{number:,} {step}" for step, number in removed.items() if number)
+    print(f"{args.cloud}: {len(read):,} points; left out: {out or 'none'}")
+    print(f"{len(points):,} points remain, prepared in {1000 * seconds:.0f} ms")
+    return ObservedScene(points=points, point_radius=args.point_radius, robot=robot, **options)
+
+
+def _goals(args, robot, checker, start):
+    """The configurations (k, n), rad, that the goal may be, the nearest first."""
+    if args.goal is not None:
+        return _configuration("--goal", args.goal, robot)[None]
+    from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
+
+    pose = _numbers("--goal-pose", args.goal_pose, 7)
+    if len(inverse_kinematics(robot, pose, args.seed, near=start)) == 0:
+        raise ValueError("--goal-pose: the arm cannot reach it")
+    goals = inverse_kinematics(robot, pose, args.seed, checker=checker, near=start)
+    if len(goals) == 0:
+        raise ValueError("--goal-pose: the arm reaches it only in collision")
+    return goals[:MAX_GOALS]
+
+
+def _check_end(flag, configuration, checker):
+    """Raise ValueError if a point of the cloud is inside the arm, which the simulator ignores.
+
+    That the arm is inside the ball around a point is allowed: balls are larger than surfaces.
+    """
+    from roboarm_nmp.envs.collision.checker import POINT
+
+    robot = checker.robot
+    state = np.clip(robot.normalise(configuration), -1.0, 1.0)
+    near = checker.signed_distances(state, self_collisions=False)
+    link = int(near.distance.argmin())
+    depth = -near.distance[link] - checker.scene.point_radius
+    if near.geometry[link] == POINT and depth > 0:
+        name = robot.bullet_names[1][robot.collision_links[link]]
+        raise ValueError(f"{flag} is in collision: a point is {1000 * depth:.0f} mm inside {name}")
+
+
+def _planned(args, scene, start, goals):
+    """A path (k, n), rad, of the planner to one of the goals, and its computing time (s).
+
+    Raises PlanningError: there is none.
+    """
+    from roboarm_nmp.demo_generation.planning import Planner
+    from roboarm_nmp.envs.arm_env import RoboArmEnv
+
+    planner = Planner(RoboArmEnv(scene))
+    began = time.perf_counter()
+    goal = goals if len(goals) > 1 else goals[0]
+    path = planner.plan(start, goal, seed=args.seed, time_limit=args.time_limit)
+    return path, time.perf_counter() - began
+
+
+def _rolled_out(args, scene, start, goal):
+    """The `Trajectory` of a policy from start to goal. Raises ValueError: it cannot act here."""
+    from roboarm_nmp import envs
+    from roboarm_nmp.envs.datasets.queries import Query
+    from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
+    from roboarm_nmp.envs.policies.rollout import rollout
+
+    policy, options = find_policy(args.policy)
+    if args.cloud is not None:
+        inputs = {options.get("encoder"), options.get("geometry_source")}
+        other = inputs - {None, "point_cloud", "ground_truth"}
+        if other:
+            raise ValueError(f"{args.policy} observes {', '.join(sorted(other))}, not points")
+    if own_safety_filter(policy) or options.get("link_distances"):
+        options |= {"link_distances": True}
+        options.setdefault("geometry_source", "ground_truth")
+    env = envs.make(scene, **options)
+    query = Query(start.astype(np.float32), goal.astype(np.float32), scene)
+    begin = make_policy(policy, env, args.seed, time_limit=args.time_limit)
+    return rollout(env, query, begin(0, query).act)
+
+
+def _describe(configurations, checker):
+    """Print the length of a motion (m, n), rad, and its minimum clearance from the scene."""
+    from roboarm_nmp.envs.collision.checker import FLOOR, NOTHING, POINT, TABLE
+
+    robot, names = checker.robot, {TABLE: "the table", FLOOR: "the floor", POINT: "a point"}
+    joints = np.linalg.norm(np.diff(configurations, axis=0), axis=1).sum()
+    positions = robot.forward_kinematics(configurations)
+    metres = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+    print(f"path length {joints:.2f} rad, of the end effector {metres:.2f} m")
+    states = np.clip(robot.normalise(configurations), -1.0, 1.0)
+    near = checker.signed_distances(states, self_collisions=False)
+    nearest = np.unravel_index(near.distance.argmin(), near.distance.shape)
+    if near.geometry[nearest] != NOTHING:
+        geometry = names.get(int(near.geometry[nearest]), "an obstacle")
+        print(f"minimum clearance {1000 * near.distance[nearest]:.1f} mm, from {geometry}")
+
+
+def main(args):
+    try:
+        flags.check(args)
+        if (args.cloud is None) == (args.task is None):
+            raise ValueError("one of --cloud and --task is needed")
+        if (args.goal is None) == (args.goal_pose is None):
+            raise ValueError("one of --goal and --goal-pose is needed")
+        # Here, because --help need not wait for Numba.
+        from roboarm_nmp.envs.collision.checker import CollisionChecker
+        from roboarm_nmp.envs.datasets.trajectories import (
+            check_ending,
+            save_joint_path,
+            save_trajectory,
+            timed,
+        )
+        from roboarm_nmp.envs.robots.files import load_robot
+        from roboarm_nmp.envs.robots.panda import PANDA
+
+        if args.output is not None:
+            check_ending(args.output)
+            check_writable(args.output)
+        if args.task is not None:
+            scene = _task_scene(args)
+        else:
+            scene = _observed_scene(args, load_robot(args.robot or PANDA.name))
+        start, checker = _configuration("--start", args.start, scene.robot), CollisionChecker(scene)
+        goals = _goals(args, scene.robot, checker, start)
+        if args.cloud is not None:
+            _check_end("--start", start, checker)
+            _check_end("--goal", goals[0], checker)
+        if args.policy == "planner":
+            path, seconds = _planned(args, scene, start, goals)
+            times, configurations = timed(path, scene.robot)
+            print(f"planned in {1000 * seconds:.0f} ms: {len(path)} waypoints")
+        else:
+            episode = _rolled_out(args, scene, start, goals[0])
+            configurations = episode.configurations
+            reached = "reached" if episode.success else "not reached"
+            seconds = episode.times.sum()
+            print(f"{len(episode)} steps, goal {reached}; policy's time {1000 * seconds:.0f} ms")
+        _describe(configurations, checker)
+        if args.output is not None:
+            if args.policy == "planner":
+                save_joint_path(args.output, configurations, times)
+            else:
+                save_trajectory(args.output, episode)
+            print(f"{args.output}: {len(configurations)} configurations")
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    sys.exit(int(args.policy != "planner" and not episode.success))
+
+
+if __name__ == "__main__":
+    end_with_one_line("nothing was written")
+    main(flags.parse(Args, others="cloud"))
