@@ -42,6 +42,7 @@ from roboarm_nmp.envs.datasets.problem_formats import (
     Rejected,
     read_file,
     read_folder,
+    request_files,
 )
 from roboarm_nmp.envs.datasets.queries import Query, validate
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -65,7 +66,7 @@ class Problems:
         all: tuple of `Problem`s.
         robot: the `Robot`; scenes may hold its other joints elsewhere.
         rejected: list of `Rejected`: problems of the file that cannot be used.
-        path, digest: of the file they were read from, and its SHA-256; None of a folder.
+        path, digest: the file or folder they were read from, and the SHA-256 (hex) of its contents.
     """
 
     all: tuple
@@ -131,7 +132,9 @@ def load_problems(path, robot=PANDA):
     """
     path = Path(path)
     if path.is_dir():
-        found, digest = list(read_folder(path, robot)), None
+        found = list(read_folder(path, robot))
+        pairs = request_files(path).values()
+        digest = _digest(*(one for pair in pairs for one in pair if one is not None))
     elif path.suffix in (".yaml", ".yml", ".json"):
         found = list(read_file(path, robot))
         digest = _digest(path)
@@ -198,8 +201,11 @@ def _as_bytes(value):
     return np.frombuffer(json.dumps(value).encode(), np.uint8)
 
 
-def _digest(path):
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _digest(*paths):
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _checksum(attributes, arrays):
