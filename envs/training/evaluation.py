@@ -131,7 +131,8 @@ def evaluate(policy, task=None, *, progress=False, **options):
           a motion found; `free_motion_rate`, only of `via-points`;
         - `policy`, `task`, `robot` (its name), `goal_type`, `split`, `queries` (the file, if it is
           not the task's own), `problems` (their file and its SHA-256), `num_queries`, `env`,
-          `deviations` (from the standard rules), `safety_filter`, `seed`, `tries`, `time_limit`, `versions`;
+          `deviations` (from the standard rules), `safety_filter`, `seed`, `tries`, `time_limit`,
+          `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles.
 
