@@ -83,8 +83,8 @@ class Args:
     workers: Workers = CORES
     """Number of processes, by default that of the cores. The file does not depend on it."""
     original: Path | None = None
-    """File or folder of problems (docs/customise/problems.md), such as MotionBenchMaker's, to add as
-    the split `original`; goes with one task."""
+    """File or folder of problems, such as MotionBenchMaker's (docs/customise/problems.md), to add
+    as the split `original`; goes with one task."""
     output: Path | None = None
     """File to write; goes with one task. The default is `envs/data/<task>.h5`, or, for a scene
     file, `<name>_queries.h5` beside it, or, for a robot's file, `<task>@<robot>_queries.h5`."""
