@@ -67,7 +67,7 @@ def get_task(task):
             raise ValueError(f"{task}: a scene file may not have the name of a task")
         return Task(load_world(task), f"the scene in {task}")
     if Path(task).suffix or Path(task).name != str(task):
-        raise ValueError(f"scene files are .yaml, .yml or .scene (docs/customise/scene.md), got {task}")
+        raise ValueError(f"scene files are .yaml or .scene (docs/customise/scene.md), got {task}")
     raise ValueError(f"unknown task {task!r}: {suggest(task, TASKS)} (or a scene file, .yaml)")
 
 

@@ -541,7 +541,7 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("roboarm_nmp.envs.world.MAX_SAMPLING_TRIES", 5)
     png, gif = ["--output", tmp_path / "out.png"], ["--output", tmp_path / "out.gif"]
     many = len(load_queries("wall"))
-    not_a_scene = "scene files are .yaml, .yml or .scene (docs/customise/scene.md), got "
+    not_a_scene = "scene files are .yaml or .scene (docs/customise/scene.md), got "
     cases = [
         (["moon", *png], "unknown task 'moon': one of no_obstacles"),
         *((["part" + kind, *png], f"{not_a_scene}part{kind}") for kind in (".stl", ".ply", ".obj")),
