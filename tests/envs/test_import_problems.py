@@ -52,7 +52,7 @@ def test_summary_says_what_was_imported_and_why_others_were_not(folder, tmp_path
     assert "not imported: 1: cones are not supported (cone)" in lines
     assert "  shelf/0004: start in collision: the arm with obstacle 0" in lines
     assert "  shelf/0005: goal outside the limits by 0.017 rad: joint 4" in lines
-    assert f"  shelf/0006: {folder / 'scene0006.yaml'}:33: cones are not supported (cone)" in lines
+    assert f"  shelf/0006: {folder / 'scene0006.yaml'}:29: cones are not supported (cone)" in lines
     problems = load_problems(output)
     assert problems.names == ("shelf/0001", "shelf/0002", "shelf/0003", "shelf/0")
     assert not problems.rejected

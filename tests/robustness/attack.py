@@ -6,7 +6,8 @@
 
 Attacks: `networks` (network files with one to three things changed at random, each in a process of
 its own), `files` (bits flipped and files cut off, of every kind that is written), `robots` (URDFs,
-their meshes and YAML files, changed likewise), `flags` (of every command), `environments`
+their meshes and YAML files, changed likewise), `problems` (files of problems and scenes in other
+programs' formats, changed likewise), `flags` (of every command), `environments`
 (arguments of environments, scenes and sensors, and actions), `kills` (`kill -9` at random moments
 of training, collecting, drawing and sweeping).
 
@@ -28,19 +29,24 @@ sys.path.append(str(Path(__file__).parents[1] / "helpers"))
 
 import torch
 import tyro
-from attacks import children, environments, files, flags, kills, networks, robots
+from attacks import children, environments, files, flags, kills, networks, problems, robots
 from tqdm import tqdm
 
 # How many attempts, and how many of them share a process.
 SIZES = {
-    **{"networks": 10_000, "files": 20_000, "robots": 2_000, "flags": 2_000},
+    **{"networks": 10_000, "files": 20_000, "robots": 2_000, "problems": 10_000, "flags": 2_000},
     **{"environments": 20_000, "kills": 50},
 }
-PER_CHILD = {"networks": 1, "files": 200, "robots": 1, "flags": 1, "environments": 100, "kills": 1}
+Name = Literal["networks", "files", "robots", "problems", "flags", "environments", "kills"]
+PER_CHILD = {
+    **{"networks": 1, "files": 200, "robots": 1, "problems": 20, "flags": 1},
+    **{"environments": 100, "kills": 1},
+}
 MODULES = {
     "networks": networks,
     "files": files,
     "robots": robots,
+    "problems": problems,
     "flags": flags,
     "environments": environments,
     "kills": kills,
@@ -50,12 +56,11 @@ GOOD = (children.REFUSED, children.RAN, files.UNCHANGED)
 
 @dataclass
 class Args:
-    only: tuple[Literal["networks", "files", "robots", "flags", "environments", "kills"], ...] = (
-        tuple(SIZES)
-    )
+    only: tuple[Name, ...] = tuple(SIZES)
     """these attacks"""
     number: int | None = None
-    """attempts of each; by default 10,000, 20,000, 2,000, 2,000, 20,000, 50 (of four kills)"""
+    """attempts of each; by default 10,000, 20,000, 2,000, 10,000, 2,000, 20,000, 50 (of
+    four kills)"""
     seed: int = 0
     """of everything random"""
     repeat: int | None = None
