@@ -30,6 +30,7 @@ import h5py
 import numpy as np
 
 from roboarm_nmp.envs.datasets.format import (
+    JOINTS,
     QUERY_SCHEMA,
     DatasetError,
     attribute,
@@ -51,11 +52,17 @@ from roboarm_nmp.envs.scenes.primitives import scene_from_json, scene_to_json, u
 from roboarm_nmp.envs.utils.files import write_atomically
 
 SCHEMA, SCHEMA_VERSION = "roboarm-nmp problems", 1
-MAX_TEXT = 200_000_000  # bytes, of the names or scenes of a file
-_DTYPES = {
-    **{"start": "<f8", "goal_count": "<u4", "goals": "<f8", "goal_pose": "<f8", "scene": "<u4"},
-    **{"names": "<u1", "scenes": "<u1"},
+MAX_ARRAY = 30_000_000  # bytes, of an array of a file: as JSON it needs twenty times as much
+ARRAYS = {
+    "start": ("<f8", JOINTS, "start"),
+    "goal_count": ("<u4", None, "start"),
+    "goals": ("<f8", JOINTS, "goals"),
+    "goal_pose": ("<f8", 7, "start"),
+    "scene": ("<u4", None, "start"),
+    "names": ("<u1", None, "names"),
+    "scenes": ("<u1", None, "scenes"),
 }
+"""As those of `envs.datasets.format`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,13 +186,15 @@ def write_problems(path, problems, made_by=""):
         "names": _as_bytes([problem.name for problem in problems]),
         "scenes": _as_bytes([json.loads(scene_to_json(scene)) for scene in numbers]),
     }
-    arrays = {name: arrays[name].astype(dtype) for name, dtype in _DTYPES.items()}
+    arrays = {name: arrays[name].astype(dtype) for name, (dtype, *_) in ARRAYS.items()}
     attributes = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
         "robot": json.dumps([arm.name, arm.fingerprint]),
         "made_by": made_by,
     }
+    for name, array in arrays.items():
+        _check_size(path, name, array)
     _problems_of(path, arrays, arm)
     contents = io.BytesIO()  # as of envs.datasets.format.write_file
     with h5py.File(contents, "w", libver=("v110", "v110")) as file:
@@ -262,12 +271,11 @@ def _read_open(path, file, robot):
         raise DatasetError(f"{path}: schema version {version}, this code reads {SCHEMA_VERSION}")
     check_plain(path, file)
     arrays = {}
-    for name, dtype in _DTYPES.items():
+    for name, (dtype, *_) in ARRAYS.items():
         dataset = file.get(name)
         if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.dtype(dtype):
             raise DatasetError(f"{path}: array {name} is missing or damaged")
-        if dataset.size * dataset.dtype.itemsize > MAX_TEXT:
-            raise DatasetError(f"{path}: {name} has {dataset.shape} numbers: too many")
+        _check_size(path, name, dataset)
         arrays[name] = dataset[()]
     if attribute(file, "checksum") != _checksum(attributes, arrays):
         raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
@@ -278,6 +286,11 @@ def _read_open(path, file, robot):
             f"{robot.arm.name!r} ({robot.arm.fingerprint[:12]}): name the robot's file (--robot)"
         )
     return _problems_of(path, arrays, robot.arm)
+
+
+def _check_size(path, name, array):
+    if array.size * array.dtype.itemsize > MAX_ARRAY:
+        raise DatasetError(f"{path}: {name} has more than {MAX_ARRAY // 1_000_000} MB")
 
 
 def _problems_of(path, arrays, arm):
@@ -309,7 +322,7 @@ def _problems_of(path, arrays, arm):
         for pose in poses[has_pose]:
             unit_quaternion(pose[3:].tolist())
         scenes = [_scene_of(scene, arm) for scene in scenes]
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: a scene or a pose that cannot be: {error}") from error
     ends = np.cumsum(arrays["goal_count"], dtype=np.int64)
     goals = np.split(arrays["goals"], ends[:-1])

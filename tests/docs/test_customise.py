@@ -1,13 +1,15 @@
-"""docs/customise/{robot,sensor,encoder,reward}.md: their code is executed."""
+"""docs/customise/{robot,problems,sensor,encoder,reward}.md: their code is executed."""
 
 import re
 
 import numpy as np
 import pytest
 from paths import ROOT
+from problem_files import write_folder
 from trainers import PATHS, load
 
 from roboarm_nmp import envs
+from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.scene_embedding_train import collect
@@ -32,6 +34,14 @@ def test_plan_of_the_page_about_robots_is_followed_without_contact(monkeypatch, 
     names = executed(blocks("robot"))
     assert capsys.readouterr().out.endswith("True False\n")
     assert names["env"].robot.name == "iiwa" and names["path"].shape[1] == 7
+
+
+def test_problems_of_the_page_are_read_and_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_folder(tmp_path / "bookshelf_tall_panda")
+    names = executed(blocks("problems"))
+    assert len(load_problems("problems.h5")) == 1 and names["env"].robot == names["wide"]
+    assert "True" in capsys.readouterr().out
 
 
 def test_sensor_of_the_page_observes_heights_of_obstacles():
