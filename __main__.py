@@ -30,6 +30,7 @@ COMMANDS = {
     "demo": ("envs.viewer.demo", "a pretrained policy in the browser, without arguments"),
     "sweep": ("clean_rl_scripts.sweep", "search a trainer's flags with Optuna"),
     "plan": ("demo_generation.plan", "plan a motion among points or in a scene"),
+    "import": ("envs.import_problems", "import problems from other programs' files"),
     "queries": ("demo_generation.make_queries", "make a query file"),
     "collect": ("demo_generation.collect", "collect demonstrations"),
     "verify": ("demo_generation.verify", "replay demonstrations in the simulator"),

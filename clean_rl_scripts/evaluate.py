@@ -3,6 +3,7 @@
     roboarm evaluate --policy go-to-goal --task double_walls
     roboarm evaluate --policy sac-ee-wall-p1-s1                  # on the task it was trained on
     roboarm evaluate --policy runs/my_run --task wall --json result.json
+    roboarm evaluate --policy planner --problems problems.h5     # of other programs' files
     python clean_rl_scripts/evaluate.py --policy random --task boxes    # the same script
 
 An episode is one query, in the query's scene, under the task's standard rules: goal tolerances,
@@ -94,6 +95,9 @@ class Args:
     """which of the task's queries; few tasks have `original` ones"""
     queries: Path | None = None
     """a query file to use instead of the task's own"""
+    problems: Path | None = None
+    """a file or folder of problems to use instead of a task's queries: `problems.h5` of `roboarm
+    import`, or a file that it reads (docs/customise/problems.md); no task is needed"""
     num_queries: PositiveInt | None = None
     """only the first so many queries of the split"""
     workers: Workers = CORES
@@ -214,6 +218,8 @@ def _table(result):
 
     count, split = f"{result['num_queries']:,}", result["split"]
     lines = [f"{result['policy']} on {result['task']}: {count} {split} queries"]
+    if problems := result.get("problems"):
+        lines = [f"{result['policy']} on {problems['file']}: {count} problems"]
     settings = _settings(result)
     lines += [f"  {name:<24}{value}" for name, value in settings.items() if value is not None]
     lines += [

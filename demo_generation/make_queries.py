@@ -32,10 +32,10 @@ import tyro
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
-from roboarm_nmp.demo_generation.motionbenchmaker import read_problems
 from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.envs.datasets.format import ORIGINAL
 from roboarm_nmp.envs.datasets.journal import Journal, journal_of
+from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.datasets.queries import query_path, write_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
@@ -83,7 +83,8 @@ class Args:
     workers: Workers = CORES
     """Number of processes, by default that of the cores. The file does not depend on it."""
     original: Path | None = None
-    """JSON file of MotionBenchMaker problems to add as the split `original`; goes with one task."""
+    """File or folder of problems, such as MotionBenchMaker's (docs/customise/problems.md), to add
+    as the split `original`; goes with one task."""
     output: Path | None = None
     """File to write; goes with one task. The default is `envs/data/<task>.h5`, or, for a scene
     file, `<name>_queries.h5` beside it, or, for a robot's file, `<task>@<robot>_queries.h5`."""
@@ -175,7 +176,7 @@ def make_queries(
         num_test, num_validation: numbers of queries, > 0.
         solvable: accept only queries that the planner solves.
         queries_per_scene: queries in a row that have the same scene, where scenes vary.
-        original: path of a JSON file of MotionBenchMaker problems for the split `original`.
+        original: path of a file or folder of problems for the split `original`.
         num_workers: number of processes.
         progress: show a progress bar.
         goal_region: (xmin, xmax, ymin, ymax, zmin, zmax), m, of the goals' end-effector positions
@@ -192,7 +193,7 @@ def make_queries(
         Whatever is raised, what is in the journal is safe.
     """
     query_path(task)  # rejects an unknown task
-    splits = {} if original is None else {ORIGINAL: read_problems(original)}
+    splits = {} if original is None else {ORIGINAL: _original_queries(original)}
     path, distribution, base = Path(path), envs.get_task(task).scene, envs.get_task(task).base_scene
     options = {"task": str(task), "seed": seed, "solvable": solvable}
     options |= {"queries_per_scene": queries_per_scene}
@@ -252,6 +253,15 @@ def make_queries(
     return rejected
 
 
+def _original_queries(path):
+    """Starts, goals and scenes of the problems in a file. The gripper is as open as in any task."""
+    problems = load_problems(path)
+    if problems.rejected:
+        raise ValueError(problems.rejected[0].reason)
+    scenes = [replace(scene, robot=PANDA) for scene in problems.scenes]
+    return problems.start, problems.goal, scenes
+
+
 def _check(args):
     """The (task, path) pairs to make. Raises ValueError for arguments that cannot work."""
     flags.check(args)
@@ -264,7 +274,7 @@ def _check(args):
     if (args.output or args.original) is not None and len(tasks) > 1:
         raise ValueError("--output and --original are one file: they go with one task")
     if args.original is not None:
-        read_problems(args.original)
+        _original_queries(args.original)
         if envs.get_task(tasks[0]).base_scene.robot != PANDA:
             raise ValueError("--original: MotionBenchMaker's problems are the Panda's")
     if args.goal_region:

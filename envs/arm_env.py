@@ -246,9 +246,11 @@ class RoboArmEnv(gym.Env):
     def set_scene(self, scene):
         """Put the arm into another `Scene`. This ends the episode. An equal one does nothing.
 
-        Raises ValueError: the scene has another robot.
+        The scene may hold the arm's other joints, such as the gripper's, elsewhere.
+
+        Raises ValueError: the scene has another arm.
         """
-        if isinstance(scene, Scene) and scene.robot != self.robot:
+        if isinstance(scene, Scene) and not scene.robot.same_arm(self.robot):
             raise ValueError(f"the scene's robot is {scene.robot.name!r}, not {self.robot.name!r}")
         if self.world.set_scene(scene):
             self.start_configuration = None

@@ -10,6 +10,7 @@
     roboarm show wall --output episode.gif --camera 2.5 90 -20
     roboarm show wall --policy planner --save-trajectory episode.csv
     roboarm show wall --output episode.gif --trajectory episode.csv
+    roboarm show --problems problems.h5 --query 3 --output image.png
 
 The arm is white. The green ball is the goal position of the end effector. Where the goal is a
 configuration, the arm at the goal is shown in transparent green; the goal type `ee` has no such
@@ -34,6 +35,7 @@ from PIL import Image
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.format import OutOfDateError
+from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
 from roboarm_nmp.envs.datasets.trajectories import (
     STEP_SECONDS,
@@ -80,8 +82,10 @@ PAUSE = 1.5  # s, at the end of an episode
 
 @dataclass
 class Args:
-    task: tyro.conf.Positional[str]
-    """The task's name, or the path of a scene file (.yaml)."""
+    task: tyro.conf.Positional[str | None] = None
+    """The task's name, or the path of a scene file (.yaml). Not needed with --problems."""
+    problems: Path | None = None
+    """A file or folder of problems, as of `roboarm import`; --query is the number of a problem."""
     robot: Path | None = None
     """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     output: Path | None = None
@@ -329,6 +333,9 @@ class _Queries:
 def _find_queries(args):
     if args.trajectory is not None:
         return _file_queries(args)
+    if args.problems is not None:
+        problems = load_problems(args.problems, envs.get_task(args.task).base_scene.robot)
+        return _Queries(problems.query, len(problems), "problem")
     if args.policy == "demo":
         path = demo_path(args.task)
         if not path.exists():
@@ -392,6 +399,14 @@ def _file_queries(args):
 def _check(args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
+    if args.problems is not None:
+        args.task = "no_obstacles" if args.task is None else args.task
+        if args.trajectory is not None or args.policy == "demo":
+            raise ShowError(
+                "--problems goes with a policy, not with a trajectory or demonstrations"
+            )
+    if args.task is None:
+        raise ShowError("name a task or a scene file, or give --problems FILE")
     args.task = task_with_robot(args.task, args.robot)
     envs.get_task(args.task)
     if args.output is not None:

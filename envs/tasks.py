@@ -13,13 +13,13 @@ from pathlib import Path
 
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.files import load_scene
+from roboarm_nmp.envs.scenes.formats import WORLD_FILES, load_world
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.utils.names import suggest
 
-SCENE_FILES = (".yaml", ".yml")
+SCENE_FILES = WORLD_FILES  # this project's and those of other programs
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ def get_task(task):
     if is_task(task):
         if has_name(task_name(task)):
             raise ValueError(f"{task}: a scene file may not have the name of a task")
-        return Task(load_scene(task), f"the scene in {task}")
+        return Task(load_world(task), f"the scene in {task}")
     if Path(task).suffix or Path(task).name != str(task):
-        raise ValueError(f"scene files are .yaml or .yml (docs/customise/scene.md), got {task}")
+        raise ValueError(f"scene files are .yaml or .scene (docs/customise/scene.md), got {task}")
     raise ValueError(f"unknown task {task!r}: {suggest(task, TASKS)} (or a scene file, .yaml)")
 
 

@@ -308,11 +308,11 @@ class World:
         before = self._snapshot()
         for name, configuration in configurations.items():
             if self.in_collision(configuration):
-                contacts = self._contact_names()
+                contacts = self.contact_names()
                 self._restore(before)
                 raise ValueError(f"{name} is in collision: {contacts}")
 
-    def _contact_names(self):
+    def contact_names(self):
         """The pairs in contact, in words; after `in_collision`."""
         names = set()
         for contact in p.getContactPoints(bodyA=self.body, physicsClientId=self.client):

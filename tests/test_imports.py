@@ -19,7 +19,7 @@ LEVELS = [
     ("envs",),  # `make`
     ("envs.datasets", "envs.policies"),
     ("envs.training",),
-    ("envs.show", "envs.robot_check"),
+    ("envs.show", "envs.robot_check", "envs.import_problems"),
     ("envs.viewer",),
     ("demo_generation",),
     ("clean_rl_scripts", "bc_script", "scene_embedding_train"),

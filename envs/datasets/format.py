@@ -263,6 +263,7 @@ def read_base_scene(path, text, robot):
     Raises DatasetError: it was made for another one.
     """
     name, fingerprint = json.loads(text).get("robot", (PANDA.name, PANDA.fingerprint))
+    robot = robot.arm
     if fingerprint != robot.fingerprint:
         hint = ""
         if name == robot.name:
@@ -279,7 +280,7 @@ def read_base_scene(path, text, robot):
 def _same_scene(one, other):
     """Whether two scenes (JSON) are equal up to rounding."""
     one, other = json.loads(one), json.loads(other)
-    if one.get("robot") != other.get("robot"):
+    if any(one.get(field) != other.get(field) for field in ("robot", "held")):
         return False
     for field in ("obstacles", "table", "floor", "friction"):
         here, there = one.get(field), other.get(field)

@@ -121,16 +121,17 @@ def save_network(path, module, example_inputs, metadata):
 
 def robot_metadata(robot):
     """The part of a network's metadata that names its `Robot`, a dict; empty for the Panda."""
-    return {} if robot == PANDA else {"robot": [robot.name, robot.fingerprint]}
+    arm = robot.arm
+    return {} if arm == PANDA else {"robot": [arm.name, arm.fingerprint]}
 
 
 def check_robot(path, metadata, robot):
     """Raise NetworkError unless the network at `path`, with this metadata, is for a `Robot`."""
     trained = metadata.get("robot", [PANDA.name, PANDA.fingerprint])
-    if trained != [robot.name, robot.fingerprint]:
+    wanted = [robot.arm.name, robot.arm.fingerprint]
+    if trained != wanted:
         raise NetworkError(
-            f"{path}: it was trained for the robot {_words(trained)}, not for "
-            f"{_words([robot.name, robot.fingerprint])}"
+            f"{path}: it was trained for the robot {_words(trained)}, not for {_words(wanted)}"
         )
 
 

@@ -90,4 +90,4 @@ PANDA = Robot(
 
 def scale_of(robot):
     """A robot's reach as a share of the Panda's: what its random scenes and sensors scale with."""
-    return 1.0 if robot == PANDA else robot.reach / PANDA.reach
+    return 1.0 if robot.arm == PANDA else robot.reach / PANDA.reach

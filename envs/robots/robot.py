@@ -22,6 +22,7 @@ import numpy as np
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+MAX_HELD = 10.0  # rad or m, of a held joint
 
 
 class Frame(NamedTuple):
@@ -91,6 +92,8 @@ class Robot:
         contact_free: a configuration without contacts (n,).
         observed_pose: the configuration (n,) in which sensors observe a scene: always the same, so
             that an encoded scene depends on the scene alone.
+        described: of `with_held`: the arm with its held joints where its description has them;
+            None for that arm itself.
     """
 
     name: str
@@ -122,6 +125,7 @@ class Robot:
     mesh_digest: str = ""
     source: str = ""
     xml: str = ""
+    described: "Robot | None" = None
 
     def __post_init__(self):
         for name in ("lower", "upper", "velocity", "acceleration", "jerk", "effort"):
@@ -146,7 +150,7 @@ class Robot:
         Numbers are rounded to 1e-9: the last bits of sines and cosines differ between machines.
         """
         content = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name in ("urdf", "source", "xml"):
+        for name in ("urdf", "source", "xml", "described"):
             content.pop(name)
         text = json.dumps(_rounded(content), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -183,6 +187,47 @@ class Robot:
         # By name, because that module is built on this one.
         urdf = importlib.import_module("roboarm_nmp.envs.robots.urdf")
         return urdf.robot_from_urdf(path, **options)
+
+    # --- Held joints
+
+    @property
+    def arm(self):
+        """The arm with its held joints where its description has them: what files name."""
+        return self.described or self
+
+    def same_arm(self, other):
+        """Whether another `Robot` is this arm, wherever the held joints of the two are."""
+        return self.arm == other.arm
+
+    @property
+    def held(self):
+        """Where the held joints are, rad or m: dict from names to positions."""
+        names = [self.bullet_names[0][index] for index in self.held_indices]
+        return dict(zip(names, self.held_positions, strict=True))
+
+    def with_held(self, positions):
+        """This arm with held joints, such as a gripper's, elsewhere.
+
+        Args:
+            positions: dict from names of held joints to positions, rad or m, which may be beyond
+                the joints' limits. Joints that mimic one of them follow it, unless they are named.
+
+        Raises:
+            ValueError: no such held joint, a position that is not finite or too large, or a joint
+                that carries one of the n joints.
+        """
+        # By name, because that module is built on this one.
+        urdf = importlib.import_module("roboarm_nmp.envs.robots.urdf")
+        held, arm = self.held, self.arm
+        for name, position in positions.items():
+            if name not in held:
+                known = ", ".join(held) or "none"
+                raise ValueError(f"{self.name}: {name!r} is no held joint; those are {known}")
+            if not abs(position) <= MAX_HELD:  # or NaN
+                raise ValueError(f"{self.name}: {name} cannot be held at {position!r}")
+        held |= urdf.followers(arm, positions)
+        held |= {name: float(position) for name, position in positions.items()}
+        return urdf.held_at(arm, tuple(held.values()))
 
     # --- Sizes and normalisation
 
@@ -313,6 +358,16 @@ class Robot:
             for b in range(a + 1, links.stop):
                 may_collide = int((a, b) in self.self_collision_pairs)
                 p.setCollisionFilterPair(body, body, a, b, may_collide, physicsClientId=client)
+        for index, position in zip(self.held_indices, self.held_positions, strict=True):
+            lower, upper = p.getJointInfo(body, index, physicsClientId=client)[8:10]
+            if lower <= upper and not lower <= position <= upper:  # a limit would push it back
+                p.changeDynamics(
+                    body,
+                    index,
+                    jointLowerLimit=min(lower, position),
+                    jointUpperLimit=max(upper, position),
+                    physicsClientId=client,
+                )
         if self.held_indices:
             p.setJointMotorControlArray(
                 body,

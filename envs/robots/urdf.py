@@ -1,6 +1,7 @@
 """A `Robot` from a URDF, which is untrusted input: everything in it is checked first."""
 
 import dataclasses
+import functools
 import hashlib
 import math
 import re
@@ -346,8 +347,7 @@ class _Tree:
 
     def axis(self, joint):
         """The direction (3,), of length 1, about or along which a joint moves."""
-        axis = self.joints[joint].find("axis")
-        axis = np.array([float(x) for x in axis.get("xyz", "1 0 0").split()])
+        axis = _axis(self.joints[joint])
         norm = np.linalg.norm(axis)
         if axis.shape != (3,) or not norm > 1e-6:
             raise RobotError(f"{self.path}: joint {joint!r}: the axis {axis} has no direction")
@@ -448,13 +448,116 @@ class _Tree:
 
     def origin(self, joint):
         """Position (3,) and rotation (3, 3) of a joint in its parent link."""
-        element = self.joints[joint].find("origin")
-        xyz, rpy = "0 0 0", "0 0 0"
-        if element is not None:
-            xyz, rpy = element.get("xyz", xyz), element.get("rpy", rpy)
-        position = np.array([float(x) for x in xyz.split()])
-        roll, pitch, yaw = (float(x) for x in rpy.split())
-        return position, _rotation_z(yaw) @ _rotation_y(pitch) @ _rotation_x(roll)
+        return _origin(self.joints[joint])
+
+
+# --- Joints held elsewhere, and links at the end
+
+
+def followers(robot, positions):
+    """Where held joints are that mimic others: dict from names to positions, rad or m.
+
+    `positions`: those of others, a dict; joints in it are left out.
+    """
+    found = {}
+    for joint in robot.parsed_urdf().findall("joint"):
+        name, mimic = joint.get("name"), joint.find("mimic")
+        if mimic is None or name in positions or name not in robot.held:
+            continue
+        if (leader := mimic.get("joint")) in positions:
+            scale, offset = float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
+            found[name] = scale * positions[leader] + offset
+    return found
+
+
+@functools.lru_cache(64)
+def held_at(arm, positions):
+    """An arm with its held joints at other positions, a tuple; see `Robot.with_held`."""
+    if positions == arm.held_positions:
+        return arm
+    robot = dataclasses.replace(arm, held_positions=positions, described=arm)
+    by_child, held = _by_child(robot), robot.held
+    changed = {name for name, position in arm.held.items() if held[name] != position}
+    joints, names = robot.bullet_names
+    for index in (*robot.joint_indices, *(mimic[0] for mimic in robot.mimics)):
+        joint = next(one for one in by_child.values() if one.get("name") == joints[index])
+        if carriers := changed & set(_held_above(joint.find("parent").get("link"), by_child, held)):
+            raise ValueError(
+                f"{arm.name}: {min(carriers)} carries joints that move: hold it elsewhere in the "
+                f"robot's file"
+            )
+    links = list(robot.links)
+    for i, link in enumerate(links):
+        if changed & set(_held_above(names[link.index], by_child, held)):
+            placement = link_placement(robot, names[link.index])
+            links[i] = link._replace(placements=_steps(placement))
+    end = names[robot.end_effector_link]
+    if changed & set(_held_above(end, by_child, held)):
+        _, rotation, position = link_placement(robot, end)
+        position = position + rotation @ np.array(robot.end_effector_offset)
+        robot = dataclasses.replace(robot, end_effector_position=tuple(position.tolist()))
+    return dataclasses.replace(robot, links=tuple(links))
+
+
+def link_placement(robot, link):
+    """Where a link is in the frame of the `Robot` that moves it.
+
+    Returns:
+        the name of the joint of that frame, None for the base; rotation (3, 3); position (3,), m.
+
+    Raises:
+        ValueError: the robot has no such link.
+    """
+    by_child, held = _by_child(robot), robot.held
+    if link not in robot.bullet_names[1].values():
+        raise ValueError(f"{robot.name} has no link {link!r}")
+    moving = {*robot.joint_names, *(robot.bullet_names[0][mimic[0]] for mimic in robot.mimics)}
+    rotation, position = np.eye(3), np.zeros(3)
+    while link in by_child:
+        joint = by_child[link]
+        name, kind = joint.get("name"), joint.get("type")
+        if name in moving:
+            aligned = _aligning(_axis(joint))
+            return name, aligned.T @ rotation, aligned.T @ position
+        if name in held and kind == "prismatic":
+            position = position + _axis(joint) * held[name]
+        elif name in held:
+            turn = _about(_axis(joint), held[name])
+            rotation, position = turn @ rotation, turn @ position
+        at, turn = _origin(joint)
+        rotation, position = turn @ rotation, at + turn @ position
+        link = joint.find("parent").get("link")
+    return None, rotation, position
+
+
+def _by_child(robot):
+    """The URDF's joints, XML elements, by the link that each moves."""
+    joints = robot.parsed_urdf().findall("joint")
+    return {joint.find("child").get("link"): joint for joint in joints}
+
+
+def _held_above(link, by_child, held):
+    """Names of the held joints between a link and the base."""
+    while link in by_child:
+        if by_child[link].get("name") in held:
+            yield by_child[link].get("name")
+        link = by_child[link].find("parent").get("link")
+
+
+def _axis(joint):
+    """The direction (3,) about or along which a joint, an XML element, moves."""
+    return np.array([float(x) for x in joint.find("axis").get("xyz", "1 0 0").split()])
+
+
+def _origin(joint):
+    """Position (3,) and rotation (3, 3) of a joint, an XML element, in its parent link."""
+    element = joint.find("origin")
+    xyz, rpy = "0 0 0", "0 0 0"
+    if element is not None:
+        xyz, rpy = element.get("xyz", xyz), element.get("rpy", rpy)
+    position = np.array([float(x) for x in xyz.split()])
+    roll, pitch, yaw = (float(x) for x in rpy.split())
+    return position, _rotation_z(yaw) @ _rotation_y(pitch) @ _rotation_x(roll)
 
 
 def _read(path):

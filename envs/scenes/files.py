@@ -4,6 +4,8 @@ All lengths in metres, in the frame of the robot's base (x forward, y left, z up
 
     robot: ur5.yaml # the arm: a file, relative to this one (docs/customise/robot.md); the Panda if
                     # left out
+    held: {panda_finger_joint1: 0.025}  # where its other joints are held, rad or m; as the robot
+                    # has them if left out
     table: true     # true (as if left out): the standard table; false: none; or one of your own,
                     # {position: [x, y, z], size: [x, y, z]}, turned like a box
     floor: -0.6     # height of the floor's surface (-0.6 if left out); false: none
@@ -102,8 +104,12 @@ def save_scene(scene, path):
 
 def _format_scene(scene):
     table = "false" if scene.table is None else _format_fields(scene.table)
+    held = ""
+    if scene.robot.described:
+        held = ", ".join(f"{joint}: {value!r}" for joint, value in scene.robot.held.items())
     lines = [
-        *[f"robot: {scene.robot.source}"] * (scene.robot != PANDA),
+        *[f"robot: {scene.robot.source}"] * (scene.robot.arm != PANDA),
+        *[f"held: {{{held}}}"] * (scene.robot.described is not None),
         f"table: {'true' if scene.table == TABLE else table}",
         f"floor: {'false' if scene.floor is None else repr(float(scene.floor))}",
         *[f"friction: {float(scene.friction)!r}"] * (scene.friction != FRICTION),
@@ -192,11 +198,13 @@ def _compose(text):
 
 
 def _scene(node, folder):
-    keys = ("robot", "table", "floor", "friction", "obstacles")
+    keys = ("robot", "held", "table", "floor", "friction", "obstacles")
     fields = _mapping(node, "a scene", optional=keys)
     table, floor, friction, obstacles, robot = TABLE, FLOOR, FRICTION, (), PANDA
     if "robot" in fields:
         robot = _robot(fields["robot"], folder)
+    if "held" in fields:
+        robot = _held(fields["held"], robot)
     if "table" in fields:
         table = _table(fields["table"])
     if "floor" in fields:
@@ -224,6 +232,14 @@ def _robot(node, folder):
         raise _mistake(node, f"robot must be a file's name, got {_describe(node)}")
     try:
         return load_robot(node.value if node.value == PANDA.name else folder / node.value)
+    except ValueError as error:
+        raise _mistake(node, str(error)) from error
+
+
+def _held(node, robot):
+    held = _mapping(node, "held", optional=tuple(robot.held))
+    try:
+        return robot.with_held({joint: _number(at, joint) for joint, at in held.items()})
     except ValueError as error:
         raise _mistake(node, str(error)) from error
 

@@ -270,15 +270,21 @@ def scene_to_json(scene):
     }
     if scene.friction != FRICTION:
         fields["friction"] = scene.friction
-    if scene.robot != PANDA:
-        fields["robot"] = scene.robot.name, scene.robot.fingerprint
+    if scene.robot.arm != PANDA:
+        fields["robot"] = scene.robot.arm.name, scene.robot.arm.fingerprint
+    if scene.robot.described:
+        fields["held"] = scene.robot.held
     return json.dumps(fields, sort_keys=True)
 
 
 def scene_from_json(text, robot=PANDA):
-    """The inverse of `scene_to_json`. `robot` is the scene's: the text has only its fingerprint."""
+    """The inverse of `scene_to_json`.
+
+    `robot` is the scene's arm: the text has only its fingerprint, and where joints are held.
+    """
     fields = json.loads(text)
     table = fields["table"] and from_array([fields["table"]])[0]
     rows = np.array(fields["obstacles"]).reshape(-1, ROW)
     friction = fields.get("friction", FRICTION)
+    robot = robot.arm.with_held(fields["held"]) if "held" in fields else robot.arm
     return Scene(from_array(rows), table, fields["floor"], friction, robot)

@@ -24,6 +24,7 @@ import torch
 from roboarm_nmp import envs
 from roboarm_nmp.envs.arm_env import deviations
 from roboarm_nmp.envs.datasets.format import QueryScenes
+from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, validate
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
@@ -62,6 +63,8 @@ class EvaluationOptions:
             `start` and `goal`, float32 (m, n), rad, and `scenes`, a sequence of m `Scene`s, like
             `envs.datasets.queries.Queries`. Without `scenes` they are in the task's scene, which
             must then not be random.
+        problems: path of a file or folder of problems instead of queries
+            (`envs.datasets.problems`), in their own scenes. The goal is the first one of each.
         split: `test`, `validation` or `original`; which queries of the file.
         num_queries: only the first so many of them; None for all.
         stop_on_collision: end an episode at the first contact.
@@ -84,6 +87,7 @@ class EvaluationOptions:
 
     goal_type: str | None = None
     queries: Any = None
+    problems: str | Path | None = None
     split: str = "test"
     num_queries: int | None = None
     stop_on_collision: bool = False
@@ -114,7 +118,7 @@ def evaluate(policy, task=None, *, progress=False, **options):
             observation (dict of `RoboArmEnv`) to an action (n,); with several workers, one that can
             be pickled.
         task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
-            for the task that the policy was trained on.
+            for the task that the policy was trained on, and for none with `problems`.
         progress: show a progress bar, with the success rate so far.
         options: the fields of `EvaluationOptions`.
 
@@ -129,8 +133,9 @@ def evaluate(policy, task=None, *, progress=False, **options):
         - `planning_seconds`, `planning_seconds_solved`: means over all queries, and over those with
           a motion found; `free_motion_rate`, only of `via-points`;
         - `policy`, `task`, `robot` (its name), `goal_type`, `split`, `queries` (the file, if it is
-          not the task's own), `num_queries`, `env`, `deviations` (from the standard rules),
-          `safety_filter`, `seed`, `tries`, `time_limit`, `versions`;
+          not the task's own), `problems` (their file and its SHA-256), `num_queries`, `env`,
+          `deviations` (from the standard rules), `safety_filter`, `seed`, `tries`, `time_limit`,
+          `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles.
 
@@ -203,7 +208,7 @@ class _Job:
 
     `options` are those in use: `env` has all arguments of `envs.make`, `geometry_source` is None
     where nothing takes obstacles from one, `queries` is the name of a file or None. Instead of it
-    there are `start`, `goal` and `scenes`.
+    there are `start`, `goal` and `scenes`. `problems` is as in the result.
     """
 
     policy: str | Path | Callable
@@ -212,6 +217,7 @@ class _Job:
     start: np.ndarray
     goal: np.ndarray
     scenes: Sequence[Scene]
+    problems: dict | None = None
 
     def make(self, **kwargs):
         """The environment, and the policy in it as `make_policy` returns it."""
@@ -240,6 +246,10 @@ def _prepare(policy, task, options):
                     f"be evaluated with {options.goal_type!r}"
                 )
             options = replace(options, env=trained or options.env)
+        problems = None
+        if options.problems is not None:
+            task = "no_obstacles" if task is None else task
+            options, problems = _with_problems(task, options)
         if task is None:
             name = getattr(policy, "__name__", policy)
             raise EvaluationError(f"{name} has no task of its own: choose one (--task)")
@@ -249,11 +259,25 @@ def _prepare(policy, task, options):
             _in_use(policy, options), queries=file, split=getattr(queries, "split", None)
         )
         start, goal = queries.start[: options.num_queries], queries.goal[: options.num_queries]
-        job = _Job(policy, str(task), options, start, goal, scenes)
+        job = _Job(policy, str(task), options, start, goal, scenes, problems)
         job.make()[0].close()  # or it raises
     except (TypeError, ValueError) as error:
         raise EvaluationError(str(error)) from error
     return job
+
+
+def _with_problems(task, options):
+    """The options with the problems as queries, and what the result says of their file."""
+    if options.queries is not None:
+        raise EvaluationError("queries and problems: give one of them")
+    problems = load_problems(options.problems, get_task(task).base_scene.robot)
+    if problems.rejected:
+        raise EvaluationError(
+            f"{len(problems.rejected)} problems cannot be used: {problems.rejected[0].reason}; "
+            f"`roboarm import` writes a file of the others"
+        )
+    said = {"file": Path(options.problems).name, "sha256": problems.digest}
+    return replace(options, queries=problems), said
 
 
 def _in_use(policy, options):
@@ -417,11 +441,12 @@ def _summary(job, outcomes):
     packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy == "planner")
     return {
         "policy": getattr(job.policy, "__name__", str(job.policy)),
-        "task": job.task,
+        "task": None if job.problems else job.task,
         "robot": get_task(job.task).base_scene.robot.name,
         "goal_type": options.env["goal_type"],
         "split": options.split,
         "queries": options.queries,
+        **({"problems": job.problems} if job.problems else {}),
         "num_queries": count,
         **share("success_rate", reached),
         **share("collision_free_success_rate", reached & ~columns.collision),

@@ -32,19 +32,8 @@ OTHERS = "algorithm"
 GROUPS = {
     "policy": ("policy", "tries", "time_limit"),
     "task": (
-        *(
-            "task",
-            "robot",
-            "start",
-            "goal",
-            "goal_pose",
-            "goal_type",
-            "split",
-            "queries",
-            "num_queries",
-            "query",
-            "num",
-        ),
+        *("task", "robot", "start", "goal", "goal_pose", "goal_type", "split", "queries"),
+        *("problems", "num_queries", "query", "num"),
         *("action_mode", "max_step", "horizon", "stop_on_collision"),
     ),
     "observation": (*("encoder", "num_points", "velocities", "geometry_source", "link_distances"),),

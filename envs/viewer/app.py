@@ -279,7 +279,7 @@ class _Page:
                 "trace": "path of the end effector",
             }
             for option in self.drawing.OPTIONS:
-                if option == "decoded" and simulation.robot != PANDA:
+                if option == "decoded" and simulation.robot.arm != PANDA:
                     continue  # pretrained encoders are the Panda's
                 box = gui.add_checkbox(names[option], option in self.drawing.show)
                 box.on_update(lambda event, o=option: self.do(self._show, o, event.target.value))
@@ -566,7 +566,7 @@ def _choices(args, simulation):
     names = args.policy or (() if simulation.episodes.recording else ("go-to-goal",))
     given = [_Choice(name, name, args.geometry_source) for name in names]
     offered = {choice.label: choice for choice in given}
-    pretrained = pretrained_policies() if simulation.robot == PANDA else ()
+    pretrained = pretrained_policies() if simulation.robot.arm == PANDA else ()
     for name in (*BASELINES, *pretrained):
         offered.setdefault(name, _Choice(name, name, args.geometry_source))
     offered[POINT_CLOUD_PLANNER] = _Choice(POINT_CLOUD_PLANNER, "planner", "point_cloud")

@@ -563,7 +563,7 @@ class Simulation:
         Returns the path of the file. Raises SceneFileError, OSError: it cannot be written.
         """
         path = Path(path)
-        if path.suffix not in envs.tasks.SCENE_FILES:
+        if path.suffix not in (".yaml", ".yml"):
             path = path.with_name(f"{path.name}.yaml")
         first, number = path, 2
         while path.exists():

@@ -35,7 +35,7 @@ def page(tmp_path_factory):
 def test_snippets_of_the_page_run(page):
     folder, names = page
     assert sorted(path.name for path in folder.iterdir()) == [
-        *("back.h5", "episode.npz", "my_scene.yaml", "path.csv", "policy.pt")
+        *("back.h5", "episode.npz", "my_scene.yaml", "path.csv", "policy.pt", "problems.h5")
     ]
     assert names["filtered"]["safety_filter"]["margin"] == 0.01
     assert len(names["demos"][:10]) == 10

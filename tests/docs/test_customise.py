@@ -1,4 +1,4 @@
-"""docs/customise/{robot,point_cloud,sensor,encoder,reward}.md: their code is executed."""
+"""docs/customise/{robot,point_cloud,problems,sensor,encoder,reward}.md: their code is executed."""
 
 import re
 import shlex
@@ -6,10 +6,12 @@ import shlex
 import numpy as np
 import pytest
 from paths import ROOT
+from problem_files import write_folder
 from trainers import PATHS, load
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import plan
+from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import flags
@@ -52,6 +54,14 @@ def test_motions_of_the_page_about_point_clouds_avoid_the_points(tmp_path, monke
         assert end.value.code == 0
         assert "minimum clearance" in capsys.readouterr().out
     assert (tmp_path / "path.csv").exists()
+
+
+def test_problems_of_the_page_are_read_and_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_folder(tmp_path / "bookshelf_tall_panda")
+    names = executed(blocks("problems"))
+    assert len(load_problems("problems.h5")) == 1 and names["env"].robot == names["wide"]
+    assert "True" in capsys.readouterr().out
 
 
 def test_sensor_of_the_page_observes_heights_of_obstacles():

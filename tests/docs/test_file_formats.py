@@ -7,6 +7,7 @@ from paths import ROOT
 
 import roboarm_nmp
 from roboarm_nmp.envs.datasets.format import DEMO_ARRAYS, QUERY_ARRAYS, SCENE_ARRAYS
+from roboarm_nmp.envs.datasets.problems import ARRAYS as PROBLEM_ARRAYS
 from roboarm_nmp.envs.networks import operations
 from roboarm_nmp.envs.scenes.files import load_scene
 
@@ -26,6 +27,7 @@ def test_arrays_are_listed_with_their_dtypes():
     for title, arrays in (
         ("Queries", QUERY_ARRAYS | SCENE_ARRAYS),
         ("Demonstrations", DEMO_ARRAYS),
+        ("Problems", PROBLEM_ARRAYS),
     ):
         rows = re.findall(r"^\| (`.*?) \| (\w+) \((.*?)\)", section(title), re.M)
         listed = {name: row for row in rows for name in re.findall(r"`(\w+)`", row[0])}

@@ -541,11 +541,11 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("roboarm_nmp.envs.world.MAX_SAMPLING_TRIES", 5)
     png, gif = ["--output", tmp_path / "out.png"], ["--output", tmp_path / "out.gif"]
     many = len(load_queries("wall"))
-    not_a_scene = "scene files are .yaml or .yml (docs/customise/scene.md), got "
+    not_a_scene = "scene files are .yaml or .scene (docs/customise/scene.md), got "
     cases = [
         (["moon", *png], "unknown task 'moon': one of no_obstacles"),
         *((["part" + kind, *png], f"{not_a_scene}part{kind}") for kind in (".stl", ".ply", ".obj")),
-        ([tmp_path / "a.scene", *png], f"{not_a_scene}{tmp_path / 'a.scene'}"),
+        ([tmp_path / "a.txt", *png], f"{not_a_scene}{tmp_path / 'a.txt'}"),
         ([tmp_path / "empty", *png], f"{not_a_scene}{tmp_path / 'empty'}"),
         ([tmp_path / "bad.yaml", *png], "bad.yaml:2: unknown kind of obstacle bax"),
         ([tmp_path / "none.yaml", *png], "none.yaml: No such file"),

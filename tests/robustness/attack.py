@@ -7,9 +7,9 @@
 Attacks: `networks` (network files with one to three things changed at random, each in a process of
 its own), `files` (bits flipped and files cut off, of every kind that is written), `robots` (URDFs,
 their meshes and YAML files, changed likewise), `clouds` (point clouds of every format, changed
-likewise), `flags` (of every command), `environments` (arguments of environments, scenes and
-sensors, and actions), `kills` (`kill -9` at random moments of training, collecting, drawing and
-sweeping).
+likewise), `problems` (files of problems and scenes in other programs' formats, changed likewise),
+`flags` (of every command), `environments` (arguments of environments, scenes and sensors, and
+actions), `kills` (`kill -9` at random moments of training, collecting, drawing and sweeping).
 
 Each attempt depends on the seed and its number only. The last lines are a table: how many attempts
 were refused clearly, ran, or read what was there before; then, of whatever else came of attempts,
@@ -29,16 +29,29 @@ sys.path.append(str(Path(__file__).parents[1] / "helpers"))
 
 import torch
 import tyro
-from attacks import children, clouds, environments, files, flags, kills, networks, robots
+from attacks import (
+    children,
+    clouds,
+    environments,
+    files,
+    flags,
+    kills,
+    networks,
+    problems,
+    robots,
+)
 from tqdm import tqdm
 
 # How many attempts, and how many of them share a process.
 SIZES = {
-    **{"networks": 10_000, "files": 20_000, "robots": 2_000, "clouds": 10_000, "flags": 2_000},
-    **{"environments": 20_000, "kills": 50},
+    **{"networks": 10_000, "files": 20_000, "robots": 2_000, "clouds": 10_000},
+    **{"problems": 10_000, "flags": 2_000, "environments": 20_000, "kills": 50},
 }
+Name = Literal[
+    *("networks", "files", "robots", "clouds", "problems", "flags", "environments", "kills")
+]
 PER_CHILD = {
-    **{"networks": 1, "files": 200, "robots": 1, "clouds": 100, "flags": 1},
+    **{"networks": 1, "files": 200, "robots": 1, "clouds": 100, "problems": 20, "flags": 1},
     **{"environments": 100, "kills": 1},
 }
 MODULES = {
@@ -46,6 +59,7 @@ MODULES = {
     "files": files,
     "robots": robots,
     "clouds": clouds,
+    "problems": problems,
     "flags": flags,
     "environments": environments,
     "kills": kills,
@@ -55,13 +69,11 @@ GOOD = (children.REFUSED, children.RAN, files.UNCHANGED)
 
 @dataclass
 class Args:
-    only: tuple[
-        Literal["networks", "files", "robots", "clouds", "flags", "environments", "kills"], ...
-    ] = tuple(SIZES)
+    only: tuple[Name, ...] = tuple(SIZES)
     """these attacks"""
     number: int | None = None
-    """attempts of each; by default 10,000, 20,000, 2,000, 10,000, 2,000, 20,000, 50 (of four
-    kills)"""
+    """attempts of each; by default 10,000, 20,000, 2,000, 10,000, 10,000, 2,000, 20,000, 50 (of
+    four kills)"""
     seed: int = 0
     """of everything random"""
     repeat: int | None = None

@@ -6,8 +6,16 @@ import time  # noqa: F401
 import attack
 import pytest
 
-FEW = {"networks": 30, "files": 300, "robots": 30, "clouds": 400, "environments": 400}
-FEW |= {"flags": 17, "kills": 2}
+FEW = {
+    "networks": 30,
+    "files": 300,
+    "robots": 30,
+    "clouds": 400,
+    "problems": 60,
+    "environments": 400,
+    "flags": 17,
+    "kills": 2,
+}
 
 
 def check(name, number, folder, seed):
@@ -17,7 +25,7 @@ def check(name, number, folder, seed):
     return found
 
 
-@pytest.mark.parametrize("name", ("networks", "files", "robots", "clouds", "environments", "flags"))
+@pytest.mark.parametrize("name", sorted(FEW.keys() - {"kills"}))
 def test_a_few(name, tmp_path):
     found = check(name, FEW[name], tmp_path, seed=7)
     assert len(found[attack.children.REFUSED]) > FEW[name] / 3

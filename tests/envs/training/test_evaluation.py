@@ -585,7 +585,10 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
         ({"task": "moon"}, "unknown task 'moon': one of no_obstacles"),
-        ({"task": "part.stl"}, "scene files are .yaml or .yml (docs/customise/scene.md), got part"),
+        (
+            {"task": "part.stl"},
+            "scene files are .yaml or .scene (docs/customise/scene.md), got part",
+        ),
         ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),
         ({"queries": str(tmp_path / "no.h5")}, "no.h5"),
         ({"num-queries": "31"}, "num_queries must be 1 to 30, got 31"),

@@ -1,0 +1,193 @@
+"""Held joints, such as the gripper's, elsewhere: body, checks, episodes and files follow."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from roboarm_nmp.envs import RoboArmEnv
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
+from roboarm_nmp.envs.networks.exported_networks import check_robot
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.primitives import Box, Scene, scene_from_json, scene_to_json
+from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.envs.world import World
+
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+OPEN = PANDA.with_held(dict.fromkeys(FINGERS, 0.065))  # wider than the URDF's limit, 0.04
+START = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8])
+GOAL = np.array([0.6, -0.3, 0.1, -1.8, 0.1, 1.5, 0.6])
+
+
+def test_arm_as_described_is_the_same_object_and_keeps_its_fingerprint():
+    assert PANDA.with_held({}) is PANDA and OPEN.with_held(PANDA.held) is PANDA
+    assert PANDA.held == dict.fromkeys(FINGERS, 0.04)
+    assert PANDA.fingerprint.startswith("026faa3f2a77")
+    assert OPEN != PANDA and OPEN.same_arm(PANDA) and PANDA.same_arm(OPEN)
+
+
+def test_joint_that_mimics_another_one_follows_it_unless_it_is_named():
+    assert PANDA.with_held({FINGERS[0]: 0.065}) == OPEN
+    one = PANDA.with_held({FINGERS[0]: 0.03, FINGERS[1]: 0.01})
+    assert one.held == {FINGERS[0]: 0.03, FINGERS[1]: 0.01}
+
+
+@pytest.mark.parametrize("opening", [0.065, 0.0])
+def test_compiled_checks_agree_with_pybullet(opening):
+    robot, rng, free = PANDA.with_held({FINGERS[0]: opening}), np.random.default_rng(0), 0
+    for _ in range(4):
+        scene = replace(RandomBoxes(4, 8).sample(rng), robot=robot)
+        world, states = World(scene, drawn=False), rng.uniform(-1, 1, (100, 7))
+        expected = [not world.in_collision(robot.denormalise(s).tolist()) for s in states]
+        np.testing.assert_array_equal(CollisionChecker(scene).is_free(states), expected)
+        free += sum(expected)
+        world.close()
+    assert 50 < free < 350
+
+
+def test_box_beside_the_hand_collides_with_the_wider_gripper_only():
+    position, rotation = PANDA.frame_poses(START)[6]
+    # The finger opens along the hand's y axis; its tip is 0.21 m beyond joint 7.
+    side = rotation @ (np.sqrt(0.5) * np.array([1.0, 1.0, 0.0]))
+    centre = position + 0.2 * rotation[:, 2] + 0.08 * side
+    box = Box(tuple(centre.tolist()), (0.005,) * 3)
+    for robot, is_free in ((PANDA, True), (OPEN, False)):
+        scene = Scene((box,), table=None, floor=None, robot=robot)
+        world = World(scene, drawn=False)
+        assert world.in_collision(START.tolist()) != is_free
+        assert CollisionChecker(scene).is_free(robot.normalise(START)) == is_free
+        world.close()
+
+
+def test_fingers_are_held_beyond_their_limit_while_the_arm_moves():
+    world = World(Scene(robot=OPEN), drawn=False)
+    world.place(START)
+    for share in np.linspace(0, 1, 40):
+        world.command((START + share * (GOAL - START)).tolist())
+        world.simulate()
+    fingers = p.getJointStates(world.body, OPEN.held_indices, physicsClientId=world.client)
+    np.testing.assert_allclose([finger[0] for finger in fingers], 0.065, atol=5e-4)
+    world.close()
+
+
+def episode(env, scene):
+    observation, _ = env.reset_specific(START, GOAL, scene)
+    states = [observation["observation"]]
+    for _ in range(30):
+        action = PANDA.normalise(GOAL) - states[-1][:7]
+        states.append(env.step(action)[0]["observation"])
+    return np.array(states)
+
+
+def test_episode_after_a_change_of_the_gripper_is_that_of_a_new_environment():
+    narrow, wide = Scene(), Scene((Box((0.5, 0.5, 0.3), (0.1, 0.1, 0.1)),), robot=OPEN)
+    fresh, env = RoboArmEnv(wide), RoboArmEnv(narrow)
+    expected, before = episode(fresh, wide), episode(env, narrow)
+    for _ in range(2):
+        np.testing.assert_array_equal(episode(env, wide), expected)
+        assert env.robot == OPEN
+        np.testing.assert_array_equal(episode(env, narrow), before)
+    assert not np.array_equal(before, expected)
+    env.reset_specific(START, GOAL, wide)
+    other = copy.deepcopy(env)
+    assert other.robot == OPEN
+    action = np.full(7, 0.01)
+    for _ in range(5):
+        one, two = env.step(action)[0], other.step(action)[0]
+        np.testing.assert_array_equal(one["observation"], two["observation"])
+
+
+def test_scene_of_another_arm_is_rejected():
+    other = replace(PANDA, name="other")
+    env = RoboArmEnv()
+    with pytest.raises(ValueError, match="the scene's robot is 'other', not 'panda'"):
+        env.set_scene(Scene(robot=other))
+
+
+def test_network_of_the_arm_is_accepted_with_any_gripper_opening():
+    check_robot("policy.pt", {}, OPEN)
+
+
+def test_scene_files_keep_the_opening(tmp_path):
+    scene = Scene((Box((0.5, 0, 0.3), (0.1, 0.1, 0.1)),), robot=OPEN)
+    save_scene(scene, tmp_path / "a.yaml")
+    assert load_scene(tmp_path / "a.yaml") == scene
+    assert scene_from_json(scene_to_json(scene)) == scene
+    assert "held" not in scene_to_json(Scene())
+    (tmp_path / "b.yaml").write_text("held: {panda_finger_joint1: 0.065}")
+    assert load_scene(tmp_path / "b.yaml").robot == OPEN
+    (tmp_path / "c.yaml").write_text("floor: 0\nheld: {thumb: 0.065}")
+    with pytest.raises(SceneFileError, match="c.yaml:2: unknown key thumb in held"):
+        load_scene(tmp_path / "c.yaml")
+
+
+def test_query_file_of_a_scene_file_with_another_opening_is_read(tmp_path):
+    task = tmp_path / "mine.yaml"
+    save_scene(Scene(robot=OPEN), task)
+    ends = np.array([START, GOAL], np.float32)
+    splits = {"test": (ends[:1], ends[1:]), "validation": (ends[1:], ends[:1])}
+    write_queries(tmp_path / "mine_queries.h5", str(task), 0, splits, "", {})
+    assert load_queries(str(task))[0].scene.robot == OPEN
+
+
+@pytest.mark.parametrize(
+    ("positions", "reason"),
+    [
+        ({"thumb": 0.1}, "'thumb' is no held joint; those are panda_finger_joint1, panda_finger_j"),
+        ({FINGERS[0]: float("nan")}, "panda_finger_joint1 cannot be held at nan"),
+        ({FINGERS[0]: 1e9}, "panda_finger_joint1 cannot be held at 1000000000.0"),
+    ],
+)
+def test_positions_that_cannot_be_are_rejected(positions, reason):
+    with pytest.raises(ValueError, match=reason):
+        PANDA.with_held(positions)
+
+
+URDF = """<robot name="arm">
+<link name="base"/><link name="one"/><link name="two"/><link name="three"/>
+<link name="tip"><collision><origin xyz="0 0 0.1" rpy="0.1 0 0"/>
+<geometry><box size="0.02 0.03 0.1"/></geometry></collision></link>
+{}
+</robot>"""
+JOINT = (
+    '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/><axis xyz="{4}"/>'
+    '<origin xyz="0.1 0 0.2" rpy="0.2 -0.1 0.3"/>'
+    '<limit lower="-1.5" upper="1.5" effort="50" velocity="2"/></joint>'
+)
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory):
+    joints = (
+        ("turn", "revolute", "base", "one", "0 1 0"),
+        ("lift", "prismatic", "one", "two", "0 0 1"),
+        ("roll", "revolute", "two", "three", "1 1 0"),
+        ("grip", "revolute", "three", "tip", "0 1 1"),
+    )
+    path = tmp_path_factory.mktemp("held") / "arm.urdf"
+    path.write_text(URDF.format("".join(JOINT.format(*joint) for joint in joints)))
+    return path
+
+
+def test_arm_of_a_urdf_has_links_and_end_effector_as_if_described_so(urdf):
+    options = {"joints": ["turn", "lift", "roll"], "end_effector": "tip", "gain": 0.6}
+    options["end_effector_position"] = (0.0, 0.01, 0.05)
+    expected = Robot.from_urdf(urdf, fixed={"grip": 0.7}, **options)
+    moved = Robot.from_urdf(urdf, fixed={"grip": -0.2}, **options).with_held({"grip": 0.7})
+    for name in ("end_effector_position", "held_positions"):
+        np.testing.assert_allclose(getattr(moved, name), getattr(expected, name), atol=1e-12)
+    [link], [other] = moved.links, expected.links
+    for one, two in zip(link.placements[0], other.placements[0], strict=True):
+        np.testing.assert_allclose(one, two, atol=1e-12)
+
+
+def test_joint_that_carries_others_cannot_be_moved(urdf):
+    robot = Robot.from_urdf(urdf, joints=["turn", "roll"], end_effector="three", gain=0.6)
+    assert robot.with_held({"grip": 0.3}).held["grip"] == 0.3
+    with pytest.raises(ValueError, match="lift carries joints that move"):
+        robot.with_held({"lift": 0.1})

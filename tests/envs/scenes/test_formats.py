@@ -1,0 +1,119 @@
+"""Worlds in other programs' formats: obstacles where the files have them; mistakes with lines."""
+
+import numpy as np
+import pytest
+from problem_files import CUROBO, MOVEIT_SCENE, OLD_SCENE_TEXT, SCENE_TEXT, write_file
+
+from roboarm_nmp.envs import make
+from roboarm_nmp.envs.scenes.formats import load_world, multiply
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.tasks import get_task
+
+HALF = 0.7071067811865476
+# A quarter turn about z and a move of (0.5, -0.5, 0.2) put (0.1, 0, 0) at (0.5, -0.4, 0.2).
+SHELF = Box((0.5, -0.4, 0.2), (0.3, 0.04, 0.5), (0, 0, HALF, HALF))
+EXPECTED = {
+    "scene.yaml": (
+        MOVEIT_SCENE,
+        (Cylinder((0.6, 0.5, 0.07), 0.03, 0.14), SHELF, Sphere((0.5, -0.5, 0.5), 0.05)),
+    ),
+    "curobo.yml": (
+        CUROBO,
+        (Box((0.4, 0.0, -0.1), (2.0, 1.5, 0.2)), Sphere((0, 0.6, 0.5), 0.1)),
+    ),
+    "new.scene": (SCENE_TEXT, (SHELF, Cylinder((0.5, -0.5, 0.5), 0.03, 0.14, (0, 0, HALF, HALF)))),
+    "old.scene": (OLD_SCENE_TEXT, (SHELF, Sphere((0.5, -0.5, 0.5), 0.05))),
+}
+
+
+def assert_same(found, expected):
+    assert [type(one) for one in found] == [type(one) for one in expected]
+    for one, other in zip(found, expected, strict=True):
+        for name, value in vars(one).items():
+            np.testing.assert_allclose(value, getattr(other, name), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_obstacles_are_those_of_the_file(name, tmp_path):
+    content, obstacles = EXPECTED[name]
+    scene = load_world(write_file(tmp_path / name, content))
+    assert_same(scene.obstacles, obstacles)
+    assert scene.table is None and scene.floor is None
+
+
+@pytest.mark.parametrize("name", ["scene.yaml", "new.scene"])
+def test_file_can_be_a_task(name, tmp_path):
+    path = write_file(tmp_path / name, EXPECTED[name][0])
+    assert get_task(path).scene == load_world(path)
+    env = make(str(path))
+    assert env.scene == load_world(path)
+    env.close()
+
+
+def test_own_scene_files_are_worlds_too(tmp_path):
+    path = write_file(tmp_path / "own.yaml", "floor: false\ntable: false\n")
+    assert load_world(path) == Scene(table=None, floor=None)
+    with pytest.raises(ValueError, match="own.yaml:1: unknown key flor"):
+        load_world(write_file(path, "flor: false"))
+
+
+def test_product_of_quaternions_turns_one_after_the_other():
+    about_x, about_z = (HALF, 0, 0, HALF), (0, 0, HALF, HALF)
+    np.testing.assert_allclose(multiply(about_z, about_x), (0.5, 0.5, 0.5, 0.5))
+
+
+def edited(text, old, new):
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+MISTAKES = [
+    ("a.yaml", edited(MOVEIT_SCENE, "type: cylinder", "type: cone"), 15,
+     "cones are not supported"),
+    ("a.yaml", edited(MOVEIT_SCENE, "  collision_objects:", "  octomap: {id: x}\n  collision_obj"
+     "ects:"), 12, "octomaps are not supported"),
+    ("a.yaml", edited(MOVEIT_SCENE, "- id: can", "- id: can\n      meshes: [{vertices: []}]"), 14,
+     "meshes are not supported"),
+    ("a.yaml", edited(MOVEIT_SCENE, "type: cylinder", "type: torus"), 15,
+     "unknown kind of obstacle 'torus'"),
+    ("a.yaml", edited(MOVEIT_SCENE, "[0.14, 0.03]", "[0.14, -0.03]"), 16,
+     "the dimensions of a cylinder must be positive"),
+    ("a.yaml", edited(MOVEIT_SCENE, "[0.14, 0.03]", "[0.14]"), 16,
+     "the dimensions of a cylinder must be 2 numbers, got 1"),
+    ("a.yaml", edited(MOVEIT_SCENE, "position: [0.6, 0.5, 0.07]", "position: [0.6, .nan, 0.07]"),
+     18, "position of primitive_poses must be a finite number, got '.nan'"),
+    ("a.yaml", edited(MOVEIT_SCENE, "orientation: [0, 0, 0, 1]", "orientation: [0, 0, 0, 2]"), 19,
+     "a quaternion x, y, z, w must have norm 1"),
+    ("a.yaml", edited(MOVEIT_SCENE, "translation: [0, 0, 0]", "translation: [0, 1, 0]"), 5,
+     "a fixed frame's transform must be the identity"),
+    ("a.yaml", edited(MOVEIT_SCENE, "- id: can", "- id: can\n      header: {frame_id: camera}"), 14,
+     "the frame 'camera' is neither panda_link0, the base, nor world"),
+    ("a.yaml", edited(MOVEIT_SCENE, "  joint_state:", "  attached_collision_objects: [{x: 1}]\n  "
+     "joint_state:"), 7, "attached objects are not supported"),
+    ("b.yml", edited(CUROBO, "mesh: {}", "mesh: {cup: {file_path: cup.obj}}"), 7,
+     "meshes are not supported"),
+    ("b.yml", edited(CUROBO, "-0.1, 1, 0, 0, 0]", "-0.1, 1, 0, 0]"), 4,
+     "pose of cuboid table must be 7 numbers, got 6"),
+    ("c.scene", edited(SCENE_TEXT, "cylinder", "cone"), 11, "cones are not supported"),
+    ("c.scene", edited(SCENE_TEXT, "0.3 0.04 0.5", "0.3 0.04"), 7,
+     "the dimensions of a box must be 3 numbers, got 2"),
+    ("c.scene", edited(SCENE_TEXT, "\n.\n", "\n"), 19, "the file ends before the last line, a dot"),
+    ("c.scene", edited(SCENE_TEXT, "\n2\n", "\n99999999999999\n"), 5,
+     "the number of shapes must be a whole number"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "content", "line", "reason"), MISTAKES)
+def test_mistake_is_rejected_with_its_line(name, content, line, reason, tmp_path):
+    path = write_file(tmp_path / name, content)
+    with pytest.raises(ValueError) as caught:
+        load_world(path)
+    assert str(caught.value).startswith(f"{path}:{line}: {reason}")
+
+
+def test_yaml_of_a_world_may_have_aliases_but_no_endless_ones(tmp_path):
+    text = "cuboid:\n  a: &a {dims: [1, 1, 1], pose: &p [0, 0, 5, 1, 0, 0, 0]}\n  b: *a\n"
+    assert len(load_world(write_file(tmp_path / "a.yaml", text)).obstacles) == 2
+    text = "cuboid: &a\n  b: *a\n"
+    with pytest.raises(ValueError, match=r"a.yaml:1: cuboid b lacks pose"):
+        load_world(write_file(tmp_path / "a.yaml", text))
