@@ -48,7 +48,7 @@ SIZES = {
     **{"problems": 10_000, "flags": 2_000, "environments": 20_000, "kills": 50},
 }
 Name = Literal[
-    *("networks", "files", "robots", "clouds", "problems", "flags", "environments", "kills")
+    "networks", "files", "robots", "clouds", "problems", "flags", "environments", "kills"
 ]
 PER_CHILD = {
     **{"networks": 1, "files": 200, "robots": 1, "clouds": 100, "problems": 20, "flags": 1},
