@@ -113,9 +113,9 @@ class Args:
     default the filter that the policy includes, if any"""
     escape: bool = True
     """the safety filter escapes local minima, in a random direction"""
-    approach: bool | None = None
-    """approach paths out of starts and into goals in tight places, where the filter's margin does
-    not hold (docs/guide/safety_filter.md); by default as the policy's filter, otherwise not"""
+    approach: bool = False
+    """add approach paths to the safety filter: out of starts, and into goals, that are nearer to
+    obstacles than its margin (docs/guide/safety_filter.md)"""
     seed: Seed = 0
     """of random numbers: `random`, `via-points`, `planner`, escapes"""
     tries: PositiveInt = TRIES
@@ -169,16 +169,15 @@ def _safety_filter(args):
     from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 
     if args.safety_margin is not None:
-        options = args.safety_margin, args.escape, bool(args.approach)
+        options = args.safety_margin, args.escape, args.approach
         return SafetyFilter(*options) if args.safety_margin else False
-    if args.escape and args.approach is None:
+    if args.escape and not args.approach:
         return None
     own = own_safety_filter(find_policy(args.policy)[0])
     if own is None:
         flag = "--approach" if args.escape else "--no-escape"
         raise ValueError(f"{flag}: the policy has no safety filter; --safety-margin adds one")
-    approach = own.approach if args.approach is None else args.approach
-    return replace(own, escape=args.escape and own.escape, approach=approach)
+    return replace(own, escape=own.escape and args.escape, approach=own.approach or args.approach)
 
 
 def _settings(result):

@@ -14,9 +14,9 @@ PyTorch's default dtype and default device change nothing: networks compute in f
 device that they were loaded for.
 
 A **policy** of an arm with n joints is a network from `observation` (N, n + 3 or more),
-`achieved_goal` and `desired_goal` (N, 3, n or n + 3), float32 as `RoboArmEnv` returns them, to the
-deterministic action (N, n), float32 in [-1, 1]. Other keys of the observation may be inputs, too.
-The metadata of a policy hold
+`achieved_goal` and `desired_goal` (N, 3, n, n + 3 or 7), float32 as `RoboArmEnv` returns them, to
+the deterministic action (N, n), float32 in [-1, 1]. Other keys of the observation may be inputs,
+too. The metadata of a policy hold
 
 - `kind`: "policy";
 - `task`: name of the task it was trained on;

@@ -22,6 +22,6 @@ def test_command_line_page_is_up_to_date():
 def test_table_shows_defaults_choices_and_positional_arguments():
     text = make_page().page()
     assert "| `--num-modes` | `1` | Gaussians of the policy's mixture;" in text
-    assert "| `--goal-type` | `combined` | `config`, `combined`: what the goal is:" in text
+    assert "| `--goal-type` | `combined` | `config`, `combined`, `pose`: what the goal is:" in text
     assert "| `--stop-on-collision` | `no` | end an episode at the first contact |" in text
     assert "| `TASK` |  | The task's name" in text

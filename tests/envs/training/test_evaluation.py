@@ -581,6 +581,7 @@ def test_errors_of_the_command_are_one_line_before_any_work(
             "margin must be in [0, 0.15) m, got 0.15",
         ),
         ({"policy": policy, "no-escape": None}, "--no-escape: the policy has no safety filter"),
+        ({"policy": policy, "approach": None}, "--approach: the policy has no safety filter"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
