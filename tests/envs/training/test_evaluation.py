@@ -318,6 +318,15 @@ def test_no_escape_changes_the_filter_that_a_policy_includes(tmp_path):
     assert result["safety_filter"] == {"margin": 0.01, "escape": False, "version": VERSION}
 
 
+def test_approach_adds_paths_to_the_filter_that_a_policy_includes(tmp_path, capsys):
+    arguments = ["--policy", POLICY, "--task", "wall", "--num-queries", "1", "--approach"]
+    assert command.main([*arguments, "--json", str(tmp_path / "result.json")]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    kept = {"margin": 0.01, "escape": True, "approach": True, "version": VERSION}
+    assert result["safety_filter"] == kept
+    assert "escapes local minima, approach paths" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("source", [None, "point_cloud"])
 def test_safety_filter_around_a_network_without_link_distances(tmp_path, source):
     path = _save(tmp_path / "policy.pt")
