@@ -37,7 +37,8 @@ LIMIT_TOLERANCE = 0.01
 """rad: the simulated arm of an episode exceeds its limits by up to this; it is clipped."""
 CHECK_RESOLUTION = RESOLUTION / 4  # of collision checks; the planner's own checks are coarser
 SAME = 1e-6  # rad: waypoints nearer than that are one
-STRAIGHT = 1e-5  # rad: waypoints that the line between their neighbours misses by less are left out
+STRAIGHT = 1e-4  # rad: waypoints that the line between their neighbours misses by less are left out
+SHORTEST = 1e-3  # rad: shorter lines between two rounded corners have no cell of their own
 SHARPEST = 2 * math.sin(math.radians(75))  # change of direction; at sharper corners the arm stops
 SHRINK, LEAST = 1 / 4, 1 / 20  # of a rounding that collides; a smaller one is none
 LINE_CELL, LEAST_CELLS = 0.05, 4  # of TOPP-RA's grid: longest cell (rad), cells of a piece at least
@@ -204,7 +205,7 @@ class Polyline:
         for segment, direction in enumerate(self.directions):
             last = segment == len(self.directions) - 1
             corner, width = self.lengths[segment + 1], 0.0 if last else half_widths[segment]
-            if corner - width - at > SAME or (width == 0.0 and not pieces):
+            if corner - width - at > SHORTEST or not (pieces and width):
                 pieces.append((at, corner - width, direction, direction, 0.0 * direction))
             if width > 0:
                 after = self.directions[segment + 1]
@@ -241,20 +242,26 @@ def _without_collinear(path):
 
 
 class _Grid:
-    """The pieces of a section on a grid, as toppra asks for a path."""
+    """The pieces of a section on a grid, as toppra asks for a path.
+
+    s is counted from the start of the section, whose length is 1.
+    """
 
     def __init__(self, pieces, cell):
         s, first, second = [], [], []
         for start, end, before, after, bend in pieces:
-            share = np.linspace(0.0, 1.0, max(LEAST_CELLS, math.ceil((end - start) / cell)) + 1)
+            cells = max(LEAST_CELLS, math.ceil((end - start) / cell))
+            share = np.linspace(0.0, 1.0, cells + 1)
             if s:  # second derivatives jump between pieces: a tiny cell, with one on each side
-                share[0] = 1e-3 * share[1]
+                share[0] = 0.05 * share[1]
             s.append(start + share * (end - start))
             first.append(before + share[:, None] * (after - before))
             second.append(np.broadcast_to(bend, first[-1].shape))
-        self.s = np.concatenate(s)
-        self._derivatives = None, np.concatenate(first), np.concatenate(second)
-        self.path_interval = np.array([self.s[0], self.s[-1]])
+        s = np.concatenate(s)
+        self.length = s[-1] - s[0]
+        self.s = (s - s[0]) / self.length
+        self._derivatives = None, np.concatenate(first), self.length * np.concatenate(second)
+        self.path_interval = np.array([0.0, 1.0])
         self.dof = len(before)
 
     def __call__(self, s, order=0):
@@ -263,8 +270,9 @@ class _Grid:
 
 
 def fastest(pieces, velocity, acceleration, cell=LINE_CELL):
-    """TOPP-RA's profile of a section: s (m,), and times (m,), s, from 0 on; the arm rests at both
-    ends. Between two of them, the second derivative of s is constant.
+    """TOPP-RA's profile of a section: s (m,), its derivative by time (m,), times (m,), s, from 0 on.
+
+    The arm rests at both ends. Between two points, the second derivative of s is constant.
     """
     try:
         import toppra
@@ -277,16 +285,20 @@ def fastest(pieces, velocity, acceleration, cell=LINE_CELL):
         ) from error
     toppra.setup_logging("ERROR")
     grid = _Grid(pieces, cell)
+    # Its tolerances are absolute: lengths are in units of the section's, and times so that
+    # accelerations stay what they are.
+    unit = math.sqrt(grid.length)
     constraints = [
-        JointVelocityConstraint(np.stack([-velocity, velocity], axis=1)),
+        JointVelocityConstraint(np.stack([-velocity, velocity], axis=1) / unit),
         JointAccelerationConstraint(np.stack([-acceleration, acceleration], axis=1)),
     ]
     problem = TOPPRA(constraints, grid, gridpoints=grid.s, solver_wrapper="seidel")
     _, speeds, _ = problem.compute_parameterization(0.0, 0.0)
     if speeds is None or not np.isfinite(speeds).all():
         raise ValueError("TOPP-RA finds no parameterisation: the path has motions that are tiny")
-    durations = 2 * np.diff(grid.s) / (speeds[:-1] + speeds[1:])
-    return grid.s, speeds, np.concatenate([[0.0], np.cumsum(durations)])
+    durations = unit * 2 * np.diff(grid.s) / (speeds[:-1] + speeds[1:])
+    s = pieces[0][0] + grid.length * grid.s
+    return s, unit * speeds, np.concatenate([[0.0], np.cumsum(durations)])
 
 
 def _controls(polyline, half_widths, bounds, step):
@@ -302,8 +314,8 @@ def _controls(polyline, half_widths, bounds, step):
             samples = max(1, math.ceil(times[-1] * stretch / step))
             if samples > MAX_SAMPLES:
                 raise ValueError(f"the trajectory has more than {MAX_SAMPLES:,} samples")
-            at.append(_s_at(np.linspace(0.0, times[-1], samples + 1), s, speeds, times))
-            at.append(np.full(width, s[-1]))  # so the spline is at rest, and where it should be
+            at.append(_s_at(np.linspace(0.0, times[-1], samples + 1)[:-1], s, speeds, times))
+            at.append(np.full(width + 1, s[-1]))  # so the spline is at rest exactly there
         at.append(at[-1][-1:])
         at = np.concatenate(at)
         controls = polyline.positions(at, half_widths)
