@@ -270,9 +270,10 @@ class _Grid:
 
 
 def fastest(pieces, velocity, acceleration, cell=LINE_CELL):
-    """TOPP-RA's profile of a section: s (m,), its derivative by time (m,), times (m,), s, from 0 on.
+    """TOPP-RA's profile of a section: s (m,), its derivative by time (m,), and times (m,), s.
 
-    The arm rests at both ends. Between two points, the second derivative of s is constant.
+    The times begin with 0. The arm rests at both ends. Between two points, the second derivative
+    of s is constant.
     """
     try:
         import toppra
@@ -280,8 +281,7 @@ def fastest(pieces, velocity, acceleration, cell=LINE_CELL):
         from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
     except ImportError as error:
         raise MissingToppraError(
-            "time parameterisation needs toppra: pip install 'roboarm-nmp[trajectories]' "
-            f"({error})"
+            f"time parameterisation needs toppra: pip install 'roboarm-nmp[trajectories]' ({error})"
         ) from error
     toppra.setup_logging("ERROR")
     grid = _Grid(pieces, cell)

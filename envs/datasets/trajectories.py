@@ -19,8 +19,8 @@ The ending names the format, for an arm with n joints:
   of an episode also `states` (m, n), normalised, `actions` (m - 1, n), `contacts` and
   `policy_seconds` (m - 1,), and `success`.
 - `.json`: the arrays of `.npz` as lists, and `robot` and `joint_names`.
-- `.yaml`: ROS's message `trajectory_msgs/JointTrajectory`, with times rounded to 1 ns. Other columns
-  of an episode are not in it.
+- `.yaml`: ROS's message `trajectory_msgs/JointTrajectory`, with times rounded to 1 ns. The other
+  columns of an episode are not in it.
 
 Only joint angles have to be there. Other columns and arrays do not matter. `.json` and `.yaml` name
 their joints, which are read in any order; the other formats do not.
@@ -106,6 +106,13 @@ class JointTrajectory:
         before = self.velocities[i] * span - (there - here)
         after = self.velocities[i + 1] * span - (there - here)
         return straight + share * (1 - share) * ((1 - share) * before - share * after)
+
+    def frames(self):
+        """Positions (k, n), rad, every `STEP_SECONDS`, to show; the last one is the end."""
+        steps = max(1, round(self.duration / STEP_SECONDS))
+        positions = self.at(self.times[0] + np.arange(steps + 1) * STEP_SECONDS)
+        positions[-1] = self.positions[-1]
+        return positions
 
 
 def check_ending(path):
