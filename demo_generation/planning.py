@@ -193,9 +193,10 @@ class Planner:
         max_checks: collision checks for one plan; None for no limit. Unlike a time limit, it ends
             a search at the same point on every machine. Asymptotically optimal planners use all of
             their limit; FMT and BFMT need about 100,000 checks.
+        limits: "urdf" or "datasheet": the position limits inside which OMPL's planners plan.
 
     Raises:
-        ValueError: unknown planner, or a number out of range.
+        ValueError: unknown planner or limits, or a number out of range.
     """
 
     def __init__(
@@ -207,6 +208,7 @@ class Planner:
         simplify=1,
         geometry_source=CollisionChecker,
         max_checks=None,
+        limits="urdf",
     ):
         if not callable(planner) and planner not in PLANNERS:
             raise ValueError(f"unknown planner {planner!r}: {suggest(planner, PLANNERS)}")
@@ -218,6 +220,10 @@ class Planner:
             raise ValueError(f"simplify must be a number of rounds, got {simplify!r}")
         if max_checks is not None and not max_checks > 0:
             raise ValueError(f"max_checks must be positive or None, got {max_checks!r}")
+        self.limits, self._bounds = limits, ()  # the URDF's are -1 and 1, without rounding
+        bounds = env.robot.position_limits(limits)
+        if limits != "urdf":
+            self._bounds = tuple(np.clip(env.robot.normalise(bounds), -1.0, 1.0))
         self.env, self.planner, self.clearance = env, planner, clearance
         self.planner_range, self.simplify = planner_range, simplify
         self.max_checks, self._geometry_source = max_checks, geometry_source
@@ -238,7 +244,7 @@ class Planner:
         path is returned.
 
         Args:
-            start, goal: joint angles (n, rad).
+            start, goal: joint angles (n, rad), inside the `limits`.
             scene: a `Scene` to change the environment to first.
             seed: int >= 0 or a sequence of such ints, as for `np.random.default_rng`.
             time_limit: seconds for all searches; `math.inf` for no limit. The plan may take a
@@ -261,6 +267,9 @@ class Planner:
         # Bad queries are rejected here, as an episode would reject them.
         self.env.reset_specific(start, goal, scene)
         start, goal = (np.asarray(end, dtype=np.float32) for end in (start, goal))
+        for name, end in (("start", start), ("goal", goal)):
+            if self._bounds and not self.env.robot.is_within(end, self.limits):
+                raise ValueError(f"{name} is outside the {self.limits} position limits: {end}")
         self.checks, best = 0, None
         for _ in range(SEARCHES):
             path = self._search(start, goal, int(rng.integers(1, 2**32)), deadline)
@@ -327,7 +336,7 @@ class Planner:
 
     def _space(self, is_valid):
         """OMPL's `SpaceInformation`, which asks `is_valid`."""
-        space = normalised_space(self.env.robot.num_joints)
+        space = normalised_space(self.env.robot.num_joints, *self._bounds)
         information = ob.SpaceInformation(space)
         information.setStateValidityChecker(_States(information, is_valid))
         information.setMotionValidator(_Motions(information, is_valid))
@@ -352,12 +361,16 @@ class Planner:
             length *= 2
 
 
-def normalised_space(num_joints):
-    """OMPL's view of the normalised configuration space."""
+def normalised_space(num_joints, lower=None, upper=None):
+    """OMPL's view of the normalised configuration space, or of a box (n,), (n,) in it."""
     space = ob.RealVectorStateSpace(num_joints)
     bounds = ob.RealVectorBounds(num_joints)
     bounds.setLow(-1.0)
     bounds.setHigh(1.0)
+    if lower is not None:
+        for joint in range(num_joints):
+            bounds.setLow(joint, float(lower[joint]))
+            bounds.setHigh(joint, float(upper[joint]))
     space.setBounds(bounds)
     return space
 

@@ -210,6 +210,11 @@ class Robot:
             raise ValueError(f"{self.name} has no position limits of a datasheet")
         return self.datasheet_lower, self.datasheet_upper
 
+    def is_within(self, configuration, limits="urdf"):
+        """Whether joint angles (..., n) are inside the `position_limits`: bool (...)."""
+        lower, upper = self.position_limits(limits)
+        return ((configuration >= lower) & (configuration <= upper)).all(-1)
+
     @property
     def collision_links(self):
         """PyBullet's indices of the moving links that may collide: the rows of link distances."""

@@ -358,7 +358,7 @@ def test_camera_flag_takes_a_name_or_three_numbers(tmp_path):
 def test_saved_trajectory_plays_as_the_episode(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 4)
     monkeypatch.delenv("DISPLAY", raising=False)
-    for ending in (".csv", ".npz"):
+    for ending in (".csv", ".npz", ".yaml"):
         file = tmp_path / f"episode{ending}"
         arguments = ["--query", 2, "--save-trajectory", file]
         assert run("wall", *arguments, "--output", tmp_path / "a.gif", *SIZE) == 0
