@@ -35,7 +35,8 @@ DEFAULT_VELOCITY, DEFAULT_ACCELERATION = 1.0, 1.0
 """rad/s and rad/s^2 (or m), of joints without limits, as in MoveIt."""
 LIMIT_TOLERANCE = 0.01
 """rad: the simulated arm of an episode exceeds its limits by up to this; it is clipped."""
-CHECK_RESOLUTION = RESOLUTION / 4  # of collision checks; the planner's own checks are coarser
+CHECK_RESOLUTION = RESOLUTION / 16  # of collision checks; the planner's own checks are coarser
+GRAZE = 0.001  # m: an additional margin, where the path has it, for what is between two checks
 SAME = 1e-6  # rad: waypoints nearer than that are one
 STRAIGHT = 1e-4  # rad: waypoints that the line between their neighbours misses by less are left out
 SHORTEST = 1e-3  # rad: shorter lines between two rounded corners have no cell of their own
@@ -95,14 +96,26 @@ def time_parameterise(
     )
     polyline = Polyline(path)
     if len(polyline.points) == 1:
+        state = np.clip(robot.normalise(path[0]), -1.0, 1.0)
+        if checker is not None and not checker.is_free(state, margin=margin):
+            raise ValueError("the path itself collides: it is one configuration")
         return _spline(np.repeat(polyline.points, 4, axis=0), step, robot, path)
     half_widths = polyline.half_widths(deviation)
+    if checker is None:
+        return _spline(_controls(polyline, half_widths, bounds, step)[0], step, robot, path)
+    try:
+        free = margin + GRAZE
+        return _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, free)
+    except ValueError:  # the path itself is nearer than that
+        return _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, margin)
+
+
+def _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, margin):
+    """A `JointTrajectory` whose corners are rounded by `half_widths` at most, with a margin."""
     least = LEAST * half_widths
     while True:
         controls, at = _controls(polyline, half_widths, bounds, step)
         trajectory = _spline(controls, step, robot, path)
-        if checker is None:
-            return trajectory
         states = np.clip(robot.normalise(trajectory.positions), -1.0, 1.0)
         options = {"margin": margin, "resolution": CHECK_RESOLUTION}
         free = checker.is_motion_free(states[:-1], states[1:], **options)
@@ -115,10 +128,9 @@ def time_parameterise(
         near = (corner + half_widths >= first[:, None]) & (corner - half_widths <= last[:, None])
         near = (near & (half_widths > 0)).any(0)
         if not near.any():
-            segment = min(np.searchsorted(polyline.lengths, first[0], side="right"), len(path) - 1)
             raise ValueError(
-                f"the path itself collides, {first[0]:.3f} rad after its start (between its "
-                f"corners {segment - 1} and {segment})"
+                f"the path itself collides, {first[0]:.3f} rad (L2) after its start, of "
+                f"{polyline.lengths[-1]:.3f}"
             )
         half_widths = np.where(near, SHRINK * half_widths, half_widths)
         half_widths[half_widths < least] = 0.0

@@ -151,6 +151,8 @@ def test_path_that_collides_itself_is_rejected():
     scene = Scene((Box(tuple(middle), (0.1,) * 3),), table=None, floor=None)
     with pytest.raises(ValueError, match="the path itself collides"):
         time_parameterise(path, PANDA, checker=CollisionChecker(scene))
+    with pytest.raises(ValueError, match="the path itself collides"):
+        time_parameterise([moved(q1=0.5)], PANDA, checker=CollisionChecker(scene))
 
 
 def test_path_outside_the_datasheet_limits_is_rejected_only_for_them():
