@@ -30,6 +30,7 @@ import csv
 import io
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,6 +48,9 @@ STEP_SECONDS = SUBSTEPS * TIME_STEP
 ENDINGS = (".csv", ".npz", ".json", ".yaml")
 LIMIT_TOLERANCE = 0.1  # rad. The simulated arm may exceed its limits a little; degrees exceed them.
 MAX_TEXT = {".csv": 100_000_000, ".json": 100_000_000, ".yaml": 10_000_000}  # bytes
+# What readers raise for a file that is damaged, or of another kind.
+DAMAGE = (ValueError, ArithmeticError, RecursionError, EOFError, NotImplementedError, MemoryError)
+DAMAGE += (csv.Error, zipfile.BadZipFile, zlib.error)
 # A loader in C is ten times as fast, where PyYAML has it.
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -213,8 +217,8 @@ def load_trajectory(path, robot):
         times, configurations, *others = _READERS[Path(path).suffix.lower()](path, robot)
     except OSError as error:
         raise DatasetError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, OverflowError, RecursionError, zipfile.BadZipFile) as error:
-        reason = str(error).replace("\n", " ")
+    except DAMAGE as error:
+        reason = str(error).replace("\n", " ") or "it is damaged"
         raise DatasetError(f"{path}: not a joint path: {reason}") from error
     if configurations.shape[1:] != (joints,) or not len(configurations):
         raise DatasetError(

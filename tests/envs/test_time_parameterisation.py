@@ -1,12 +1,16 @@
 """Trajectories keep their limits at every time, stay near their path, and avoid collisions."""
 
+import math
 import sys
 
 import numpy as np
 import pytest
 
+import roboarm_nmp
+from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.envs import retime
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.datasets.trajectories import load_trajectory, save_joint_path
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
@@ -143,6 +147,17 @@ def test_corner_whose_rounding_collides_is_rounded_less():
     assert free.duration < trajectory.duration < stop.duration
     again = time_parameterise(path, PANDA, deviation=0.3, checker=checker)
     np.testing.assert_array_equal(trajectory.positions, again.positions)
+
+
+def test_trajectory_does_not_graze_an_obstacle_between_two_checks():
+    query = load_queries("random_boxes_hard", "validation")[49]
+    env = roboarm_nmp.make("random_boxes_hard")
+    path = Planner(env).plan(*query, seed=649, time_limit=math.inf)
+    checker = CollisionChecker(query.scene)
+    trajectory = time_parameterise(path, PANDA, checker=checker)
+    fine = trajectory.at(np.arange(0, trajectory.duration, 0.001))
+    assert checker.is_free(np.clip(PANDA.normalise(fine), -1, 1)).all()
+    env.close()
 
 
 def test_path_that_collides_itself_is_rejected():
