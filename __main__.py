@@ -28,6 +28,7 @@ COMMANDS = {
     "show": ("envs.show", "window, image or animation of a task and of a policy"),
     "view": ("envs.viewer.app", "policies in the browser; move goal and obstacles"),
     "demo": ("envs.viewer.demo", "a pretrained policy in the browser, without arguments"),
+    "retime": ("envs.retime", "make an executable trajectory of a joint path"),
     "sweep": ("clean_rl_scripts.sweep", "search a trainer's flags with Optuna"),
     "plan": ("demo_generation.plan", "plan a motion among points or in a scene"),
     "import": ("envs.import_problems", "import problems from other programs' files"),

@@ -43,6 +43,9 @@ Metrics:
 - steps, path length, smoothness: means over the successful episodes. With configurations
   c_0 ... c_T in rad, the path length is the sum of |c_t+1 - c_t|, in rad, and the smoothness the
   mean of |c_t+1 - 2 c_t + c_t-1|, in rad per step^2 (L2 norms; lower is smoother);
+- end effector's path, in m, duration of the motion, in s, and mean jerk, in rad/s^3: likewise. The
+  JSON has more (`envs.metrics`): rotation of the end effector, largest jerk, SPARC;
+- clearance, with `--clearance`: the episode's smallest distance from an obstacle, in m, likewise;
 - time per action: of the policy alone, without the simulator and without planning.
 
 Also of `via-points` and `planner`:
@@ -122,6 +125,8 @@ class Args:
     """random configurations that `via-points` tries per query"""
     time_limit: PositiveFloat = TIME_LIMIT
     """seconds that `planner` may search per query"""
+    clearance: bool = False
+    """also measure each successful episode's smallest distance from the ground-truth obstacles"""
     json: Path | None = None
     """write the results to this file too"""
     image: Path | None = None
@@ -235,8 +240,13 @@ def _table(result):
         row("mean steps", result["mean_steps"], "of successful episodes"),
         row("path length", result["path_length"], "rad"),
         row("smoothness", result["smoothness"], "rad/step^2"),
-        row("time per action", result["ms_per_action"], "ms"),
+        row("end effector's path", result["ee_path_length"], "m"),
+        row("duration", result["duration"], "s"),
+        row("mean jerk", result["mean_jerk"], "rad/s^3"),
     ]
+    if result["min_clearance"] is not None:
+        lines.append(row("smallest clearance", result["min_clearance"], "m"))
+    lines.append(row("time per action", result["ms_per_action"], "ms"))
     if result["planning_seconds"] is not None:
         lines += [
             row("planning time", result["planning_seconds"], "s"),

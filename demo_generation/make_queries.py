@@ -13,6 +13,9 @@ With `--goal-region`, the end effector of every goal is in a box. The goals are 
 configurations as always, of which those elsewhere are left out. In scenes that vary, the box must
 have room in every scene.
 
+With `--limits datasheet`, starts and goals are inside the position limits of the arm's datasheet,
+where these are narrower than the URDF's. Others are left out. Plans of `--solvable` stay inside.
+
 Where scenes vary, `--queries-per-scene` queries in a row share a scene, which makes smaller files.
 
 Query i of a split depends only on the seed, the split and i, so the file is the same on every
@@ -25,7 +28,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -74,6 +77,8 @@ class Args:
     goal_region: Region = ()
     """Box (m) for the goals' end-effector positions, in the world's frame: its origin is the arm's
     base, x points to the front, y to the left, z up. By default they are anywhere."""
+    limits: Literal["urdf", "datasheet"] = "urdf"
+    """Position limits of starts and goals: the URDF's, or those of the arm's datasheet."""
     seed: Seed = 0
     """Seed of the queries. (The files of this project have seed 0.)"""
     num_test: PositiveInt = 10_000
@@ -95,18 +100,19 @@ class Args:
 class Sampler:
     """Samples queries of a task; a job is (seed, split, number)."""
 
-    def __init__(self, task, solvable, queries_per_scene=1, goal_region=None):
+    def __init__(self, task, solvable, queries_per_scene=1, goal_region=None, limits="urdf"):
         self.queries_per_scene, self.goal_region = queries_per_scene, goal_region
-        self.env = envs.make(task)
+        self.env, self.limits = envs.make(task), limits
         self.planner = None
         if solvable:
-            self.planner = Planner(self.env, max_checks=SOLVE_CHECKS)
+            self.planner = Planner(self.env, max_checks=SOLVE_CHECKS, limits=limits)
 
     def __call__(self, job):
         """Query `number` of a split, as a JSON-ready dict.
 
         Its `rejected` counts the samples that the simulated arm does not hold for long enough
-        (`unheld`) and those that the planner does not solve (`unsolved`).
+        (`unheld`), those that the planner does not solve (`unsolved`), and those outside the limits
+        of a datasheet (`outside`).
         """
         seed, split, number = job
         scene = [seed, STREAMS[split], number // self.queries_per_scene]
@@ -115,7 +121,10 @@ class Sampler:
         rejected = Counter()
         for _ in range(MAX_QUERIES):
             start, goal = self._sample_query(rng)
-            if not all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal)):
+            ends, robot = np.array([start, goal]), self.env.robot
+            if self.limits != "urdf" and not robot.is_within(ends, self.limits).all():
+                rejected["outside"] += 1
+            elif not all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal)):
                 rejected["unheld"] += 1
             elif self.planner and not demonstrate(self.planner, start, goal, rng, SOLVE_ATTEMPTS):
                 rejected["unsolved"] += 1
@@ -166,6 +175,7 @@ def make_queries(
     num_workers=1,
     progress=True,
     goal_region=None,
+    limits="urdf",
 ):
     """Sample the queries of a task and write its file.
 
@@ -181,9 +191,10 @@ def make_queries(
         progress: show a progress bar.
         goal_region: (xmin, xmax, ymin, ymax, zmin, zmax), m, of the goals' end-effector positions
             in the world's frame; None for anywhere.
+        limits: "urdf" or "datasheet", of starts and goals.
 
     Returns:
-        A Counter of the samples rejected: `unheld`, `unsolved`.
+        A Counter of the samples rejected: `unheld`, `unsolved`, `outside`.
 
     Raises:
         ValueError: unknown task; the journal belongs to other queries, or is in use.
@@ -198,6 +209,8 @@ def make_queries(
     options = {"task": str(task), "seed": seed, "solvable": solvable}
     options |= {"queries_per_scene": queries_per_scene}
     options["goal_region"] = None if goal_region is None else list(goal_region)
+    if limits != "urdf":
+        options["limits"] = limits
     with contextlib.closing(Journal(journal_of(path), options)) as journal:
         jobs = [(seed, "test", number) for number in range(num_test)]
         jobs += [(seed, "validation", number) for number in range(num_validation)]
@@ -209,7 +222,7 @@ def make_queries(
             unit="query",
             disable=not progress,
         )
-        arguments = (task, solvable, queries_per_scene, goal_region)
+        arguments = (task, solvable, queries_per_scene, goal_region, limits)
         results = workers.run(Sampler, arguments, missing, num_workers, warn=write_line)
         with bar, contextlib.closing(results):
             for query in results:
@@ -239,6 +252,8 @@ def make_queries(
             parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
         if goal_region is not None:
             parameters["goal_region"] = list(goal_region)
+        if limits != "urdf":
+            parameters |= {"limits": limits, "outside": rejected["outside"]}
         made_by = f"roboarm queries --task {task} --seed {seed} "
         made_by += f"--num-test {num_test} --num-validation {num_validation}"
         made_by += " --solvable" * solvable
@@ -246,6 +261,8 @@ def make_queries(
             made_by += f" --queries-per-scene {queries_per_scene}"
         if goal_region is not None:
             made_by += f" --goal-region {' '.join(map(str, goal_region))}"
+        if limits != "urdf":
+            made_by += f" --limits {limits}"
         if original is not None:
             made_by += f" --original {Path(original).name}"
         write_queries(path, task, seed, splits, made_by, parameters)
@@ -289,6 +306,7 @@ def _check(args):
             )
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
+        envs.get_task(task).base_scene.robot.position_limits(args.limits)  # or it raises
         query_path(task)  # rejects an unknown task, also with --output
         check_writable(path)
         if path.exists() and not args.overwrite:
@@ -314,6 +332,7 @@ def main(args):
                 args.original,
                 args.workers,
                 goal_region=args.goal_region or None,
+                limits=args.limits,
             )
             text = f"{path}: written; {rejected['unheld']} samples rejected by the long hold check"
             if args.solvable:

@@ -201,9 +201,10 @@ class Planner:
         max_checks: collision checks for one plan; None for no limit. Unlike a time limit, it ends
             a search at the same point on every machine. Asymptotically optimal planners use all of
             their limit; FMT and BFMT need about 100,000 checks.
+        limits: "urdf" or "datasheet": the position limits inside which OMPL's planners plan.
 
     Raises:
-        ValueError: unknown planner, or a number out of range.
+        ValueError: unknown planner or limits, or a number out of range.
     """
 
     def __init__(
@@ -215,6 +216,7 @@ class Planner:
         simplify=1,
         geometry_source=CollisionChecker,
         max_checks=None,
+        limits="urdf",
     ):
         if not callable(planner) and planner not in PLANNERS:
             raise ValueError(f"unknown planner {planner!r}: {suggest(planner, PLANNERS)}")
@@ -226,6 +228,10 @@ class Planner:
             raise ValueError(f"simplify must be a number of rounds, got {simplify!r}")
         if max_checks is not None and not max_checks > 0:
             raise ValueError(f"max_checks must be positive or None, got {max_checks!r}")
+        self.limits, self._bounds = limits, ()  # the URDF's are -1 and 1, without rounding
+        bounds = env.robot.position_limits(limits)
+        if limits != "urdf":
+            self._bounds = tuple(np.clip(env.robot.normalise(bounds), -1.0, 1.0))
         self.env, self.planner, self.clearance = env, planner, clearance
         self.planner_range, self.simplify = planner_range, simplify
         self.max_checks, self._geometry_source = max_checks, geometry_source
@@ -250,9 +256,9 @@ class Planner:
         configurations from inverse kinematics.
 
         Args:
-            start: joint angles (n, rad).
-            goal: joint angles (n, rad), or a set of goals (m, n), of which those in collision, or
-                outside the limits, are ignored.
+            start: joint angles (n, rad), inside the `limits`.
+            goal: joint angles (n, rad), inside the `limits`, or a set of goals (m, n), of which
+                those in collision, or outside the limits, are ignored.
             scene: a `Scene` to change the environment to first.
             seed: int >= 0 or a sequence of such ints, as for `np.random.default_rng`.
             time_limit: seconds for all searches; `math.inf` for no limit. The plan may take a
@@ -291,6 +297,7 @@ class Planner:
                 goals = self._goals_of_pose(start, goal_pose, seed)
             else:
                 goals = self._free_goals(start, goal)
+        goals = self._goals_within_limits(start, goals)
         deadline = time.monotonic() + time_limit
         self.checks, best = 0, None
         for _ in range(SEARCHES):
@@ -323,6 +330,16 @@ class Planner:
             raise ValueError(f"none of the {len(goals)} goals is possible: {problem}")
         distances = np.linalg.norm(normalise(free) - normalise(start), axis=1)
         return np.array(free)[np.argsort(distances, kind="stable")]
+
+    def _goals_within_limits(self, start, goals):
+        """Those of the goals (m, n) that are inside the `limits`, as the start has to be."""
+        if not self._bounds:
+            return goals
+        for name, ends in (("start", [start]), ("goal", goals)):
+            inside = [end for end in ends if self.env.robot.is_within(end, self.limits)]
+            if not inside:
+                raise ValueError(f"{name} is outside the {self.limits} position limits: {ends[0]}")
+        return np.array(inside)
 
     def _goals_of_pose(self, start, pose, seed):
         """Free configurations with a pose, float32 (m, n), rad, nearest to the start first.
@@ -405,7 +422,7 @@ class Planner:
 
     def _space(self, is_valid):
         """OMPL's `SpaceInformation`, which asks `is_valid`."""
-        space = normalised_space(self.env.robot.num_joints)
+        space = normalised_space(self.env.robot.num_joints, *self._bounds)
         information = ob.SpaceInformation(space)
         information.setStateValidityChecker(_States(information, is_valid))
         information.setMotionValidator(_Motions(information, is_valid))
@@ -430,12 +447,16 @@ class Planner:
             length *= 2
 
 
-def normalised_space(num_joints):
-    """OMPL's view of the normalised configuration space."""
+def normalised_space(num_joints, lower=None, upper=None):
+    """OMPL's view of the normalised configuration space, or of a box (n,), (n,) in it."""
     space = ob.RealVectorStateSpace(num_joints)
     bounds = ob.RealVectorBounds(num_joints)
     bounds.setLow(-1.0)
     bounds.setHigh(1.0)
+    if lower is not None:
+        for joint in range(num_joints):
+            bounds.setLow(joint, float(lower[joint]))
+            bounds.setHigh(joint, float(upper[joint]))
     space.setBounds(bounds)
     return space
 

@@ -40,7 +40,7 @@ from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
 from roboarm_nmp.envs.datasets.trajectories import (
     STEP_SECONDS,
     check_ending,
-    load_joint_path,
+    load_trajectory,
     save_trajectory,
 )
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
@@ -114,13 +114,14 @@ class Args:
     arm's right, 90 its front, 180 its left; pitch -90 looks straight down, 0 horizontally. By
     default from a corner that obstacles do not hide."""
     trajectory: Path | None = None
-    """Play this file (.csv or .npz) instead of a policy's episode: one of --save-trajectory, or of
-    one's own. A .csv needs columns `q1` to `q7` (rad; as many as joints), and may have `time` (s);
-    a .npz an array `configurations` (k, n), and perhaps `times`. The arm is moved without physics,
-    in the scene of --query; the ghost is the end."""
+    """Play this file (.csv, .npz, .json, .yaml) instead of a policy's episode: one of `roboarm
+    retime`, of --save-trajectory, or of one's own. A .csv needs columns `q1` to `q7` (rad; as many
+    as joints), and may have `time` (s); a .npz an array `configurations` (k, n), and perhaps
+    `times`; a .yaml is ROS's trajectory_msgs/JointTrajectory. The arm is moved without physics, in
+    the scene of --query; the ghost is the end."""
     save_trajectory: Path | None = None
-    """Write the shown episode to this file (.csv or .npz): configurations, actions, contacts,
-    times. Without --output there is no window then."""
+    """Write the shown episode to this file (.csv, .npz, .json): configurations, actions, contacts,
+    times; or its configurations to a .yaml for ROS. Without --output there is no window then."""
     seed: Seed = 0
     """Of random queries, and of `random`, `via-points` and `planner`."""
 
@@ -379,13 +380,11 @@ def _task_queries(args):
 def _file_queries(args):
     """From the start to the end of --trajectory, in the scene of a query where scenes vary."""
     task = envs.get_task(args.task)
-    times, path = load_joint_path(args.trajectory, task.base_scene.robot)
-    steps = round((times[-1] - times[0]) / STEP_SECONDS)
-    if steps * STEP_SECONDS > MAX_SECONDS:
+    trajectory = load_trajectory(args.trajectory, task.base_scene.robot)
+    path = trajectory.positions
+    if trajectory.duration > MAX_SECONDS:
         raise ShowError(f"{args.trajectory}: it is longer than {MAX_SECONDS} s")
-    shown = np.clip(times[0] + np.arange(steps + 1) * STEP_SECONDS, None, times[-1])
-    configurations = np.stack([np.interp(shown, times, joint) for joint in path.T], axis=1)
-    configurations[-1] = path[-1]
+    configurations = trajectory.frames()
     scene = task.scene
     scenes = None if isinstance(scene, Scene) else _task_queries(args)
 

@@ -18,8 +18,9 @@ LEVELS = [
     ("envs.arm_env", "envs.perception", "envs.wrappers"),
     ("envs",),  # `make`
     ("envs.datasets", "envs.policies"),
+    ("envs.metrics", "envs.time_parameterisation"),
     ("envs.training",),
-    ("envs.show", "envs.robot_check", "envs.import_problems"),
+    ("envs.show", "envs.robot_check", "envs.import_problems", "envs.retime"),
     ("envs.viewer",),
     ("demo_generation",),
     ("clean_rl_scripts", "bc_script", "scene_embedding_train"),

@@ -45,7 +45,9 @@ PANDA = Robot(
     urdf=str(Path(pybullet_data.getDataPath(), "franka_panda", "panda.urdf")),
     joint_names=tuple(f"panda_joint{joint}" for joint in range(1, 8)),
     joint_indices=(0, 1, 2, 3, 4, 5, 6),
-    # Limits of positions and torques as in the URDF, the others of the manufacturer's datasheet.
+    # Limits of positions and torques as in the URDF. Those of velocity, acceleration and jerk, and
+    # `datasheet_lower` and `datasheet_upper`, as in Franka's documentation of the Panda ("Robot and
+    # interface specifications", limits in the joint space; libfranka's `rate_limiting.h`).
     lower=_LOWER,
     upper=_UPPER,
     velocity=(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
@@ -85,6 +87,8 @@ PANDA = Robot(
     gains=(0.6,) * 7,
     observed_pose=(0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8),
     contact_free=tuple((low + high) / 2 for low, high in zip(_LOWER, _UPPER, strict=True)),
+    datasheet_lower=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),
+    datasheet_upper=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
 )
 
 

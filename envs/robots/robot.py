@@ -88,6 +88,8 @@ class Robot:
         mesh_digest: SHA-256 (hex) of the meshes of the links that may collide; empty for `PANDA`.
         source: the file that names the robot, for scene files; empty for `PANDA`.
         xml: the URDF's text, with absolute paths of meshes; empty if PyBullet can read the file.
+        datasheet_lower, datasheet_upper: position limits (n,) of the manufacturer's datasheet, rad
+            or m, where they are others than the URDF's; None otherwise.
         gains: of the position controllers (n,).
         contact_free: a configuration without contacts (n,).
         observed_pose: the configuration (n,) in which sensors observe a scene: always the same, so
@@ -126,9 +128,12 @@ class Robot:
     source: str = ""
     xml: str = ""
     described: "Robot | None" = None
+    datasheet_lower: np.ndarray | None = None
+    datasheet_upper: np.ndarray | None = None
 
     def __post_init__(self):
-        for name in ("lower", "upper", "velocity", "acceleration", "jerk", "effort"):
+        names = ("lower", "upper", "velocity", "acceleration", "jerk", "effort")
+        for name in (*names, "datasheet_lower", "datasheet_upper"):
             if getattr(self, name) is not None:
                 array = np.array(getattr(self, name), dtype=np.float64)
                 array.flags.writeable = False
@@ -150,7 +155,7 @@ class Robot:
         Numbers are rounded to 1e-9: the last bits of sines and cosines differ between machines.
         """
         content = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name in ("urdf", "source", "xml", "described"):
+        for name in ("urdf", "source", "xml", "described", "datasheet_lower", "datasheet_upper"):
             content.pop(name)
         text = json.dumps(_rounded(content), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -235,6 +240,25 @@ class Robot:
     def num_joints(self):
         """n."""
         return len(self.joint_indices)
+
+    def position_limits(self, limits="urdf"):
+        """Lower and upper position limits, two arrays (n,), rad or m.
+
+        `limits`: "urdf" or "datasheet". Raises ValueError: another one, or an arm without the
+        limits of a datasheet.
+        """
+        if limits == "urdf":
+            return self.lower, self.upper
+        if limits != "datasheet":
+            raise ValueError(f"limits must be 'urdf' or 'datasheet', got {limits!r}")
+        if self.datasheet_lower is None:
+            raise ValueError(f"{self.name} has no position limits of a datasheet")
+        return self.datasheet_lower, self.datasheet_upper
+
+    def is_within(self, configuration, limits="urdf"):
+        """Whether joint angles (..., n) are inside the `position_limits`: bool (...)."""
+        lower, upper = self.position_limits(limits)
+        return ((configuration >= lower) & (configuration <= upper)).all(-1)
 
     @property
     def collision_links(self):

@@ -26,6 +26,7 @@ from roboarm_nmp.envs.arm_env import deviations
 from roboarm_nmp.envs.datasets.format import QueryScenes
 from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, validate
+from roboarm_nmp.envs.metrics import motion_metrics, path_length, smoothness
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
@@ -76,6 +77,7 @@ class EvaluationOptions:
             policy's own, otherwise `ground_truth`.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
             one that the policy includes, if any; False for none.
+        clearance: also measure each episode's smallest distance from the ground-truth obstacles.
         workers: processes, >= 1. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
         env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
@@ -96,6 +98,7 @@ class EvaluationOptions:
     time_limit: float = TIME_LIMIT
     geometry_source: str | None = None
     safety_filter: SafetyFilter | bool | None = None
+    clearance: bool = False
     workers: int = 1
     env: dict | None = None
 
@@ -129,6 +132,9 @@ def evaluate(policy, task=None, *, progress=False, **options):
         - `success_rate`, `collision_free_success_rate`, `collision_rate`, each with its 95% Wilson
           interval, `..._interval`;
         - `mean_steps`, `path_length` (rad), `smoothness` (rad per step^2): means over successes;
+        - `ee_path_length` (m), `ee_rotation` (degrees), `duration` (s), `mean_jerk` and `max_jerk`
+          (rad/s^3), `sparc`, `ee_sparc`, and with `clearance` `min_clearance` (m): means over
+          successes of `envs.metrics.motion_metrics`;
         - `ms_per_action`: of the policy alone, without the simulator and without planning;
         - `planning_seconds`, `planning_seconds_solved`: means over all queries, and over those with
           a motion found; `free_motion_rate`, only of `via-points`;
@@ -182,21 +188,6 @@ def wilson_interval(successes, n):
     spread = z * (share * (1 - share) / n + z * z / (4 * n * n)) ** 0.5
     scale = 1 + z * z / n
     return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
-
-
-def path_length(configurations):
-    """Sum of the L2 distances, in rad, between successive configurations (T + 1, n), rad."""
-    return float(np.linalg.norm(np.diff(configurations, axis=0), axis=1).sum())
-
-
-def smoothness(configurations):
-    """Mean L2 norm of the second differences, rad per step^2, of configurations (T + 1, n), rad.
-
-    Zero for fewer than three configurations.
-    """
-    if len(configurations) < 3:
-        return 0.0
-    return float(np.linalg.norm(np.diff(configurations, n=2, axis=0), axis=1).mean())
 
 
 # --- Arguments
@@ -329,10 +320,16 @@ def _queries(task, options):
 # --- Episodes
 
 
+MOTION_METRICS = (
+    *("ee_path_length", "ee_rotation", "duration", "mean_jerk", "max_jerk", "sparc", "ee_sparc"),
+    "min_clearance",
+)
+
+
 class _Outcome(NamedTuple):
     """The result of one episode; lengths are NaN where the goal was not reached.
 
-    `plan_found`: see `EpisodePolicy`.
+    `plan_found`: see `EpisodePolicy`. `motion`: the `MOTION_METRICS`, likewise.
     """
 
     success: bool
@@ -340,6 +337,7 @@ class _Outcome(NamedTuple):
     steps: int
     path_length: float
     smoothness: float
+    motion: tuple[float, ...]
     policy_seconds: float
     planning_seconds: float
     plan_found: bool | None
@@ -369,10 +367,12 @@ class _Worker:
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
         trajectory = rollout(self.env, query, act)
-        lengths = [np.nan, np.nan]
+        lengths = [np.nan, np.nan, (np.nan,) * len(MOTION_METRICS)]
         if trajectory.success:
             configurations = trajectory.configurations
+            motion = motion_metrics(trajectory, self._checker(query.scene))
             lengths = [path_length(configurations), smoothness(configurations)]
+            lengths.append(tuple(motion[name] for name in MOTION_METRICS))
         return _Outcome(
             trajectory.success,
             trajectory.collides,
@@ -382,6 +382,15 @@ class _Worker:
             planning_seconds,
             plan_found,
         )
+
+    def _checker(self, scene):
+        """For the clearance in a scene; None where it is not measured."""
+        if not self.job.options.clearance:
+            return None
+        # Here, because Numba takes a while to import.
+        from roboarm_nmp.envs.collision.checker import CollisionChecker
+
+        return CollisionChecker(scene)
 
 
 def _run(job, progress):
@@ -429,6 +438,10 @@ def _summary(job, outcomes):
     def mean(values, which=reached):
         return float(values[which].mean()) if which.any() else None
 
+    motion = np.array(columns.motion, dtype=np.float64).T
+    motion = dict(zip(MOTION_METRICS, map(mean, motion), strict=True))
+    if not options.clearance:
+        motion["min_clearance"] = None
     plans, safety_filter = job.policy in PLANNERS, options.safety_filter
     planning = {"planning_seconds": None, "planning_seconds_solved": None, "free_motion_rate": None}
     if plans:
@@ -454,6 +467,7 @@ def _summary(job, outcomes):
         "mean_steps": mean(columns.steps),
         "path_length": mean(columns.path_length),
         "smoothness": mean(columns.smoothness),
+        **motion,
         "ms_per_action": 1e3 * float(columns.policy_seconds.sum()) / actions if actions else None,
         **planning,
         "env": options.env,

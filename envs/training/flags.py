@@ -42,6 +42,7 @@ GROUPS = {
     OTHERS: (),
     "evaluation": (
         *("eval_every", "eval_queries", "test_queries", "stop_at_success", "eval_scenes"),
+        *("clearance",),
     ),
     "run": (
         *("exp_name", "seed", "runs_dir", "resume", "device", "bf16", "track", "workers"),

@@ -5,6 +5,7 @@
     roboarm view my_scene.yaml
     roboarm view random_boxes_hard --robot ur5.yaml
     roboarm view wall --demos
+    roboarm view wall --trajectory motion.yaml
     roboarm view roadmaps
     roboarm view wall --policy planner --record replay.html
 
@@ -84,6 +85,9 @@ class Args:
     one, `go-to-goal`, or the recorded motion alone"""
     demos: bool = False
     """show the task's demonstrations; --query is then the number of a demonstration"""
+    trajectory: Path | None = None
+    """play this file (.csv, .npz, .json, .yaml; docs/guide/trajectories.md) in the scene of
+    --query"""
     query: NonNegativeInt = 0
     """number of the first query, from 0"""
     split: Literal["test", "validation", "original"] = "test"
@@ -493,9 +497,11 @@ def _set(handle, name, value):
 def _check(args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
-    for flag in ("demos", "robot"):
+    for flag in ("demos", "robot", "trajectory"):
         if getattr(args, flag) and Path(args.task).is_dir():
             raise ViewError(f"--{flag} goes with a task, not with a folder of roadmap paths")
+    if args.demos and args.trajectory is not None:
+        raise ViewError("--demos and --trajectory are both recordings: give one of them")
     args.task = envs.tasks.task_with_robot(args.task, args.robot)
     if not Path(args.task).is_dir():
         envs.get_task(args.task)
@@ -551,6 +557,8 @@ def _simulation(args):
         episodes = core.roadmap_episodes(args.task)
     elif args.demos:
         episodes = core.demonstration_episodes(args.task)
+    elif args.trajectory is not None:
+        episodes = core.trajectory_episodes(args.task, args.trajectory)
     else:
         episodes = core.task_episodes(args.task, args.seed)
     simulation = core.Simulation(episodes)

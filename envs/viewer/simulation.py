@@ -25,6 +25,7 @@ from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.format import ORIGINAL, SPLITS, DatasetError
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
+from roboarm_nmp.envs.datasets.trajectories import load_trajectory
 from roboarm_nmp.envs.policies.baselines import PLANNERS
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
 from roboarm_nmp.envs.policies.rollout import Episode
@@ -36,6 +37,7 @@ from roboarm_nmp.envs.world import World
 
 GROUND_TRUTH = "ground_truth"
 TIME_LIMIT = 2.0  # s, that `planner` may search: the browser waits
+MAX_SECONDS = 3600  # of a trajectory from a file
 # Of the inverse kinematics: steps at most, error of the position (m), damping, longest step (rad).
 IK_STEPS, IK_TOLERANCE, IK_DAMPING, IK_MAX_STEP = 200, 1e-4, 0.05, 0.2
 
@@ -129,6 +131,24 @@ def roadmap_episodes(folder):
 
     count = len(paths.offsets) - 1
     return Episodes(paths.task, ("roadmap paths",), lambda split: count, get, "roadmap path")
+
+
+def trajectory_episodes(task, path):
+    """The `Episodes` of a file of a trajectory, in the scene of each query.
+
+    Raises ValueError: there is no such task, or the file is no trajectory of its arm.
+    """
+    trajectory = load_trajectory(path, envs.get_task(task).base_scene.robot)
+    if trajectory.duration > MAX_SECONDS:
+        raise DatasetError(f"{path}: it is longer than {MAX_SECONDS} s")
+    robot, queries = trajectory.robot, task_episodes(task)
+    ends = trajectory.positions[[0, -1]].astype(np.float32)
+    states = robot.normalise(trajectory.frames()).astype(np.float32)
+
+    def get(split, number):
+        return Query(*ends, queries.get(split, number)[0].scene), states
+
+    return replace(queries, get=get, recording="trajectory")
 
 
 # --- Arms

@@ -1,6 +1,7 @@
 """The planner: exact ends, no collisions, the clearance asked for, and the same path for a seed."""
 
 import copy
+import dataclasses
 import math
 import pickle
 import subprocess
@@ -23,6 +24,7 @@ from roboarm_nmp.demo_generation.planning import (
     Planner,
     PlanningError,
 )
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -654,3 +656,29 @@ def test_planning_does_not_leak_memory(worlds):
     for seed in range(51, 351):
         planner.plan(*queries[seed], seed=seed)
     assert psutil.Process().memory_info().rss - before < 20e6
+
+
+def test_plans_stay_inside_the_limits_of_the_datasheet(worlds):
+    env = worlds["double_walls"]
+    start, goal, scene = load_queries("double_walls", "validation")[2]
+    path = Planner(env).plan(start, goal, seed=1)
+    beyond = path.max(0) - np.maximum(start, goal)
+    joint, upper = beyond.argmax(), PANDA.upper.copy()
+    assert beyond[joint] > 0.1
+    upper[joint] = path[:, joint].max() - beyond[joint] / 2  # the plan leaves these limits
+    robot = dataclasses.replace(PANDA, datasheet_upper=upper, datasheet_lower=PANDA.lower)
+    env = RoboArmEnv(dataclasses.replace(scene, robot=robot))
+    inside = Planner(env, limits="datasheet").plan(start, goal, seed=1)
+    assert (
+        robot.is_within(inside, "datasheet").all() and not robot.is_within(path, "datasheet").all()
+    )
+    outside = goal.copy()
+    outside[joint] = upper[joint] + 1e-3
+    with pytest.raises(ValueError, match="goal is outside the datasheet position limits|collision"):
+        Planner(env, limits="datasheet").plan(start, outside, seed=1)
+    env.close()
+
+
+def test_unknown_limits_are_rejected(worlds):
+    with pytest.raises(ValueError, match="limits must be 'urdf' or 'datasheet', got 'wide'"):
+        Planner(worlds["wall"], limits="wide")

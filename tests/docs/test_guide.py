@@ -52,3 +52,8 @@ def test_code_of_safety_filter_page_runs():
 def test_code_of_evaluation_page_runs():
     result = run("evaluation.md")["result"]
     assert result["safety_filter"]["margin"] == 0.01 and not result["privileged"]
+
+
+def test_code_of_trajectories_page_runs(folder):
+    names = run("trajectories.md")
+    assert names["metrics"]["min_clearance"] > 0 and (folder / "motion.yaml").exists()

@@ -358,7 +358,7 @@ def test_camera_flag_takes_a_name_or_three_numbers(tmp_path):
 def test_saved_trajectory_plays_as_the_episode(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 4)
     monkeypatch.delenv("DISPLAY", raising=False)
-    for ending in (".csv", ".npz"):
+    for ending in (".csv", ".npz", ".yaml"):
         file = tmp_path / f"episode{ending}"
         arguments = ["--query", 2, "--save-trajectory", file]
         assert run("wall", *arguments, "--output", tmp_path / "a.gif", *SIZE) == 0
@@ -572,10 +572,10 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
         (["wall", *png, "--camera", 0, 90, -15], "--camera DISTANCE YAW PITCH: at most 15 m"),
         (["wall", *png, "--camera", 2, 90, -95], "-90 to 90 degrees, got 2 90 -95"),
         (["wall", *gif, "--trajectory", tmp_path / "none.csv"], "none.csv: No such file"),
-        (["wall", *gif, "--trajectory", policy], "a trajectory's file must end in .csv or .npz"),
+        (["wall", *gif, "--trajectory", policy], "a trajectory's file must end in .csv, .npz"),
         (["wall", *gif, "--trajectory", "a.csv", "--policy", "planner"], "give one of them"),
         (["wall", *png, "--trajectory", "a.csv", "--draws", 2], "not with --trajectory"),
-        (["wall", *gif, "--save-trajectory", tmp_path / "a.txt"], "must end in .csv or .npz"),
+        (["wall", *gif, "--save-trajectory", tmp_path / "a.txt"], "must end in .csv, .npz"),
         (["wall", *png, "--save-trajectory", tmp_path / "a.csv"], "--output FILE.gif, or without"),
         (["wall", "--save-trajectory", tmp_path / "none" / "a.csv"], "cannot write"),
         (["wall", "--policy", "demo", "--save-trajectory", tmp_path / "a.csv"], "with a policy"),

@@ -546,6 +546,19 @@ def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path):
         assert "--goal-region 0.4 0.65 -0.4 0.4 0.24 0.46" in file.attrs["made_by"].decode()
 
 
+def test_queries_inside_the_limits_of_the_datasheet_are_a_share_of_all(tmp_path):
+    path = tmp_path / "queries.h5"
+    rejected = make_queries.make_queries(
+        path, "no_obstacles", 0, 12, 2, progress=False, limits="datasheet"
+    )
+    queries = load_queries(path, "test", "no_obstacles")
+    ends = np.concatenate([queries.start, queries.goal])
+    assert PANDA.is_within(ends, "datasheet").all() and rejected["outside"] > 0
+    with h5py.File(path) as file:
+        assert json.loads(file.attrs["parameters"])["limits"] == "datasheet"
+        assert b"--limits datasheet" in file.attrs["made_by"]
+
+
 def test_goal_region_without_room_is_an_error_that_counts(tmp_path, monkeypatch):
     monkeypatch.setattr(make_queries, "MAX_GOALS", 20_000)
     inside_a_wall = (0.3, 0.9, -0.015, 0.015, 0.1, 0.7)

@@ -1,6 +1,7 @@
 """Files of joint paths: they are read as they were written; bad files are named."""
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ import pytest
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.trajectories import (
     STEP_SECONDS,
+    JointTrajectory,
     load_joint_path,
+    load_trajectory,
     save_joint_path,
     save_trajectory,
     timed,
@@ -20,7 +23,112 @@ PATH = np.array([[0, -0.3, 0, -1.8, 0, 1.6, 0], [0.5, -0.3, 0, -1.8, 0, 1.6, 0.1
 Q = ",".join(f"q{i}" for i in range(1, 8))
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz", "a.CSV"])
+FORMATS = ["a.csv", "a.npz", "a.json", "a.yaml"]
+TIMES = np.array([0, 10_000_000, 1_070_000_000]) / 1e9
+
+
+def random_trajectory():
+    rng = np.random.default_rng(0)
+    positions = np.array(PANDA.contact_free) + rng.normal(size=(3, 7)) * [[1e-6], [1e-1], [1]] * 0.1
+    velocities, accelerations = rng.normal(size=(2, 3, 7)) * [[1e-20], [1.0], [1e3]]
+    return JointTrajectory(TIMES, positions, velocities, accelerations, PANDA)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_joint_trajectory_is_read_exactly_as_it_was_written(name, tmp_path):
+    written = random_trajectory()
+    save_trajectory(tmp_path / name, written)
+    read = load_trajectory(tmp_path / name, PANDA)
+    for field in ("times", "positions", "velocities", "accelerations"):
+        np.testing.assert_array_equal(getattr(read, field), getattr(written, field))
+    assert read.robot == PANDA and read.duration == 1.07
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_file_without_velocities_is_read_without_them(name, tmp_path):
+    save_trajectory(tmp_path / name, JointTrajectory(TIMES[:2], PATH, None, None, PANDA))
+    read = load_trajectory(tmp_path / name, PANDA)
+    assert read.velocities is None and read.accelerations is None
+    np.testing.assert_array_equal(read.positions, PATH)
+
+
+ROS1 = """
+header: {seq: 0, stamp: {secs: 0, nsecs: 0}, frame_id: ''}
+joint_names: [panda_joint7, panda_joint6, panda_joint5, panda_joint4, panda_joint3, panda_joint2,
+  panda_joint1]
+points:
+- positions: [0.7, 1.6, 0.5, -1.8, 0.3, 0.2, 0.1]
+  velocities: []
+  accelerations: []
+  effort: []
+  time_from_start: {secs: 1, nsecs: 500000000}
+"""
+
+
+def test_joints_of_a_ros_message_are_read_in_any_order(tmp_path):
+    (tmp_path / "a.yaml").write_text(ROS1)
+    read = load_trajectory(tmp_path / "a.yaml", PANDA)
+    assert read.times.tolist() == [1.5] and read.velocities is None
+    assert read.positions.tolist() == [[0.1, 0.2, 0.3, -1.8, 0.5, 1.6, 0.7]]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.yaml", "a: [", "no YAML"),
+        ("a.yaml", "a: &b [1]\nc: *b", "anchors and aliases"),
+        ("a.yaml", "!!python/object/apply:os.system ['touch made']", "no YAML"),
+        ("a.yaml", "[" * 5000, "not a joint path"),
+        ("a.yaml", "points: 3", "no list `points`"),
+        ("a.yaml", ROS1.replace("0.7, 1.6", "1.6"), "has not 7 numbers"),
+        ("a.yaml", ROS1.replace("0.7,", "x,"), "something other than numbers"),
+        ("a.yaml", ROS1.replace("panda_joint7", "iiwa_joint7"), "its joints are .*iiwa_joint7"),
+        ("a.yaml", ROS1.replace("secs: 1", "secs: 0.5"), "no duration in whole sec"),
+        ("a.yaml", ROS1.replace("time_from_start", "time"), "no `time_from_start`"),
+        ("a.yaml", ROS1.replace("-1.8", "-90.0"), "q4 exceeds its limits"),
+        ("a.yaml", ROS1.replace("velocities: []", "velocities: [1.0]"), "has not 7 numbers"),
+        (
+            "a.yaml",
+            ROS1.replace("velocities: []", f"velocities: [{', '.join(['.inf'] * 7)}]"),
+            "velocities must be finite",
+        ),
+        ("a.json", "{", "not a joint path"),
+        ("a.json", "[1]", "no JSON object"),
+        ("a.json", "[" * 100_000, "not a joint path"),
+        ("a.json", json.dumps({"times": [0.0]}), "no array configurations, but times"),
+        ("a.json", json.dumps({"configurations": [[0] * 7, [0]]}), "not a joint path"),
+        ("a.json", json.dumps({"configurations": [[10**400] * 7]}), "something other than numbers"),
+    ],
+)
+def test_bad_text_file_is_named_with_the_reason(name, text, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(DatasetError, match=f"^.*{name}: .*{message}") as caught:
+        load_trajectory(tmp_path / name, PANDA)
+    assert "\n" not in str(caught.value) and not (tmp_path / "made").exists()
+
+
+def test_file_that_is_too_large_is_not_read(tmp_path):
+    with open(tmp_path / "a.yaml", "wb") as file:
+        file.truncate(11_000_000)
+    with pytest.raises(DatasetError, match="a.yaml: .*larger than 10 MB"):
+        load_trajectory(tmp_path / "a.yaml", PANDA)
+
+
+def test_positions_between_samples_are_those_of_cubic_polynomials():
+    times = np.array([0.0, 0.5, 2.0])
+    polynomial = np.polynomial.Polynomial([0.1, -0.4, 0.3, 0.05])
+    rows = [f(times)[:, None] * np.ones(7) for f in (polynomial, polynomial.deriv())]
+    trajectory = JointTrajectory(times, *rows, None, PANDA)
+    between = np.linspace(0, 2, 17)
+    np.testing.assert_allclose(trajectory.at(between)[:, 3], polynomial(between), atol=1e-12)
+    np.testing.assert_allclose(trajectory.at([-1.0, 5.0]), rows[0][[0, 2]])
+    straight = JointTrajectory(times, rows[0], None, None, PANDA)
+    np.testing.assert_allclose(straight.at([0.25])[0], rows[0][:2].mean(0))
+    assert len(trajectory.frames()) == 61
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.npz", "a.CSV", "a.json", "a.yaml"])
 def test_joint_path_is_read_as_it_was_written(name, tmp_path):
     save_joint_path(tmp_path / name, PATH, [0.5, 2.0])
     times, configurations = load_joint_path(tmp_path / name, PANDA)
@@ -109,6 +217,6 @@ def test_bad_npz_file_is_named_with_the_reason(tmp_path):
 def test_shapes_and_endings_are_checked_before_writing(tmp_path):
     with pytest.raises(ValueError, match="configurations must be"):
         save_joint_path(tmp_path / "a.csv", PATH, [0.0])
-    with pytest.raises(ValueError, match="must end in .csv or .npz"):
+    with pytest.raises(ValueError, match="must end in .csv, .npz, .json or .yaml"):
         save_joint_path(tmp_path / "a.txt", PATH, [0.0, 1.0])
     assert not list(tmp_path.iterdir())

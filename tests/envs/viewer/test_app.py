@@ -42,6 +42,8 @@ def error_of(capfd, *arguments, main=app.main):
         (["wall", "--policy", "nothing"], "no such policy: nothing"),
         (["wall", "--query", "10000"], "no test query 10000: the numbers are 0 to 9999"),
         (["three_shelves", "--demos"], "three_shelves"),
+        (["wall", "--trajectory", "a.csv"], "a.csv: No such file"),
+        (["wall", "--trajectory", "a.csv", "--demos"], "give one of them"),
         (["wall", "--port", "0"], "--port must be in [1, 65535], got 0"),
         (["wall", "--speed", "0"], "--speed must be above 0"),
         (["wall", "--record", "replay.gif"], "--record must end in .html"),

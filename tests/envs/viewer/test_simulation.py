@@ -10,6 +10,7 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.datasets.roadmap_paths import shard_bytes
+from roboarm_nmp.envs.datasets.trajectories import JointTrajectory, save_trajectory
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
@@ -24,6 +25,7 @@ from roboarm_nmp.envs.viewer.simulation import (
     inverse_kinematics,
     roadmap_episodes,
     task_episodes,
+    trajectory_episodes,
 )
 
 PRETRAINED = "dagger-combined-point_cloud-random_boxes_hard-s1"
@@ -285,3 +287,23 @@ def test_inverse_kinematics_stays_within_limits_and_near_the_goal():
         assert np.abs(PANDA.forward_kinematics(moved) - 0.9 * here).max() < 1e-3
         beyond = inverse_kinematics(PANDA, [0.0, 0.0, 3.0], query.goal)
         assert np.isfinite(beyond).all() and np.all(np.abs(PANDA.normalise(beyond)) <= 1 + 1e-9)
+
+
+def test_file_of_a_trajectory_is_played_in_the_scene_of_each_query(tmp_path):
+    ends = np.array([[0, -0.5, 0, -1.5, 0, 1, 0.8], [0.3, -0.5, 0, -1.5, 0, 1, 0.8]])
+    rest = np.zeros_like(ends)
+    trajectory = JointTrajectory(np.array([0.0, 1.0]), ends, rest, rest, PANDA)
+    save_trajectory(tmp_path / "motion.yaml", trajectory)
+    episodes = trajectory_episodes("random_boxes_hard", tmp_path / "motion.yaml")
+    simulation = Simulation(episodes)
+    simulation.add(RecordedArm(episodes))
+    simulation.select("validation", 7)
+    scene = load_queries("random_boxes_hard", "validation")[7].scene
+    assert simulation.query.scene == scene and episodes.recording == "trajectory"
+    run(simulation)
+    (arm,) = simulation.arms
+    assert arm.steps == 30 and arm.success
+    np.testing.assert_allclose(PANDA.denormalise(arm.state), ends[1], atol=1e-5)
+    middle = PANDA.denormalise(arm.trace[15])
+    np.testing.assert_allclose(middle[0], 0.15, atol=1e-5)  # the cubic's, between rest and rest
+    simulation.close()
