@@ -2,6 +2,7 @@
 
     roboarm plan --cloud table.ply --start "1 0.4 0 -1.8 0 2.2 0.8" --goal "-1 0.4 0 -1.8 0 2.2 0.8"
     roboarm plan --cloud table.ply --start "…" --goal-pose "0.4 -0.3 0.3 1 0 0 0" --output path.csv
+    roboarm plan --cloud table.ply --start "…" --goal "…" --retime --output motion.yaml
     roboarm plan --task wall --start "…" --goal "…" --policy go-to-goal
 
 The points are prepared first (docs/customise/point_cloud.md): those of the table, the floor and the
@@ -80,8 +81,11 @@ class Args:
     """of random numbers"""
     time_limit: PositiveFloat = 5.0
     """seconds that the planner may search"""
+    retime: bool = False
+    """times, velocities and accelerations within the arm's limits, checked for collisions (extra
+    `trajectories`); otherwise the motion has the speed of the environment"""
     output: Path | None = None
-    """write the motion to this file, .csv or .npz"""
+    """write the motion to this file, .csv, .npz, .json or .yaml (docs/guide/trajectories.md)"""
 
 
 def _numbers(flag, text, number):
@@ -214,6 +218,23 @@ def _rolled_out(args, scene, start, goal):
     return rollout(env, query, begin(0, query).act)
 
 
+def _retimed(path, checker):
+    """The `JointTrajectory` of a path (k, n), rad; it stops at corners where the path collides.
+
+    A path collides where it is inside the ball around a point, as its ends may be.
+    """
+    from roboarm_nmp.envs.time_parameterisation import time_parameterise
+
+    began = time.perf_counter()
+    try:
+        trajectory = time_parameterise(path, checker.robot, checker=checker)
+    except ValueError:
+        trajectory = time_parameterise(path, checker.robot, deviation=0.0)
+    milliseconds = 1000 * (time.perf_counter() - began)
+    print(f"timed in {milliseconds:.0f} ms: {trajectory.duration:.2f} s")
+    return trajectory
+
+
 def _describe(configurations, checker):
     """Print the length of a motion (m, n), rad, and its minimum clearance from the scene."""
     from roboarm_nmp.envs.collision.checker import FLOOR, NOTHING, POINT, TABLE
@@ -267,18 +288,23 @@ def main(args):
             print(f"planned in {1000 * seconds:.0f} ms: {len(path)} waypoints")
         else:
             episode = _rolled_out(args, scene, start, goals[0])
-            configurations = episode.configurations
+            path = configurations = episode.configurations
             reached = "reached" if episode.success else "not reached"
             seconds = episode.times.sum()
             print(f"{len(episode)} steps, goal {reached}; policy's time {1000 * seconds:.0f} ms")
+        if args.retime:
+            trajectory = _retimed(path, checker)
+            configurations = trajectory.positions
         _describe(configurations, checker)
         if args.output is not None:
-            if args.policy == "planner":
-                save_joint_path(args.output, configurations, times)
+            if args.retime:
+                save_trajectory(args.output, trajectory)
+            elif args.policy == "planner":
+                save_joint_path(args.output, configurations, times, scene.robot)
             else:
                 save_trajectory(args.output, episode)
             print(f"{args.output}: {len(configurations)} configurations")
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
         sys.exit(f"error: {error}")
     sys.exit(int(args.policy != "planner" and not episode.success))
 

@@ -8,7 +8,7 @@ from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.envs import make
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.datasets.trajectories import load_joint_path
+from roboarm_nmp.envs.datasets.trajectories import load_joint_path, load_trajectory
 from roboarm_nmp.envs.perception.sensors import PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import flags
@@ -51,6 +51,21 @@ def cloud(query, tmp_path_factory):
     # Turned by 90 degrees about z, and 1 m higher.
     np.save(path, 1000 * (points[:, [1, 0, 2]] * (1, -1, 1) - (0, 0, 1)))
     return path, ("--units", "mm", "--frame", f"0 0 1 0 0 {0.5**0.5:.9f} {0.5**0.5:.9f}")
+
+
+def test_retimed_motion_keeps_the_limits_and_its_ends(query, cloud, tmp_path, capsys):
+    path, placed = cloud
+    ends = "--start", text(query.start), "--goal", text(query.goal)
+    output = tmp_path / "motion.yaml"
+    assert run("--cloud", path, *placed, *ends, "--retime", "--output", output) == 0
+    assert "timed in" in capsys.readouterr().out
+    motion = load_trajectory(output, PANDA)
+    assert np.allclose(motion.positions[[0, -1]], [query.start, query.goal], atol=1e-5)
+    for rates, limit in (
+        (motion.velocities, PANDA.velocity),
+        (motion.accelerations, PANDA.acceleration),
+    ):
+        assert (np.abs(rates).max(0) <= limit * 1.001).all() and np.abs(rates).max() > 0.3
 
 
 def test_path_among_points_is_followed_without_contact(query, cloud, tmp_path, capsys):

@@ -47,13 +47,13 @@ def test_motions_of_the_page_about_point_clouds_avoid_the_points(tmp_path, monke
     assert names["checker"].is_free(states).all()
     page = (ROOT / "docs/customise/point_cloud.md").read_text()
     commands = re.findall(r"^roboarm plan --cloud table.npy (.*)$", page, re.M)
-    assert len(commands) == 3
+    assert len(commands) == 4
     for command in commands:
         with pytest.raises(SystemExit) as end:
             plan.main(flags.parse(plan.Args, ["--cloud", "table.npy", *shlex.split(command)]))
         assert end.value.code == 0
         assert "minimum clearance" in capsys.readouterr().out
-    assert (tmp_path / "path.csv").exists()
+    assert (tmp_path / "path.csv").exists() and (tmp_path / "motion.yaml").exists()
 
 
 def test_problems_of_the_page_are_read_and_written(tmp_path, monkeypatch, capsys):
