@@ -533,7 +533,7 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
     encoder = save(tmp_path / "encoder.pt", kind="encoder")
     unfit = save(tmp_path / "unfit.pt", env={"goal_type": "ee"})
     no_action = save(tmp_path / "no_action.pt", NoAction())
-    strange = save(tmp_path / "strange.pt", env={"goal_type": "pose"})
+    strange = save(tmp_path / "strange.pt", env={"goal_type": "poses"})
     (tmp_path / "bad.yaml").write_text("obstacles:\n  - bax: {}\n")
     (tmp_path / "full.yaml").write_text("obstacles: [sphere: {position: [0, 0, 0.3], radius: 0.3}]")
     (tmp_path / "empty").mkdir()

@@ -624,7 +624,7 @@ def test_errors_of_the_command_are_one_line_before_any_work(
     assert command.main(["--policy", "go-to-goal"]) == 2
     assert "go-to-goal has no task of its own: choose one (--task)" in capsys.readouterr().err
     with pytest.raises(SystemExit) as stop:
-        command.main(["--policy", "random", "--task", "wall", "--goal-type", "pose"])
+        command.main(["--policy", "random", "--task", "wall", "--goal-type", "poses"])
     assert stop.value.code == 2
 
 
