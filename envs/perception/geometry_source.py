@@ -17,12 +17,11 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import (
     FINE_POINT_RADIUS,
     POINT_CLOUD,
-    POINT_RADIUS,
     fine_observed_points,
     observed_points,
 )
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
-from roboarm_nmp.envs.scenes.primitives import ObservedScene
+from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene
 from roboarm_nmp.envs.utils.names import suggest
 
 GROUND_TRUTH = "ground_truth"

@@ -21,13 +21,7 @@ from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
 from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, first_in_cells, label_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, cardinal, observe_scene
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
-from roboarm_nmp.envs.scenes.primitives import (
-    FLOOR,
-    POINT_RADIUS,  # noqa: F401 (scaled like `CELL`; used from here)
-    TABLE,
-    ObservedScene,
-    floor_box,
-)
+from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, ObservedScene, floor_box
 
 POINT_CLOUD = "point_cloud"
 """Its name as an encoder and as a geometry source."""
@@ -35,7 +29,7 @@ NUM_POINTS = 64
 """Of the encoder `point_cloud`, by default."""
 CELL = 0.025
 """m. One point of each cube of this size is used: about 1,500 on `random_boxes_hard`. For an arm of
-another reach than the Panda's, it is scaled, and so is `POINT_RADIUS`."""
+another reach than the Panda's, it is scaled, and so is `POINT_RADIUS` (`envs.scenes.primitives`)."""
 FINE_CELL, FINE_POINT_RADIUS = 0.006, 0.005
 """m. The same as `CELL` and `POINT_RADIUS` for approach paths, which lead closer to surfaces."""
 KNOWN_DISTANCE = 0.01

@@ -11,11 +11,10 @@ from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import observed_checker
 from roboarm_nmp.envs.perception.point_clouds import (
     CELL,
-    POINT_RADIUS,
     farthest_points,
     observed_points,
 )
-from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
+from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, Box, Scene, Sphere
 
 BOX = Box((0.5, 0.0, 0.25), (0.2, 0.3, 0.5))
 EMPTY = Scene(())
