@@ -29,7 +29,7 @@ NUM_POINTS = 64
 """Of the encoder `point_cloud`, by default."""
 CELL = 0.025
 """m. One point of each cube of this size is used: about 1,500 on `random_boxes_hard`. For an arm of
-another reach than the Panda's, it is scaled, and so is `POINT_RADIUS` (`envs.scenes.primitives`)."""
+another reach than the Panda's, it is scaled, and so is `POINT_RADIUS`."""
 FINE_CELL, FINE_POINT_RADIUS = 0.006, 0.005
 """m. The same as `CELL` and `POINT_RADIUS` for approach paths, which lead closer to surfaces."""
 KNOWN_DISTANCE = 0.01
