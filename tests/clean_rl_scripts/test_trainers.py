@@ -292,7 +292,7 @@ def test_run_folder_is_printed_before_demonstrations_are_encoded(
         (["--task", "walls"], "unknown task 'walls': did you mean wall?"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
         (["--resume", "nowhere"], "nowhere is no run's folder"),
-        (["--goal-type", "pose"], "goal-type"),
+        (["--goal-type", "poses"], "goal-type"),
         (["--buffer-size", "49"], "--buffer-size 49: an episode has 50 transitions"),
         (["--demo-prob", "1.5"], "--demo-prob must be in [0, 1], got 1.5"),
         (["--demo-prob", "1", "--velocities"], "demonstrations have no velocities"),
