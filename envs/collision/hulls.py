@@ -264,7 +264,7 @@ def _joined_cells(cells, others, num_vertices):
 
 
 def shape_rows(obstacles):
-    """Obstacles -> float64 (n, `ROW`). The bodies of convex hulls are filled in by `world_shapes`."""
+    """Obstacles -> float64 (n, `ROW`); `world_shapes` adds the bodies of convex hulls."""
     rows = np.zeros((len(obstacles), ROW))
     for obstacle, numbers, row in zip(obstacles, to_array(obstacles), rows, strict=True):
         (kind,), position, quaternion, size = np.split(numbers, (1, 4, 8))

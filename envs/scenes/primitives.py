@@ -158,13 +158,13 @@ class Scene:
                 raise TypeError(
                     f"obstacles must be Box, Cylinder, Sphere or ConvexHull, got {obstacle!r}"
                 )
-            _check(obstacle)
+            check_obstacle(obstacle)
         if len(self.obstacles) > MAX_SCENE_OBSTACLES:
             raise ValueError(f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
         if self.table is not None:
             if not isinstance(self.table, Box):
                 raise TypeError(f"table must be a Box or None, got {self.table!r}")
-            _check(self.table)
+            check_obstacle(self.table)
         if self.floor is not None and not _is_length(self.floor):
             raise ValueError(f"floor must be a height in m or None, got {self.floor!r}")
         if not (is_number(self.friction) and self.friction >= 0):
@@ -216,7 +216,8 @@ def _is_length(value):
     return is_number(value) and abs(value) <= MAX_LENGTH
 
 
-def _check(body):
+def check_obstacle(body):
+    """Raise ValueError unless an obstacle's numbers are finite, its sizes positive, in bounds."""
     if isinstance(body, ConvexHull):
         _check_hull(body)
         return
@@ -280,7 +281,7 @@ def convex_hull(points, position=(0.0, 0.0, 0.0), orientation=IDENTITY):
     """The `ConvexHull` of points (n, 3), m, in its own frame; interior points are dropped.
 
     If more than `MAX_HULL_VERTICES` remain, those that are farthest along as many directions are
-    kept, and moved away from their mean, all by the same factor, until the hull contains all points.
+    kept, and moved away from their mean by one factor, so that the hull contains all points.
 
     Raises ValueError: the points are in one plane, not finite, or of another shape.
     """
@@ -342,8 +343,11 @@ def hull_vertices(obstacles):
 
 
 def vertex_counts(rows):
-    """How many of `hull_vertices` each row of `to_array` has: int64 (n,)."""
-    return np.where(rows[:, 0] == HULL, rows[:, 8], 0).astype(np.int64)
+    """How many of `hull_vertices` each row of `to_array` has: int64 (n,). Raises ValueError."""
+    counts = np.where(rows[:, 0] == HULL, rows[:, 8], 0)
+    if not (np.isfinite(counts).all() and (counts >= 0).all() and (counts == counts.round()).all()):
+        raise ValueError("a convex hull has a number of vertices that is no whole number")
+    return counts.astype(np.int64)
 
 
 def padded_rows(obstacles, number):
@@ -370,7 +374,7 @@ def from_array(rows, vertices=()):
         raise ValueError(f"an obstacle array has shape (n, {ROW}), got {rows.shape}")
     vertices = np.reshape(vertices, (-1, 3))
     counts = vertex_counts(rows)
-    if (counts < 0).any() or counts.sum() != len(vertices):
+    if counts.sum() != len(vertices):
         raise ValueError(f"convex hulls of {counts.sum()} vertices have {len(vertices)}")
     vertices, used = [tuple(vertex) for vertex in vertices.tolist()], 0
     obstacles = []

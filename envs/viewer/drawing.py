@@ -248,7 +248,9 @@ class Drawing:
         elif isinstance(body, ConvexHull):
             mesh = np.array(body.vertices, np.float32), hull_faces(body.vertices).astype(np.uint32)
             wxyz = _wxyz(body.orientation)
-            handle = self._scene.add_mesh_simple(name, *mesh, flat_shading=True, wxyz=wxyz, **options)
+            handle = self._scene.add_mesh_simple(
+                name, *mesh, flat_shading=True, wxyz=wxyz, **options
+            )
         else:
             handle = self._scene.add_icosphere(name, radius=body.radius, **options)
         if self.on_click is not None and colour != TABLE_COLOUR:

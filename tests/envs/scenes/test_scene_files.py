@@ -14,7 +14,9 @@ from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
 from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import TASKS
 
-DOCUMENTED = textwrap.dedent(re.search(r"(    table:.*\n)\nA box", scene_files.__doc__, re.S)[1])
+DOCUMENTED = textwrap.dedent(
+    re.search(r"(    table:.*\n)\nAn obstacle", scene_files.__doc__, re.S)[1]
+)
 EXAMPLE = Scene(
     (
         Box((0.5, 0.0, 0.3), (0.3, 0.04, 0.6)),
