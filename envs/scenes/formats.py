@@ -259,7 +259,7 @@ def read_scene_text(path):
 def _scene_text(lines):
     at, obstacles = 0, []
 
-    def take(what, count=None):
+    def take(what, count=None, most=MAX_LENGTH):
         """The next line; with a count, so many numbers of it."""
         nonlocal at
         while at < len(lines) and not lines[at]:
@@ -271,7 +271,7 @@ def _scene_text(lines):
         if count is None:
             return node
         words = Node([Node(word, at) for word in node.value.split()], at)
-        return numbers(words, what, count, MAX_LENGTH), words
+        return numbers(words, what, count, most), words
 
     def starts_with_pose():
         """Whether an object's pose follows, as in newer files; else the number of its shapes."""
@@ -306,11 +306,13 @@ def _scene_text(lines):
         for _ in range(count("the number of shapes")):
             kind = take("a shape")
             if kind.value == "mesh":
-                (num_vertices, num_faces), node = take("the numbers of vertices and triangles", 2)
+                (num_vertices, num_faces), node = take(
+                    "the numbers of vertices and triangles", 2, 1e9
+                )
                 if max(num_vertices, num_faces) > len(lines):
                     raise Mistake(node, "the file ends before the last triangle")
                 vertices = [take("a vertex", 3)[0] for _ in range(int(num_vertices))]
-                faces = [_face(take("a triangle", 3)[1]) for _ in range(int(num_faces))]
+                faces = [_face(take("a triangle", 3, 1e9)[1]) for _ in range(int(num_faces))]
                 position, orientation = placed(outer)
                 obstacles += _hulls(kind, vertices, faces, position, orientation)
                 _check_number(kind, obstacles)

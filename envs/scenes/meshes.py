@@ -20,7 +20,7 @@ MAX_CONCAVITY = 0.001
 """m. A mesh is convex if no triangle's centre is deeper inside its convex hull."""
 THRESHOLD, SEED = 0.05, 0
 """Of CoACD: the concavity that is left, 0.01 (many hulls) to 1, and its random seed."""
-_AT_ONCE = 10_000  # triangles
+_MAX_COMPARISONS, _AT_ONCE = 50_000_000, 2_000_000  # of triangles with planes of the hull
 
 
 class MeshError(ValueError):
@@ -119,13 +119,18 @@ def mesh_hulls(vertices, faces, position, orientation=IDENTITY, scale=1.0, decom
 
 
 def _concavity(triangles):
-    """How deep (m) the deepest of triangles' (f, 3, 3) centres is inside of their convex hull."""
+    """How deep (m) the deepest of triangles' (f, 3, 3) centres is inside of their convex hull.
+
+    Of meshes with very many triangles, every second one is examined, or every third, and so on.
+    """
     from scipy import spatial  # here, because it takes a while to import
 
     planes = spatial.ConvexHull(triangles.reshape(-1, 3)).equations
-    centres, deepest = triangles.mean(axis=1), 0.0
-    for i in range(0, len(centres), _AT_ONCE):
-        depths = -(centres[i : i + _AT_ONCE] @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+    step = 1 + len(triangles) * len(planes) // _MAX_COMPARISONS
+    centres, deepest = triangles[::step].mean(axis=1), 0.0
+    count = 1 + _AT_ONCE // len(planes)
+    for i in range(0, len(centres), count):
+        depths = -(centres[i : i + count] @ planes[:, :3].T + planes[:, 3]).max(axis=1)
         deepest = max(deepest, float(depths.max()))
     return deepest
 
