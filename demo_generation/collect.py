@@ -24,7 +24,7 @@ from roboarm_nmp.demo_generation.planning import Planner, PlanningError
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, write_demos
 from roboarm_nmp.envs.datasets.journal import Journal, journal_of
 from roboarm_nmp.envs.datasets.queries import query_path, validate
-from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
+from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
@@ -136,7 +136,7 @@ class Collector:
                     "digest": execution.digest,
                     "collided": execution.collided,
                     "plan_seed": seed,
-                    "obstacles": to_array(self.env.scene.obstacles).tolist(),
+                    "obstacles": to_lists(self.env.scene.obstacles),
                     "rejected": dict(rejected),
                     "given_up": given_up,
                 }
@@ -234,7 +234,7 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
         base = task.base_scene
         joints = base.robot.num_joints
         if not isinstance(task.scene, Scene):
-            scenes_of = [replace(base, obstacles=from_array(demo["obstacles"])) for demo in demos]
+            scenes_of = [replace(base, obstacles=from_lists(demo["obstacles"])) for demo in demos]
         flags = " ".join(f"--{name.replace('_', '-')} {options[name]}" for name in OPTIONS[:-1])
         flags += " --allow-collisions" * options["allow_collisions"]
         write_demos(

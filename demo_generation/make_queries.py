@@ -41,7 +41,7 @@ from roboarm_nmp.envs.datasets.journal import Journal, journal_of
 from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.datasets.queries import query_path, write_queries
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import Scene, from_array, to_array
+from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
 from roboarm_nmp.envs.tasks import is_for_any_robot, task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers
@@ -133,7 +133,7 @@ class Sampler:
                     "index": f"{split}/{number}",
                     "start": start.tolist(),
                     "goal": goal.tolist(),
-                    "obstacles": to_array(self.env.scene.obstacles).tolist(),
+                    "obstacles": to_lists(self.env.scene.obstacles),
                     "rejected": rejected,
                 }
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
@@ -238,7 +238,7 @@ def make_queries(
             )
             splits[split] = (np.array(start, np.float32), np.array(goal, np.float32))
             if not isinstance(distribution, Scene):
-                scenes = [replace(base, obstacles=from_array(row)) for row in rows]
+                scenes = [replace(base, obstacles=from_lists(row)) for row in rows]
                 splits[split] += (scenes,)
         parameters = {
             "hold_steps": HOLD_STEPS,

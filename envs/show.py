@@ -46,7 +46,8 @@ from roboarm_nmp.envs.datasets.trajectories import (
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.robots.panda import scale_of
-from roboarm_nmp.envs.scenes.primitives import Scene, to_array
+from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.scenes.primitives import ConvexHull, Scene, to_array
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import NonNegativeInt, Pixels, PositiveInt, Seed
@@ -221,12 +222,17 @@ def _visible(env, goal, configurations):
 def _extent(env, configurations):
     """Corners (n, 3), m, of boxes around the obstacles, the table, and the arm in all its poses."""
     solids = [*env.scene.obstacles, *[env.scene.table] * (env.scene.table is not None)]
-    rows = to_array(solids)
+    hulls = [solid for solid in solids if isinstance(solid, ConvexHull)]
+    rows = to_array([solid for solid in solids if not isinstance(solid, ConvexHull)])
     # From the sizes in a row to half edges, for each kind: box, cylinder, sphere.
     scale = np.array([[0.5, 0.5, 0.5], [1, 1, 0.5], [1, 1, 1]])[rows[:, 0].astype(int)]
     turns = np.array([p.getMatrixFromQuaternion(row[4:8]) for row in rows]).reshape(-1, 3, 3)
     halves = np.einsum("nij,nj->ni", np.abs(turns), rows[:, 8:] * scale)
-    boxes = np.stack([rows[:, 1:4] - halves, rows[:, 1:4] + halves], axis=1)
+    boxes = [*np.stack([rows[:, 1:4] - halves, rows[:, 1:4] + halves], axis=1)]
+    for hull in hulls:
+        corners = np.array(hull.vertices) @ matrix(hull.orientation).T + hull.position
+        boxes.append(np.stack([corners.min(0), corners.max(0)]))
+    boxes = np.reshape(boxes, (-1, 2, 3))
     boxes = [*np.clip(boxes, *_around(env.robot, [LOWEST, HIGHEST]))]
     for configuration in configurations:
         env.robot.set_configuration(env.client, env.body, configuration)

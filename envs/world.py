@@ -13,7 +13,15 @@ import sys
 import numpy as np
 
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
-from roboarm_nmp.envs.scenes.primitives import FRICTION, Box, Cylinder, Scene, floor_box
+from roboarm_nmp.envs.scenes.primitives import (
+    FRICTION,
+    Box,
+    ConvexHull,
+    Cylinder,
+    Scene,
+    floor_box,
+    hull_faces,
+)
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 # A configuration is "held" if the controller keeps the arm there without contact for this many
@@ -230,6 +238,12 @@ class World:
             kind, orientation = p.GEOM_CYLINDER, obstacle.orientation
             collision = {"radius": obstacle.radius, "height": obstacle.length}
             visual = {"radius": obstacle.radius, "length": obstacle.length}
+        elif isinstance(obstacle, ConvexHull):
+            kind, orientation = p.GEOM_MESH, obstacle.orientation
+            collision = {"vertices": obstacle.vertices}
+            # Each face has its own corners: PyBullet would shade common ones as a round surface.
+            corners = np.array(obstacle.vertices)[hull_faces(obstacle.vertices)].reshape(-1, 3)
+            visual = {"vertices": corners.tolist(), "indices": list(range(len(corners)))}
         else:
             kind, collision = p.GEOM_SPHERE, {"radius": obstacle.radius}
             visual = collision

@@ -9,10 +9,11 @@
     checker.link_distances(states)           # as in observations, and faster
 
 The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`, without a PyBullet
-world. The shapes are: the convex hulls of the links' collision meshes, `BULLET_MARGIN` thicker on
-all sides; boxes and cylinders, with edges rounded by as much; spheres; the table and the floor. Of
-links, the robot's `self_collision_pairs` are checked. As in PyBullet, the base collides only with
-the arm itself. How often the two disagree: docs/benchmark/performance.md.
+world. The shapes are: the convex hulls of the links' collision meshes, and of obstacles,
+`BULLET_MARGIN` thicker on all sides; boxes and cylinders, with edges rounded by as much; spheres;
+the table and the floor. Of links, the robot's `self_collision_pairs` are checked. As in PyBullet,
+the base collides only with the arm itself. How often the two disagree:
+docs/benchmark/performance.md.
 
 Two shapes are compared in three stages, each only if the one before could not separate them: the
 link's bounding sphere against the box around the obstacle; the link's bounding box against that
@@ -31,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, group_points, shape_rows
+from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, group_points, world_shapes
 from roboarm_nmp.envs.collision.kernels import (
     free_batch,
     link_distances_batch,
@@ -101,7 +102,6 @@ class CollisionChecker:
                 f"a scene must be a roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
             )
         self.scene, self.robot = scene, scene.robot
-        self._arm = arm_hulls(scene.robot)
         if isinstance(scene, ObservedScene):
             points, point_radius = scene.points, scene.point_radius
         shapes, geometries = list(scene.obstacles), list(range(len(scene.obstacles)))
@@ -112,7 +112,8 @@ class CollisionChecker:
             shapes.append(floor_box(scene.floor))
             geometries.append(FLOOR)
         self._geometries = np.array([*geometries, ARM, POINT, NOTHING])
-        self._world = shape_rows(shapes), *group_points(points, point_radius)
+        rows, self._arm = world_shapes(shapes, arm_hulls(scene.robot))
+        self._world = rows, *group_points(points, point_radius)
 
     @classmethod
     def from_points(

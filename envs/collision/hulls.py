@@ -13,13 +13,14 @@ from roboarm_nmp.envs.collision.kernels import (
     BULLET_MARGIN,
     CELLS,
     FRAME_COLUMNS,
+    LINK,
     POSITION,
     ROTATION,
     ROW,
     SPHERE,
 )
 from roboarm_nmp.envs.robots.robot import matrix, temporary_file
-from roboarm_nmp.envs.scenes.primitives import Cylinder, Sphere, to_array
+from roboarm_nmp.envs.scenes.primitives import ConvexHull, Cylinder, Sphere, to_array
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 MAX_MARGIN = 0.5
@@ -216,8 +217,54 @@ def _cells(meshes):
     return np.concatenate([np.array(ends) + len(ends), *candidates])
 
 
+def world_shapes(obstacles, arm):
+    """Obstacles as `shape_rows`, and `arm_hulls` with their convex hulls as well.
+
+    A convex hull is a row of the kind `LINK`, of a body that is not among the arm's `bodies`.
+    """
+    rows = shape_rows(obstacles)
+    hulls = [obstacle for obstacle in obstacles if isinstance(obstacle, ConvexHull)]
+    if not hulls:
+        return rows, arm
+    chain, bodies, pairs, vertices, cells = arm
+    rows[[isinstance(obstacle, ConvexHull) for obstacle in obstacles], 17] = np.arange(
+        len(bodies), len(bodies) + len(hulls)
+    )
+    for hull in hulls:
+        _, mesh, own = _hull(hull.vertices)
+        cells = _joined_cells(cells, own, len(vertices))
+        vertices = np.concatenate([vertices, mesh])
+    return rows, (chain, bodies, pairs, vertices, cells)
+
+
+@functools.lru_cache(maxsize=1024)
+def _hull(vertices):
+    """A `ConvexHull` as PyBullet makes it: centre (3,), vertices (v, 3) relative to it, `_cells`.
+
+    PyBullet is asked for the vertices: it rounds them to about 1/10,000 of the hull's size.
+    """
+    client = p.connect(p.DIRECT)
+    try:
+        shape = p.createCollisionShape(p.GEOM_MESH, vertices=vertices, physicsClientId=client)
+        body = p.createMultiBody(0.0, shape, physicsClientId=client)
+        flags = p.MESH_DATA_SIMULATION_MESH
+        mesh = np.array(p.getMeshData(body, -1, flags=flags, physicsClientId=client)[1])
+    finally:
+        p.disconnect(physicsClientId=client)
+    centre = (mesh.min(0) + mesh.max(0)) / 2
+    return centre, mesh - centre, _cells([mesh - centre])
+
+
+def _joined_cells(cells, others, num_vertices):
+    """`_cells` of two lists of meshes as those of one; the first ones have `num_vertices`."""
+    # The first entry says where indices begin: after all positions.
+    a, b = cells[0], others[0]
+    positions = np.concatenate([cells[: a - 1], others[:b] + (cells[a - 1] - b)]) + (b - 1)
+    return np.concatenate([positions, cells[a:], others[b:] + num_vertices])
+
+
 def shape_rows(obstacles):
-    """Obstacles -> float64 (n, `ROW`)."""
+    """Obstacles -> float64 (n, `ROW`); `world_shapes` adds the bodies of convex hulls."""
     rows = np.zeros((len(obstacles), ROW))
     for obstacle, numbers, row in zip(obstacles, to_array(obstacles), rows, strict=True):
         (kind,), position, quaternion, size = np.split(numbers, (1, 4, 8))
@@ -232,6 +279,10 @@ def shape_rows(obstacles):
             *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
             *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
         )
+        if isinstance(obstacle, ConvexHull):
+            centre, mesh, _ = _hull(obstacle.vertices)
+            kind, rounding, half = LINK, BULLET_MARGIN, mesh.max(0) + BULLET_MARGIN
+            position = position + np.reshape(rotation, (3, 3)) @ centre
         row[:] = (kind, *position, *rotation, *half - rounding, rounding, 0)
     return rows
 

@@ -7,7 +7,8 @@ task has queries from elsewhere, each with
 - `goal_position`: float32 (n, 3), the end-effector position at the goal in metres,
 - where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
   uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
-  scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`.
+  scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`; where there are
+  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another.
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
@@ -17,7 +18,7 @@ A demonstration file, `envs/demos/<task>.h5`, has the arrays
   `envs.datasets.demonstrations.write_demos`); `length`: uint32 (n,), configurations in each;
 - `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
 - `collided`: uint8 (n,), whether the execution has a contact;
-- where scenes vary, `scene`, `obstacle_count` and `obstacles`, as above.
+- where scenes vary, `scene`, `obstacle_count`, `obstacles` and `hull_vertices`, as above.
 
 j is the number of the robot's joints, 7 of the Panda.
 
@@ -30,6 +31,7 @@ renamed: there is never half a file.
 
 import hashlib
 import io
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -41,10 +43,14 @@ from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import (
     MAX_LENGTH,
     ROW,
+    ConvexHull,
+    check_obstacle,
     from_array,
+    hull_vertices,
     scene_from_json,
     scene_to_json,
     to_array,
+    vertex_counts,
 )
 from roboarm_nmp.envs.tasks import (
     TASKS,
@@ -71,6 +77,7 @@ SCENE_ARRAYS = {
     "obstacle_count": ("<u4", None, "obstacle_count"),
     "obstacles": ("<f8", ROW, "obstacles"),
 }
+HULL_ARRAYS = {"hull_vertices": ("<f8", 3, "hull_vertices")}  # where there are convex hulls
 QUERY_ARRAYS = {
     "start": ("<f4", JOINTS, "start"),
     "goal": ("<f4", JOINTS, "start"),
@@ -93,6 +100,8 @@ def array_formats(schema, names):
     def with_scenes(arrays, rows_of, prefix=""):
         if f"{prefix}scene" in names:
             arrays = {**arrays, **SCENE_ARRAYS, "scene": ("<u4", None, rows_of)}
+            if f"{prefix}hull_vertices" in names:
+                arrays |= HULL_ARRAYS
         return {
             prefix + name: (dtype, width, prefix + sibling)
             for name, (dtype, width, sibling) in arrays.items()
@@ -135,21 +144,27 @@ class QueryScenes:
         index: int64 (n,), the number of each query's scene; None if all have the same scene.
         offsets: int64 (s + 1,): the obstacles of scene j are `rows[offsets[j] : offsets[j + 1]]`.
         rows: float64 (k, 11), as of `envs.scenes.primitives.to_array`.
+        vertices: float64 (v, 3), as of `envs.scenes.primitives.hull_vertices`.
     """
 
-    def __init__(self, base, index=None, offsets=None, rows=None):
+    def __init__(self, base, index=None, offsets=None, rows=None, vertices=()):
         self.base, self.index, self.offsets, self.rows = base, index, offsets, rows
+        self.vertices = vertices
+        if rows is not None:  # the vertices of row j begin at number `_vertex_offsets[j]`
+            self._vertex_offsets = np.concatenate([[0], np.cumsum(vertex_counts(rows))])
 
     def __getitem__(self, i):
         if self.index is None:
             return self.base
         first, last = self.offsets[self.index[i] :][:2]
-        return replace(self.base, obstacles=from_array(self.rows[first:last]))
+        begin, end = self._vertex_offsets[[first, last]]
+        obstacles = from_array(self.rows[first:last], self.vertices[begin:end])
+        return replace(self.base, obstacles=obstacles)
 
     def take(self, which):
         """The scenes of fewer queries, by slice or index array."""
         index = None if self.index is None else self.index[which]
-        return QueryScenes(self.base, index, self.offsets, self.rows)
+        return QueryScenes(self.base, index, self.offsets, self.rows, self.vertices)
 
 
 def task_file(task, folder, suffix):
@@ -224,11 +239,14 @@ def scene_arrays(path, scenes_of, base, prefix=""):
             raise DatasetError(
                 f"{path}: {prefix}scene differs from the task's in more than its obstacles"
             )
-    return {
+    obstacles = [o for s in numbers for o in s.obstacles]
+    arrays = {
         f"{prefix}scene": np.array(index, np.uint32),
         f"{prefix}obstacle_count": np.array([len(s.obstacles) for s in numbers], np.uint32),
-        f"{prefix}obstacles": to_array([o for s in numbers for o in s.obstacles]),
+        f"{prefix}obstacles": to_array(obstacles),
     }
+    vertices = hull_vertices(obstacles)
+    return arrays | ({f"{prefix}hull_vertices": vertices} if len(vertices) else {})
 
 
 def read_scenes(path, base, arrays, prefix=""):
@@ -239,8 +257,11 @@ def read_scenes(path, base, arrays, prefix=""):
     offsets = np.concatenate([[0], np.cumsum(counts.astype(np.int64))])
     if offsets[-1] != len(rows) or index.max() >= len(counts):
         raise DatasetError(f"{path}: {prefix}scene does not fit the number of scenes or obstacles")
+    vertices = arrays.get(f"{prefix}hull_vertices", np.empty((0, 3)))
     try:
-        from_array(rows)
+        for obstacle in from_array(rows, vertices):
+            if isinstance(obstacle, ConvexHull):
+                check_obstacle(obstacle)
     except ValueError as error:
         raise DatasetError(f"{path}: {prefix}obstacles: {error}") from error
     if not np.isfinite(rows).all():
@@ -249,7 +270,7 @@ def read_scenes(path, base, arrays, prefix=""):
         raise DatasetError(
             f"{path}: {prefix}obstacles has sizes that are not positive, or too large"
         )
-    return QueryScenes(base, index.astype(np.int64), offsets, rows)
+    return QueryScenes(base, index.astype(np.int64), offsets, rows, vertices)
 
 
 def read_base_scene(path, text, robot):
@@ -288,6 +309,10 @@ def _same_scene(one, other):
             if here is not there:
                 return False
             continue
+        if field == "obstacles":  # rows may have different lengths, those of convex hulls
+            if [len(row) for row in here] != [len(row) for row in there]:
+                return False
+            here, there = (list(itertools.chain(*rows)) for rows in (here, there))
         a, b = np.array(here, dtype=float), np.array(there, dtype=float)
         if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SCENE_TOLERANCE):
             return False

@@ -3,7 +3,8 @@
 A shard, `shard_00012.h5`, has the arrays (n scenes)
 
 - `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
-  rows of `envs.scenes.primitives.to_array`;
+  rows of `envs.scenes.primitives.to_array`; where there are convex hulls, `hull_vertices` float64
+  (v, 3), their vertices, one hull after another;
 - `configuration` float32 (n, j), the arm's joint angles in rad;
 - of each `Camera`, by its name, the outputs: `front/rgb` uint8 (n, height, width, 3),
   `front/segmentation` uint8 (n, height, width), `front/depth` uint16 (n, height, width) in units of
@@ -16,22 +17,32 @@ compressed one by one, with a checksum each, so each can be read alone.
 """
 
 import io
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from roboarm_nmp.envs.datasets import shards
-from roboarm_nmp.envs.datasets.format import DatasetError, attribute, read_base_scene
-from roboarm_nmp.envs.datasets.shards import read_array, shard_path, shard_paths, write_attributes
+from roboarm_nmp.envs.datasets.format import (
+    DatasetError,
+    QueryScenes,
+    attribute,
+    read_base_scene,
+)
+from roboarm_nmp.envs.datasets.shards import (
+    read_array,
+    read_vertices,
+    shard_path,
+    shard_paths,
+    write_attributes,
+)
 from roboarm_nmp.envs.perception.sensors import (
     PointCloud,
     sensors_from_json,
     sensors_to_json,
 )
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json, to_array
+from roboarm_nmp.envs.scenes.primitives import hull_vertices, scene_to_json, to_array
 from roboarm_nmp.envs.tasks import get_task, task_name
 
 SCHEMA, SCHEMA_VERSION = "roboarm-nmp observations", 1
@@ -67,12 +78,14 @@ def shard_bytes(task, seed, first, sensors, scenes, configurations, observations
         observations: list of n dicts, those of `observe`.
         made_by: the command line that makes the shards.
     """
-    rows = to_array([o for scene in scenes for o in scene.obstacles])
+    obstacles = [o for scene in scenes for o in scene.obstacles]
     arrays = {
         "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
-        "obstacles": rows,
+        "obstacles": to_array(obstacles),
         "configuration": np.asarray(configurations, np.float32),
     }
+    if len(vertices := hull_vertices(obstacles)):
+        arrays["hull_vertices"] = vertices
     attributes = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -151,9 +164,11 @@ class Observations:
 
     def scenes(self, number):
         """The `Scene`s of a shard, a list."""
-        counts, rows = self.read(number, "obstacle_count"), self.read(number, "obstacles")
-        ends = np.cumsum(counts.astype(np.int64))
-        return [
-            replace(self.base_scene, obstacles=from_array(rows[end - count : end]))
-            for end, count in zip(ends, counts, strict=True)
-        ]
+        path = shard_path(self.folder, number)
+        with open_shard(path) as file:
+            counts, rows = (read_array(file, path, n) for n in ("obstacle_count", "obstacles"))
+            vertices = read_vertices(file, path)
+        offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+        indices = np.arange(len(counts))
+        scenes = QueryScenes(self.base_scene, indices, offsets, rows, vertices)
+        return [scenes[i] for i in indices]

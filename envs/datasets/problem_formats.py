@@ -3,6 +3,7 @@
 Each reader yields a `Problem`, or a `Rejected` with the reason, for every problem of a file.
 """
 
+import functools
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -83,7 +84,8 @@ def read_file(path, robot):
         if "problems" in fields:
             entries, reader = list(_vamp_entries(fields, Path(path).stem)), _vamp_problem
         else:
-            entries, reader = list(_robometrics_entries(fields)), _robometrics_problem
+            entries = list(_robometrics_entries(fields))
+            reader = functools.partial(_robometrics_problem, folder=Path(path).parent)
         if not entries:
             raise Mistake(root, "no problems")
         if len(entries) > MAX_PROBLEMS:
@@ -220,7 +222,7 @@ def _robometrics_entries(fields):
             yield f"{scene[:60]}/{index}", node
 
 
-def _robometrics_problem(name, node, robot):
+def _robometrics_problem(name, node, robot, folder):
     fields = mapping(node, "a problem")
     robot = _with_opening(node, robot, ROBOMETRICS_OPENING)
     if "world_frame" in fields:
@@ -235,7 +237,7 @@ def _robometrics_problem(name, node, robot):
         pose = _goal_pose(fields["goal_pose"], robot)
     elif not goals:
         raise Mistake(node, "a problem needs goal_ik or goal_pose")
-    obstacles = curobo_obstacles(get(node, "obstacles", "a problem"))
+    obstacles = curobo_obstacles(get(node, "obstacles", "a problem"), folder)
     goals = np.reshape(goals, (-1, robot.num_joints))
     return Problem(name, start, goals, pose, checked_scene(node, obstacles, robot))
 

@@ -8,7 +8,8 @@
 A shard, `shard_00012.h5`, has the arrays
 
 - `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
-  rows of `envs.scenes.primitives.to_array`;
+  rows of `envs.scenes.primitives.to_array`; where there are convex hulls, `hull_vertices` float64
+  (v, 3), their vertices, one hull after another;
 - `path_count` uint32 (n,): paths in each scene; `length` uint16 (m,): points of each path;
 - `points` float32 (p, j): normalised configurations, one path after another, the first point of
   each the start, the last one the goal
@@ -30,9 +31,14 @@ from roboarm_nmp.envs.datasets.format import (
     attribute,
     read_base_scene,
 )
-from roboarm_nmp.envs.datasets.shards import read_array, shard_paths, write_attributes
+from roboarm_nmp.envs.datasets.shards import (
+    read_array,
+    read_vertices,
+    shard_paths,
+    write_attributes,
+)
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import scene_to_json, to_array
+from roboarm_nmp.envs.scenes.primitives import hull_vertices, scene_to_json, to_array
 from roboarm_nmp.envs.tasks import get_task, task_name
 
 SCHEMA, SCHEMA_VERSION = "roboarm-nmp roadmap paths", 1
@@ -83,13 +89,16 @@ def shard_bytes(task, seed, first, scenes, paths, made_by):
     """
     flat = [path for of_scene in paths for path in of_scene]
     base = get_task(task).base_scene
+    obstacles = [o for scene in scenes for o in scene.obstacles]
     arrays = {
         "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
-        "obstacles": to_array([o for scene in scenes for o in scene.obstacles]),
+        "obstacles": to_array(obstacles),
         "path_count": np.array([len(of_scene) for of_scene in paths], np.uint32),
         "length": np.array([len(path) for path in flat], np.uint16),
         "points": np.concatenate([np.empty((0, base.robot.num_joints), np.float32), *flat]),
     }
+    if len(vertices := hull_vertices(obstacles)):
+        arrays["hull_vertices"] = vertices
     attributes = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -119,12 +128,13 @@ def load_roadmap_paths(folder, robot=PANDA):
         DatasetError: there are no shards, or one is missing, damaged, or not of the same collection
             as the others; or they were made for another robot.
     """
-    parts, first = {name: [] for name in _ARRAYS}, None
+    parts, vertices, first = {name: [] for name in _ARRAYS}, [], None
     for path in shard_paths(folder, "roadmap paths"):
         with open_shard(path) as file:
             found = {name: attribute(file, name) for name in ("task", "seed", "scene")}
             for name, part in parts.items():
                 part.append(read_array(file, path, name))
+            vertices.append(read_vertices(file, path))
         first = first or found
         for name, value in found.items():
             if value != first[name]:
@@ -136,5 +146,5 @@ def load_roadmap_paths(folder, robot=PANDA):
     )
     base = read_base_scene(folder, first["scene"], robot)
     indices = np.arange(len(arrays["path_count"]))
-    scenes = QueryScenes(base, indices, obstacles, arrays["obstacles"])
+    scenes = QueryScenes(base, indices, obstacles, arrays["obstacles"], np.concatenate(vertices))
     return RoadmapPaths(first["task"], first["seed"], scenes, paths, arrays["points"], offsets)

@@ -73,6 +73,13 @@ def read_array(file, path, name):
         raise DatasetError(f"{path}: {name} is missing or corrupt ({error})") from error
 
 
+def read_vertices(file, path):
+    """The vertices of an open shard's convex hulls: float64 (v, 3). Raises DatasetError."""
+    if "hull_vertices" not in file:
+        return np.empty((0, 3))
+    return read_array(file, path, "hull_vertices")
+
+
 def check_collection(args):
     """Raise ValueError for flags of a collection, as `collect` takes them, that cannot work."""
     check_folder(args.output)

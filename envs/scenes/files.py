@@ -16,8 +16,14 @@ All lengths in metres, in the frame of the robot's base (x forward, y left, z up
       - cylinder: {position: [0.4, 0.4, 0.25], radius: 0.05, length: 0.5,   # around its own z axis
                    orientation: [0, 0, 0, 1]}                               # quaternion x, y, z, w
       - sphere: {position: [0.3, -0.4, 0.5], radius: 0.1}
+      - convex_hull: {position: [-0.4, 0.4, 0.2], vertices: [[0, 0, 0], [0.2, 0, 0],  # in its own
+                      [0, 0.2, 0], [0, 0, 0.2]]}       # frame, whose origin is at the position
 
-A box and a cylinder may have `yaw` or `orientation`, not both. A quaternion whose norm differs from
+An obstacle can be a mesh of a file in this file's folder, or below: `mesh: {file: part.stl, scale:
+0.001, decompose: true, position: [0.5, 0, 0.2]}`. `scale` is 1 and `decompose` false if left out:
+then a mesh's convex hull takes its place (`envs.scenes.meshes`).
+
+All but a sphere may have `yaw` or `orientation`, not both. A quaternion whose norm differs from
 1 by up to 1 % is normalised. A number is any finite number that Python's `float` reads, without
 quotes; also `1e-2`, which YAML 1.1 treats as text. YAML's anchors and aliases (`&a`, `*a`) work;
 tags (`!a`) and merge keys (`<<`) are rejected. Positions are not checked here: the simulator
@@ -35,14 +41,17 @@ from roboarm_nmp.envs.scenes.primitives import (
     FLOOR,
     FRICTION,
     IDENTITY,
+    MAX_HULL_VERTICES,
     MAX_LENGTH,
     MAX_SCENE_OBSTACLES,
     TABLE,
     Box,
+    ConvexHull,
     Cylinder,
     ObservedScene,
     Scene,
     Sphere,
+    check_obstacle,
     unit_quaternion,
 )
 from roboarm_nmp.envs.utils.files import write_atomically
@@ -116,7 +125,10 @@ def _format_scene(scene):
         "obstacles:" if scene.obstacles else "obstacles: []",
     ]
     for obstacle in scene.obstacles:
-        lines.append(f"  - {type(obstacle).__name__.lower()}: {_format_fields(obstacle)}")
+        kind = (
+            "convex_hull" if isinstance(obstacle, ConvexHull) else type(obstacle).__name__.lower()
+        )
+        lines.append(f"  - {kind}: {_format_fields(obstacle)}")
     return _HEADER + "\n".join(lines) + "\n"
 
 
@@ -127,10 +139,16 @@ def _format_fields(obstacle):
         if name in ("position", "size", "orientation"):
             if name == "orientation" and tuple(value) == IDENTITY:
                 continue
-            fields.append(f"{name}: [{', '.join(repr(float(number)) for number in value)}]")
+            fields.append(f"{name}: {_format_numbers(value)}")
+        elif name == "vertices":
+            fields.append(f"{name}: [{', '.join(map(_format_numbers, value))}]")
         else:
             fields.append(f"{name}: {float(value)!r}")
     return "{" + ", ".join(fields) + "}"
+
+
+def _format_numbers(numbers):
+    return f"[{', '.join(repr(float(number)) for number in numbers)}]"
 
 
 # --- Reading. PyYAML only composes nodes, which have line numbers; the functions below descend the
@@ -223,7 +241,11 @@ def _scene(node, folder):
             raise _mistake(node, reason)
         if len(node.value) > MAX_SCENE_OBSTACLES:
             raise _mistake(node, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
-        obstacles = tuple(_obstacle(entry) for entry in node.value)
+        obstacles = []
+        for entry in node.value:
+            obstacles += _obstacle(entry, folder)
+            if len(obstacles) > MAX_SCENE_OBSTACLES:  # a mesh may be several
+                raise _mistake(entry, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
     return Scene(obstacles, table, floor, friction, robot)
 
 
@@ -254,8 +276,9 @@ def _table(node):
     return _box(node, "table")
 
 
-def _obstacle(node):
-    kinds = ", ".join(_KINDS)
+def _obstacle(node, folder):
+    """A tuple of obstacles: a mesh may be several."""
+    kinds = ", ".join((*_KINDS, "mesh"))
     if not isinstance(node, yaml.MappingNode):
         expected = f"a mapping of its kind ({kinds}) to its fields"
         raise _mistake(node, f"an obstacle must be {expected}, got {_describe(node)}")
@@ -263,9 +286,11 @@ def _obstacle(node):
         keys = ", ".join(_describe(key) for key, _ in node.value[:5]) or "none"
         raise _mistake(node, f"an obstacle must have exactly one key, its kind ({kinds}): {keys}")
     [(key, fields)] = node.value
+    if isinstance(key, yaml.ScalarNode) and key.value == "mesh":
+        return _mesh(fields, key.value, folder)
     if not isinstance(key, yaml.ScalarNode) or key.value not in _KINDS:
         raise _mistake(key, f"unknown kind of obstacle {_describe(key)}: one of {kinds}")
-    return _KINDS[key.value](fields, key.value)
+    return (_KINDS[key.value](fields, key.value),)
 
 
 def _box(node, what):
@@ -295,7 +320,51 @@ def _sphere(node, what):
     )
 
 
-_KINDS = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}
+def _convex_hull(node, what):
+    fields = _mapping(node, what, ("position", "vertices"), ("orientation", "yaw"))
+    vertices = fields["vertices"]
+    if not isinstance(vertices, yaml.SequenceNode):
+        raise _mistake(vertices, f"vertices must be a list of points, got {_describe(vertices)}")
+    if len(vertices.value) > MAX_HULL_VERTICES:
+        raise _mistake(vertices, f"{what} has at most {MAX_HULL_VERTICES} vertices")
+    hull = ConvexHull(
+        _vector(fields["position"], f"position of {what}", 3),
+        tuple(_vector(vertex, f"a vertex of {what}", 3) for vertex in vertices.value),
+        _orientation(fields, what),
+    )
+    try:
+        check_obstacle(hull)
+    except ValueError as error:
+        raise _mistake(vertices, str(error)) from error
+    return hull
+
+
+def _mesh(node, what, folder):
+    # Here, because meshes are rare.
+    from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
+
+    optional = ("scale", "decompose", "orientation", "yaw")
+    fields = _mapping(node, what, ("file", "position"), optional)
+    file, scale, decompose = fields["file"], 1.0, False
+    if not isinstance(file, yaml.ScalarNode):
+        raise _mistake(file, f"file must be a file's name, got {_describe(file)}")
+    if "scale" in fields:
+        scale = _number(fields["scale"], f"scale of {what}", positive=True)
+    if "decompose" in fields:
+        decompose = _switch(fields["decompose"])
+        if decompose is None:
+            found = _describe(fields["decompose"])
+            raise _mistake(fields["decompose"], f"decompose must be true or false, got {found}")
+    position = _vector(fields["position"], f"position of {what}", 3)
+    orientation = _orientation(fields, what)
+    try:
+        mesh = load_mesh(file.value, folder)
+        return mesh_hulls(*mesh, position, orientation, scale, decompose)
+    except MeshError as error:
+        raise _mistake(file, str(error)) from error
+
+
+_KINDS = {"box": _box, "cylinder": _cylinder, "sphere": _sphere, "convex_hull": _convex_hull}
 
 
 def _orientation(fields, what):

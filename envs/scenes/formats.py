@@ -3,7 +3,8 @@
     scene = load_world("shelf.scene")
 
 All lengths in metres, in the frame of the robot's base. None of these formats has a table or a
-floor. What cannot be represented is rejected, with its line: see `UNSUPPORTED`.
+floor. Meshes become convex hulls (`envs.scenes.meshes`). What cannot be represented is rejected,
+with its line: see `UNSUPPORTED`.
 """
 
 import math
@@ -13,7 +14,7 @@ import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import matrix
-from roboarm_nmp.envs.scenes import documents
+from roboarm_nmp.envs.scenes import documents, meshes
 from roboarm_nmp.envs.scenes.documents import (
     DocumentError,
     Mistake,
@@ -85,7 +86,7 @@ def load_world(path):
     try:
         if any(key in root.value for key in _MOVEIT_SCENE):
             return moveit_scene(root, PANDA)
-        return checked_scene(root, curobo_obstacles(root))
+        return checked_scene(root, curobo_obstacles(root, path.parent))
     except Mistake as mistake:
         raise DocumentError(f"{path}:{mistake.line}: {mistake.reason}") from mistake
 
@@ -177,24 +178,29 @@ def _collision_object(node, robot):
         header = mapping(fields["header"], "header")
         if "frame_id" in header:
             check_frame(header["frame_id"], robot)
-    _reject_unless_empty(fields, "meshes", "planes")
+    _reject_unless_empty(fields, "planes")
     if "operation" in fields:
         operation = documents.text(fields["operation"], "operation")
         if operation not in ("0", "add"):
             raise Mistake(fields["operation"], f"operation {shorten(operation)} is not `add`")
     outer = _moveit_pose(fields["pose"], "pose") if "pose" in fields else None
-    if "primitives" not in fields:
-        return []
-    primitives = sequence(fields["primitives"], "primitives", MAX_SCENE_OBSTACLES)
-    poses = sequence(get(node, "primitive_poses", "a collision object"), "primitive_poses")
-    if len(primitives) != len(poses):
-        raise Mistake(node, f"{len(primitives)} primitives have {len(poses)} primitive_poses")
     found = []
-    for primitive, pose in zip(primitives, poses, strict=True):
-        position, orientation = _moveit_pose(pose, "primitive_poses")
-        if outer is not None:  # from the left
-            position, orientation = compose_poses(*outer, position, orientation)
-        found.append(_moveit_primitive(primitive, position, orientation))
+    for many, one, read in (
+        ("primitives", "primitive", _moveit_primitive),
+        ("meshes", "mesh", _moveit_mesh),
+    ):
+        if is_nothing(fields.get(many)):
+            continue
+        shapes = sequence(fields[many], many, MAX_SCENE_OBSTACLES)
+        poses = sequence(get(node, f"{one}_poses", "a collision object"), f"{one}_poses")
+        if len(shapes) != len(poses):
+            raise Mistake(node, f"{len(shapes)} {many} have {len(poses)} {one}_poses")
+        for shape, pose in zip(shapes, poses, strict=True):
+            position, orientation = _moveit_pose(pose, f"{one}_poses")
+            if outer is not None:  # from the left
+                position, orientation = compose_poses(*outer, position, orientation)
+            found += read(shape, position, orientation)
+            _check_number(shape, found)
     return found
 
 
@@ -203,13 +209,21 @@ def _moveit_primitive(node, position, orientation):
     kind = _MOVEIT_TYPES.get(kind, kind)
     sizes = get(node, "dimensions", "a primitive")
     if kind == "box":
-        return Box(position, _sizes(sizes, "the dimensions of a box", 3), orientation)
+        return [Box(position, _sizes(sizes, "the dimensions of a box", 3), orientation)]
     if kind == "sphere":
-        return Sphere(position, *_sizes(sizes, "the dimensions of a sphere", 1))
+        return [Sphere(position, *_sizes(sizes, "the dimensions of a sphere", 1))]
     if kind == "cylinder":
         length, radius = _sizes(sizes, "the dimensions of a cylinder", 2)
-        return Cylinder(position, radius, length, orientation)
+        return [Cylinder(position, radius, length, orientation)]
     _unknown_kind(node, kind)
+
+
+def _moveit_mesh(node, position, orientation):
+    points = sequence(get(node, "vertices", "a mesh"), "vertices")
+    vertices = [_vector(point, "a vertex", (0.0, 0.0, 0.0)) for point in points]
+    triangles = sequence(get(node, "triangles", "a mesh"), "triangles", meshes.MAX_TRIANGLES)
+    faces = (_face(get(one, "vertex_indices", "a triangle")) for one in triangles)
+    return _hulls(node, vertices, faces, position, orientation)
 
 
 def _moveit_pose(node, what):
@@ -245,7 +259,7 @@ def read_scene_text(path):
 def _scene_text(lines):
     at, obstacles = 0, []
 
-    def take(what, count=None):
+    def take(what, count=None, most=MAX_LENGTH):
         """The next line; with a count, so many numbers of it."""
         nonlocal at
         while at < len(lines) and not lines[at]:
@@ -257,7 +271,7 @@ def _scene_text(lines):
         if count is None:
             return node
         words = Node([Node(word, at) for word in node.value.split()], at)
-        return numbers(words, what, count, MAX_LENGTH), words
+        return numbers(words, what, count, most), words
 
     def starts_with_pose():
         """Whether an object's pose follows, as in newer files; else the number of its shapes."""
@@ -268,6 +282,14 @@ def _scene_text(lines):
         position, _ = take("a position", 3)
         turn, node = take("an orientation", 4)
         return position, _turn(node, turn)
+
+    def placed(outer):
+        """The pose of a shape in the base's frame, and its colour, which is dropped."""
+        position, orientation = pose()
+        take("a colour", 4)
+        if outer is not None:
+            return compose_poses(*outer, position, orientation)
+        return position, orientation
 
     def count(what):
         node = take(what)
@@ -283,15 +305,24 @@ def _scene_text(lines):
         outer = pose() if is_new else None
         for _ in range(count("the number of shapes")):
             kind = take("a shape")
+            if kind.value == "mesh":
+                (num_vertices, num_faces), node = take(
+                    "the numbers of vertices and triangles", 2, 1e9
+                )
+                if max(num_vertices, num_faces) > len(lines):
+                    raise Mistake(node, "the file ends before the last triangle")
+                vertices = [take("a vertex", 3)[0] for _ in range(int(num_vertices))]
+                faces = [_face(take("a triangle", 3, 1e9)[1]) for _ in range(int(num_faces))]
+                position, orientation = placed(outer)
+                obstacles += _hulls(kind, vertices, faces, position, orientation)
+                _check_number(kind, obstacles)
+                continue
             number_of_sizes = {"box": 3, "sphere": 1, "cylinder": 2}.get(kind.value)
             if number_of_sizes is None:
                 _unknown_kind(kind, kind.value)
             what = f"the dimensions of a {kind.value}"
             sizes = _sizes(take(what, number_of_sizes)[1], what, number_of_sizes)
-            position, orientation = pose()
-            take("a colour", 4)
-            if outer is not None:
-                position, orientation = compose_poses(*outer, position, orientation)
+            position, orientation = placed(outer)
             if kind.value == "box":
                 obstacles.append(Box(position, sizes, orientation))
             elif kind.value == "sphere":
@@ -309,23 +340,28 @@ def _scene_text(lines):
 # --- robometrics and cuRobo
 
 
-def curobo_obstacles(node):
+def curobo_obstacles(node, folder):
     """The obstacles of a cuRobo world, or of robometrics' `obstacles`, a `Node`. Raises Mistake.
 
     Kinds are dicts from names to fields. A pose is x, y, z and a quaternion w, x, y, z; `dims` are
-    full edges.
+    full edges. Files of meshes are relative to `folder`, and inside of it.
     """
     fields = mapping(node, "obstacles")
     for kind in fields:
-        if kind not in ("cuboid", "cylinder", "sphere", "box") and not is_nothing(fields[kind]):
+        if kind not in ("cuboid", "cylinder", "sphere", "box", "mesh") and not is_nothing(
+            fields[kind]
+        ):
             _unknown_kind(fields[kind], kind)
     obstacles = []
-    for kind in ("cuboid", "box", "cylinder", "sphere"):
+    for kind in ("cuboid", "box", "cylinder", "sphere", "mesh"):
         if is_nothing(fields.get(kind)):
             continue
         for name, one in mapping(fields[kind], kind).items():
             what = f"{kind} {name[:40]}"
-            obstacles.append(_curobo_obstacle(one, kind, what))
+            if kind == "mesh":
+                obstacles += _curobo_mesh(one, what, folder)
+            else:
+                obstacles.append(_curobo_obstacle(one, kind, what))
             _check_number(one, obstacles)
     return tuple(obstacles)
 
@@ -335,9 +371,7 @@ def _curobo_obstacle(node, kind, what):
     if kind == "sphere" and "pose" not in fields:
         position = numbers(get(node, "position", what), f"position of {what}", 3, MAX_LENGTH)
     else:
-        pose = get(node, "pose", what)
-        x, y, z, w, i, j, k = numbers(pose, f"pose of {what}", 7, MAX_LENGTH)
-        position, orientation = (x, y, z), _turn(pose, (i, j, k, w))
+        position, orientation = _curobo_pose(node, what)
     if kind in ("cuboid", "box"):
         return Box(position, _sizes(get(node, "dims", what), f"dims of {what}", 3), orientation)
     radius = _size(get(node, "radius", what), f"radius of {what}")
@@ -346,6 +380,55 @@ def _curobo_obstacle(node, kind, what):
     return Cylinder(
         position, radius, _size(get(node, "height", what), f"height of {what}"), orientation
     )
+
+
+def _curobo_pose(node, what):
+    pose = get(node, "pose", what)
+    x, y, z, w, i, j, k = numbers(pose, f"pose of {what}", 7, MAX_LENGTH)
+    return (x, y, z), _turn(pose, (i, j, k, w))
+
+
+def _curobo_mesh(node, what, folder):
+    """The `ConvexHull`s of a mesh, which has a `file_path`, or `vertices` and `faces`."""
+    fields, scale = mapping(node, what), 1.0
+    if not is_nothing(fields.get("scale")):
+        scale = numbers(fields["scale"], f"scale of {what}", 3, MAX_LENGTH)
+        if min(scale) <= 0:
+            raise Mistake(fields["scale"], f"scale of {what} must be positive")
+    position, orientation = _curobo_pose(node, what)
+    if is_nothing(fields.get("file_path")):
+        points = sequence(get(node, "vertices", what), "vertices")
+        vertices = [numbers(one, "a vertex", 3, MAX_LENGTH) for one in points]
+        faces = sequence(get(node, "faces", what), "faces", meshes.MAX_TRIANGLES)
+        return _hulls(node, vertices, map(_face, faces), position, orientation, scale)
+    try:
+        file = fields["file_path"]
+        mesh = meshes.load_mesh(documents.text(file, "file_path"), folder)
+        return meshes.mesh_hulls(*mesh, position, orientation, scale)
+    except meshes.MeshError as error:
+        raise Mistake(file, str(error)) from error
+
+
+def _face(node):
+    """The vertices of a triangle, three whole numbers."""
+    return tuple(int(number(one, "a triangle's vertex", 1e9)) for one in _three(node))
+
+
+def _three(node):
+    corners = sequence(node, "a triangle")
+    if len(corners) != 3:
+        raise Mistake(node, f"a triangle has 3 vertices, got {len(corners)}")
+    return corners
+
+
+def _hulls(node, vertices, faces, position, orientation, scale=1.0):
+    """The `ConvexHull`s of a mesh in the file itself. Raises Mistake."""
+    vertices = np.reshape(vertices, (-1, 3)).astype(np.float64)
+    faces = np.reshape(list(faces), (-1, 3)).astype(np.int64)
+    try:
+        return meshes.mesh_hulls(vertices, faces, position, orientation, scale)
+    except meshes.MeshError as error:
+        raise Mistake(node, str(error)) from error
 
 
 # --- VAMP's JSON

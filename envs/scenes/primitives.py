@@ -1,8 +1,9 @@
-"""Scenes as plain data: an arm, boxes, cylinders and spheres around it, a table and a floor.
+"""Scenes as plain data: an arm, boxes, cylinders, spheres and convex hulls around it, table, floor.
 
 All lengths in metres, in the world's frame: that of the Panda's base (x forward, y left, z up).
 """
 
+import functools
 import hashlib
 import json
 import math
@@ -16,6 +17,8 @@ from roboarm_nmp.envs.robots.robot import Robot
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 MAX_LENGTH, MAX_SCENE_OBSTACLES = 1000.0, 10_000
 """Limits of sizes and coordinates (m), and of a scene's obstacles: more is a mistake."""
+MAX_HULL_VERTICES = 256
+"""Of a `ConvexHull`."""
 # Quaternions: of up to the first deviation of the norm from 1, they stay as they are, bit for bit;
 # up to the second, such as (0, 0, 0.7071, 0.7071), they are normalised.
 _EXACT_NORM, _ROUNDED_NORM = 1e-6, 0.01
@@ -95,7 +98,28 @@ class Sphere:
     __post_init__ = _normalise
 
 
-Obstacle = Box | Cylinder | Sphere
+@dataclass(frozen=True)
+class ConvexHull:
+    """The convex hull of points, 4 to `MAX_HULL_VERTICES` of them, not in one plane.
+
+    `convex_hull` makes one of any number of points; `envs.scenes.meshes` of a mesh's file.
+
+    `vertices` are (x, y, z), m, in the hull's own frame, which has its origin at `position`, and
+    `orientation` as of a `Box`.
+    """
+
+    position: tuple[float, float, float]
+    vertices: tuple[tuple[float, float, float], ...]
+    orientation: tuple[float, float, float, float] = IDENTITY
+
+    def __post_init__(self):
+        _normalise(self)
+        vertices = self.vertices
+        if type(vertices) is not tuple or any(type(vertex) is not tuple for vertex in vertices):
+            object.__setattr__(self, "vertices", tuple(map(tuple, vertices)))
+
+
+Obstacle = Box | Cylinder | Sphere | ConvexHull
 
 # The arm stands on the table's top (z = 0).
 TABLE = Box(position=(0.2, 0.0, -0.02), size=(1.0, 1.0, 0.04))
@@ -131,14 +155,16 @@ class Scene:
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
         for obstacle in self.obstacles:
             if not isinstance(obstacle, Obstacle):
-                raise TypeError(f"obstacles must be Box, Cylinder or Sphere, got {obstacle!r}")
-            _check(obstacle)
+                raise TypeError(
+                    f"obstacles must be Box, Cylinder, Sphere or ConvexHull, got {obstacle!r}"
+                )
+            check_obstacle(obstacle)
         if len(self.obstacles) > MAX_SCENE_OBSTACLES:
             raise ValueError(f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
         if self.table is not None:
             if not isinstance(self.table, Box):
                 raise TypeError(f"table must be a Box or None, got {self.table!r}")
-            _check(self.table)
+            check_obstacle(self.table)
         if self.floor is not None and not _is_length(self.floor):
             raise ValueError(f"floor must be a height in m or None, got {self.floor!r}")
         if not (is_number(self.friction) and self.friction >= 0):
@@ -190,7 +216,11 @@ def _is_length(value):
     return is_number(value) and abs(value) <= MAX_LENGTH
 
 
-def _check(body):
+def check_obstacle(body):
+    """Raise ValueError unless an obstacle's numbers are finite, its sizes positive, in bounds."""
+    if isinstance(body, ConvexHull):
+        _check_hull(body)
+        return
     sizes = (body.radius,) if not isinstance(body, Box) else body.size
     if isinstance(body, Cylinder):
         sizes = body.radius, body.length
@@ -205,15 +235,90 @@ def _check(body):
         )
 
 
-_KINDS = (Box, Cylinder, Sphere)
+def _check_hull(hull):
+    if not 4 <= len(hull.vertices) <= MAX_HULL_VERTICES:
+        raise ValueError(
+            f"a convex hull has 4 to {MAX_HULL_VERTICES} vertices, got {len(hull.vertices)}: "
+            f"`convex_hull` reduces them"
+        )
+    if not (
+        len(hull.position) == 3
+        and all(map(_is_length, hull.position))
+        and all(len(vertex) == 3 and all(map(_is_length, vertex)) for vertex in hull.vertices)
+    ):
+        raise ValueError(
+            f"a convex hull needs finite numbers, up to {MAX_LENGTH:.0f} m, three per vertex"
+        )
+    hull_faces(hull.vertices)
+
+
+@functools.lru_cache(maxsize=1024)
+def hull_faces(vertices):
+    """The triangles of a `ConvexHull`'s surface: int64 (f, 3), counterclockwise from outside.
+
+    Raises ValueError: the vertices are in one plane.
+    """
+    points = np.array(vertices, dtype=np.float64)
+    found = _qhull(points)
+    faces = found.simplices.astype(np.int64)
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), found.equations[:, :3]) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    faces.flags.writeable = False  # the next caller gets the same array
+    return faces
+
+
+def _qhull(points):
+    from scipy import spatial  # here, because it takes a while to import
+
+    try:
+        return spatial.ConvexHull(points)
+    except (spatial.QhullError, ValueError) as error:
+        raise ValueError("the vertices of a convex hull are in one plane, or too close") from error
+
+
+def convex_hull(points, position=(0.0, 0.0, 0.0), orientation=IDENTITY):
+    """The `ConvexHull` of points (n, 3), m, in its own frame; interior points are dropped.
+
+    If more than `MAX_HULL_VERTICES` remain, those that are farthest along as many directions are
+    kept, and moved away from their mean by one factor, so that the hull contains all points.
+
+    Raises ValueError: the points are in one plane, not finite, or of another shape.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ValueError(f"points must be finite, of shape (n, 3), got {points.shape}")
+    if len(points) < 4:
+        raise ValueError(f"a convex hull needs at least 4 points, got {len(points)}")
+    points = points[np.sort(_qhull(points).vertices)]
+    if len(points) > MAX_HULL_VERTICES:
+        # Evenly spread over the sphere (Gonzalez, 2010), of a box around the points as a cube.
+        i = np.arange(MAX_HULL_VERTICES) + 0.5
+        z, angle = 1 - 2 * i / MAX_HULL_VERTICES, i * math.pi * (3 - math.sqrt(5))
+        across = np.sqrt(1 - z * z)
+        directions = np.stack([across * np.cos(angle), across * np.sin(angle), z])
+        kept = np.unique((points / np.ptp(points, axis=0) @ directions).argmax(axis=0))
+        inner = _qhull(points[kept])
+        kept = points[kept][np.sort(inner.vertices)]
+        centre, normals = kept.mean(axis=0), inner.equations[:, :3]
+        reach = ((points - centre) @ normals.T).max(axis=0)
+        grown = (reach / -(inner.equations[:, 3] + normals @ centre)).max()
+        points = centre + grown * (kept - centre)
+    return ConvexHull(position, tuple(map(tuple, points.tolist())), orientation)
+
+
+_KINDS = (Box, Cylinder, Sphere, ConvexHull)
 ROW = 11  # numbers per obstacle: kind, position 3, orientation 4, size 3
+HULL = 3
+"""Kind of a `ConvexHull` in `to_array`."""
 
 
 def to_array(obstacles):
     """Obstacles -> float64 array (n, 11): kind, position, quaternion, size.
 
-    Kinds: 0 box, 1 cylinder, 2 sphere. Sizes: a box's three edges; (radius, radius, length) of a
-    cylinder; three times the radius of a sphere.
+    Kinds: 0 box, 1 cylinder, 2 sphere, 3 convex hull. Sizes: a box's three edges; (radius, radius,
+    length) of a cylinder; three times the radius of a sphere; three times the number of a hull's
+    vertices, which are in `hull_vertices`.
     """
     rows = np.zeros((len(obstacles), ROW))
     for row, obstacle in zip(rows, obstacles, strict=True):
@@ -224,27 +329,54 @@ def to_array(obstacles):
         row[4:8] = obstacle.orientation
         if isinstance(obstacle, Box):
             row[8:11] = obstacle.size
+        elif isinstance(obstacle, ConvexHull):
+            row[8:11] = len(obstacle.vertices)
         else:
             row[8:11] = obstacle.radius, obstacle.radius, obstacle.length
     return rows
 
 
+def hull_vertices(obstacles):
+    """The vertices of all `ConvexHull`s among obstacles, one after another: float64 (v, 3), m."""
+    hulls = [o.vertices for o in obstacles if isinstance(o, ConvexHull)]
+    return np.array([vertex for vertices in hulls for vertex in vertices]).reshape(-1, 3)
+
+
+def vertex_counts(rows):
+    """How many of `hull_vertices` each row of `to_array` has: int64 (n,). Raises ValueError."""
+    counts = np.where(rows[:, 0] == HULL, rows[:, 8], 0)
+    if not (np.isfinite(counts).all() and (counts >= 0).all() and (counts == counts.round()).all()):
+        raise ValueError("a convex hull has a number of vertices that is no whole number")
+    return counts.astype(np.int64)
+
+
 def padded_rows(obstacles, number):
-    """Obstacles -> float32 array (number, 12): 1 and a row of `to_array`, then rows of zeros."""
+    """Obstacles -> float32 array (number, 12): 1 and a row of `to_array`, then rows of zeros.
+
+    Raises ValueError: a `ConvexHull`, whose vertices a row cannot have.
+    """
+    if any(isinstance(obstacle, ConvexHull) for obstacle in obstacles):
+        raise ValueError("convex hulls cannot be described by rows of 12 numbers: use a sensor")
     rows = np.zeros((number, 1 + ROW), np.float32)
     rows[: len(obstacles), 0] = 1.0
     rows[: len(obstacles), 1:] = to_array(obstacles)
     return rows
 
 
-def from_array(rows):
-    """The inverse of `to_array`.
+def from_array(rows, vertices=()):
+    """The inverse of `to_array`, and of `hull_vertices`.
 
-    Raises ValueError: another shape, an unknown kind, or no unit quaternion.
+    Raises ValueError: another shape, an unknown kind, no unit quaternion, or another number of
+    vertices.
     """
     rows = np.asarray(rows, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != ROW:
         raise ValueError(f"an obstacle array has shape (n, {ROW}), got {rows.shape}")
+    vertices = np.reshape(vertices, (-1, 3))
+    counts = vertex_counts(rows)
+    if counts.sum() != len(vertices):
+        raise ValueError(f"convex hulls of {counts.sum()} vertices have {len(vertices)}")
+    vertices, used = [tuple(vertex) for vertex in vertices.tolist()], 0
     obstacles = []
     for kind, *numbers in rows.tolist():
         position, orientation, size = tuple(numbers[:3]), tuple(numbers[3:7]), tuple(numbers[7:])
@@ -254,9 +386,30 @@ def from_array(rows):
             obstacles.append(Cylinder(position, size[0], size[2], orientation))
         elif kind == 2:
             obstacles.append(Sphere(position, size[0]))
+        elif kind == HULL:
+            end = used + int(size[0])
+            obstacles.append(ConvexHull(position, tuple(vertices[used:end]), orientation))
+            used = end
         else:
-            raise ValueError(f"unknown kind of obstacle {kind}: 0 box, 1 cylinder, 2 sphere")
+            raise ValueError(
+                f"unknown kind of obstacle {kind}: 0 box, 1 cylinder, 2 sphere, 3 convex hull"
+            )
     return tuple(obstacles)
+
+
+def to_lists(obstacles):
+    """Obstacles as JSON's lists: rows of `to_array`, a hull's followed by its vertices' numbers."""
+    rows = to_array(obstacles).tolist()
+    for row, obstacle in zip(rows, obstacles, strict=True):
+        if isinstance(obstacle, ConvexHull):
+            row += [float(number) for vertex in obstacle.vertices for number in vertex]
+    return rows
+
+
+def from_lists(rows):
+    """The inverse of `to_lists`. Raises ValueError, TypeError: as `from_array`."""
+    vertices = np.array([number for row in rows for number in row[ROW:]]).reshape(-1, 3)
+    return from_array(np.array([row[:ROW] for row in rows]).reshape(-1, ROW), vertices)
 
 
 def scene_to_json(scene):
@@ -264,7 +417,7 @@ def scene_to_json(scene):
     if isinstance(scene, ObservedScene):
         raise ValueError("a scene with points cannot be written: save the points as .npy instead")
     fields = {
-        "obstacles": to_array(scene.obstacles).tolist(),
+        "obstacles": to_lists(scene.obstacles),
         "table": None if scene.table is None else to_array([scene.table])[0].tolist(),
         "floor": scene.floor,
     }
@@ -284,7 +437,6 @@ def scene_from_json(text, robot=PANDA):
     """
     fields = json.loads(text)
     table = fields["table"] and from_array([fields["table"]])[0]
-    rows = np.array(fields["obstacles"]).reshape(-1, ROW)
     friction = fields.get("friction", FRICTION)
     robot = robot.arm.with_held(fields["held"]) if "held" in fields else robot.arm
-    return Scene(from_array(rows), table, fields["floor"], friction, robot)
+    return Scene(from_lists(fields["obstacles"]), table, fields["floor"], friction, robot)

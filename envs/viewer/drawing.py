@@ -9,7 +9,7 @@ import numpy as np
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, find_geometry_source
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
 from roboarm_nmp.envs.robots.panda import scale_of
-from roboarm_nmp.envs.scenes.primitives import Box, Cylinder
+from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, Cylinder, hull_faces
 from roboarm_nmp.envs.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, arm_joints, link_meshes
 
 # m, for the Panda; for other arms in proportion to their reach.
@@ -245,6 +245,12 @@ class Drawing:
             size = {"radius": body.radius, "height": body.length}
             wxyz = _wxyz(body.orientation)
             handle = self._scene.add_cylinder(name, **size, wxyz=wxyz, **options)
+        elif isinstance(body, ConvexHull):
+            mesh = np.array(body.vertices, np.float32), hull_faces(body.vertices).astype(np.uint32)
+            wxyz = _wxyz(body.orientation)
+            handle = self._scene.add_mesh_simple(
+                name, *mesh, flat_shading=True, wxyz=wxyz, **options
+            )
         else:
             handle = self._scene.add_icosphere(name, radius=body.radius, **options)
         if self.on_click is not None and colour != TABLE_COLOUR:

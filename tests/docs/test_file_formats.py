@@ -6,7 +6,12 @@ import numpy as np
 from paths import ROOT
 
 import roboarm_nmp
-from roboarm_nmp.envs.datasets.format import DEMO_ARRAYS, QUERY_ARRAYS, SCENE_ARRAYS
+from roboarm_nmp.envs.datasets.format import (
+    DEMO_ARRAYS,
+    HULL_ARRAYS,
+    QUERY_ARRAYS,
+    SCENE_ARRAYS,
+)
 from roboarm_nmp.envs.datasets.problems import ARRAYS as PROBLEM_ARRAYS
 from roboarm_nmp.envs.networks import operations
 from roboarm_nmp.envs.scenes.files import load_scene
@@ -25,7 +30,7 @@ def code(title, language):
 
 def test_arrays_are_listed_with_their_dtypes():
     for title, arrays in (
-        ("Queries", QUERY_ARRAYS | SCENE_ARRAYS),
+        ("Queries", QUERY_ARRAYS | SCENE_ARRAYS | HULL_ARRAYS),
         ("Demonstrations", DEMO_ARRAYS),
         ("Problems", PROBLEM_ARRAYS),
     ):
@@ -51,7 +56,7 @@ def test_code_about_queries_and_demonstrations_runs():
 def test_scene_of_the_page_is_read(tmp_path):
     path = tmp_path / "scene.yaml"
     path.write_text(code("Scenes", "yaml"))
-    assert len(load_scene(path).obstacles) == 4
+    assert len(load_scene(path).obstacles) == 5
 
 
 def test_keys_of_an_evaluation_are_listed():

@@ -72,8 +72,8 @@ MISTAKES = [
      "cones are not supported"),
     ("a.yaml", edited(MOVEIT_SCENE, "  collision_objects:", "  octomap: {id: x}\n  collision_obj"
      "ects:"), 12, "octomaps are not supported"),
-    ("a.yaml", edited(MOVEIT_SCENE, "- id: can", "- id: can\n      meshes: [{vertices: []}]"), 14,
-     "meshes are not supported"),
+    ("a.yaml", edited(MOVEIT_SCENE, "- id: can", "- id: can\n      meshes: [{vertices: []}]"), 13,
+     "a collision object lacks mesh_poses"),
     ("a.yaml", edited(MOVEIT_SCENE, "type: cylinder", "type: torus"), 15,
      "unknown kind of obstacle 'torus'"),
     ("a.yaml", edited(MOVEIT_SCENE, "[0.14, 0.03]", "[0.14, -0.03]"), 16,
@@ -91,7 +91,7 @@ MISTAKES = [
     ("a.yaml", edited(MOVEIT_SCENE, "  joint_state:", "  attached_collision_objects: [{x: 1}]\n  "
      "joint_state:"), 7, "attached objects are not supported"),
     ("b.yml", edited(CUROBO, "mesh: {}", "mesh: {cup: {file_path: cup.obj}}"), 7,
-     "meshes are not supported"),
+     "mesh cup lacks pose"),
     ("b.yml", edited(CUROBO, "-0.1, 1, 0, 0, 0]", "-0.1, 1, 0, 0]"), 4,
      "pose of cuboid table must be 7 numbers, got 6"),
     ("c.scene", edited(SCENE_TEXT, "cylinder", "cone"), 11, "cones are not supported"),

@@ -11,10 +11,20 @@ import pytest
 
 from roboarm_nmp.envs.scenes import files as scene_files
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
-from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.scenes.primitives import (
+    FLOOR,
+    TABLE,
+    Box,
+    ConvexHull,
+    Cylinder,
+    Scene,
+    Sphere,
+)
 from roboarm_nmp.envs.tasks import TASKS
 
-DOCUMENTED = textwrap.dedent(re.search(r"(    table:.*\n)\nA box", scene_files.__doc__, re.S)[1])
+DOCUMENTED = textwrap.dedent(
+    re.search(r"(    table:.*\n)\nAn obstacle", scene_files.__doc__, re.S)[1]
+)
 EXAMPLE = Scene(
     (
         Box((0.5, 0.0, 0.3), (0.3, 0.04, 0.6)),
@@ -25,6 +35,7 @@ EXAMPLE = Scene(
         ),
         Cylinder((0.4, 0.4, 0.25), 0.05, 0.5),
         Sphere((0.3, -0.4, 0.5), 0.1),
+        ConvexHull((-0.4, 0.4, 0.2), ((0, 0, 0), (0.2, 0, 0), (0, 0.2, 0), (0, 0, 0.2))),
     )
 )
 
@@ -176,6 +187,8 @@ def test_written_file_is_short_and_has_comments(tmp_path):
     assert lines[7:] == [
         "  - cylinder: {position: [0.4, 0.4, 0.25], radius: 0.05, length: 0.5}",
         "  - sphere: {position: [0.3, -0.4, 0.5], radius: 0.1}",
+        "  - convex_hull: {position: [-0.4, 0.4, 0.2], "
+        "vertices: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.2]]}",
     ]
 
 
@@ -299,7 +312,11 @@ def sphere(position="[0, 0, 0]", radius="1"):
         ("\nobstacles: {box: 1}\n", 2, "obstacles must be a list .* got a mapping"),
         (obstacle("box"), 3, r"an obstacle must be a mapping of its kind \(box, cyl.*, got box"),
         (obstacle(""), 3, "an obstacle must be a mapping of its kind .* got nothing"),
-        (obstacle("{}"), 3, r"exactly one key, its kind \(box, cylinder, sphere\): none"),
+        (
+            obstacle("{}"),
+            3,
+            r"exactly one key, its kind \(box, cylinder, sphere, convex_hull, mesh\): none",
+        ),
         (obstacle("box: 1\n    sphere: 1"), 3, "exactly one key, its kind .*: box, sphere"),
         (obstacle("box: 1\n    box: 1"), 3, "exactly one key, its kind .*: box, box"),
         (obstacle("box:\n    size: 1"), 3, "exactly one key, its kind .*: box, size"),

@@ -1,0 +1,156 @@
+"""Meshes as convex hulls: STL, OBJ and PLY files, and triangles from other files.
+
+Files are read by trimesh, and split by CoACD (Wei et al., 2022): the extra `meshes`.
+
+    obstacles = mesh_hulls(*load_mesh("part.stl", folder="."), position=(0.5, 0.0, 0.2))
+"""
+
+import functools
+import io
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from roboarm_nmp.envs.scenes.primitives import IDENTITY, MAX_LENGTH, ConvexHull, convex_hull
+
+MESH_FILES = (".stl", ".obj", ".ply")
+MAX_MESH_BYTES, MAX_TRIANGLES = 20_000_000, 500_000
+MAX_CONCAVITY = 0.001
+"""m. A mesh is convex if no triangle's centre is deeper inside its convex hull."""
+THRESHOLD, SEED = 0.05, 0
+"""Of CoACD: the concavity that is left, 0.01 (many hulls) to 1, and its random seed."""
+_MAX_COMPARISONS, _AT_ONCE = 50_000_000, 2_000_000  # of triangles with planes of the hull
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be used. The message names the file, if there is one, and the reason."""
+
+
+def load_mesh(name, folder):
+    """The triangles of a file inside of a folder: float64 (v, 3) vertices and int64 (f, 3).
+
+    Nothing outside of the folder is read, and no other file, such as one of materials.
+
+    Raises MeshError: the file is missing, outside of the folder, too large, or damaged; or trimesh
+    is not installed.
+    """
+    path, folder = Path(folder) / name, Path(folder).resolve()
+    try:
+        found = path.resolve(strict=True)
+        if not found.is_relative_to(folder):
+            raise MeshError(f"{name}: outside of the folder of the file that names it")
+        if not found.is_file():  # a pipe would never end
+            raise MeshError(f"{name}: no regular file")
+        kind = found.suffix.lower()
+        if kind not in MESH_FILES:
+            raise MeshError(f"{name}: a mesh's file ends in {', '.join(MESH_FILES)}")
+        if found.stat().st_size > MAX_MESH_BYTES:
+            raise MeshError(f"{name}: more than {MAX_MESH_BYTES // 1_000_000} MB")
+        contents = found.read_bytes()
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links; a name with byte 0
+        if isinstance(error, MeshError):
+            raise
+        reason = getattr(error, "strerror", None) or "cannot be read"
+        raise MeshError(f"{name}: {reason}") from error
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MeshError(f"{name}: meshes need: pip install 'roboarm-nmp[meshes]'") from error
+    try:
+        mesh = trimesh.load_mesh(
+            io.BytesIO(contents), file_type=kind[1:], process=False, skip_materials=True
+        )
+        vertices = np.array(mesh.vertices, dtype=np.float64)
+        faces = np.array(mesh.faces, dtype=np.int64)
+    except Exception as error:  # damaged files raise all kinds of exceptions
+        raise MeshError(f"{name}: damaged, or no {kind[1:].upper()} file") from error
+    try:
+        check_mesh(vertices, faces)
+    except MeshError as error:
+        raise MeshError(f"{name}: {error}") from error
+    return vertices, faces
+
+
+def check_mesh(vertices, faces):
+    """Raise MeshError unless vertices (v, 3) and triangles (f, 3) are those of a mesh."""
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError("not a mesh of triangles")
+    if not 1 <= len(faces) <= MAX_TRIANGLES:
+        raise MeshError(f"{len(faces):,} triangles, not 1 to {MAX_TRIANGLES:,}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError("a triangle has a vertex that is not there")
+    if not np.isfinite(vertices[faces]).all():
+        raise MeshError("a vertex is not finite")
+
+
+def mesh_hulls(vertices, faces, position, orientation=IDENTITY, scale=1.0, decompose=True):
+    """A mesh as a tuple of `ConvexHull`s: one, if it is convex to `MAX_CONCAVITY`.
+
+    Args:
+        vertices, faces: of `load_mesh`.
+        position, orientation: of the mesh's frame: m, and a quaternion (xyzw).
+        scale: a number, or three, by which vertices are multiplied to be in m.
+        decompose: split a mesh that is not convex into several hulls, by CoACD. Otherwise its
+            convex hull is returned, with a warning that says how far that is from the mesh.
+
+    Raises MeshError: the mesh is flat, or too large; or CoACD is not installed.
+    """
+    check_mesh(vertices, faces)
+    vertices = vertices * np.broadcast_to(scale, 3)
+    if np.abs(vertices[faces]).max() > MAX_LENGTH:
+        raise MeshError(f"coordinates exceed {MAX_LENGTH:.0f} m: is the scale right?")
+    try:
+        hull = convex_hull(vertices[np.unique(faces)], position, orientation)
+    except ValueError as error:
+        raise MeshError(str(error)) from error
+    depth = _concavity(vertices[faces])
+    if depth <= MAX_CONCAVITY:
+        return (hull,)
+    if not decompose:
+        warnings.warn(
+            f"a mesh is not convex: its convex hull is used, up to {depth * 1000:.0f} mm from the "
+            f"mesh (decompose: true splits it)",
+            stacklevel=2,
+        )
+        return (hull,)
+    parts = _parts(vertices.tobytes(), faces.tobytes())
+    return tuple(ConvexHull(position, part, orientation) for part in parts)
+
+
+def _concavity(triangles):
+    """How deep (m) the deepest of triangles' (f, 3, 3) centres is inside of their convex hull.
+
+    Of meshes with very many triangles, every second one is examined, or every third, and so on.
+    """
+    from scipy import spatial  # here, because it takes a while to import
+
+    planes = spatial.ConvexHull(triangles.reshape(-1, 3)).equations
+    step = 1 + len(triangles) * len(planes) // _MAX_COMPARISONS
+    centres, deepest = triangles[::step].mean(axis=1), 0.0
+    count = 1 + _AT_ONCE // len(planes)
+    for i in range(0, len(centres), count):
+        depths = -(centres[i : i + count] @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+        deepest = max(deepest, float(depths.max()))
+    return deepest
+
+
+@functools.lru_cache(maxsize=256)
+def _parts(vertices, faces):
+    """The vertices of the convex parts of a mesh, given as bytes: a tuple of tuples."""
+    try:
+        import coacd
+    except ImportError as error:
+        raise MeshError(
+            "a mesh that is not convex needs: pip install 'roboarm-nmp[meshes]'"
+        ) from error
+    coacd.set_log_level("error")
+    vertices = np.frombuffer(vertices).reshape(-1, 3)
+    faces = np.frombuffer(faces, np.int64).reshape(-1, 3)
+    used, faces = np.unique(faces, return_inverse=True)
+    mesh = coacd.Mesh(vertices[used], faces.reshape(-1, 3))
+    try:
+        parts = coacd.run_coacd(mesh, threshold=THRESHOLD, seed=SEED)
+        return tuple(convex_hull(part, (0.0, 0.0, 0.0)).vertices for part, _ in parts)
+    except (RuntimeError, ValueError) as error:
+        raise MeshError(f"a mesh cannot be split into convex parts: {error}") from error

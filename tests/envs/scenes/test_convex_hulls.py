@@ -1,0 +1,416 @@
+"""Convex hulls as obstacles: PyBullet's answers, images, files, meshes of other programs."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from problem_files import CUROBO, MOVEIT_SCENE, write_file
+
+from roboarm_nmp.envs import RoboArmEnv
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.datasets import observations, roadmap_paths
+from roboarm_nmp.envs.datasets.format import DatasetError, QueryScenes, read_scenes, scene_arrays
+from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
+from roboarm_nmp.envs.perception.encoders import make_encoder
+from roboarm_nmp.envs.perception.point_clouds import observed_points
+from roboarm_nmp.envs.perception.sensors import OBSTACLE, Camera, observe_scene
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.formats import load_world
+from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
+from roboarm_nmp.envs.scenes.primitives import (
+    MAX_HULL_VERTICES,
+    Box,
+    ConvexHull,
+    Scene,
+    Sphere,
+    convex_hull,
+    from_array,
+    hull_faces,
+    hull_vertices,
+    scene_from_json,
+    scene_to_json,
+    to_array,
+)
+from roboarm_nmp.envs.tasks import TASKS
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+
+WEDGE = ConvexHull(
+    (0.5, 0.1, 0.3),
+    ((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.2)),
+    (0.0, 0.0, 0.6, 0.8),
+)
+# The corners of the wedge, and its triangles, as other programs write them.
+CORNERS = [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.2]]
+TRIANGLES = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+OBJ = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS)
+OBJ += "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in TRIANGLES)
+PLY = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+element face 4
+property list uchar int vertex_indices
+end_header
+"""
+PLY += "".join(f"{x} {y} {z}\n" for x, y, z in CORNERS)
+PLY += "".join(f"3 {a} {b} {c}\n" for a, b, c in TRIANGLES)
+STL = "solid wedge\n"
+for triangle in TRIANGLES:
+    STL += "facet normal 0 0 0\nouter loop\n"
+    STL += "".join(f"vertex {x} {y} {z}\n" for x, y, z in (CORNERS[i] for i in triangle))
+    STL += "endloop\nendfacet\n"
+STL += "endsolid wedge\n"
+FILES = {"part.obj": OBJ, "part.ply": PLY, "part.stl": STL}
+
+
+def random_scene(rng, number):
+    hulls = []
+    for _ in range(number):
+        direction, turn = rng.normal(size=3), rng.normal(size=4)
+        direction[2] = abs(direction[2])
+        place = rng.uniform(0.4, 0.9) * direction / np.linalg.norm(direction)
+        shape = rng.normal(size=(rng.integers(4, 200), 3)) * rng.uniform(0.02, 0.08, 3)
+        turn = (turn / np.linalg.norm(turn)).tolist()
+        hulls.append(convex_hull(shape + rng.uniform(-0.05, 0.05, 3), tuple(place.tolist()), turn))
+    return Scene(tuple(hulls), table=None, floor=None)
+
+
+def corners(hull):
+    """The vertices in the base's frame, (v, 3), m, in lexicographic order."""
+    moved = np.array(hull.vertices) @ matrix(hull.orientation).T + hull.position
+    return moved[np.lexsort(np.round(moved, 6).T)]
+
+
+def assert_wedge(obstacles):
+    """The only obstacle is `WEDGE`."""
+    [hull] = obstacles
+    np.testing.assert_allclose(corners(hull), corners(WEDGE), atol=1e-6)
+
+
+# --- Checks
+
+
+def test_checks_and_distances_agree_with_pybullet():
+    rng = np.random.default_rng(1)
+    scene = random_scene(rng, 10)
+    env, checker = RoboArmEnv(scene), CollisionChecker(scene)
+    states = rng.uniform(-1, 1, (400, 7))
+    free, nearest = checker.is_free(states), checker.signed_distances(states).distance.min(1)
+    hits = np.array([env.in_collision(PANDA.denormalise(state)) for state in states])
+    assert 0.2 < hits.mean() < 0.8
+    assert (free == ~hits)[np.abs(nearest) > 1e-4].all()
+    found = checker.signed_distances(states[:100], self_collisions=False)
+    assert (found.distance < -0.01).any()
+    for i, state in enumerate(states[:100]):
+        PANDA.set_configuration(env.client, env.body, PANDA.denormalise(state))
+        for row, link in enumerate(PANDA.collision_links):
+            points = [
+                point
+                for body in range(p.getNumBodies(physicsClientId=env.client))
+                if body != env.body
+                for point in p.getClosestPoints(
+                    env.body, body, 3.0, linkIndexA=link, physicsClientId=env.client
+                )
+            ]
+            assert abs(min(point[8] for point in points) - found.distance[i, row]) < 2e-4
+    env.close()
+
+
+def test_hull_among_other_obstacles_is_the_nearest_geometry():
+    at = PANDA.forward_kinematics(PANDA.contact_free)
+    cube = np.array(np.meshgrid(*[[-0.02, 0.02]] * 3)).reshape(3, -1).T
+    hull = convex_hull(cube, tuple((at + [0.0, 0.0, 0.1]).tolist()))
+    scene = Scene((Sphere((0.0, 0.9, 0.9), 0.05), hull, Box((-0.9, 0.0, 0.9), (0.1, 0.1, 0.1))))
+    state = PANDA.normalise(PANDA.contact_free)
+    found = CollisionChecker(scene).signed_distances(state)
+    box = Box(hull.position, (0.042,) * 3)  # its edges are as round as those of the thicker hull
+    same = CollisionChecker(Scene((scene.obstacles[0], box))).signed_distances(state)
+    assert (found.geometry == 1).any()
+    rows = found.geometry == 1
+    np.testing.assert_allclose(found.distance[rows], same.distance[rows], atol=2e-5)
+    np.testing.assert_allclose(found.gradient[rows], same.gradient[rows], atol=1e-3)
+
+
+def test_hull_of_many_points_contains_all_of_them():
+    points = np.random.default_rng(0).normal(size=(3000, 3)) * (0.1, 0.2, 0.02)
+    points[:1000] *= 0.1 / np.linalg.norm(points[:1000] / (1, 2, 0.2), axis=1, keepdims=True)
+    hull = convex_hull(points)
+    assert 4 <= len(hull.vertices) <= MAX_HULL_VERTICES
+    assert outside(hull, points).max() < 1e-9
+    ball = np.random.default_rng(0).normal(size=(5000, 3))
+    ball *= 0.1 / np.linalg.norm(ball, axis=1, keepdims=True)
+    hull = convex_hull(ball)
+    assert len(hull.vertices) > 200
+    assert outside(hull, ball).max() < 1e-9
+    assert np.linalg.norm(hull.vertices, axis=1).max() < 0.103
+
+
+def outside(hull, points):
+    """How far (m) points are outside of a hull, in its own frame."""
+    a, b, c = np.array(hull.vertices)[hull_faces(hull.vertices)].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return (points @ normals.T - (normals * a).sum(1)).max(1)
+
+
+def test_hull_is_seen_as_an_obstacle_with_points_on_its_surface():
+    scene = Scene((WEDGE,))
+    points = observed_points(scene)
+    assert len(points) > 20
+    local = (points - WEDGE.position) @ matrix(WEDGE.orientation)
+    assert np.abs(outside(WEDGE, local)).max() < 1e-4
+    outputs = ("rgb", "segmentation")
+    camera = Camera((1.4, -0.6, 0.9), (0.5, 0.1, 0.3), outputs=outputs, size=(64, 48))
+    image = observe_scene(scene, {"camera": camera})["camera"]
+    seen = image["segmentation"] == OBSTACLE
+    assert 20 < seen.sum() < 1000
+    assert image["rgb"][seen].std() > 2  # its faces are shaded
+
+
+@pytest.mark.parametrize(
+    ("vertices", "reason"),
+    [
+        (CORNERS[:3], "4 to 256 vertices, got 3"),
+        (np.random.default_rng(0).normal(size=(300, 3)), "4 to 256 vertices, got 300"),
+        ([*CORNERS[:3], [0.1, 0.1, 0.0]], "in one plane"),
+        ([*CORNERS[:3], [0.0, 0.0, np.nan]], "finite numbers"),
+        ([*CORNERS[:3], [0.0, 0.0, 2000.0]], "up to 1000 m"),
+        ([*CORNERS[:3], [0.0, 0.0]], "three per vertex"),
+    ],
+)
+def test_invalid_hull_is_rejected(vertices, reason):
+    with pytest.raises(ValueError, match=reason):
+        Scene((ConvexHull((0, 0, 0), vertices),))
+
+
+def test_hulls_are_values():
+    same = ConvexHull(list(WEDGE.position), np.array(WEDGE.vertices), list(WEDGE.orientation))
+    assert same == WEDGE and hash(same) == hash(WEDGE)
+    assert convex_hull(np.array([*CORNERS, [0.05, 0.05, 0.05]])).vertices == WEDGE.vertices
+
+
+def test_oracle_refuses_hulls():
+    with pytest.raises(ValueError, match="convex hulls cannot be described"):
+        make_encoder("oracle")(Scene((WEDGE,)))
+
+
+# --- Files
+
+MIXED = (Sphere((0.3, 0.3, 0.3), 0.1), WEDGE, Box((0.5, 0.5, 0.5), (0.1, 0.1, 0.1)))
+OTHER = random_scene(np.random.default_rng(3), 2).obstacles
+
+
+def test_scene_files_and_json_make_the_round_trip(tmp_path):
+    scene = Scene((*MIXED, *OTHER))
+    save_scene(scene, tmp_path / "scene.yaml")
+    assert load_scene(tmp_path / "scene.yaml") == scene
+    assert scene_from_json(scene_to_json(scene)) == scene
+    assert from_array(to_array(scene.obstacles), hull_vertices(scene.obstacles)) == scene.obstacles
+
+
+def test_queries_keep_their_hulls(tmp_path):
+    base, q = TASKS["random_boxes_hard"].scene.base, np.full((2, 7), -0.05, np.float32)
+    scenes = [replace(base, obstacles=MIXED), replace(base, obstacles=OTHER)]
+    path = tmp_path / "queries.h5"
+    splits = {"test": (q, q, scenes), "validation": (q / 2, q / 2, [scenes[0], base])}
+    write_queries(path, "random_boxes_hard", 0, splits, "made by a test", {})
+    assert [query.scene for query in load_queries(path)] == scenes
+    assert [query.scene for query in load_queries(path, "validation")] == [scenes[0], base]
+    arrays = scene_arrays(path, scenes, base)
+    for change, reason in [
+        ({"hull_vertices": arrays["hull_vertices"][1:]}, "convex hulls of"),
+        ({"hull_vertices": arrays["hull_vertices"] * 0}, "in one plane"),
+        ({"obstacles": arrays["obstacles"] * [*[1] * 8, 1.01, 1, 1]}, "no whole number"),
+    ]:
+        with pytest.raises(DatasetError, match=f"{path}: obstacles: .*{reason}"):
+            read_scenes(path, base, arrays | change)
+
+
+def test_observations_and_roadmap_paths_keep_their_hulls(tmp_path):
+    base = TASKS["random_boxes_hard"].scene.base
+    scenes = [replace(base, obstacles=o) for o in (MIXED, (), OTHER)]
+    camera = {"front": Camera((1, 0, 1), (0, 0, 0))}
+    image = [{"front/rgb": np.zeros((2, 2, 3), np.uint8)}] * 3
+    q = np.zeros((3, 7))
+    contents = observations.shard_bytes(
+        "random_boxes_hard", 0, 0, camera, scenes, q, image, "made by a test"
+    )
+    (tmp_path / "shard_00000.h5").write_bytes(contents)
+    assert observations.Observations(tmp_path).scenes(0) == scenes
+    paths = [[np.zeros((2, 7), np.float32)]] * 3
+    for number, some in ((0, scenes), (1, scenes[::-1])):
+        contents = roadmap_paths.shard_bytes("random_boxes_hard", 0, 0, some, paths, "by a test")
+        (tmp_path / f"shard_{number:05}.h5").write_bytes(contents)
+    loaded = roadmap_paths.load_roadmap_paths(tmp_path)
+    assert [loaded.scenes[i] for i in range(6)] == [*scenes, *scenes[::-1]]
+    contents = roadmap_paths.shard_bytes("random_boxes_hard", 0, 0, scenes[1:2], paths[:1], "test")
+    (tmp_path / "shard_00000.h5").write_bytes(contents)
+    with h5py.File(tmp_path / "shard_00000.h5") as file:
+        assert "hull_vertices" not in file  # as before there were hulls
+
+
+def test_scenes_of_queries_have_only_their_own_vertices():
+    rows = to_array([*MIXED, *OTHER])
+    vertices = hull_vertices([*MIXED, *OTHER])
+    scenes = QueryScenes(Scene(), np.array([1, 0]), np.array([0, 3, 5]), rows, vertices)
+    assert scenes[0].obstacles == OTHER and scenes.take([1])[0].obstacles == MIXED
+
+
+# --- Meshes
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_mesh_of_a_scene_file_becomes_its_hull(name, tmp_path):
+    (tmp_path / "parts").mkdir()
+    write_file(tmp_path / "parts" / name, FILES[name].replace("0.2", "200"))
+    text = "obstacles:\n- mesh: {file: parts/%s, scale: 0.001, position: [0.5, 0.1, 0.3],\n"
+    text += "         orientation: [0, 0, 0.6, 0.8]}\n"
+    scene = load_scene(write_file(tmp_path / "scene.yaml", text % name))
+    assert_wedge(scene.obstacles)
+    save_scene(scene, tmp_path / "hulls.yaml")  # which needs no file of a mesh
+    assert load_scene(tmp_path / "hulls.yaml") == scene
+
+
+@pytest.mark.parametrize(
+    ("mesh", "reason"),
+    [
+        ("{file: none.stl, position: [0, 0, 0]}", "none.stl: No such file"),
+        ("{file: ../part.stl, position: [0, 0, 0]}", "../part.stl: outside of the folder"),
+        ("{file: link.stl, position: [0, 0, 0]}", "link.stl: outside of the folder"),
+        ("{file: /etc/passwd, position: [0, 0, 0]}", "/etc/passwd: outside of the folder"),
+        ("{file: ., position: [0, 0, 0]}", r"\.: no regular file"),
+        ("{file: scene.yaml, position: [0, 0, 0]}", "a mesh's file ends in .stl, .obj, .ply"),
+        ("{file: bad.stl, position: [0, 0, 0]}", "bad.stl: 0 triangles"),
+        ("{file: bad.ply, position: [0, 0, 0]}", "bad.ply: not a mesh of triangles"),
+        ("{file: bad.obj, position: [0, 0, 0]}", "bad.obj: damaged, or no OBJ file"),
+        ("{file: flat.obj, position: [0, 0, 0]}", "in one plane"),
+        ("{file: part.obj, scale: 1e3, position: [900, 0, 0]}", "finite numbers|scale"),
+        ("{file: part.obj, scale: 0, position: [0, 0, 0]}", "scale of mesh must be positive"),
+        ("{file: part.obj, decompose: 1, position: [0, 0, 0]}", "decompose must be true or fal"),
+        ("{file: [part.obj], position: [0, 0, 0]}", "file must be a file's name, got a list"),
+        ("{position: [0, 0, 0]}", "mesh lacks file"),
+    ],
+)
+def test_mesh_that_cannot_be_used_is_rejected_with_its_line(mesh, reason, tmp_path):
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    write_file(tmp_path / "part.stl", STL)
+    (folder / "link.stl").symlink_to(tmp_path / "part.stl")
+    write_file(folder / "bad.stl", "solid " + "x" * 100)
+    write_file(folder / "bad.ply", PLY[:-30])
+    write_file(folder / "bad.obj", OBJ + "f 1 2 x\n")
+    write_file(folder / "part.obj", OBJ.replace("0.2", "2.2"))
+    write_file(folder / "flat.obj", OBJ.replace("v 0.0 0.0 0.2", "v 0.1 0.1 0.0"))
+    path = write_file(folder / "scene.yaml", f"floor: false\nobstacles:\n- mesh: {mesh}\n")
+    with pytest.raises(SceneFileError, match=f"scene.yaml:3: .*({reason})"):
+        load_scene(path)
+
+
+def test_invalid_hull_of_a_scene_file_is_rejected_with_its_line(tmp_path):
+    for vertices, reason in [
+        (CORNERS[:3], "4 to 256 vertices, got 3"),
+        (CORNERS * 100, "at most 256 vertices"),
+        ("5", "vertices must be a list of points"),
+        ([[1, 2]], "a vertex of convex_hull must be a list of 3 numbers, got 2"),
+    ]:
+        text = f"obstacles:\n- convex_hull: {{position: [0, 0, 0], vertices: {vertices}}}\n"
+        with pytest.raises(SceneFileError, match=f"scene.yaml:2: .*{reason}"):
+            load_scene(write_file(tmp_path / "scene.yaml", text))
+
+
+# Two boxes, 0.2 x 0.1 x 0.1 and 0.1 x 0.1 x 0.3, that stand side by side: an L.
+_PROFILE = [(0.0, 0.0), (0.3, 0.0), (0.3, 0.1), (0.1, 0.1), (0.1, 0.3), (0.0, 0.3)]
+L_VERTICES = np.array([(x, y, z) for y in (0.0, 0.1) for x, z in _PROFILE])
+_SIDE = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]
+L_FACES = [*_SIDE, *[(a + 6, c + 6, b + 6) for a, b, c in _SIDE]]
+for i in range(6):
+    j = (i + 1) % 6
+    L_FACES += [(i, i + 6, j), (j, i + 6, j + 6)]
+L_FACES = np.array(L_FACES)
+
+
+def test_mesh_that_is_not_convex_is_split_or_warned_about():
+    with pytest.warns(UserWarning, match="up to 33 mm from the mesh"):
+        [hull] = mesh_hulls(L_VERTICES, L_FACES, (0, 0, 0), decompose=False)
+    notch = np.array([[0.18, 0.05, 0.18], [0.05, 0.05, 0.2], [0.2, 0.05, 0.05]])
+    assert (outside(hull, notch) < 0).all()
+    hulls = mesh_hulls(L_VERTICES, L_FACES, (1.0, 0.0, 0.0))
+    assert len(hulls) >= 2 and all(hull.position == (1.0, 0.0, 0.0) for hull in hulls)
+    inside = np.min([outside(hull, notch) for hull in hulls], axis=0)
+    assert inside[0] > 0.05 and (inside[1:] < 0).all()
+    assert mesh_hulls(L_VERTICES, L_FACES, (1.0, 0.0, 0.0)) == hulls
+
+
+def test_damaged_mesh_files_give_one_error(tmp_path):
+    rng, rejected = np.random.default_rng(0), 0
+    for i in range(150):
+        name, text = list(FILES.items())[i % 3]
+        contents = bytearray(text.encode())
+        for at in rng.integers(len(contents), size=rng.integers(1, 4)):
+            contents[at] = rng.integers(256)
+        (tmp_path / name).write_bytes(contents[: rng.integers(1, 2 * len(contents))])
+        try:
+            mesh_hulls(*load_mesh(name, tmp_path), (0, 0, 0), decompose=False)
+        except MeshError:
+            rejected += 1
+    assert 50 < rejected < 150
+
+
+VERTICES = "[" + ", ".join(f"{{x: {x}, y: {y}, z: {z}}}" for x, y, z in CORNERS) + "]"
+INDICES = "[" + ", ".join(f"{{vertex_indices: {triangle}}}" for triangle in TRIANGLES) + "]"
+MOVEIT = f"""\
+collision_objects:
+- id: wedge
+  meshes:
+  - vertices: {VERTICES}
+    triangles: {INDICES}
+  mesh_poses: [{{position: [0.5, 0.1, 0.3], orientation: [0, 0, 0.6, 0.8]}}]
+"""
+CUROBO_FILE = "mesh: {w: {file_path: part.stl, pose: [0.5, 0.1, 0.3, 0.8, 0, 0, 0.6]}}\n"
+CUROBO_INLINE = (
+    f"mesh: {{w: {{vertices: {CORNERS}, faces: {TRIANGLES}, scale: [1, 1, 1], "
+    "pose: [0.5, 0.1, 0.3, 0.8, 0, 0, 0.6]}}\n"
+)
+SCENE = "(noname)+\n* w\n0.5 0.1 0.3\n0 0 0.6 0.8\n1\nmesh\n4 4\n"
+SCENE += "".join(f"{a} {b} {c}\n" for a, b, c in [*CORNERS, *TRIANGLES])
+SCENE += "0 0 0\n0 0 0 1\n0 0 0 0\n0\n.\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("moveit.yaml", MOVEIT),
+        ("file.yaml", CUROBO_FILE),
+        ("inline.yaml", CUROBO_INLINE),
+        ("a.scene", SCENE),
+    ],
+)
+def test_meshes_of_other_programs_are_read(name, text, tmp_path):
+    write_file(tmp_path / "part.stl", STL)
+    assert_wedge(load_world(write_file(tmp_path / name, text)).obstacles)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line", "reason"),
+    [
+        ("a.yaml", MOVEIT.replace("[0, 2, 1]", "[0, 2, 9]"), 4, "a vertex that is not there"),
+        ("a.yaml", MOVEIT.replace("[0, 2, 1]", "[0, 2]"), 5, "a triangle has 3 vertices, got 2"),
+        ("a.yaml", MOVEIT.replace("  mesh_poses", "  poses"), 2, "lacks mesh_poses"),
+        ("a.yaml", CUROBO_FILE.replace("part", "../part"), 1, r"\.\./part.stl: (outside|No such)"),
+        ("a.yaml", CUROBO_FILE.replace("part", "none"), 1, "none.stl: No such file"),
+        ("a.scene", SCENE.replace("\n4 4\n", "\n4 4000\n"), 7, "ends before the last triangle"),
+        ("a.scene", SCENE.replace("\n4 4\n", "\n4 0\n"), 13, "an orientation must be 4 numbers"),
+        ("a.yaml", MOVEIT_SCENE.replace("- id: can", "- id: can\n      planes: [{a: 1}]"), 14,
+         "planes are not supported"),
+        ("a.yaml", CUROBO.replace("mesh: {}", "capsule: {a: {b: 1}}"), 7, "capsules are not"),
+    ],
+)  # fmt: skip
+def test_mesh_of_another_program_is_rejected_with_its_line(name, text, line, reason, tmp_path):
+    write_file(tmp_path / "part.stl", STL)
+    with pytest.raises(ValueError, match=f"{name}:{line}: .*{reason}"):
+        load_world(write_file(tmp_path / name, text))
