@@ -37,6 +37,7 @@ import yaml
 
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
 from roboarm_nmp.envs.scenes.primitives import (
     FLOOR,
     FRICTION,
@@ -340,9 +341,6 @@ def _convex_hull(node, what):
 
 
 def _mesh(node, what, folder):
-    # Here, because meshes are rare.
-    from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
-
     optional = ("scale", "decompose", "orientation", "yaw")
     fields = _mapping(node, what, ("file", "position"), optional)
     file, scale, decompose = fields["file"], 1.0, False

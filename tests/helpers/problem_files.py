@@ -157,6 +157,27 @@ sphere
 0.2 0.3 0.4 1
 .
 """
+# A wedge as a mesh: its corners, and its triangles.
+CORNERS = [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.2]]
+TRIANGLES = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+VERTICES = "[" + ", ".join(f"{{x: {x}, y: {y}, z: {z}}}" for x, y, z in CORNERS) + "]"
+INDICES = "[" + ", ".join(f"{{vertex_indices: {triangle}}}" for triangle in TRIANGLES) + "]"
+MOVEIT_MESH = f"""\
+collision_objects:
+- id: wedge
+  meshes:
+  - vertices: {VERTICES}
+    triangles: {INDICES}
+  mesh_poses: [{{position: [0.5, 0.1, 0.3], orientation: [0, 0, 0.6, 0.8]}}]
+"""
+CUROBO_MESH = "mesh: {w: {file_path: part.stl, pose: [0.5, 0.1, 0.3, 0.8, 0, 0, 0.6]}}\n"
+CUROBO_TRIANGLES = (
+    f"mesh: {{w: {{vertices: {CORNERS}, faces: {TRIANGLES}, scale: [1, 1, 1], "
+    "pose: [0.5, 0.1, 0.3, 0.8, 0, 0, 0.6]}}\n"
+)
+SCENE_MESH = "(noname)+\n* w\n0.5 0.1 0.3\n0 0 0.6 0.8\n1\nmesh\n4 4\n"
+SCENE_MESH += "".join(f"{a} {b} {c}\n" for a, b, c in [*CORNERS, *TRIANGLES])
+SCENE_MESH += "0 0 0\n0 0 0 1\n0 0 0 0\n0\n.\n"
 
 
 def write_folder(folder, digits="0001", scene=MOVEIT_SCENE, request=MOVEIT_REQUEST):

@@ -5,12 +5,24 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from problem_files import CUROBO, MOVEIT_SCENE, write_file
+from problem_files import (
+    CORNERS,
+    CUROBO,
+    CUROBO_MESH,
+    CUROBO_TRIANGLES,
+    MOVEIT_MESH,
+    MOVEIT_SCENE,
+    ROBOMETRICS,
+    SCENE_MESH,
+    TRIANGLES,
+    write_file,
+)
 
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets import observations, roadmap_paths
 from roboarm_nmp.envs.datasets.format import DatasetError, QueryScenes, read_scenes, scene_arrays
+from roboarm_nmp.envs.datasets.problems import load_problems, write_problems
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.point_clouds import observed_points
@@ -42,9 +54,7 @@ WEDGE = ConvexHull(
     ((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.2)),
     (0.0, 0.0, 0.6, 0.8),
 )
-# The corners of the wedge, and its triangles, as other programs write them.
-CORNERS = [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.2]]
-TRIANGLES = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+# The wedge as other programs write it.
 OBJ = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS)
 OBJ += "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in TRIANGLES)
 PLY = """ply
@@ -361,33 +371,13 @@ def test_damaged_mesh_files_give_one_error(tmp_path):
     assert 50 < rejected < 150
 
 
-VERTICES = "[" + ", ".join(f"{{x: {x}, y: {y}, z: {z}}}" for x, y, z in CORNERS) + "]"
-INDICES = "[" + ", ".join(f"{{vertex_indices: {triangle}}}" for triangle in TRIANGLES) + "]"
-MOVEIT = f"""\
-collision_objects:
-- id: wedge
-  meshes:
-  - vertices: {VERTICES}
-    triangles: {INDICES}
-  mesh_poses: [{{position: [0.5, 0.1, 0.3], orientation: [0, 0, 0.6, 0.8]}}]
-"""
-CUROBO_FILE = "mesh: {w: {file_path: part.stl, pose: [0.5, 0.1, 0.3, 0.8, 0, 0, 0.6]}}\n"
-CUROBO_INLINE = (
-    f"mesh: {{w: {{vertices: {CORNERS}, faces: {TRIANGLES}, scale: [1, 1, 1], "
-    "pose: [0.5, 0.1, 0.3, 0.8, 0, 0, 0.6]}}\n"
-)
-SCENE = "(noname)+\n* w\n0.5 0.1 0.3\n0 0 0.6 0.8\n1\nmesh\n4 4\n"
-SCENE += "".join(f"{a} {b} {c}\n" for a, b, c in [*CORNERS, *TRIANGLES])
-SCENE += "0 0 0\n0 0 0 1\n0 0 0 0\n0\n.\n"
-
-
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("moveit.yaml", MOVEIT),
-        ("file.yaml", CUROBO_FILE),
-        ("inline.yaml", CUROBO_INLINE),
-        ("a.scene", SCENE),
+        ("moveit.yaml", MOVEIT_MESH),
+        ("file.yaml", CUROBO_MESH),
+        ("inline.yaml", CUROBO_TRIANGLES),
+        ("a.scene", SCENE_MESH),
     ],
 )
 def test_meshes_of_other_programs_are_read(name, text, tmp_path):
@@ -398,13 +388,13 @@ def test_meshes_of_other_programs_are_read(name, text, tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "line", "reason"),
     [
-        ("a.yaml", MOVEIT.replace("[0, 2, 1]", "[0, 2, 9]"), 4, "a vertex that is not there"),
-        ("a.yaml", MOVEIT.replace("[0, 2, 1]", "[0, 2]"), 5, "a triangle has 3 vertices, got 2"),
-        ("a.yaml", MOVEIT.replace("  mesh_poses", "  poses"), 2, "lacks mesh_poses"),
-        ("a.yaml", CUROBO_FILE.replace("part", "../part"), 1, r"\.\./part.stl: (outside|No such)"),
-        ("a.yaml", CUROBO_FILE.replace("part", "none"), 1, "none.stl: No such file"),
-        ("a.scene", SCENE.replace("\n4 4\n", "\n4 4000\n"), 7, "ends before the last triangle"),
-        ("a.scene", SCENE.replace("\n4 4\n", "\n4 0\n"), 13, "an orientation must be 4 numbers"),
+        ("a.yaml", MOVEIT_MESH.replace("[0, 2, 1]", "[0, 2, 9]"), 4, "a vertex that is not there"),
+        ("a.yaml", MOVEIT_MESH.replace("[0, 2, 1]", "[0, 2]"), 5, "3 vertices, got 2"),
+        ("a.yaml", MOVEIT_MESH.replace("  mesh_poses", "  poses"), 2, "lacks mesh_poses"),
+        ("a.yaml", CUROBO_MESH.replace("part", "../part"), 1, r"\.\./part.stl: (outside|No such)"),
+        ("a.yaml", CUROBO_MESH.replace("part", "none"), 1, "none.stl: No such file"),
+        ("a.scene", SCENE_MESH.replace("\n4 4\n", "\n4 4000\n"), 7, "before the last triangle"),
+        ("a.scene", SCENE_MESH.replace("\n4 4\n", "\n4 0\n"), 13, "an orientation must be"),
         ("a.yaml", MOVEIT_SCENE.replace("- id: can", "- id: can\n      planes: [{a: 1}]"), 14,
          "planes are not supported"),
         ("a.yaml", CUROBO.replace("mesh: {}", "capsule: {a: {b: 1}}"), 7, "capsules are not"),
@@ -414,3 +404,43 @@ def test_mesh_of_another_program_is_rejected_with_its_line(name, text, line, rea
     write_file(tmp_path / "part.stl", STL)
     with pytest.raises(ValueError, match=f"{name}:{line}: .*{reason}"):
         load_world(write_file(tmp_path / name, text))
+
+
+def test_problems_keep_the_hulls_of_their_meshes(tmp_path):
+    (tmp_path / "part.stl").write_text(STL)
+    mesh = "    mesh:\n      w: {file_path: part.stl, pose: [0.5, 0.1, 0.3, 0.8, 0, 0, 0.6]}\n"
+    text = ROBOMETRICS.replace("  start:", mesh + "  start:")
+    problems = load_problems(write_file(tmp_path / "set.yaml", text))
+    assert not problems.rejected
+    assert_wedge(problems[0].scene.obstacles[2:])
+    write_problems(tmp_path / "problems.h5", problems)
+    assert load_problems(tmp_path / "problems.h5").scenes == problems.scenes
+    (tmp_path / "part.stl").unlink()
+    [rejected] = load_problems(tmp_path / "set.yaml").rejected
+    assert "part.stl: No such file" in rejected.reason
+
+
+def test_viewer_draws_moves_and_selects_a_hull():
+    viser = pytest.importorskip("viser")
+    from roboarm_nmp.envs.viewer.drawing import SELECTED_COLOUR, Drawing
+    from roboarm_nmp.envs.viewer.simulation import PolicyArm, Simulation, task_episodes
+
+    simulation = Simulation(task_episodes("no_obstacles"))
+    simulation.add(PolicyArm("no_obstacles", "go-to-goal"))
+    simulation.select("test", 0)
+    server = viser.ViserServer(port=0, verbose=False)
+    try:
+        drawing = Drawing(server, simulation)
+        simulation.add_obstacle(WEDGE)
+        drawing.update()
+        handle = drawing._places[0].bodies[0][1]
+        assert handle.vertices.shape == (4, 3) and handle.faces.shape == (4, 3)
+        drawing.selected = 0
+        simulation.replace_obstacle(0, replace(WEDGE, position=(0.4, 0.1, 0.5)))
+        drawing.update()
+        assert drawing._places[0].bodies[0][1] is handle  # moved, not made anew
+        assert handle.color == SELECTED_COLOUR
+        np.testing.assert_allclose(handle.position, (0.4, 0.1, 0.5))
+    finally:
+        server.stop()
+        simulation.close()

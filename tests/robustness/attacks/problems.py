@@ -28,6 +28,9 @@ WORLDS = {
     "curobo.yaml": problem_files.CUROBO,
     "new.scene": problem_files.SCENE_TEXT,
     "old.scene": problem_files.OLD_SCENE_TEXT,
+    "meshes.yaml": problem_files.MOVEIT_MESH,
+    "triangles.yaml": problem_files.CUROBO_TRIANGLES,
+    "mesh.scene": problem_files.SCENE_MESH,
 }
 PROBLEMS = {
     "shelf/scene0001.yaml": problem_files.MOVEIT_SCENE,
