@@ -353,7 +353,8 @@ def test_mesh_that_is_not_convex_is_split_or_warned_about():
     assert len(hulls) >= 2 and all(hull.position == (1.0, 0.0, 0.0) for hull in hulls)
     inside = np.min([outside(hull, notch) for hull in hulls], axis=0)
     assert inside[0] > 0.05 and (inside[1:] < 0).all()
-    assert mesh_hulls(L_VERTICES, L_FACES, (1.0, 0.0, 0.0)) == hulls
+    apart = L_VERTICES[L_FACES].reshape(-1, 3), np.arange(L_FACES.size).reshape(-1, 3)  # as in STL
+    assert mesh_hulls(*apart, (1.0, 0.0, 0.0)) == hulls
 
 
 def test_damaged_mesh_files_give_one_error(tmp_path):
