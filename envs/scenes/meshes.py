@@ -6,7 +6,11 @@ Files are read by trimesh, and split by CoACD (Wei et al., 2022): the extra `mes
 """
 
 import functools
+import importlib.util
 import io
+import os
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -20,6 +24,21 @@ MAX_CONCAVITY = 0.001
 """m. A mesh is convex if no triangle's centre is deeper inside its convex hull."""
 THRESHOLD, SEED = 0.05, 0
 """Of CoACD: the concavity that is left, 0.01 (many hulls) to 1, and its random seed."""
+# CoACD takes minutes for some damaged meshes, so it runs in another process, with limits.
+SPLIT_SECONDS, SPLIT_MEMORY = 60, 4_000_000_000  # of processor time; bytes
+SPLIT = """
+import io, os, resource, sys
+resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+answer = os.dup(1)
+os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+import coacd, numpy
+given, split = numpy.load(io.BytesIO(sys.stdin.buffer.read())), io.BytesIO()
+coacd.set_log_level("error")
+mesh = coacd.Mesh(given["corners"], given["faces"])
+numpy.savez(split, *[part for part, _ in coacd.run_coacd(mesh, threshold=THRESHOLD, seed=SEED)])
+os.fdopen(answer, "wb").write(split.getvalue())
+"""
 _MAX_COMPARISONS, _AT_ONCE = 50_000_000, 2_000_000  # of triangles with planes of the hull
 
 
@@ -138,21 +157,25 @@ def _concavity(triangles):
 @functools.lru_cache(maxsize=256)
 def _parts(vertices, faces):
     """The vertices of the convex parts of a mesh, given as bytes: a tuple of tuples."""
-    try:
-        import coacd
-    except ImportError as error:
-        raise MeshError(
-            "a mesh that is not convex needs: pip install 'roboarm-nmp[meshes]'"
-        ) from error
-    coacd.set_log_level("error")
+    if importlib.util.find_spec("coacd") is None:
+        raise MeshError("a mesh that is not convex needs: pip install 'roboarm-nmp[meshes]'")
     vertices = np.frombuffer(vertices).reshape(-1, 3)
     faces = np.frombuffer(faces, np.int64).reshape(-1, 3)
     # In an STL file each triangle has corners of its own: joined, the surface is closed, which
     # spares CoACD the repair of the mesh, most of its time.
     corners, faces = np.unique(vertices[faces.ravel()], axis=0, return_inverse=True)
-    mesh = coacd.Mesh(corners, faces.reshape(-1, 3))
+    given = io.BytesIO()
+    np.savez(given, corners=corners, faces=faces.reshape(-1, 3))
+    limits = (
+        f"SECONDS, MEMORY, THRESHOLD, SEED = {SPLIT_SECONDS}, {SPLIT_MEMORY}, {THRESHOLD}, {SEED}"
+    )
+    command = [sys.executable, "-c", f"{limits}\n{SPLIT}"]
+    one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, input=given.getvalue(), capture_output=True, env=one_thread)
     try:
-        parts = coacd.run_coacd(mesh, threshold=THRESHOLD, seed=SEED)
-        return tuple(convex_hull(part, (0.0, 0.0, 0.0)).vertices for part, _ in parts)
-    except (RuntimeError, ValueError) as error:
+        if done.returncode:
+            raise ValueError(f"not within {SPLIT_SECONDS} s and {SPLIT_MEMORY // 10**9} GB")
+        with np.load(io.BytesIO(done.stdout), allow_pickle=False) as parts:
+            return tuple(convex_hull(parts[name], (0.0, 0.0, 0.0)).vertices for name in parts)
+    except ValueError as error:
         raise MeshError(f"a mesh cannot be split into convex parts: {error}") from error

@@ -29,6 +29,7 @@ from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, Camera, observe_scene
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.scenes import meshes
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
 from roboarm_nmp.envs.scenes.formats import load_world
 from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
@@ -355,6 +356,13 @@ def test_mesh_that_is_not_convex_is_split_or_warned_about():
     assert inside[0] > 0.05 and (inside[1:] < 0).all()
     apart = L_VERTICES[L_FACES].reshape(-1, 3), np.arange(L_FACES.size).reshape(-1, 3)  # as in STL
     assert mesh_hulls(*apart, (1.0, 0.0, 0.0)) == hulls
+
+
+def test_mesh_that_takes_too_much_to_split_gives_one_error(monkeypatch):
+    monkeypatch.setattr(meshes, "SPLIT_MEMORY", 50_000_000)
+    other = L_VERTICES * 1.01  # those of the test above are remembered
+    with pytest.raises(MeshError, match="cannot be split into convex parts: not within 60"):
+        mesh_hulls(other, L_FACES, (0, 0, 0))
 
 
 def test_damaged_mesh_files_give_one_error(tmp_path):
