@@ -38,8 +38,10 @@ SHOWN = ("rendering", "encoding", "planning", "action", "total")
 def forget(networks):
     """Empty all caches of scenes, those of these encoders, too."""
     for cached in (
+        point_clouds._clouds,
         point_clouds._observe,
         geometry_source.observed_checker,
+        geometry_source.fine_observed_checker,
         geometry_source.ground_truth_checker,
         geometry_source.decoded_checker,
     ):
