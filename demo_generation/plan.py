@@ -82,8 +82,8 @@ class Args:
     time_limit: PositiveFloat = 5.0
     """seconds that the planner may search"""
     retime: bool = False
-    """times, velocities and accelerations within the arm's limits, checked for collisions (extra
-    `trajectories`); otherwise the motion has the speed of the environment"""
+    """times, velocities and accelerations within the arm's limits, checked for collisions where the
+    path has none (extra `trajectories`); otherwise the motion has the speed of the environment"""
     output: Path | None = None
     """write the motion to this file, .csv, .npz, .json or .yaml (docs/guide/trajectories.md)"""
 
@@ -219,17 +219,19 @@ def _rolled_out(args, scene, start, goal):
 
 
 def _retimed(path, checker):
-    """The `JointTrajectory` of a path (k, n), rad; it stops at corners where the path collides.
+    """The `JointTrajectory` of a path (k, n), rad, checked for collisions where that is possible.
 
-    A path collides where it is inside the ball around a point, as its ends may be.
+    A path that is inside the ball around a point, as its ends may be, or in contact, as a policy's
+    may be, is timed without a check, exactly along the path, and a line says so.
     """
     from roboarm_nmp.envs.time_parameterisation import time_parameterise
 
     began = time.perf_counter()
     try:
         trajectory = time_parameterise(path, checker.robot, checker=checker)
-    except ValueError:
+    except ValueError as error:
         trajectory = time_parameterise(path, checker.robot, deviation=0.0)
+        print(f"timed exactly along the path, without a check: {error}")
     milliseconds = 1000 * (time.perf_counter() - began)
     print(f"timed in {milliseconds:.0f} ms: {trajectory.duration:.2f} s")
     return trajectory
@@ -238,11 +240,11 @@ def _retimed(path, checker):
 def _describe(configurations, checker):
     """Print the length of a motion (m, n), rad, and its minimum clearance from the scene."""
     from roboarm_nmp.envs.collision.checker import FLOOR, NOTHING, POINT, TABLE
+    from roboarm_nmp.envs.metrics import path_length
 
     robot, names = checker.robot, {TABLE: "the table", FLOOR: "the floor", POINT: "a point"}
-    joints = np.linalg.norm(np.diff(configurations, axis=0), axis=1).sum()
-    positions = robot.forward_kinematics(configurations)
-    metres = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+    joints = path_length(configurations)
+    metres = path_length(robot.forward_kinematics(configurations))
     print(f"path length {joints:.2f} rad, of the end effector {metres:.2f} m")
     states = np.clip(robot.normalise(configurations), -1.0, 1.0)
     near = checker.signed_distances(states, self_collisions=False)

@@ -48,7 +48,8 @@ STEP_SECONDS = SUBSTEPS * TIME_STEP
 ENDINGS = (".csv", ".npz", ".json", ".yaml")
 LIMIT_TOLERANCE = 0.1  # rad. The simulated arm may exceed its limits a little; degrees exceed them.
 MAX_TEXT = {".csv": 100_000_000, ".json": 100_000_000, ".yaml": 10_000_000}  # bytes
-# What readers raise for a file that is damaged, or of another kind.
+# What readers raise for a file that is damaged, or of another kind: NotImplementedError is
+# zipfile's for an unknown compression.
 DAMAGE = (ValueError, ArithmeticError, RecursionError, EOFError, NotImplementedError, MemoryError)
 DAMAGE += (csv.Error, zipfile.BadZipFile, zlib.error)
 # A loader in C is ten times as fast, where PyYAML has it.

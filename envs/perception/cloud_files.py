@@ -105,6 +105,7 @@ def load_cloud(path, units=None, frame=None, intrinsics=None):
     except OSError as error:
         raise CloudError(f"{path}: {error.strerror or error}") from error
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        # The last one is zipfile's, for an unknown compression.
         raise CloudError(f"{path}: {' '.join(str(error).split())}") from error
     return _placed(points.reshape(-1, 3), float(scale), rotation, position)
 

@@ -18,7 +18,8 @@ import numpy as np
 from roboarm_nmp.envs.collision.checker import self_distances
 from roboarm_nmp.envs.collision.kernels import project
 
-# Chosen on validation queries: docs/lab_notebook.md, "Approach paths".
+# The clearances were compared on validation queries, how paths climb on problems of
+# MotionBenchMaker: docs/lab_notebook.md, "Approach paths".
 START_CLEARANCE, GOAL_CLEARANCE = 0.02, 0.05  # m, where a start's and a goal's path end
 SELF_CLEARANCE = 0.01  # m, of links from other links
 MAX_STEPS = 320  # of a path; it also ends there
