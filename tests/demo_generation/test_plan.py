@@ -68,6 +68,14 @@ def test_retimed_motion_keeps_the_limits_and_its_ends(query, cloud, tmp_path, ca
         assert (np.abs(rates).max(0) <= limit * 1.001).all() and np.abs(rates).max() > 0.3
 
 
+def test_retimed_path_in_contact_is_exactly_followed_and_a_line_says_so(query, capsys):
+    path = np.stack([query.start, query.goal]).astype(np.float64)  # a blocked motion
+    motion = plan._retimed(path, CollisionChecker(query.scene))
+    assert "without a check: the path itself collides" in capsys.readouterr().out
+    along = (motion.positions - path[0]) @ (path[1] - path[0]) / np.square(path[1] - path[0]).sum()
+    assert np.allclose(motion.positions, path[0] + along[:, None] * (path[1] - path[0]), atol=1e-6)
+
+
 def test_path_among_points_is_followed_without_contact(query, cloud, tmp_path, capsys):
     path, placed = cloud
     ends = "--start", text(query.start), "--goal", text(query.goal)
