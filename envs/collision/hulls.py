@@ -289,6 +289,15 @@ def shape_rows(obstacles):
     return rows
 
 
+def shape_centres(obstacles):
+    """The centres of obstacles' shapes in their own frames: float64 (n, 3), m."""
+    hulls = [isinstance(obstacle, ConvexHull) for obstacle in obstacles]
+    centres = np.zeros((len(obstacles), 3))
+    for i in np.flatnonzero(hulls):
+        centres[i] = _hull(obstacles[i].vertices)[0]
+    return centres
+
+
 def group_points(points, radius):
     """Points in groups of neighbours, as the compiled functions take them. Raises ValueError.
 
