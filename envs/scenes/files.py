@@ -137,6 +137,8 @@ def _format_fields(obstacle):
     """The dataclass's fields as a YAML mapping on one line."""
     fields = []
     for name, value in vars(obstacle).items():
+        if value is None:  # no motion
+            continue
         if name in ("position", "size", "orientation"):
             if name == "orientation" and tuple(value) == IDENTITY:
                 continue
