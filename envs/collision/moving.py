@@ -11,10 +11,12 @@ number j there is row `np.flatnonzero(now.present)[j]`.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.hulls import shape_centres, shape_rows
 from roboarm_nmp.envs.collision.kernels import (
     AMPLITUDE,
@@ -109,3 +111,19 @@ def motion_arrays(obstacles):
             row[REPEAT] = REPEATS.index(motion.repeat)
         row[WAYPOINTS + 1] = len(waypoints)
     return own, np.reshape(waypoints, (-1, 8)), np.reshape(intervals, (-1, 2))
+
+
+def free_over_time(scene, states, times):
+    """Whether configurations are free of a scene's moving obstacles.
+
+    Args:
+        scene: a `Scene`. Its table, its floor and obstacles without a motion do not count.
+        states: normalised configurations (m, n).
+        times: s, (t,).
+
+    Returns:
+        bool (m, t).
+    """
+    moving = [obstacle for obstacle in scene.obstacles if obstacle.motion is not None]
+    scene = replace(scene, obstacles=moving, table=None, floor=None)
+    return np.array([CollisionChecker(scene.at(t)).is_free(states) for t in times]).T

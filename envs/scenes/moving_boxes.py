@@ -5,6 +5,9 @@ goal of an episode are drawn among them. `animate` then draws motions for this s
 `accepts` says whether they make sense: the start is free in the first second, and the goal when it
 has to be.
 
+Times and positions are multiples of `envs.scenes.random_boxes.GRID`: on every machine the scenes of
+a seed are the same.
+
 The paper proposes policies for scenes with changing obstacles (section 1), and has no such task.
 The ranges were fixed before any policy was measured. For an arm other than the Panda, lengths and
 speeds are multiplied by the ratio of their reaches.
@@ -15,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.motions import CYCLIC, Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
@@ -26,52 +30,71 @@ from roboarm_nmp.envs.scenes.random_boxes import (
     rounded,
 )
 
-DURATION = 400 / 24
+DURATION = 400 * STEP_SECONDS
 """s, of the longest episode (paper: 400 steps)."""
-CHECK_TIMES = np.arange(0.0, DURATION, 0.1)
-"""s, at which `accepts` needs to know whether start and goal are free."""
 START_FREE = 1.0
 """s: until then the start is free."""
+SPEED = 0.03 / STEP_SECONDS  # of the arm, normalised, per second (paper: 0.03 per step)
 
-# Boxes of `random_boxes_hard` oscillate, mostly horizontally. m; share of upward amplitudes.
-BOXES = 4, 8
+# Boxes oscillate, mostly horizontally. m; share of upward amplitudes.
 AMPLITUDE, RISE = (0.1, 0.3), 0.3
-# Half of these boxes appear, s. Nowhere near an arm on the straight way to its goal: then and until
-# `AHEAD` (s) later all its joints are at least `ROOM` (m) away.
+# Boxes appear, s; nowhere near an arm on the straight way to its goal: then, and until `AHEAD` (s)
+# later, all its joints are at least `ROOM` (m) away.
 APPEARING, APPEARS = 0.5, (0.3, 3.0)
 AHEAD, ROOM = (0.0, 0.25, 0.5), 0.15
-SPEED = 0.03 * 24  # of the arm, normalised, per second (paper: 0.03 per step)
-# A visitor is a box at the goal, among fewer boxes at rest. Edges and distance from the goal, m;
-# speed, m/s; how far it goes, outwards and upwards, m.
-BOXES_AT_REST = 3, 6
+# A visitor is a box at the goal. Edges and distance from the goal, m; speed, m/s; how far it goes,
+# outwards and upwards, m.
 VISITOR, OFF_CENTRE = (0.08, 0.16), 0.02
 VISITOR_SPEED, WAY = (0.15, 0.35), (0.5, 0.7)
-LEAVES, LATEST = (2.0, 7.0), 10.0  # s, of `BlockedGoals`: when it leaves; the goal is free from
+LEAVES, FREE_FROM = (2.0, 6.0), 8.0  # s, of `BlockedGoals`: when it leaves; the goal is free
 STAYS, STAYS_AWAY = (0.5, 1.5), (2.0, 4.0)  # s, of `ChasedGoals`
-FREE_SHARE, BLOCKED_FOR = 0.4, 5.0  # of the time; s, at most, without a break
+FREE_SHARE, BLOCKED_FOR = 0.4, 5.0  # of the time, at least; s without a break, at most
 TRIES = 50
 
 
 @dataclass(frozen=True)
-class MovingBoxes:
+class MovingScenes:
+    """What the distributions of this file share.
+
+    Attributes:
+        base: the `Scene` without the obstacles that vary.
+        boxes: (fewest, most) boxes around the arm.
+        check_times: s, (t,), at which `accepts` needs to know whether start and goal are free.
+    """
+
+    base: Scene = Scene(friction=FRICTION)
+    boxes: tuple[int, int] = (4, 8)  # as in `random_boxes_hard`
+    check_times = np.arange(0.0, DURATION, 0.1)
+
+    def sample(self, rng):
+        """A `Scene` at rest, drawn with a NumPy Generator."""
+        return RandomBoxes(*self.boxes, self.base).sample(rng)
+
+    def animate(self, scene, start, goal, rng):
+        """The scene with motions, drawn for a start and a goal (n,), rad."""
+        raise NotImplementedError
+
+    def accepts(self, start_free, goal_free):
+        """Whether start and goal are free when they have to be: bool (t,), at `check_times`."""
+        return self._starts(start_free) and bool(goal_free.all())
+
+    def _starts(self, start_free):
+        return bool(start_free[self.check_times <= START_FREE].all())
+
+
+@dataclass(frozen=True)
+class MovingBoxes(MovingScenes):
     """A share of the boxes oscillates. The goal is free at all times.
 
     Attributes:
         share: of the boxes, rounded to a whole number of them.
         periods: s, (shortest, longest).
-        base: the `Scene` without the boxes.
     """
 
-    share: float
-    periods: tuple[float, float]
-    base: Scene = Scene(friction=FRICTION)
-
-    def sample(self, rng):
-        """A `Scene` at rest, drawn with a NumPy Generator."""
-        return RandomBoxes(*BOXES, self.base).sample(rng)
+    share: float = 0.5
+    periods: tuple[float, float] = (3.0, 8.0)
 
     def animate(self, scene, start, goal, rng):
-        """The scene with motions, for a start and a goal (n,), rad."""
         boxes, scale = list(scene.obstacles), scale_of(scene.robot)
         for i in _some(boxes, self.share, rng):
             for _ in range(TRIES):
@@ -80,10 +103,6 @@ class MovingBoxes:
                     boxes[i] = replace(boxes[i], motion=motion)
                     break
         return replace(scene, obstacles=boxes)
-
-    def accepts(self, start_free, goal_free):
-        """Whether start and goal are free when they have to be: bool (t,), at `CHECK_TIMES`."""
-        return _starts(start_free) and bool(goal_free.all())
 
     def _oscillation(self, rng, scale):
         direction = rng.normal(size=3) * (1.0, 1.0, RISE)
@@ -94,88 +113,54 @@ class MovingBoxes:
 
 
 @dataclass(frozen=True)
-class AppearingBoxes:
-    """Half of the boxes appear in the first seconds. The goal is free at all times.
-
-    Attributes:
-        base: the `Scene` without the boxes.
-    """
-
-    base: Scene = Scene(friction=FRICTION)
-
-    def sample(self, rng):
-        """As `MovingBoxes.sample`."""
-        return RandomBoxes(*BOXES, self.base).sample(rng)
+class AppearingBoxes(MovingScenes):
+    """Half of the boxes appear in the first seconds. The goal is free at all times."""
 
     def animate(self, scene, start, goal, rng):
-        """As `MovingBoxes.animate`."""
         boxes, robot = list(scene.obstacles), scene.robot
         first, last = robot.normalise(np.array([start, goal]))
         duration = np.linalg.norm(last - first) / SPEED
 
-        def joints(t):
-            share = min(t / duration, 1.0)
-            configuration = robot.denormalise(first + share * (last - first))
-            positions = [position for position, _ in robot.frame_poses(configuration)]
-            return np.array([*positions, robot.forward_kinematics(configuration)])
+        def joints(times):
+            shares = np.minimum(times / duration, 1.0)[:, None]
+            configurations = robot.denormalise(first + shares * (last - first))
+            positions = [position for position, _ in robot.frame_poses(configurations)]
+            return np.concatenate([*positions, robot.forward_kinematics(configurations)])
 
         for i in _some(boxes, APPEARING, rng):
             for _ in range(TRIES):
                 (appears,) = rounded(rng.uniform(*APPEARS))
-                points = np.concatenate([joints(appears + ahead) for ahead in AHEAD])
-                if _distances(boxes[i], points).min() >= ROOM * scale_of(robot):
+                apart = _distances(boxes[i], joints(appears + np.array(AHEAD)))
+                if apart.min() >= ROOM * scale_of(robot):
                     boxes[i] = replace(boxes[i], motion=Presence(((appears, math.inf),)))
                     break
         return replace(scene, obstacles=boxes)
 
-    def accepts(self, start_free, goal_free):
-        """As `MovingBoxes.accepts`."""
-        return _starts(start_free) and bool(goal_free.all())
-
 
 @dataclass(frozen=True)
-class BlockedGoals:
-    """A box stands at the goal, and leaves after some seconds. The goal is free from then on.
+class BlockedGoals(MovingScenes):
+    """A box stands at the goal, and leaves after some seconds. The goal is free from then on."""
 
-    Attributes:
-        base: the `Scene` without the boxes.
-    """
-
-    base: Scene = Scene(friction=FRICTION)
-
-    def sample(self, rng):
-        """As `MovingBoxes.sample`."""
-        return RandomBoxes(*BOXES_AT_REST, self.base).sample(rng)
+    boxes: tuple[int, int] = (3, 6)  # as in `random_boxes_medium`
 
     def animate(self, scene, start, goal, rng):
-        """As `MovingBoxes.animate`."""
         box, away, duration = _visitor(scene.robot, goal, rng)
         (leaves,) = rounded(rng.uniform(*LEAVES))
         motion = Waypoints((leaves, leaves + duration), ((0.0, 0.0, 0.0), away))
         return replace(scene, obstacles=(*scene.obstacles, replace(box, motion=motion)))
 
     def accepts(self, start_free, goal_free):
-        """As `MovingBoxes.accepts`."""
-        later = CHECK_TIMES >= LATEST
-        return _starts(start_free) and not goal_free[0] and bool(goal_free[later].all())
+        later = goal_free[self.check_times >= FREE_FROM]
+        return self._starts(start_free) and not goal_free[0] and bool(later.all())
 
 
 @dataclass(frozen=True)
-class ChasedGoals:
-    """One or two boxes visit the goal again and again.
+class ChasedGoals(MovingScenes):
+    """One or two boxes visit the goal again and again."""
 
-    Attributes:
-        base: the `Scene` without the boxes.
-    """
-
-    base: Scene = Scene(friction=FRICTION)
-
-    def sample(self, rng):
-        """As `MovingBoxes.sample`."""
-        return RandomBoxes(*BOXES_AT_REST, self.base).sample(rng)
+    boxes: tuple[int, int] = (3, 6)
 
     def animate(self, scene, start, goal, rng):
-        """As `MovingBoxes.animate`."""
         visitors = []
         for _ in range(rng.integers(1, 3)):
             box, away, duration = _visitor(scene.robot, goal, rng)
@@ -189,15 +174,10 @@ class ChasedGoals:
         return replace(scene, obstacles=(*scene.obstacles, *visitors))
 
     def accepts(self, start_free, goal_free):
-        """As `MovingBoxes.accepts`."""
-        blocked = np.flatnonzero(np.diff(np.concatenate([[True], goal_free, [True]])))
-        longest = np.diff(blocked)[::2].max(initial=0) * (CHECK_TIMES[1] - CHECK_TIMES[0])
+        changes = np.flatnonzero(np.diff(np.concatenate([[True], goal_free, [True]])))
+        longest = np.diff(changes)[::2].max(initial=0) * self.check_times[1]
         often = FREE_SHARE <= goal_free.mean() < 1.0 and longest <= BLOCKED_FOR
-        return _starts(start_free) and bool(often)
-
-
-def _starts(start_free):
-    return bool(start_free[CHECK_TIMES <= START_FREE].all())
+        return self._starts(start_free) and bool(often)
 
 
 def _some(boxes, share, rng):
@@ -231,8 +211,6 @@ def _visitor(robot, goal, rng):
     azimuth = math.atan2(position[1], position[0]) + rng.uniform(-1.0, 1.0) * math.pi / 3
     elevation, way = rng.uniform(0.0, math.pi / 4), scale * rng.uniform(*WAY)
     level = way * math.cos(elevation)
-    away = rounded(
-        level * math.cos(azimuth), level * math.sin(azimuth), way * math.sin(elevation)
-    )
+    away = rounded(level * math.cos(azimuth), level * math.sin(azimuth), way * math.sin(elevation))
     (duration,) = rounded(way / (scale * rng.uniform(*VISITOR_SPEED)))
     return Box(centre, size), away, duration
