@@ -16,8 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.collision.hulls import shape_centres, shape_rows
+from roboarm_nmp.envs.collision.hulls import (
+    arm_hulls,
+    group_points,
+    shape_centres,
+    shape_rows,
+    world_shapes,
+)
 from roboarm_nmp.envs.collision.kernels import (
     AMPLITUDE,
     ANGLE,
@@ -28,6 +33,8 @@ from roboarm_nmp.envs.collision.kernels import (
     PHASE,
     REPEAT,
     WAYPOINTS,
+    free_batch,
+    moved_rows,
     obstacle_states,
 )
 from roboarm_nmp.envs.scenes.motions import REPEATS, Oscillation, Presence, Waypoints
@@ -124,6 +131,13 @@ def free_over_time(scene, states, times):
     Returns:
         bool (m, t).
     """
-    moving = [obstacle for obstacle in scene.obstacles if obstacle.motion is not None]
-    scene = replace(scene, obstacles=moving, table=None, floor=None)
-    return np.array([CollisionChecker(scene.at(t)).is_free(states) for t in times]).T
+    moving = replace(scene, obstacles=[o for o in scene.obstacles if o.motion is not None])
+    rows, arm = world_shapes(moving.obstacles, arm_hulls(scene.robot))
+    own, shapes = MovingObstacles(moving), rows.copy()
+    world = rows, *group_points((), 0.0)
+    rule = np.zeros(4), np.empty((1, 0, scene.robot.num_joints + 1))
+    states, free = np.ascontiguousarray(states, float), np.empty((len(times), len(states)), bool)
+    for t, answers in zip(times, free, strict=True):
+        moved_rows(own.motions, own.centres, shapes, t, rows)
+        free_batch(states, *rule, arm, world, answers)
+    return free.T
