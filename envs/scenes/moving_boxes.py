@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.motions import CYCLIC, Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
@@ -30,11 +30,11 @@ from roboarm_nmp.envs.scenes.random_boxes import (
     rounded,
 )
 
-DURATION = 400 * SUBSTEPS * TIME_STEP
+DURATION = 400 * STEP_SECONDS
 """s, of the longest episode (paper: 400 steps)."""
 START_FREE = 1.0
 """s: until then the start is free."""
-SPEED = 0.03 / (SUBSTEPS * TIME_STEP)  # of the arm, normalised, per second (paper: 0.03 per step)
+SPEED = 0.03 / STEP_SECONDS  # of the arm, normalised, per second (paper: 0.03 per step)
 
 # Boxes oscillate, mostly horizontally. m; share of upward amplitudes.
 AMPLITUDE, RISE = (0.1, 0.3), 0.3
