@@ -39,7 +39,7 @@ SPEED = 0.03 / STEP_SECONDS  # of the arm, normalised, per second (paper: 0.03 p
 # Boxes oscillate, mostly horizontally. m; share of upward amplitudes.
 AMPLITUDE, RISE = (0.1, 0.3), 0.3
 # Boxes appear, s; nowhere near an arm on the straight way to its goal: then, and until `AHEAD` (s)
-# later, all its joints are at least `ROOM` (m) away.
+# later, its joints and the middles between them are at least `ROOM` (m) away.
 APPEARING, APPEARS = 0.5, (0.3, 3.0)
 AHEAD, ROOM = (0.0, 0.25, 0.5), 0.15
 # A visitor is a box at the goal. Edges and distance from the goal, m; speed, m/s; how far it goes,
@@ -121,16 +121,18 @@ class AppearingBoxes(MovingScenes):
         first, last = robot.normalise(np.array([start, goal]))
         duration = np.linalg.norm(last - first) / SPEED
 
-        def joints(times):
+        def arm_points(times):
+            """The joints, the end effector, and the middles between them: (n, 3), m."""
             shares = np.minimum(times / duration, 1.0)[:, None]
             configurations = robot.denormalise(first + shares * (last - first))
-            positions = [position for position, _ in robot.frame_poses(configurations)]
-            return np.concatenate([*positions, robot.forward_kinematics(configurations)])
+            points = [position for position, _ in robot.frame_poses(configurations)]
+            points = np.array([*points, robot.forward_kinematics(configurations)])
+            return np.concatenate([*points, *(points[1:] + points[:-1]) / 2])
 
         for i in _some(boxes, APPEARING, rng):
             for _ in range(TRIES):
                 (appears,) = rounded(rng.uniform(*APPEARS))
-                apart = _distances(boxes[i], joints(appears + np.array(AHEAD)))
+                apart = _distances(boxes[i], arm_points(appears + np.array(AHEAD)))
                 if apart.min() >= ROOM * scale_of(robot):
                     boxes[i] = replace(boxes[i], motion=Presence(((appears, math.inf),)))
                     break
