@@ -31,11 +31,11 @@ episode, angles in rad:
                                                                               # may be left out
       - sphere: {position: [0.5, 0, 0.5], radius: 0.1, motion: {waypoints: {times: [1, 2],
                  displacements: [[0, 0, 0], [0, 0.3, 0]], rotations: [[0, 0, 0, 1], [0, 0, 0, 1]],
-                 repeat: back_and_forth}}}  # or once, as if left out, or cyclic; rotations: optional
+                 repeat: back_and_forth}}}  # or once, as if left out, or cyclic
       - box: {position: [0.5, 0, 0.3], size: [0.1, 0.1, 0.1], motion: {present: [[0, 2], [5]]}}
 
-`present` are intervals of time; the last one may have no end. It may stand beside `oscillation` or
-`waypoints`. A mesh and the table cannot move.
+`rotations` may be left out. `present` are intervals of time, of which the last one may have no end;
+it may stand beside `oscillation` or `waypoints`. A mesh and the table cannot move.
 
 All but a sphere may have `yaw` or `orientation`, not both. A quaternion whose norm differs from
 1 by up to 1 % is normalised. A number is any finite number that Python's `float` reads, without
