@@ -183,7 +183,9 @@ class Scene:
             return self
         if not is_number(t):
             raise ValueError(f"a time is a finite number of seconds, got {t!r}")
-        return replace(self, obstacles=[o for o in map(_at, self.obstacles, repeat(t)) if o])
+        return replace(
+            self, obstacles=[o for o in map(obstacle_at, self.obstacles, repeat(t)) if o]
+        )
 
 
 def pose_at(obstacle, t):
@@ -196,7 +198,7 @@ def pose_at(obstacle, t):
     return moved(obstacle.position, orientation, *obstacle.motion.pose(t))
 
 
-def _at(obstacle, t):
+def obstacle_at(obstacle, t):
     """An obstacle as it is at a time (s), without its motion; None: it is absent."""
     if obstacle.motion is None:
         return obstacle
