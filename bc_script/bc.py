@@ -10,7 +10,6 @@ your own, copy this file and change the parts under `# ALGO LOGIC`. Parts betwee
 """
 
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,7 +21,6 @@ import torch.nn.functional as F
 
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.datasets.episodes import observed
-from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training import flags, protocol, runs
@@ -31,8 +29,6 @@ from roboarm_nmp.envs.training import flags, protocol, runs
 @dataclass
 class Args(protocol.PolicyFlags):
     # More flags are in `envs/training/protocol.py` (task) and `envs/training/runs.py` (run).
-    exp_name: str = "bc"
-    """name of the experiment, part of the name of the run's folder"""
     goal_type: Literal["ee", "config", "combined", "pose"] = "combined"
     """what the goal is: end-effector position, configuration, both, or end-effector pose"""
     demos: tuple[Path, ...] = ()
@@ -206,10 +202,8 @@ if __name__ == "__main__":
     args = runs.parse_args(Args, may_change={"total_updates", "test_queries"})
     device = runs.seed_torch(args)
     validation, test = protocol.load_task(args)
-    try:
+    with runs.errors_of("--demos"):
         files = [load_demos(file, args.task) for file in args.demos or (args.task,)]
-    except DatasetError as error:
-        sys.exit(f"--demos: {error}")
     env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
     env_arguments["num_points"] = args.num_points
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)

@@ -10,7 +10,6 @@ paper's sections 2 and 5. For an algorithm of your own, copy this file and chang
 """
 
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,7 +19,6 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
 from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.training import flags, protocol, runs
 
@@ -28,8 +26,6 @@ from roboarm_nmp.envs.training import flags, protocol, runs
 @dataclass
 class Args(protocol.PolicyFlags, protocol.EnvFlags):
     # More flags are in `envs/training/protocol.py` (task, MDP) and `envs/training/runs.py` (run).
-    exp_name: str = "sac_her_mp"
-    """name of the experiment, part of the name of the run's folder"""
     num_envs: flags.Environments = 4
     """environments stepped together; every one of their steps counts"""
     total_timesteps: flags.PositiveInt = 1_000_000
@@ -38,8 +34,6 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """environment steps with random actions before the first update"""
     updates_per_step: flags.NonNegativeFloat = 0.5
     """updates of the critics per environment step (CleanRL: 1)"""
-    buffer_size: flags.PositiveInt = 1_000_000
-    """transitions in the replay buffer"""
     batch_size: flags.PositiveInt = 256
     """transitions per update"""
     her_probability: flags.Share = 0.8
@@ -209,6 +203,9 @@ class Actor(nn.Module):
 
 # ALGO LOGIC: replay buffer
 # SHARED: replay buffer
+BUFFER_SIZE = 1_000_000  # transitions; memory is taken as they come
+
+
 class HerReplayBuffer:
     """Transitions of finished episodes in a ring; goals are relabelled when they are sampled.
 
@@ -370,8 +367,6 @@ if __name__ == "__main__":
     # SHARED: checks and environments
     args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = runs.seed_torch(args)
-    if args.buffer_size < args.horizon:
-        sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
     validation, test = protocol.load_task(args)
     env_arguments = protocol.env_arguments_of(args)
     envs = protocol.make_training_envs(args, args.demo_prob, args.demos)
@@ -381,40 +376,34 @@ if __name__ == "__main__":
     agent = SAC(args, eval_envs[0], device)
     # SHARED: run and episodes
     rng = np.random.default_rng(args.seed)
-    rb = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
+    rb = HerReplayBuffer(eval_envs[0], BUFFER_SIZE, args.her_probability, rng)
     counts, losses = {"updates": 0, "demos_injected": 0}, {}
     state = agent.checkpoint_state() | {"buffer": rb, "rng": rng, "counts": counts}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
-    protocol.encode_demos(envs)
+    envs.encode_demos()
     run.start(args.total_timesteps, "step")
-    obs = protocol.begin_episodes(envs, args.seed, run.step)
-    episodes, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
+    envs.begin_episodes(args.seed, run.step)
     # END SHARED
 
     while run.step < args.total_timesteps and not run.reached(args.stop_at_success):
         # ALGO LOGIC: act
         if run.step < args.learning_starts:
-            actions = 2 * torch.rand(args.num_envs, *envs[0].action_space.shape) - 1
+            actions = 2 * torch.rand(args.num_envs, *eval_envs[0].action_space.shape) - 1
             actions = actions.numpy() * agent.actor.action_scale
         else:
-            actions = agent.explore(**protocol.stack(obs, device))
+            actions = agent.explore(**protocol.stack(envs.observations, device))
 
         # SHARED: a step in every environment
         runs.check_finite("the policy's actions", actions)
-        for i, env in enumerate(envs):
-            next_obs, reward, termination, truncation, info = env.step(actions[i])
-            episodes[i].append(transition(obs[i], actions[i], next_obs, info["collision"]))
-            returns[i] += reward
-            obs[i] = next_obs
-            if termination or truncation:
-                rb.add_episode(episodes[i])
-                run.log_episode(run.step + i + 1, returns[i], info)
-                if args.demo_prob is not None:
-                    if not info["is_success"] and env.np_random.random() < args.demo_prob:
-                        rb.add_episode(demo_transitions(env.demo, env.env))
-                        counts["demos_injected"] += 1
-                    run.log({"charts/demos_injected": counts["demos_injected"]}, run.step + i + 1)
-                episodes[i], returns[i], obs[i] = [], 0.0, env.reset()[0]
+        for episode in envs.step(actions):
+            ended_at = run.step + episode.number + 1
+            rb.add_episode(episode.transitions)
+            run.log_episode(ended_at, episode)
+            if episode.demo is not None:
+                rb.add_episode(episode.demo)
+                counts["demos_injected"] += 1
+            if args.demo_prob is not None:
+                run.log({"charts/demos_injected": counts["demos_injected"]}, ended_at)
         global_step = run.advance(args.num_envs)
 
         # ALGO LOGIC: learn
@@ -423,8 +412,8 @@ if __name__ == "__main__":
             losses |= agent.update(data, counts["updates"])
             counts["updates"] += 1
             if counts["updates"] % 1000 == 0:
-                run.log({f"losses/{name}": value for name, value in losses.items()})
-                run.log({"charts/SPS": int(run.rate)})
+                named = {f"losses/{name}": value for name, value in losses.items()}
+                run.log(named | {"charts/SPS": int(run.rate)})
 
         # Evaluate, save the best policy, checkpoint
         evaluating = run.step % args.eval_every < args.num_envs or run.step >= args.total_timesteps
@@ -432,10 +421,8 @@ if __name__ == "__main__":
             run.save_policy(agent.actor_average)
         if evaluating or run.interrupted:
             # New episodes begin, in this run as in one that is resumed from the checkpoint.
-            for episode in filter(None, episodes):
-                rb.add_episode(episode)
+            for transitions in envs.begin_episodes(args.seed, run.step):
+                rb.add_episode(transitions)
             run.checkpoint()
-            obs = protocol.begin_episodes(envs, args.seed, global_step)
-            episodes, returns = [[] for _ in envs], [0.0 for _ in envs]
     run.final_test(test)
     # END SHARED

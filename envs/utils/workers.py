@@ -8,6 +8,7 @@ import collections
 import concurrent.futures
 import contextlib
 import importlib.util
+import itertools
 import multiprocessing
 import os
 import re
@@ -63,6 +64,39 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             raise
         finally:
             executor.shutdown(cancel_futures=True)
+
+
+def in_order(work, jobs, workers):
+    """Yield `work(job)` of every job, in their order; `workers` processes work ahead.
+
+    Args:
+        work: a picklable function.
+        jobs: an iterable, which may be endless: closing this generator ends the processes.
+        workers: >= 0; without a process, a job is done when its result is asked for.
+
+    Raises:
+        BrokenProcessPool: a process died.
+        Exception: the exception of a job.
+    """
+    if workers == 0:
+        yield from map(work, jobs)
+        return
+    context, jobs, running = multiprocessing.get_context("spawn"), iter(jobs), collections.deque()
+    executor = concurrent.futures.ProcessPoolExecutor(workers, context, _start, (_same, (work,)))
+    try:
+        while True:
+            for job in itertools.islice(jobs, 2 * workers - len(running)):
+                with _starting_processes():
+                    running.append(executor.submit(_work, job))
+            if not running:
+                return
+            yield running.popleft().result()
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _same(work):
+    return work
 
 
 @contextlib.contextmanager

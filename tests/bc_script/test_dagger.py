@@ -67,7 +67,9 @@ def setting(request, folder, tmp_path_factory):
     actor = dagger.Actor(args, env)
     torch.nn.init.normal_(actor.head.weight)  # (the initial one ignores the scene)
     latents = torch.as_tensor(env.encoder.encode_demos(paths))
-    yield actor, env, dagger.with_scene(batch, latents, actor.token_size)
+    latents = dagger.without_padding(latents, actor.token_size)
+    scenes = latents[batch["scene"]]
+    yield actor, env, batch | {"observation": torch.cat([batch["observation"], scenes], dim=1)}
     env.close()
 
 
