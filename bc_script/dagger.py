@@ -33,7 +33,7 @@ from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.training import flags, protocol, runs
+from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.progress import progress_bar
 from roboarm_nmp.envs.utils.random_streams import Stream
@@ -91,6 +91,8 @@ class Args(protocol.PolicyFlags):
     """number of residual blocks"""
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
+    compile: bool = True
+    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
 
     # The safety filter
     safety_margin: flags.NonNegativeFloat = 0.01
@@ -107,7 +109,6 @@ class Args(protocol.PolicyFlags):
     """number of states that are labelled, of those that the policy visits on a query"""
     round_weight: flags.NonNegativeFloat = 5.0
     """probability of a visited state in a batch, relative to an example of the pool"""
-
     eval_every: flags.PositiveInt = 4_000
     """updates between evaluations on validation queries; the best policy is saved"""
 
@@ -196,9 +197,9 @@ class Actor(nn.Module):
         inputs += [torch.sin(angles), torch.cos(angles), distances.flatten(1)]
         return torch.cat(inputs, dim=1)
 
-    def outputs(self, observation, desired_goal, link_distances, goal_link_distances=None):
+    def outputs(self, observation, desired_goal, **distances):
         """The direction (N, n), of any length, and the remaining length of the path (N,)."""
-        features = self.features(observation, desired_goal, link_distances, goal_link_distances)
+        features = self.features(observation, desired_goal, **distances)
         joints = self.num_joints
         tokens = observation[:, self.arm_size :].unflatten(1, (-1, self.token_size))
         fused = F.relu(self.token_in(tokens) + self.arm_in(features).unsqueeze(1))
@@ -213,12 +214,10 @@ class Actor(nn.Module):
         direction = F.normalize(to_goal, dim=1) + outputs[:, :joints]
         return direction, to_goal.norm(dim=1) + F.softplus(outputs[:, joints])
 
-    def forward(
-        self, observation, achieved_goal, desired_goal, link_distances, goal_link_distances=None
-    ):
+    def forward(self, observation, achieved_goal, desired_goal, **distances):
         """The action (N, n); policy.pt contains this function."""
-        given = observation, desired_goal, link_distances, goal_link_distances
-        (direction, length), joints = self.outputs(*given), self.num_joints
+        direction, length = self.outputs(observation, desired_goal, **distances)
+        joints = self.num_joints
         if self.goal_is_pose:
             return F.normalize(direction, dim=1) * length.unsqueeze(1).clamp(max=MAX_STEP)
         to_goal = (desired_goal[:, :joints] - observation[:, :joints]).norm(dim=1, keepdim=True)
@@ -227,15 +226,15 @@ class Actor(nn.Module):
 
 # ALGO LOGIC: one update
 def update(actor, optimizer, batch, length_weight):
-    """One step on a batch of examples. Returns the losses before it, of direction and length."""
+    """One step on a batch of examples. Returns the losses before it."""
     inputs = ("observation", "desired_goal", "link_distances", "goal_link_distances")
-    direction, length = actor.outputs(*(batch[name] for name in inputs))
+    direction, length = actor.outputs(**{name: batch[name] for name in inputs})
     direction_loss = 1.0 - F.cosine_similarity(direction, batch["direction"]).mean()
     length_loss = F.smooth_l1_loss(length, batch["length"])
     optimizer.zero_grad()
     (direction_loss + length_weight * length_loss).backward()
     optimizer.step()
-    return direction_loss, length_loss
+    return {"losses/direction": direction_loss, "losses/length": length_loss}
 
 
 # ALGO LOGIC: a round of DAgger
@@ -254,8 +253,7 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         visited.append(observation["observation"][0, : robot.num_joints].cpu().numpy())
         return actor(**observation)
 
-    queries = range(args.round_queries)
-    for _ in progress_bar(queries, "round", unit="query", transient=True):
+    for _ in progress_bar(range(args.round_queries), "round", unit="query", transient=True):
         number, ends = examples.random_query(rng)
         query = Query(*robot.denormalise(ends).astype(np.float32), examples.paths.scenes[number])
         visited.clear()
@@ -274,7 +272,7 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
 
 # ALGO LOGIC: batches, dicts of tensors
 def on_device(examples, device):
-    return {name: torch.as_tensor(array, device=device) for name, array in examples.items()}
+    return {name: cuda_graphs.to_device(array, device) for name, array in examples.items()}
 
 
 def concat(parts):
@@ -318,7 +316,8 @@ if __name__ == "__main__":
     actor = Actor(args, eval_envs[0]).to(device)
     actor_average = Actor(args, eval_envs[0]).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
-    optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
+    optimizer = cuda_graphs.adam(actor.parameters(), args.learning_rate, args, device)
+    learn = cuda_graphs.graphed(functools.partial(update, actor, optimizer), args, device)
     visited = {}  # examples of all rounds
     state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
     state |= {"visited": visited}
@@ -344,16 +343,16 @@ if __name__ == "__main__":
         # ALGO LOGIC: learn, while the next examples are drawn
         if args.anneal:
             remaining = 1.0 - run.step / args.total_updates
-            optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
+            cuda_graphs.set_learning_rate(optimizer, args.learning_rate * remaining)
         batch = sample(pool, args.batch_size)
         if visited and len(visited["scene"]):
             weight = args.round_weight * len(visited["scene"])
             count = int(args.batch_size * weight / (weight + len(pool["scene"])))
             batch = concat([sample(visited, count), batch])
             batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
-        scenes = latents[batch["scene"]]
+        scenes = latents[batch.pop("scene")]
         batch["observation"] = torch.cat([batch["observation"], scenes], dim=1)
-        direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
+        losses = learn(batch, args.length_weight)
         polyak_update(actor_average, actor, args.policy_average)
         oldest = run.step % num_draws * args.examples_per_update
         for name, tensor in on_device(next(draws), device).items():
@@ -361,7 +360,6 @@ if __name__ == "__main__":
         step = run.advance()
         if step % 100 == 0:
             learning_rate = optimizer.param_groups[0]["lr"]
-            losses = {"losses/direction": direction_loss, "losses/length": length_loss}
             run.log(losses | {"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
 
         # ALGO LOGIC: a round of DAgger

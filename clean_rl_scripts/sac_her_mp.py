@@ -20,7 +20,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs.networks.poses import pose_difference
-from roboarm_nmp.envs.training import flags, protocol, runs
+from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
 
 
 @dataclass
@@ -68,6 +68,8 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not twice `max_step`)"""
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
+    compile: bool = True
+    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
     eval_every: flags.PositiveInt = 25_000
     """environment steps between evaluations on validation queries; the best policy is saved"""
     stop_at_success: flags.Share | None = None
@@ -271,7 +273,7 @@ class HerReplayBuffer:
         """Yield `number` batches, dicts of tensors; up to 64 are sampled together, for speed."""
         for first in range(0, number, 64):
             data = self.sample(min(64, number - first) * batch_size)
-            parts = [torch.as_tensor(a, device=device).split(batch_size) for a in data.values()]
+            parts = [cuda_graphs.to_device(a, device).split(batch_size) for a in data.values()]
             for batch in zip(*parts, strict=True):
                 yield dict(zip(data, batch, strict=True))
 
@@ -310,10 +312,10 @@ class SAC:
         self.critics, self.critics_target = critics
         self.critics_target.load_state_dict(self.critics.state_dict())
         self.log_alpha = torch.full((1,), math.log(args.alpha), device=device, requires_grad=True)
-        parameters = [{"params": self.actor.parameters(), "lr": args.policy_lr}]
+        parameters = [{"params": self.actor.parameters()}]
         parameters += [{"params": [self.log_alpha], "lr": args.q_lr}]
-        self.actor_optimizer = torch.optim.Adam(parameters, fused=True)
-        self.q_optimizer = torch.optim.Adam(self.critics.parameters(), lr=args.q_lr, fused=True)
+        self.actor_optimizer = cuda_graphs.adam(parameters, args.policy_lr, args, device)
+        self.q_optimizer = cuda_graphs.adam(self.critics.parameters(), args.q_lr, args, device)
 
     def checkpoint_state(self):
         """The parts of a checkpoint, by name."""
@@ -321,15 +323,16 @@ class SAC:
         return {name: part for name, part in vars(self).items() if name not in flags}
 
     @torch.no_grad()
-    def explore(self, observation, achieved_goal, desired_goal, **_):
-        """Random actions (N, n), a NumPy array, for training."""
+    def explore(self, data):
+        """From observations, (N, ...) each, to a dict with random `actions` (N, n)."""
         self.actor.eval()
-        actions, _ = self.actor.get_action(self.actor.features(observation, desired_goal))
+        features = self.actor.features(data["observation"], data["desired_goal"])
+        actions, _ = self.actor.get_action(features)
         self.actor.train()
-        return actions.cpu().numpy()
+        return {"actions": actions}
 
-    def update(self, data, number):
-        """Update number `number` of the run, on a batch. Returns tensors whose means are logged."""
+    def update(self, data, of_policy):
+        """An update on a batch, `of_policy` or not. Returns tensors whose means are logged."""
         args, alpha = self.args, self.log_alpha.detach().exp()
         features = self.actor.features(data["observation"], data["desired_goal"])
         with torch.no_grad():
@@ -346,7 +349,7 @@ class SAC:
         losses = {"qf1_values": qf_values[0], "qf2_values": qf_values[1], "alpha": alpha}
         losses |= {"qf1_loss": qf_losses[0], "qf2_loss": qf_losses[1], "qf_loss": qf_losses}
 
-        if number % args.policy_frequency == 0:
+        if of_policy:
             self.critics.requires_grad_(False)  # they need no gradient of the policy's loss
             actions, log_pi = self.actor.get_action(features)
             min_qf_pi = self.critics(features, actions).amin(0)
@@ -375,6 +378,7 @@ if __name__ == "__main__":
 
     agent = SAC(args, eval_envs[0], device)
     # SHARED: run and episodes
+    explore, update = (cuda_graphs.graphed(f, args, device) for f in (agent.explore, agent.update))
     rng = np.random.default_rng(args.seed)
     rb = HerReplayBuffer(eval_envs[0], BUFFER_SIZE, args.her_probability, rng)
     counts, losses = {"updates": 0, "demos_injected": 0}, {}
@@ -391,25 +395,22 @@ if __name__ == "__main__":
             actions = 2 * torch.rand(args.num_envs, *eval_envs[0].action_space.shape) - 1
             actions = actions.numpy() * agent.actor.action_scale
         else:
-            actions = agent.explore(**protocol.stack(envs.observations, device))
+            actions = explore(protocol.stack(envs.observations, device))["actions"].cpu().numpy()
 
         # SHARED: a step in every environment
         runs.check_finite("the policy's actions", actions)
         for episode in envs.step(actions):
-            ended_at = run.step + episode.number + 1
             rb.add_episode(episode.transitions)
-            run.log_episode(ended_at, episode)
             if episode.demo is not None:
                 rb.add_episode(episode.demo)
                 counts["demos_injected"] += 1
-            if args.demo_prob is not None:
-                run.log({"charts/demos_injected": counts["demos_injected"]}, ended_at)
+            run.log_episode(episode, counts["demos_injected"])
         global_step = run.advance(args.num_envs)
 
         # ALGO LOGIC: learn
         due = updates_due(global_step, args) if rb.size > 0 else 0
         for data in rb.batches(due, args.batch_size, device):
-            losses |= agent.update(data, counts["updates"])
+            losses |= update(data, counts["updates"] % args.policy_frequency == 0)
             counts["updates"] += 1
             if counts["updates"] % 1000 == 0:
                 named = {f"losses/{name}": value for name, value in losses.items()}

@@ -6,15 +6,20 @@ for episode in envs.step(actions):              # those that end with this step
     ...
 """
 
+import contextlib
+import functools
+import multiprocessing
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from roboarm_nmp.envs.datasets.episodes import (
     DemoQueriesWrapper,
     demo_transitions,
     transition,
 )
+from roboarm_nmp.envs.utils.workers import begin_worker, starting_processes
 
 
 class FinishedEpisode(NamedTuple):
@@ -36,6 +41,8 @@ class FinishedEpisode(NamedTuple):
 class TrainingEnvs:
     """Environments that are stepped together. Each resets itself when its episode ends.
 
+    What they do does not depend on the number of processes.
+
     Attributes:
         observations: of every environment, a list of dicts.
 
@@ -43,23 +50,31 @@ class TrainingEnvs:
         envs: a list of environments.
         demo_prob: None, or the probability that a failure adds its query's demonstration. The
             environments then are `envs.datasets.episodes.DemoQueriesWrapper`.
+        processes: number of processes that share the environments; 0: they stay in this one.
     """
 
-    def __init__(self, envs, demo_prob=None):
-        self._collectors = [_Collector(env, number, demo_prob) for number, env in enumerate(envs)]
+    def __init__(self, envs, demo_prob=None, processes=0):
+        self._num_envs, self.observations = len(envs), []
+        parts = np.array_split(np.arange(len(envs)), min(max(1, processes), len(envs)))
+        groups = [_Group([envs[i] for i in part], int(part[0]), demo_prob) for part in parts]
+        self._spans = [slice(part[0], part[-1] + 1) for part in parts]
+        self._groups = [_Process(group) for group in groups] if processes else groups
+
+    def _call(self, name, *arguments):
+        """Call a method of every group, each with its own arguments; the results, a list."""
+        calls = zip(self._groups, zip(*arguments, strict=True), strict=True)
+        waiting = [getattr(group, name)(*given) for group, given in calls]
+        return [result() if callable(result) else result for result in waiting]
 
     def encode_demos(self):
         """Encode the scenes of the demonstrations, if there are both encoder and demonstrations.
 
         It may take minutes, once; without it, scenes are encoded at their resets.
         """
-        env = self._collectors[0].env
-        if isinstance(env, DemoQueriesWrapper) and hasattr(env.env, "encoder"):
-            env.env.encoder.encode_demos(env.demos)
-
-    @property
-    def observations(self):
-        return [collector.observation for collector in self._collectors]
+        for group in self._groups:  # the first stores what the others load
+            done = group.encode_demos()
+            if callable(done):
+                done()
 
     def begin_episodes(self, seed, step):
         """Begin new episodes, whose random numbers depend on `seed` and `step` only.
@@ -70,16 +85,85 @@ class TrainingEnvs:
         Returns:
             The transitions of each episode that was running, a list of lists.
         """
-        seeds = np.random.SeedSequence([seed, step]).generate_state(len(self._collectors)).tolist()
-        begun = zip(self._collectors, seeds, strict=True)
-        running = [collector.begin_episode(seed=one) for collector, one in begun]
-        return [transitions for transitions in running if transitions]
+        seeds = np.random.SeedSequence([seed, step]).generate_state(self._num_envs).tolist()
+        return self._collect("begin_episodes", [seeds[span] for span in self._spans])
 
     def step(self, actions):
         """One step with an action (n,) for each environment; the `FinishedEpisode`s, a list."""
+        return self._collect("step", [actions[span] for span in self._spans])
+
+    def _collect(self, name, given):
+        episodes, observations = zip(*self._call(name, given), strict=True)
+        self.observations = [one for part in observations for one in part]
+        return [one for part in episodes for one in part]
+
+
+class _Group:
+    """The environments of a process. Methods return episodes, and the observations after them."""
+
+    def __init__(self, envs, first, demo_prob):
+        self._collectors = [_Collector(env, first + i, demo_prob) for i, env in enumerate(envs)]
+
+    def encode_demos(self):
+        env = self._collectors[0].env
+        if isinstance(env, DemoQueriesWrapper) and hasattr(env.env, "encoder"):
+            env.env.encoder.encode_demos(env.demos)
+
+    def begin_episodes(self, seeds):
+        begun = zip(self._collectors, seeds, strict=True)
+        running = [collector.begin_episode(seed=seed) for collector, seed in begun]
+        return [one for one in running if one], self._observations()
+
+    def step(self, actions):
         steps = zip(self._collectors, actions, strict=True)
         ended = [collector.step(action) for collector, action in steps]
-        return [episode for episode in ended if episode is not None]
+        return [one for one in ended if one is not None], self._observations()
+
+    def _observations(self):
+        return [collector.observation for collector in self._collectors]
+
+
+class _Process:
+    """A `_Group` in a process of its own: methods return functions that wait for the results."""
+
+    def __init__(self, group):
+        self._connection, other = multiprocessing.Pipe()
+        process = multiprocessing.get_context("spawn").Process(
+            target=_serve, args=(group, other), daemon=True
+        )
+        with starting_processes():
+            process.start()
+        other.close()
+
+    def __getattr__(self, name):
+        return functools.partial(self._call, name)
+
+    def _call(self, *call):
+        self._connection.send(call)
+        return self._result
+
+    def _result(self):
+        try:
+            result = self._connection.recv()
+        except EOFError:
+            raise RuntimeError("a process with environments has died") from None
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+
+def _serve(group, connection):
+    """Do what a `_Process` asks for, until the process that it belongs to ends."""
+    begin_worker()
+    torch.set_num_threads(1)
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        while True:
+            name, *arguments = connection.recv()
+            try:
+                result = getattr(group, name)(*arguments)
+            except Exception as error:
+                result = error
+            connection.send(result)
 
 
 class _Collector:

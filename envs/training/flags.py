@@ -45,7 +45,7 @@ GROUPS = {
         *("clearance",),
     ),
     "run": (
-        *("seed", "runs_dir", "resume", "device", "bf16", "track", "workers"),
+        *("seed", "runs_dir", "resume", "device", "bf16", "compile", "track", "workers"),
         *("ray_address",),
     ),
     "output": ("output", "overwrite", "repair", "shard_size", "json", "image"),

@@ -31,7 +31,14 @@ from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name, task_with_robot
 from roboarm_nmp.envs.training.collection import TrainingEnvs
-from roboarm_nmp.envs.training.flags import Horizon, NonNegativeInt, PositiveFloat, PositiveInt
+from roboarm_nmp.envs.training.cuda_graphs import to_device
+from roboarm_nmp.envs.training.flags import (
+    CORES,
+    Horizon,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+)
 from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite, script_name
 from roboarm_nmp.envs.utils.progress import progress_bar
 
@@ -161,19 +168,21 @@ def make_training_envs(args, demo_prob=None, demos=None):
     if demo_prob is None and demos is not None:
         sys.exit("--demos goes with --demo-prob")
     made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
+    # A GPU waits for its environments; on a CPU they take less time than the updates.
+    processes = min(args.num_envs, CORES) if torch.device(args.device).type == "cuda" else 0
     if demo_prob is None:
-        return TrainingEnvs(made)
+        return TrainingEnvs(made, processes=processes)
     try:
         demos = load_demos_for(made[0], demos or args.task, args.task)
     except ValueError as error:
         sys.exit(f"--demo-prob: {error}")
-    return TrainingEnvs([DemoQueriesWrapper(env, demos) for env in made], demo_prob)
+    return TrainingEnvs([DemoQueriesWrapper(env, demos) for env in made], demo_prob, processes)
 
 
 def stack(observations, device):
     """List of observation dicts -> dict of float32 tensors (N, ...)."""
     return {
-        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
+        name: to_device(np.stack([o[name] for o in observations]), device)
         for name in observations[0]
     }
 
@@ -311,12 +320,15 @@ class PolicyRun(Run):
         self.validation, self.safety_filter = validation, safety_filter
         self._recent = collections.deque(maxlen=100)  # outcomes of training episodes
 
-    def log_episode(self, step, episode):
-        """Log a training episode, a `FinishedEpisode`, which ended at `step` of the training."""
+    def log_episode(self, episode, demos_injected):
+        """Log a `FinishedEpisode`, and with --demo-prob how many demonstrations were added."""
         self._recent.append(episode.info["is_success"])
         values = {"episodic_return": episode.episode_return}
         values |= {"episodic_length": episode.info["elapsed_steps"]}
+        if self.args.demo_prob is not None:
+            values["demos_injected"] = demos_injected
         values["success"] = np.mean(self._recent)
+        step = self.step + episode.number + 1  # every environment's step counts
         self.log({f"charts/{name}": value for name, value in values.items()}, step)
 
     def validate(self, policy):

@@ -325,6 +325,9 @@ def _restore(part, state):
         part.update(state)
     else:
         part.load_state_dict(state)
+        for group in getattr(part, "param_groups", ()):
+            if isinstance(group["lr"], torch.Tensor):  # of `envs.training.cuda_graphs.adam`
+                group["lr"] = group["lr"].to(group["params"][0].device)
 
 
 def summary_writer(run, args, step):

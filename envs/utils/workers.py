@@ -32,7 +32,7 @@ def run(make_worker, arguments, jobs, workers, warn=print):
     """
     waiting, deaths = collections.deque(jobs), 0
     while waiting:
-        with _starting_processes():
+        with starting_processes():
             executor = concurrent.futures.ProcessPoolExecutor(
                 workers, multiprocessing.get_context("spawn"), _start, (make_worker, arguments)
             )
@@ -40,7 +40,7 @@ def run(make_worker, arguments, jobs, workers, warn=print):
         try:
             while waiting or running:
                 while waiting and len(running) < 2 * workers:
-                    with _starting_processes():  # at the first job
+                    with starting_processes():  # at the first job
                         running[executor.submit(_work, waiting[0])] = waiting[0]
                     waiting.popleft()
                 done, _ = concurrent.futures.wait(
@@ -86,7 +86,7 @@ def in_order(work, jobs, workers):
     try:
         while True:
             for job in itertools.islice(jobs, 2 * workers - len(running)):
-                with _starting_processes():
+                with starting_processes():
                     running.append(executor.submit(_work, job))
             if not running:
                 return
@@ -100,7 +100,7 @@ def _same(work):
 
 
 @contextlib.contextmanager
-def _starting_processes():
+def starting_processes():
     """A context for starting processes: SIGINT and SIGTERM, also of a terminal, wait for its end.
 
     Neither this process is interrupted between two of its steps, nor a new one killed while this
@@ -122,11 +122,16 @@ def _starting_processes():
             signal.raise_signal(number)
 
 
-def _start(make_worker, arguments):
-    global _worker
+def begin_worker():
+    """What a process of `starting_processes` does first. It ends when its parent was killed."""
     # SIGINT stays blocked: a terminal sends Ctrl-C to this process, too, but the parent handles it.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+def _start(make_worker, arguments):
+    global _worker
+    begin_worker()
     _worker = make_worker(*arguments)
 
 

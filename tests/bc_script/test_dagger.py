@@ -85,7 +85,7 @@ def test_update(setting):
     actor, _, batch = setting
     old, actor = copy.deepcopy(actor), copy.deepcopy(actor)
     optimizer = torch.optim.Adam(actor.parameters(), lr=1e-3)
-    losses = dagger.update(actor, optimizer, batch, 0.1)
+    losses = list(dagger.update(actor, optimizer, batch, 0.1).values())
     with torch.no_grad():
         direction, length = (x.double().numpy() for x in old.outputs(**inputs_of(batch)))
     label = batch["direction"].double().numpy()
@@ -95,7 +95,7 @@ def test_update(setting):
     assert losses[0].item() == pytest.approx(1.0 - cosine.mean(), abs=1e-5)
     assert losses[1].item() == pytest.approx(smooth.mean(), rel=1e-4)
     for _ in range(30):
-        last = dagger.update(actor, optimizer, batch, 0.1)
+        last = list(dagger.update(actor, optimizer, batch, 0.1).values())
     assert last[0] < losses[0] - 0.02 and last[1] < losses[1]
 
 

@@ -324,6 +324,7 @@ def test_training_environments_need_neither_replay_buffer_nor_demonstrations():
     class Args(protocol.EnvFlags):
         task: str = "wall"
         num_envs: int = 2
+        device: str = "cpu"
 
     made = protocol.make_training_envs(Args(goal_type="config", velocities=True))
     assert made.begin_episodes(seed=1, step=0) == []
