@@ -70,15 +70,6 @@ from roboarm_nmp.envs.policies.baselines import TIME_LIMIT, TRIES
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import (
-    CORES,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    Seed,
-    Workers,
-)
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
@@ -102,9 +93,9 @@ class Args:
     problems: Path | None = None
     """a file or folder of problems to use instead of a task's queries: `problems.h5` of `roboarm
     import`, or a file that it reads (docs/customise/problems.md); no task is needed"""
-    num_queries: PositiveInt | None = None
+    num_queries: flags.PositiveInt | None = None
     """only the first so many queries of the split"""
-    workers: Workers = CORES
+    workers: flags.Workers = flags.CORES
     """processes, one core each; by default as many as there are cores"""
     stop_on_collision: bool = False
     """end an episode at the first contact"""
@@ -112,7 +103,7 @@ class Args:
     """where `planner`, `via-points`, the safety filter and the policy's observations take the
     obstacles from: `ground_truth`, `point_cloud`, or an encoder with a decoder (a name or path); by
     default the policy's own, otherwise `ground_truth`"""
-    safety_margin: NonNegativeFloat | None = None
+    safety_margin: flags.NonNegativeFloat | None = None
     """put a safety filter with this margin (m) around the policy, e.g. 0.01; 0 for no filter; by
     default the filter that the policy includes, if any"""
     escape: bool = True
@@ -120,13 +111,13 @@ class Args:
     approach: bool = False
     """add approach paths to the safety filter: out of starts, and into goals, that are nearer to
     obstacles than its margin (docs/guide/safety_filter.md)"""
-    seed: Seed = 0
+    seed: flags.Seed = 0
     """of random numbers: `random`, `via-points`, `planner`, escapes"""
-    tries: PositiveInt = TRIES
+    tries: flags.PositiveInt = TRIES
     """random configurations that `via-points` tries per query"""
-    time_limit: PositiveFloat = TIME_LIMIT
+    time_limit: flags.PositiveFloat = TIME_LIMIT
     """seconds that `planner` may search per query"""
-    action_delay: NonNegativeInt = 0
+    action_delay: flags.NonNegativeInt = 0
     """steps after which an action takes effect, while the arm makes the step before it and then
     holds its configuration; 0: the simulation waits for the policy"""
     real_time: bool = False
@@ -145,14 +136,11 @@ def main(arguments=None):
     args = flags.parse(Args, arguments)
     try:
         flags.check(args)
-        for path in (args.json, args.image):
-            if path is not None:
-                check_writable(path)
+        for path in filter(None, (args.json, args.image)):
+            check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
         from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
 
-        if args.task is None and args.robot is not None:
-            raise ValueError("--robot goes with --task")
         options = vars(args) | {"safety_filter": _safety_filter(args)}
         options["task"] = task_with_robot(args.task, args.robot)
         for name in ("robot", "safety_margin", "escape", "approach", "json", "image"):
@@ -267,8 +255,7 @@ def _table(result):
             row("planning time", result["planning_seconds"], "s"),
             row("  ... if found", result["planning_seconds_solved"], "s"),
         ]
-    if result["free_motion_rate"] is not None:
-        lines.append(row("free motion", result["free_motion_rate"]))
+    lines += [row("free motion", result["free_motion_rate"])] * (result["tries"] is not None)
     return "\n".join(lines)
 
 

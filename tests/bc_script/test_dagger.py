@@ -67,7 +67,9 @@ def setting(request, folder, tmp_path_factory):
     actor = dagger.Actor(args, env)
     torch.nn.init.normal_(actor.head.weight)  # (the initial one ignores the scene)
     latents = torch.as_tensor(env.encoder.encode_demos(paths))
-    yield actor, env, dagger.with_scene(batch, latents, actor.token_size)
+    latents = dagger.without_padding(latents, actor.token_size)
+    scenes = latents[batch["scene"]]
+    yield actor, env, batch | {"observation": torch.cat([batch["observation"], scenes], dim=1)}
     env.close()
 
 
@@ -83,7 +85,7 @@ def test_update(setting):
     actor, _, batch = setting
     old, actor = copy.deepcopy(actor), copy.deepcopy(actor)
     optimizer = torch.optim.Adam(actor.parameters(), lr=1e-3)
-    losses = dagger.update(actor, optimizer, batch, 0.1)
+    losses = list(dagger.update(actor, optimizer, batch, 0.1).values())
     with torch.no_grad():
         direction, length = (x.double().numpy() for x in old.outputs(**inputs_of(batch)))
     label = batch["direction"].double().numpy()
@@ -93,7 +95,7 @@ def test_update(setting):
     assert losses[0].item() == pytest.approx(1.0 - cosine.mean(), abs=1e-5)
     assert losses[1].item() == pytest.approx(smooth.mean(), rel=1e-4)
     for _ in range(30):
-        last = dagger.update(actor, optimizer, batch, 0.1)
+        last = list(dagger.update(actor, optimizer, batch, 0.1).values())
     assert last[0] < losses[0] - 0.02 and last[1] < losses[1]
 
 
