@@ -954,6 +954,32 @@ def first_in_cells(points, cell):
 
 
 @compiled
+def farthest(points, chosen):
+    """Write the points of `envs.perception.point_clouds.farthest_points` to `chosen` (k, 3).
+
+    `points`: float32 (n, 3), m. Squares are added in NumPy's order, for the same last bits.
+    """
+    n = points.shape[0]
+    nearest = np.empty(n, np.float32)
+    for k in range(min(chosen.shape[0], n)):
+        best, found = np.float32(-1.0), 0
+        for i in range(n):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            if k > 0:
+                x, y, z = x - chosen[k - 1, 0], y - chosen[k - 1, 1], z - chosen[k - 1, 2]
+            distance = np.sqrt(x * x + y * y + z * z)
+            if k < 2 or distance < nearest[i]:
+                nearest[i] = distance
+            if nearest[i] > best:
+                best, found = nearest[i], i
+        chosen[k, 0], chosen[k, 1], chosen[k, 2] = (
+            points[found, 0],
+            points[found, 1],
+            points[found, 2],
+        )
+
+
+@compiled
 def decompress_lzf(compressed, result):
     """Write the bytes of LZF data (uint8) to `result`; returns how many, -1 if it is damaged."""
     i, n = 0, 0
@@ -1254,7 +1280,7 @@ def _draw_ball(view, radius, pose, area, label, inverse, classes):
             if under < 0.0:
                 continue
             depth = (along - math.sqrt(under)) / square
-            if depth >= view[NEAREST] and 1.0 > depth * inverse[row, column]:
+            if depth >= view[NEAREST] and depth * inverse[row, column] < 1.0:
                 inverse[row, column], classes[row, column] = 1.0 / depth, label
 
 
@@ -1287,13 +1313,13 @@ def _draw_cylinder(view, surface, pose, area, label, inverse, classes):
                 enter, leave = max(enter, min(one, other)), min(leave, max(one, other))
             elif abs(oz) > half:
                 continue
-            if view[NEAREST] <= enter <= leave and 1.0 > enter * inverse[row, column]:
+            if view[NEAREST] <= enter <= leave and enter * inverse[row, column] < 1.0:
                 inverse[row, column], classes[row, column] = 1.0 / enter, label
 
 
 @compiled
 def points_of_pixels(view, depth, classes, only, nothing, points, labels):
-    """Write the points (m) and classes of pixels that hit something, row by row from the upper left.
+    """Write the points (m) and classes of pixels that hit something, row by row from upper left.
 
     Args:
         view: float64 (`VIEW`,).
@@ -1320,3 +1346,27 @@ def points_of_pixels(view, depth, classes, only, nothing, points, labels):
             labels[n] = label
             n += 1
     return n
+
+
+@compiled
+def edge_pixels(depth, classes, nothing, edge):
+    """Of pixels at edges, the least and the largest depth of the pixel and its four neighbours.
+
+    At an edge they are more than `edge` (m) apart; neighbours of the class `nothing` do not count.
+
+    Returns two arrays, float32 (height, width), m; zeros where there is no edge.
+    """
+    height, width = depth.shape
+    front, back = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    for row in range(height):
+        for column in range(width):
+            if classes[row, column] == nothing:
+                continue
+            least = most = depth[row, column]
+            for i in range(4):
+                r, c = row + (i == 0) - (i == 1), column + (i == 2) - (i == 3)
+                if 0 <= r < height and 0 <= c < width and classes[r, c] != nothing:
+                    least, most = min(least, depth[r, c]), max(most, depth[r, c])
+            if most - least > edge:
+                front[row, column], back[row, column] = least, most
+    return front, back
