@@ -73,6 +73,7 @@ from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
     CORES,
     NonNegativeFloat,
+    NonNegativeInt,
     PositiveFloat,
     PositiveInt,
     Seed,
@@ -131,6 +132,12 @@ class Args:
     """random configurations that `via-points` tries per query"""
     time_limit: PositiveFloat = TIME_LIMIT
     """seconds that `planner` may search per query"""
+    action_delay: NonNegativeInt = 0
+    """steps after which an action takes effect, while the arm makes the step before it and then
+    holds its configuration; 0: the simulation waits for the policy"""
+    real_time: bool = False
+    """instead: as many steps of 1/30 s as an action, or a plan, takes to compute, at least 1; the
+    numbers depend on the machine and its load"""
     clearance: bool = False
     """also measure each successful episode's smallest distance from the ground-truth obstacles"""
     json: Path | None = None
@@ -219,8 +226,16 @@ def _settings(result):
         "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",
         "tries": result["tries"],
+        "action delay": _delay(result["action_delay"]),
         "seed": result["seed"],
     }
+
+
+def _delay(steps):
+    """The delay in words; None for none."""
+    if steps == "real_time":
+        return "real time: the steps that each action takes to compute"
+    return f"{steps} steps" if steps else None
 
 
 def _table(result):

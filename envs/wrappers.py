@@ -43,7 +43,7 @@ class SensorWrapper(gym.Wrapper):
     def _observe(self, number):
         env = self.unwrapped
         configuration = _configuration(env) if number else env.start_configuration
-        self._world.show(_current_scene(env), configuration, number)
+        self._world.show(env.current_scene, configuration, number)
         return {name: sensor.observe(self._world) for name, sensor in self.sensors.items()}
 
     def _with_sensors(self, observation):
@@ -58,7 +58,7 @@ class SensorWrapper(gym.Wrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         env = self.unwrapped
         self._world.begin_episode(_key(env.start_configuration), len(self.sensors))
-        self._observed = self._schedule.begin(_is_static(env.scene), self._observe)
+        self._observed = self._schedule.begin(env.scene.is_static, self._observe)
         return self._with_sensors(observation), info
 
     def reset_specific(self, start, goal=None, scene=None, goal_pose=None):
@@ -108,15 +108,6 @@ class _Schedule:
         while self._due and self._due[0][0] <= self._steps:
             self._received = self._due.popleft()[1]
         return self._received
-
-
-def _current_scene(env):
-    """The static `Scene` of this moment."""
-    return getattr(env, "current_scene", env.scene)
-
-
-def _is_static(scene):
-    return getattr(scene, "is_static", True)
 
 
 def _configuration(env):
@@ -180,26 +171,26 @@ class ObservedSceneWrapper(_ObservingWrapper):
     @property
     def observed_scene(self):
         """The last observation received: a `Scene`, possibly a `SceneObservation`."""
-        scene = self.unwrapped.scene
-        return scene if self._observed is None or self._is_received(scene) else self._observed
+        env = self.unwrapped
+        is_itself = self._observed is None or self._is_received(env.scene)
+        return env.current_scene if is_itself else self._observed
 
     def _is_received(self, scene):
         """Whether a scene itself is received."""
-        return isinstance(scene, ObservedScene) or (self._observes_once and _is_static(scene))
+        return isinstance(scene, ObservedScene) or (self._observes_once and scene.is_static)
 
     def observed_at_start(self, scene, start):
         """The `observed_scene` after a reset to a `Scene` and a start (n,), rad."""
         if self._is_received(scene):
-            return scene
-        at_start = scene if _is_static(scene) else scene.at(0.0)
-        return SceneObservation.of(at_start, start, self._schedule.noise, _key(start))
+            return scene.at(0.0)
+        return SceneObservation.of(scene.at(0.0), start, self._schedule.noise, _key(start))
 
     def _observe(self, number):
         env = self.unwrapped
         start = env.start_configuration
         if number == 0:
             return self.observed_at_start(env.scene, start)
-        scene, noise = _current_scene(env), self._schedule.noise
+        scene, noise = env.current_scene, self._schedule.noise
         if self._is_received(env.scene):
             return scene
         return SceneObservation.of(scene, _configuration(env), noise, _key(start), number)
@@ -207,7 +198,7 @@ class ObservedSceneWrapper(_ObservingWrapper):
     def reset(self, *, seed=None, options=None):
         """As `RoboArmEnv.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._observed = self._schedule.begin(_is_static(self.unwrapped.scene), self._observe)
+        self._observed = self._schedule.begin(self.unwrapped.scene.is_static, self._observe)
         return observation, info
 
     def step(self, action):
@@ -222,13 +213,14 @@ def observed_scene(env):
     try:
         return env.get_wrapper_attr("observed_scene")
     except AttributeError:  # no `ObservedSceneWrapper`
-        return _current_scene(env.unwrapped)
+        return env.unwrapped.current_scene
 
 
 class SceneEncodingWrapper(_ObservingWrapper):
     """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
 
-    A scene is encoded once. All attributes of the wrapped environment are available.
+    A scene is encoded once; one with moving obstacles in each step. All attributes of the wrapped
+    environment are available.
 
     Args:
         env: a `RoboArmEnv`.

@@ -277,13 +277,15 @@ def shape_rows(obstacles):
     """Obstacles -> float64 (n, `ROW`); `world_shapes` adds the bodies of convex hulls."""
     rows = np.zeros((len(obstacles), ROW))
     for obstacle, numbers, row in zip(obstacles, to_array(obstacles), rows, strict=True):
-        (kind,), position, quaternion, size = np.split(numbers, (1, 4, 8))
-        norm = math.sqrt(quaternion @ quaternion)
-        half = np.array(size) if isinstance(obstacle, Sphere) else size / 2
+        quaternion = numbers[4:8]
+        # Python's floats: NumPy's are ten times as slow one by one, and scenes that move have a
+        # checker per step.
+        x, y, z, w = (quaternion / math.sqrt(quaternion @ quaternion)).tolist()
+        kind, *position = numbers[:4].tolist()
+        half = [size if isinstance(obstacle, Sphere) else size / 2 for size in numbers[8:].tolist()]
         if isinstance(obstacle, Cylinder):
-            half[:2] = obstacle.radius
-        rounding = half[0] if isinstance(obstacle, Sphere) else min(BULLET_MARGIN, half.min())
-        x, y, z, w = quaternion / norm
+            half[:2] = obstacle.radius, obstacle.radius
+        rounding = half[0] if isinstance(obstacle, Sphere) else min(BULLET_MARGIN, *half)
         rotation = (
             *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
             *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
@@ -291,10 +293,19 @@ def shape_rows(obstacles):
         )
         if isinstance(obstacle, ConvexHull):
             centre, mesh, _ = _hull(obstacle.vertices)
-            kind, rounding, half = LINK, BULLET_MARGIN, mesh.max(0) + BULLET_MARGIN
+            kind, rounding, half = LINK, BULLET_MARGIN, (mesh.max(0) + BULLET_MARGIN).tolist()
             position = position + np.reshape(rotation, (3, 3)) @ centre
-        row[:] = (kind, *position, *rotation, *half - rounding, rounding, 0)
+        row[:] = (kind, *position, *rotation, *(edge - rounding for edge in half), rounding, 0)
     return rows
+
+
+def shape_centres(obstacles):
+    """The centres of obstacles' shapes in their own frames: float64 (n, 3), m."""
+    hulls = [isinstance(obstacle, ConvexHull) for obstacle in obstacles]
+    centres = np.zeros((len(obstacles), 3))
+    for i in np.flatnonzero(hulls):
+        centres[i] = _hull(obstacles[i].vertices)[0]
+    return centres
 
 
 def group_points(points, radius):

@@ -42,7 +42,7 @@ def observed_at_start(env, query):
     try:
         observe = env.get_wrapper_attr("observed_at_start")
     except AttributeError:  # no `envs.wrappers.ObservedSceneWrapper`
-        return query.scene
+        return query.scene.at(0.0)
     return observe(query.scene, query.start)
 
 
@@ -76,7 +76,7 @@ class ConfigurationGoals:
     def begin_anywhere(self):
         """Choose any goal, to see what the policy would observe."""
         goal = np.zeros(self.robot.num_joints)
-        self._set(goal, np.zeros(3), self.env.unwrapped.scene)
+        self._set(goal, np.zeros(3), self.env.unwrapped.current_scene)
 
     def _set(self, state, position, scene):
         self._more = {"desired_goal": goal_of(self.goal_type, state, position).astype(np.float32)}

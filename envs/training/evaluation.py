@@ -39,8 +39,9 @@ from roboarm_nmp.envs.policies.registry import (
     own_safety_filter,
     own_task,
 )
-from roboarm_nmp.envs.policies.rollout import render_strip, rollout
+from roboarm_nmp.envs.policies.rollout import REAL_TIME, render_strip, rollout
 from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.envs.utils import workers
@@ -81,6 +82,10 @@ class EvaluationOptions:
         observe_every: steps from one observation of the scene to the next; None: static scenes are
             observed once (`envs.wrappers.ObservedSceneWrapper`).
         sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
+        action_delay: steps after which an action takes effect; 0: the simulation waits for the
+            policy (`envs.policies.rollout.rollout`).
+        real_time: instead of `action_delay`, as many steps as an action, or a plan, takes to
+            compute, at least 1. Results then depend on the machine and its load.
         clearance: also measure each episode's smallest distance from the ground-truth obstacles.
         workers: processes, >= 1. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
@@ -104,6 +109,8 @@ class EvaluationOptions:
     safety_filter: SafetyFilter | bool | None = None
     observe_every: int | None = None
     sensor_noise: SensorNoise | None = None
+    action_delay: int = 0
+    real_time: bool = False
     clearance: bool = False
     workers: int = 1
     env: dict | None = None
@@ -112,6 +119,10 @@ class EvaluationOptions:
         for name in ("workers", "tries"):
             if getattr(self, name) < 1:
                 raise EvaluationError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.action_delay < 0:
+            raise EvaluationError(f"action_delay must not be negative, got {self.action_delay}")
+        if self.action_delay and self.real_time:
+            raise EvaluationError("action_delay and real_time: give one of them")
         if not 0 < self.time_limit < math.inf:
             raise EvaluationError(
                 f"time_limit must be a positive number of seconds, got {self.time_limit}"
@@ -147,7 +158,7 @@ def evaluate(policy, task=None, *, progress=False, **options):
         - `policy`, `task`, `robot` (its name), `goal_type`, `split`, `queries` (the file, if it is
           not the task's own), `problems` (their file and its SHA-256), `num_queries`, `env`,
           `deviations` (from the standard rules), `safety_filter`, `seed`, `tries`, `time_limit`,
-          `versions`;
+          `action_delay` (steps, or `real_time`), `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles;
         - `observe_every`, `sensor_noise` (a dict), where they were given.
@@ -167,7 +178,7 @@ def first_episode_image(policy, task=None, frames=8, **options):
     job = _prepare(policy, task, EvaluationOptions(**options))
     env, begin = job.make(render_mode="rgb_array")
     query = job.query(0)
-    actions = rollout(env, query, begin(0, query).act).actions
+    actions = rollout(env, query, begin(0, query).act, job.delay).actions
     steps = np.linspace(0, len(actions), frames).round().astype(int)
     image = render_strip(env, query, actions, sorted(set(steps.tolist())))
     env.close()
@@ -225,6 +236,11 @@ class _Job:
         source, safety_filter = o.geometry_source or GROUND_TRUTH, o.safety_filter or False
         options = o.seed, o.tries, o.time_limit, source, safety_filter
         return env, make_policy(self.policy, env, *options)
+
+    @property
+    def delay(self):
+        """As of `rollout`."""
+        return REAL_TIME if self.options.real_time else self.options.action_delay
 
     def query(self, index):
         return Query(self.start[index], self.goal[index], self.scenes[index])
@@ -382,11 +398,11 @@ class _Worker:
         began = time.perf_counter()
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
-        trajectory = rollout(self.env, query, act)
+        trajectory = rollout(self.env, query, act, self.job.delay, planning_seconds)
         lengths = [np.nan, np.nan, (np.nan,) * len(MOTION_METRICS)]
         if trajectory.success:
             configurations = trajectory.configurations
-            motion = motion_metrics(trajectory, self._checker(query.scene))
+            motion = motion_metrics(trajectory, self._checker(query.scene, len(trajectory)))
             lengths = [path_length(configurations), smoothness(configurations)]
             lengths.append(tuple(motion[name] for name in MOTION_METRICS))
         return _Outcome(
@@ -399,14 +415,16 @@ class _Worker:
             plan_found,
         )
 
-    def _checker(self, scene):
-        """For the clearance in a scene; None where it is not measured."""
+    def _checker(self, scene, steps):
+        """For the clearance in an episode; None where it is not measured."""
         if not self.job.options.clearance:
             return None
         # Here, because Numba takes a while to import.
         from roboarm_nmp.envs.collision.checker import CollisionChecker
 
-        return CollisionChecker(scene)
+        if scene.is_static:
+            return CollisionChecker(scene)
+        return [CollisionChecker(scene.at(step * STEP_SECONDS)) for step in range(steps + 1)]
 
 
 def _run(job, progress):
@@ -499,6 +517,7 @@ def _summary(job, outcomes):
         "seed": options.seed if random else None,
         "tries": options.tries if job.policy == "via-points" else None,
         "time_limit": options.time_limit if job.policy == "planner" else None,
+        "action_delay": job.delay,
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in packages},
