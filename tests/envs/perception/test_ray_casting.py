@@ -1,4 +1,4 @@
-"""Compiled ray casting: against PyBullet's images and ray tests, and formulas worked out by hand."""
+"""Compiled ray casting: against PyBullet's images and ray tests, and against formulas."""
 
 import math
 
