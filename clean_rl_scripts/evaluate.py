@@ -111,6 +111,12 @@ class Args:
     approach: bool = False
     """add approach paths to the safety filter: out of starts, and into goals, that are nearer to
     obstacles than its margin (docs/guide/safety_filter.md)"""
+    observe_every: flags.PositiveInt | None = None
+    """steps from one observation of the scene to the next, with the arm where it is; by default
+    static scenes are observed once, and scenes with moving obstacles in every step"""
+    sensor_noise: tuple[str, ...] = ()
+    """NAME=VALUE pairs of sensor noise, e.g. `gaussian=0.005 dropout=0.1`
+    (docs/guide/perception.md, "Sensor noise")"""
     seed: flags.Seed = 0
     """of random numbers: `random`, `via-points`, `planner`, escapes"""
     tries: flags.PositiveInt = TRIES
@@ -139,9 +145,11 @@ def main(arguments=None):
         for path in filter(None, (args.json, args.image)):
             check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
+        from roboarm_nmp.envs.perception.noise import SensorNoise
         from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
 
-        options = vars(args) | {"safety_filter": _safety_filter(args)}
+        noise = SensorNoise.parse(args.sensor_noise) if args.sensor_noise else None
+        options = vars(args) | {"safety_filter": _safety_filter(args), "sensor_noise": noise}
         options["task"] = task_with_robot(args.task, args.robot)
         for name in ("robot", "safety_margin", "escape", "approach", "json", "image"):
             del options[name]
@@ -192,7 +200,7 @@ def _settings(result):
         escape = "escapes local minima" if safety_filter["escape"] else "no escape"
         margin = f"margin {safety_filter['margin']:g} m, {escape}"
         margin += ", approach paths" * ("approach" in safety_filter)
-    limit = result["time_limit"]
+    limit, noise = result["time_limit"], result.get("sensor_noise", {})
     return {
         "robot": None if result["robot"] == PANDA.name else result["robot"],
         "queries": result["queries"],
@@ -201,6 +209,8 @@ def _settings(result):
         "geometry source": result["geometry_source"] or "none",
         "privileged": "yes" if result["privileged"] else None,
         "safety filter": margin,
+        "observed every": f"{result['observe_every']} steps" if "observe_every" in result else None,
+        "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",
         "tries": result["tries"],
         "action delay": _delay(result["action_delay"]),

@@ -29,6 +29,7 @@ from roboarm_nmp.envs.datasets.queries import Query, load_queries, validate
 from roboarm_nmp.envs.metrics import motion_metrics, path_length, smoothness
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
+from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
 from roboarm_nmp.envs.policies.baselines import PLANNERS, TIME_LIMIT, TRIES
 from roboarm_nmp.envs.policies.registry import (
@@ -78,6 +79,9 @@ class EvaluationOptions:
             policy's own, otherwise `ground_truth`.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
             one that the policy includes, if any; False for none.
+        observe_every: steps from one observation of the scene to the next; None: static scenes are
+            observed once (`envs.wrappers.ObservedSceneWrapper`).
+        sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
         action_delay: steps after which an action takes effect; 0: the simulation waits for the
             policy (`envs.policies.rollout.rollout`).
         real_time: instead of `action_delay`, as many steps as an action, or a plan, takes to
@@ -103,6 +107,8 @@ class EvaluationOptions:
     time_limit: float = TIME_LIMIT
     geometry_source: str | None = None
     safety_filter: SafetyFilter | bool | None = None
+    observe_every: int | None = None
+    sensor_noise: SensorNoise | None = None
     action_delay: int = 0
     real_time: bool = False
     clearance: bool = False
@@ -154,7 +160,8 @@ def evaluate(policy, task=None, *, progress=False, **options):
           `deviations` (from the standard rules), `safety_filter`, `seed`, `tries`, `time_limit`,
           `action_delay` (steps, or `real_time`), `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
-          whether policy, filter or observations received the ground-truth obstacles.
+          whether policy, filter or observations received the ground-truth obstacles;
+        - `observe_every`, `sensor_noise` (a dict), where they were given.
 
     Raises:
         EvaluationError: the policy, the task or the queries cannot be used.
@@ -223,7 +230,9 @@ class _Job:
 
     def make(self, **kwargs):
         """The environment, and the policy in it as `make_policy` returns it."""
-        env, o = envs.make(self.task, **self.options.env, **kwargs), self.options
+        o = self.options
+        kwargs |= {"observe_every": o.observe_every, "sensor_noise": o.sensor_noise}
+        env = envs.make(self.task, **o.env, **kwargs)
         source, safety_filter = o.geometry_source or GROUND_TRUTH, o.safety_filter or False
         options = o.seed, o.tries, o.time_limit, source, safety_filter
         return env, make_policy(self.policy, env, *options)
@@ -307,6 +316,13 @@ def _in_use(policy, options):
         raise EvaluationError(
             "geometry_source is for via-points, planner, a safety filter, and policies that "
             "observe points or link distances"
+        )
+    noise = options.sensor_noise
+    unseen = (None, GROUND_TRUTH), (None, ORACLE)
+    if noise and noise.changes_images and source in unseen[0] and env.get("encoder") in unseen[1]:
+        raise EvaluationError(
+            "sensor_noise: nothing is observed by sensors; choose the geometry source point_cloud, "
+            "or a policy that receives an encoded scene"
         )
     return replace(options, env=env, geometry_source=source, safety_filter=safety_filter)
 
@@ -491,6 +507,8 @@ def _summary(job, outcomes):
         "env": options.env,
         "deviations": deviations(options.env),
         "geometry_source": options.geometry_source,
+        **({"observe_every": options.observe_every} if options.observe_every else {}),
+        **({"sensor_noise": options.sensor_noise.to_metadata()} if options.sensor_noise else {}),
         "privileged": is_privileged(options.env)
         or (plans and options.geometry_source == GROUND_TRUTH),
         "safety_filter": safety_filter.to_metadata() | {"version": VERSION}
