@@ -65,6 +65,8 @@ JOINED = 30
 GROWN, GROWN_SCALE = 400, 0.6
 # Nodes around each configuration on the way out of a place.
 AROUND = 5
+# Standard deviation (normalised, each joint) of starts around the arm's observed pose.
+POSE_NOISE = 0.15
 # Spacing (normalised) of the points at which paths through narrow places measure their room.
 DENSE = 0.15
 # `random_paths`: goals per path (each costs a search of the whole roadmap), queries per path, and
@@ -160,7 +162,8 @@ class Roadmap:
         """`number` smoothed paths between random free configurations: a list of float32 (k, j).
 
         Fewer, where hardly any two configurations have a path between them. With `ends` (n, j),
-        the goals are those, but for one in five, and so are a third of the starts.
+        the goals are those, but for one in five, and so are a third of the starts; a quarter of the
+        starts is near the pose in which the arm is observed, where that is free.
         """
         goals = self.sample(_goal_count(number), rng)
         if len(ends):
@@ -171,10 +174,14 @@ class Roadmap:
             which = rng.integers(len(goals), size=tried)
             starts = self.sample(tried, rng)
             if len(ends):
-                inside = rng.random(tried) < 1 / 3
-                starts[inside] = ends[rng.integers(len(ends), size=inside.sum())]
+                drawn = rng.random(tried)
+                starts[drawn < 1 / 3] = ends[rng.integers(len(ends), size=(drawn < 1 / 3).sum())]
+                pose = self.scene.robot.normalise(np.array(self.scene.robot.observed_pose))
+                poses = pose + POSE_NOISE * rng.standard_normal(starts.shape)
+                usual = (drawn > 3 / 4) & self._checker.is_free(poses.clip(-1.0, 1.0), NODE_MARGIN)
+                starts[usual] = poses[usual].clip(-1.0, 1.0)
             found = self.paths(starts, goals[which], rng)
-            paths += [path for path in found if path is not None]
+            paths += [p for p in found if p is not None and (p[0] != p[-1]).any()]
             if len(paths) >= number:
                 break
         return paths[:number]

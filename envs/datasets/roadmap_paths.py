@@ -60,7 +60,7 @@ class RoadmapPaths:
 
     task: str
     seed: int
-    scenes: QueryScenes
+    scenes: QueryScenes | list
     path_offsets: np.ndarray
     points: np.ndarray
     offsets: np.ndarray
@@ -74,6 +74,22 @@ class RoadmapPaths:
         first, last = self.path_offsets[i : i + 2]
         ends = self.offsets[first : last + 1]
         return [self.points[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def join_roadmap_paths(parts):
+    """The paths of several `RoadmapPaths` of one robot, in their order: one `RoadmapPaths`.
+
+    `task` and `seed` are those of the first.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    scenes = [part.scenes[i] for part in parts for i in range(len(part))]
+    path_offsets, offsets = (
+        np.concatenate([[0], np.cumsum(np.concatenate([np.diff(one) for one in of_parts]))])
+        for of_parts in ([part.path_offsets for part in parts], [part.offsets for part in parts])
+    )
+    points = np.concatenate([part.points for part in parts])
+    return RoadmapPaths(parts[0].task, parts[0].seed, scenes, path_offsets, points, offsets)
 
 
 def shard_bytes(task, seed, first, scenes, paths, made_by):

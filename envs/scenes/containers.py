@@ -24,14 +24,15 @@ from roboarm_nmp.envs.scenes.random_boxes import (
 # m. All stand on `base`, the height of their undersides; `near` is the distance of their fronts
 # from the robot's axis. Boxes are open at the top, half of them with a lid that is open, too.
 OPEN_BOX = {
-    "near": (0.15, 0.45),
-    "base": (-0.6, 0.35),
-    "depth": (0.3, 0.75),
-    "width": (0.3, 0.75),
-    "height": (0.15, 0.7),
+    "near": (0.1, 0.4),
+    "base": (-0.65, 0.2),
+    "depth": (0.35, 0.8),
+    "width": (0.35, 0.8),
+    "height": (0.2, 0.8),
     "thickness": (0.01, 0.04),
 }
-FRONT, LID = (0.5, 1.0), (math.radians(60), math.radians(115))  # height of the front wall, opening
+FRONT, LID = (0.6, 1.0), (math.radians(30), math.radians(115))  # height of the front wall, opening
+DEEP = 0.7  # share of an open box's height that is its place
 SHELF = {
     "near": (0.3, 0.75),
     "base": (-0.6, 0.3),
@@ -74,7 +75,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Containers:
-    """One or two of open boxes, shelves and tables around the robot, all kinds equally likely.
+    """One or two of open boxes (one half), shelves and tables (a quarter each) around the robot.
 
     Attributes:
         base: the `Scene` without obstacles.
@@ -137,7 +138,7 @@ def _open_box(rng, most):
         parts.append((centre, (length, width, thickness), math.pi + opening))
     inside = depth - 2 * thickness, width - 2 * thickness
     parts += _objects(rng, int(rng.integers(*IN_BOX)), (0.0, 0.0), inside, base + thickness)
-    low, high = base + thickness + INSET, base + height
+    low, high = base + thickness + INSET, base + DEEP * height
     size = inside[0] - 2 * INSET, inside[1] - 2 * INSET, high - low
     place = (0.0, 0.0, (low + high) / 2), size, (0.0, 0.0, -1.0)
     return parts[:most], [place], near, depth
@@ -187,7 +188,7 @@ def _table(rng, most):
     return parts[:most], places, near, depth
 
 
-_KINDS = _open_box, _shelf, _table
+_KINDS = _open_box, _open_box, _shelf, _table
 
 
 def _drawn(rng, ranges):
