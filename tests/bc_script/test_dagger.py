@@ -269,6 +269,17 @@ def test_run_begins_with_the_weights_of_another_policy(tmp_path, folder, short_e
         torch.testing.assert_close(weights, same, atol=1e-6, rtol=0.0)
 
 
+@pytest.mark.parametrize(
+    "policy, message",
+    [(f"dagger-combined-point_cloud-{HARD}-s1", "{}: the sizes"), ("nobody", "no such")],
+)
+def test_initial_policy_that_does_not_fit_is_rejected(tmp_path, folder, policy, message, capsys):
+    flags = ["--paths", str(folder), "--initial-policy", policy]
+    assert "--initial-policy: " + message.format(policy) in refusal(
+        "dagger", capsys, tmp_path, *flags
+    )
+
+
 def test_goal_poses_are_imitated_saved_and_evaluated(tmp_path, folder, short_episodes):
     flags = ["--paths", str(folder), "--goal-type", "pose", "--eval-queries", "1"]
     run = run_script("dagger", tmp_path, *flags, "--encoder", "point_cloud", "--num-points", "8")
@@ -313,11 +324,6 @@ def test_no_kernel_receives_two_dtypes(tmp_path, folder, short_episodes):
         (["--encoder", "lidar"], "--encoder: no such encoder: lidar"),
         (["--geometry-source", "vae"], "--geometry-source: a geometry source is"),
         (["--batch-size", "0"], "--batch-size must be at least 1"),
-        (["--initial-policy", "nobody"], "--initial-policy: "),
-        (
-            ["--initial-policy", "dagger-combined-point_cloud-random_boxes_hard-s1"],
-            "--initial-policy: dagger-combined-point_cloud-random_boxes_hard-s1: the sizes",
-        ),
         (["--pool-size", "5"], "--pool-size must be at least --examples-per-update"),
     ],
 )
