@@ -22,17 +22,18 @@ from roboarm_nmp.envs.scenes.random_boxes import (
 )
 
 # m. All stand on `base`, the height of their undersides; `near` is the distance of their fronts
-# from the robot's axis. Boxes are open at the top, half of them with a lid that is open, too.
+# from the robot's axis. Boxes are open at the top, two of three with a lid that is open, too.
 OPEN_BOX = {
     "near": (0.1, 0.35),
-    "base": (-0.65, 0.0),
+    "base": (-0.65, -0.05),
     "depth": (0.4, 0.8),
     "width": (0.4, 0.8),
-    "height": (0.3, 0.8),
+    "height": (0.35, 0.8),
     "thickness": (0.01, 0.04),
 }
-FRONT, LID = (0.7, 1.0), (math.radians(30), math.radians(110))  # height of the front wall, opening
-DEEP = 0.6  # share of an open box's height that is its place
+FRONT, LID = (0.75, 1.0), (math.radians(30), math.radians(100))  # height of the front wall, opening
+LIDS = 2 / 3
+DEEP = 0.5  # share of an open box's height that is its place
 SHELF = {
     "near": (0.3, 0.75),
     "base": (-0.6, 0.3),
@@ -128,7 +129,7 @@ def _open_box(rng, most):
         ((0.0, y, middle), (depth, thickness, height)),
         ((0.0, -y, middle), (depth, thickness, height)),
     ]
-    if rng.random() < 0.5:
+    if rng.random() < LIDS:
         opening, length = rng.uniform(*LID), rng.uniform(0.5, 1.0) * depth
         centre = (
             depth / 2 - length / 2 * math.cos(opening),
