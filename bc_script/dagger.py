@@ -234,7 +234,8 @@ def begin_with(actor, policy):
     if [weights.shape for weights in given] != [weights.shape for weights in own]:
         raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
     with torch.no_grad():
-        torch._foreach_copy_(own, given)
+        for weights, initial in zip(own, given, strict=True):
+            weights.copy_(initial)
 
 
 # ALGO LOGIC: one update
