@@ -27,12 +27,10 @@ import torch.nn.functional as F
 from roboarm_nmp.envs.arm_env import end_effector_size
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import Query
-from roboarm_nmp.envs.datasets.roadmap_paths import join_roadmap_paths, load_roadmap_paths
-from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, ground_truth_checker
-from roboarm_nmp.envs.policies.registry import policy_file
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.training import flags, protocol, runs
@@ -228,16 +226,6 @@ class Actor(nn.Module):
         return F.normalize(direction, dim=1) * to_goal.clamp(max=MAX_STEP)
 
 
-def begin_with(actor, policy):
-    """Copy the weights of a policy, a name or path. Raises ValueError: it has other sizes."""
-    given, own = load_network(policy_file(policy)).parameters(), list(actor.parameters())
-    if [weights.shape for weights in given] != [weights.shape for weights in own]:
-        raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
-    with torch.no_grad():
-        for weights, initial in zip(own, given, strict=True):
-            weights.copy_(initial)
-
-
 # ALGO LOGIC: one update
 def update(actor, optimizer, batch, length_weight):
     """One step on a batch of examples. Returns the losses before it, of direction and length."""
@@ -332,7 +320,7 @@ if __name__ == "__main__":
     except ValueError as error:
         sys.exit(f"--geometry-source: {error}")
     try:
-        paths = join_roadmap_paths([load_roadmap_paths(one, robot) for one in args.paths])
+        paths = load_roadmap_paths(args.paths, robot)
     except DatasetError as error:
         sys.exit(f"--paths: {error}")
     env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
@@ -344,10 +332,7 @@ if __name__ == "__main__":
     # ALGO LOGIC: network and optimiser
     actor = Actor(args, eval_envs[0]).to(device)
     if args.initial_policy is not None:
-        try:
-            begin_with(actor, args.initial_policy)
-        except ValueError as error:
-            sys.exit(f"--initial-policy: {error}")
+        protocol.copy_weights(args.initial_policy, actor)
     actor_average = Actor(args, eval_envs[0]).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
     optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)

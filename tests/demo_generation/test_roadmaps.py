@@ -18,7 +18,7 @@ from roboarm_nmp.demo_generation.roadmaps import Args, Roadmap, collect
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.datasets.roadmap_paths import join_roadmap_paths, load_roadmap_paths
+from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.datasets.shards import shard_path
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, to_array
@@ -315,7 +315,7 @@ def test_interrupted_command_continues_to_the_same_files(collected, tmp_path, nu
 def test_joined_collections_have_the_paths_of_both(collected, tmp_path):
     collect(Args(tmp_path, **SMALL | {"task": "containers", "scenes": 1}), progress=False)
     parts = [load_roadmap_paths(tmp_path), load_roadmap_paths(collected)]
-    joined = join_roadmap_paths(parts)
+    joined = load_roadmap_paths([tmp_path, collected])
     assert len(joined) == 6 and joined.task == "containers"
     whole = [(part.scenes[i], part.of_scene(i)) for part in parts for i in range(len(part))]
     for i, (scene, paths) in enumerate(whole):
