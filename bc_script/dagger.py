@@ -46,9 +46,11 @@ class Args(protocol.PolicyFlags):
     """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
     goal_type: Literal["config", "combined", "pose"] = "combined"
     """what the goal is: configuration, that and end-effector position, or end-effector pose"""
-    paths: Path = Path("roadmaps")
-    """folder of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any task of the
+    paths: tuple[Path, ...] = (Path("roadmaps"),)
+    """folders of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any tasks of the
     same robot"""
+    initial_policy: str | None = None
+    """begin with the weights of this policy of the same sizes: a name, a run's folder or a file"""
 
     # The algorithm
     total_updates: flags.PositiveInt = 24_000
@@ -314,6 +316,8 @@ if __name__ == "__main__":
 
     # ALGO LOGIC: network and optimiser
     actor = Actor(args, eval_envs[0]).to(device)
+    if args.initial_policy is not None:
+        protocol.copy_weights(args.initial_policy, actor)
     actor_average = Actor(args, eval_envs[0]).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
     optimizer = cuda_graphs.adam(actor.parameters(), args.learning_rate, args, device)

@@ -26,7 +26,7 @@ from roboarm_nmp.envs.networks.exported_networks import (
     robot_metadata,
     save_network,
 )
-from roboarm_nmp.envs.policies.registry import recurrent_size
+from roboarm_nmp.envs.policies.registry import policy_file, recurrent_size
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name, task_with_robot
@@ -119,6 +119,22 @@ def load_task(args):
         )
     except ValueError as error:
         sys.exit(f"--task: {error}")
+
+
+def copy_weights(policy, module):
+    """Give a module the weights of a policy of the same sizes, a name or path: `--initial-policy`.
+
+    Ends the program with a message where that cannot be.
+    """
+    try:
+        given, own = load_network(policy_file(policy)).parameters(), list(module.parameters())
+        if [weights.shape for weights in given] != [weights.shape for weights in own]:
+            raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
+    except ValueError as error:
+        sys.exit(f"--initial-policy: {error}")
+    with torch.no_grad():
+        for weights, initial in zip(own, given, strict=True):
+            weights.copy_(initial)
 
 
 def _first(queries, flag, number):

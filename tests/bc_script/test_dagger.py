@@ -259,6 +259,29 @@ def test_interrupted_run_continues_bit_for_bit(tmp_path, folder, monkeypatch, sh
         assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
 
 
+def test_run_begins_with_the_weights_of_another_policy(tmp_path, folder, short_episodes):
+    flags = ["--paths", str(folder), str(folder), "--encoder", "oracle", "--round-every", "0"]
+    flags += ["--eval-every", "40", "--eval-queries", "1", "--test-queries", "0"]
+    first = run_script("dagger", tmp_path / "first", *flags)
+    flags += ["--initial-policy", str(first), "--learning-rate", "1e-9", "--total-updates", "1"]
+    second = run_script("dagger", tmp_path / "second", *flags)
+    one, other = (load_network(run / "policy.pt").parameters() for run in (first, second))
+    assert len(one) > 10 and one[-2].abs().max() > 0.001  # the head, which begins with zeros
+    for weights, same in zip(one, other, strict=True):
+        torch.testing.assert_close(weights, same, atol=1e-6, rtol=0.0)
+
+
+@pytest.mark.parametrize(
+    "policy, message",
+    [(f"dagger-combined-point_cloud-{HARD}-s1", "{}: the sizes"), ("nobody", "no such")],
+)
+def test_initial_policy_that_does_not_fit_is_rejected(tmp_path, folder, policy, message, capsys):
+    flags = ["--paths", str(folder), "--initial-policy", policy]
+    assert "--initial-policy: " + message.format(policy) in refusal(
+        "dagger", capsys, tmp_path, *flags
+    )
+
+
 def test_goal_poses_are_imitated_saved_and_evaluated(tmp_path, folder, short_episodes):
     flags = ["--paths", str(folder), "--goal-type", "pose", "--eval-queries", "1"]
     run = run_script("dagger", tmp_path, *flags, "--encoder", "point_cloud", "--num-points", "8")
