@@ -45,13 +45,18 @@ def robot_from_urdf(
     base_position=(0.0, 0.0, 0.0),
     base_orientation=(0.0, 0.0, 0.0, 1.0),
     gain=None,
+    velocity=None,
+    acceleration=None,
+    jerk=None,
+    datasheet_limits=None,
 ):
     """See `Robot.from_urdf`."""
     _check_options(
         path,
         joints=joints or (),
         fixed=fixed or {},
-        limits=limits or {},
+        pairs={"limits": limits or {}, "datasheet_limits": datasheet_limits or {}},
+        positive={"velocity": velocity, "acceleration": acceleration, "jerk": jerk},
         end_effector_position=end_effector_position,
         base_position=base_position,
         base_orientation=base_orientation,
@@ -79,6 +84,9 @@ def robot_from_urdf(
     for joint in fixed or {}:
         if joint not in others:
             raise RobotError(f"{path}: fixed: {joint!r} is none of the other joints {others}")
+    for joint in datasheet_limits or {}:
+        if joint not in joints:
+            raise RobotError(f"{path}: datasheet_limits: {joint!r} is none of the joints {joints}")
     bounds = np.array([tree.limits(joint, limits) for joint in joints])
     held = {joint: tree.held_at(joint, fixed) for joint in others}
     positions, mimics = dict(held), {}
@@ -113,6 +121,10 @@ def robot_from_urdf(
     links.sort(key=lambda link: (link.frame >= 0, link.index))
     still = [joint for joint in positions if joint in tree.joints]
     frame, rotation, position = placements[end_effector]
+    urdf_velocity = tree.limit_values("velocity", joints)
+    datasheet = np.array(
+        [tree.datasheet_limits(joint, datasheet_limits, limits) for joint in joints]
+    )
     robot = Robot(
         name=name or tree.root.get("name") or Path(path).stem,
         urdf=str(path),
@@ -122,9 +134,10 @@ def robot_from_urdf(
         joint_indices=tuple(index[joint] for joint in joints),
         lower=bounds[:, 0],
         upper=bounds[:, 1],
-        velocity=tree.limit_values("velocity", joints),
-        acceleration=None,
-        jerk=None,
+        velocity=_motion_limits(path, "velocity", velocity, joints, urdf_velocity),
+        acceleration=_motion_limits(path, "acceleration", acceleration, joints),
+        jerk=_motion_limits(path, "jerk", jerk, joints),
+        urdf_velocity=urdf_velocity,
         effort=[tree.effort(joint) for joint in joints],
         held_indices=tuple(index[joint] for joint in still),
         held_positions=tuple(positions[joint] for joint in still),
@@ -145,6 +158,8 @@ def robot_from_urdf(
         observed_pose=tuple(bounds.mean(1)),
         base_position=tuple(map(float, base_position)),
         base_orientation=tuple((base_orientation / np.linalg.norm(base_orientation)).tolist()),
+        datasheet_lower=datasheet[:, 0] if datasheet_limits else None,
+        datasheet_upper=datasheet[:, 1] if datasheet_limits else None,
     )
     adjacent = {
         tuple(sorted((link_index[a], link_index[b]))) for a, b in tree.neighbours(robot, link_index)
@@ -163,12 +178,29 @@ def robot_from_urdf(
     return robot
 
 
-def _check_options(path, joints, fixed, limits, gain, **vectors):
+def _motion_limits(path, name, given, joints, own=None):
+    """Limits (n,) of velocity, acceleration or jerk, or None: `given`, or the URDF's own."""
+    if given is None:
+        return own
+    if not isinstance(given, dict):
+        return [given] * len(joints)
+    if unknown := [joint for joint in given if joint not in joints]:
+        raise RobotError(f"{path}: {name}: {unknown[0]!r} is none of the joints {joints}")
+    given = dict(zip(joints, own or (), strict=False)) | given
+    if missing := [joint for joint in joints if joint not in given]:
+        raise RobotError(f"{path}: {name}: no limit of {', '.join(missing)}")
+    return [given[joint] for joint in joints]
+
+
+def _check_options(path, joints, fixed, pairs, positive, gain, **vectors):
     """Raise RobotError for an option of another type, or one that is not finite."""
 
     def are_numbers(values, count):
         return len(values) == count and all(
-            isinstance(x, (int, float, np.number)) and abs(x) <= MAX_NUMBER for x in values
+            isinstance(x, (int, float, np.number))
+            and not isinstance(x, bool)
+            and abs(x) <= MAX_NUMBER
+            for x in values
         )
 
     sizes = {"end_effector_position": 3, "base_position": 3, "base_orientation": 4}
@@ -176,10 +208,18 @@ def _check_options(path, joints, fixed, limits, gain, **vectors):
     wrong += [f"joints {name!r}" for name in joints if not isinstance(name, str)]
     wrong += [f"fixed {name}: {x}" for name, x in fixed.items() if not are_numbers([x], 1)]
     wrong += [
-        f"limits {name}: {pair}"
-        for name, pair in limits.items()
+        f"{option} {name}: {pair}"
+        for option, given in pairs.items()
+        for name, pair in given.items()
         if not (isinstance(pair, (list, tuple, np.ndarray)) and are_numbers(pair, 2))
     ]
+    for option, given in positive.items():
+        values = given if isinstance(given, dict) else {"of all joints": given}
+        wrong += [
+            f"{option} {name}: {value}, which must be positive"
+            for name, value in values.items()
+            if given is not None and not (are_numbers([value], 1) and value > 0)
+        ]
     if gain is not None and not (are_numbers([gain], 1) and 0 < gain <= 1):
         wrong.append(f"gain {gain}, which must be in (0, 1]")
     if not wrong and abs(np.linalg.norm(vectors["base_orientation"]) - 1) > MAX_NORM_ERROR:
@@ -411,6 +451,17 @@ class _Tree:
             lower, upper = (float(element.get(end, 0)) for end in ("lower", "upper"))
         if not lower < upper:
             raise RobotError(f"{self.path}: joint {joint!r}: limits from {lower} to {upper}")
+        return lower, upper
+
+    def datasheet_limits(self, joint, given, limits):
+        """Limits (lower, upper) of a joint's datasheet, from `given`, or those of `limits`."""
+        widest = self.limits(joint, limits)
+        lower, upper = map(float, (given or {}).get(joint, widest))
+        if not widest[0] <= lower < upper <= widest[1]:
+            raise RobotError(
+                f"{self.path}: joint {joint!r}: datasheet_limits from {lower} to {upper} are not "
+                f"inside the limits from {widest[0]} to {widest[1]}"
+            )
         return lower, upper
 
     def held_at(self, joint, fixed):

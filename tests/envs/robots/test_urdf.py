@@ -18,6 +18,7 @@ from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.urdf import RobotError
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.time_parameterisation import time_parameterise
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
 
@@ -362,6 +363,11 @@ def test_frame_without_inertial_is_light(urdf):
         {"limits": {"turn": 5}},
         {"limits": {"turn": (float("nan"), 1)}},
         {"joints": [5]},
+        {"acceleration": 0},
+        {"acceleration": True},
+        {"jerk": {"turn": float("nan")}},
+        {"velocity": {"turn": "fast"}},
+        {"datasheet_limits": {"turn": 1}},
     ],
 )
 def test_options_of_other_types_are_rejected(urdf, options):
@@ -391,6 +397,16 @@ def test_options_that_do_not_fit_are_rejected(urdf):
         Robot.from_urdf(path, end_effector="tool", joints=["turn", "grip"])
     with pytest.raises(RobotError, match="fixed: 'turn' is none of the other joints"):
         Robot.from_urdf(path, end_effector="tool", fixed={"turn": 0.0})
+    with pytest.raises(RobotError, match="acceleration: no limit of slide, roll"):
+        Robot.from_urdf(path, end_effector="tool", acceleration={"turn": 5})
+    with pytest.raises(RobotError, match="velocity: 'grip' is none of the joints"):
+        Robot.from_urdf(path, end_effector="tool", velocity={"grip": 1})
+    with pytest.raises(RobotError, match="datasheet_limits: 'grip' is none of the joints"):
+        Robot.from_urdf(path, end_effector="tool", datasheet_limits={"grip": (0, 1)})
+    with pytest.raises(
+        RobotError, match="'roll': datasheet_limits from -2.0 to 1.0 are not inside"
+    ):
+        Robot.from_urdf(path, end_effector="tool", datasheet_limits={"roll": (-2, 1)})
 
 
 def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
@@ -406,6 +422,39 @@ def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
     assert load_robot(file) == robot
 
 
+def test_robot_file_adds_limits_of_trajectories_and_the_datasheet(urdf, tmp_path):
+    path = urdf(ARM)
+    plain, file = Robot.from_urdf(path, end_effector="tool", gain=0.5), tmp_path / "arm.yaml"
+    file.write_text(
+        f"urdf: {path}\nname: arm\nend_effector: tool\ngain: 0.5\nvelocity: {{slide: 0.4}}\n"
+        "acceleration: 3\njerk: {turn: 30, slide: 10, roll: 50}\n"
+        "datasheet_limits: {roll: [-1, 1.2]}\n"
+    )
+    robot = load_robot(file)
+    assert robot.velocity.tolist() == [2.0, 0.4, 2.0]  # the others are the URDF's
+    assert robot.acceleration.tolist() == [3.0] * 3
+    assert robot.jerk.tolist() == [30.0, 10.0, 50.0]
+    lower, upper = robot.position_limits("datasheet")
+    assert lower.tolist() == [-1.5, -1.5, -1.0] and upper.tolist() == [1.5, 1.5, 1.2]
+    assert robot.upper.tolist() == [1.5, 1.5, 1.5]
+    # Demonstrations and policies of the arm stay valid.
+    assert robot == plain and plain.acceleration is None and plain.datasheet_lower is None
+
+    pytest.importorskip("toppra")
+    motion = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    trajectory = time_parameterise(motion, robot)
+    assert np.abs(trajectory.velocities).max(0)[1] <= 0.4 + 1e-9
+    assert np.abs(trajectory.accelerations).max() <= 3 + 1e-9
+    assert (
+        np.diff(np.abs(trajectory.accelerations), axis=0) <= np.array([0.3, 0.1, 0.5]) + 1e-9
+    ).all()
+    assert trajectory.duration > 1.2 * time_parameterise(motion, plain).duration
+    with pytest.raises(
+        ValueError, match="waypoint 1 .* the datasheet position limits: roll is 1.5"
+    ):
+        time_parameterise([[0, 0, 0], [1, 1, 1.5]], robot, limits="datasheet")
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -417,6 +466,8 @@ def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
         ("a: &a [1]\nb: *a", "anchors"),
         ("urdf: package:no_such_package/x.urdf", "not installed"),
         ("{", "no YAML"),
+        ("urdf: x.urdf\njerk: [5]", "jerk must be a float or dict"),
+        ("urdf: x.urdf\ngain: true", "gain must be a float"),
     ],
 )
 def test_malformed_robot_file_is_rejected_with_its_reason(tmp_path, text, reason):
