@@ -5,6 +5,7 @@ import functools
 import hashlib
 import math
 import re
+import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,11 +17,13 @@ from roboarm_nmp.envs.robots.self_collisions import disabled_pairs, sample_pairs
 from roboarm_nmp.envs.robots.untrusted import RobotError, bullet_indices, read_xml
 
 MAX_LINKS = 200
+MAX_JOINTS, MAX_MOVABLE = 32, 100  # actuated ones, and all: PyBullet has states of 128
 MAX_NAME = 200  # letters
 # Bytes of all meshes, and shapes for collisions.
-MAX_MESHES = {"collision": 50_000_000, "visual": 200_000_000}
+MAX_MESHES = {"collision": 50_000_000, "visual": 100_000_000}
 MAX_SHAPES = 500
-MAX_MESH = {"collision": 20_000_000, "visual": 50_000_000}  # bytes of one
+MAX_MESH = {"collision": 20_000_000, "visual": 30_000_000}  # bytes of one
+BLOCK = 4_000_000  # bytes of a mesh that are read at once
 MESH_ENDINGS = (".obj", ".stl", ".dae")
 MOVABLE = ("revolute", "continuous", "prismatic")
 DEFAULT_EFFORT = 1_000.0  # N m or N, where a URDF has none
@@ -66,6 +69,8 @@ def robot_from_urdf(
     movable = [joint for joint in tree.joints if tree.is_movable(joint)]
     if not movable:
         raise RobotError(f"{path}: no joint can move")
+    if len(movable) > MAX_MOVABLE:
+        raise RobotError(f"{path}: {len(movable)} movable joints, at most {MAX_MOVABLE}")
     end_effector = end_effector or tree.likely_end_effector()
     if end_effector not in tree.links:
         raise RobotError(f"{path}: no link {end_effector!r}, but {', '.join(tree.links)}")
@@ -79,6 +84,8 @@ def robot_from_urdf(
                 f"{path}: {joint!r} is no movable joint between the base and {end_effector!r}; "
                 f"those are {', '.join(on_chain)}"
             )
+    if len(joints) > MAX_JOINTS:
+        raise RobotError(f"{path}: {len(joints)} actuated joints, at most {MAX_JOINTS}")
     joints = sorted(joints, key=on_chain.index)
     others = [joint for joint in movable if joint not in joints]
     for joint in fixed or {}:
@@ -621,14 +628,28 @@ def _read(path):
 
 def _has_its_vertices(obj):
     """Whether an OBJ file's faces have vertices of the file; PyBullet would read beyond them."""
-    count = len(re.findall(rb"^[ \t]*v[ \t]", obj, re.MULTILINE))
-    faces = re.findall(rb"^[ \t]*f[ \t]([^#\r\n]*)", obj, re.MULTILINE)
-    corners = re.sub(rb"/[^ \t]*", b"", b" ".join(faces)).split()  # textures and normals
-    try:
-        numbers = np.array(corners, dtype="S20").astype(np.int64)
-    except ValueError:
-        return False
-    return bool(((numbers != 0) & (np.abs(numbers) <= count)).all())
+    count = sum(len(re.findall(rb"^[ \t]*v[ \t]", part, re.MULTILINE)) for part in _blocks(obj))
+    for part in _blocks(obj):
+        faces = re.findall(rb"^[ \t]*f[ \t]([^#\r\n]*)", part, re.MULTILINE)
+        corners = re.sub(rb"/[^ \t]*", b"", b" ".join(faces)).strip()  # textures and normals
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # of what are no numbers
+                numbers = np.fromstring(corners, dtype=np.int64, sep=" ")
+        except (DeprecationWarning, ValueError):
+            return False
+        if ((numbers == 0) | (numbers < -count) | (numbers > count)).any():
+            return False
+    return True
+
+
+def _blocks(text):
+    """Yield a text of bytes in parts of whole lines, so that lists of its words stay short."""
+    start = 0
+    while start < len(text):
+        end = text.find(b"\n", start + BLOCK) + 1 or len(text)
+        yield text[start:end]
+        start = end
 
 
 def _rotation_x(angle):

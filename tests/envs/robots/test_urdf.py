@@ -46,6 +46,12 @@ def joint(name, parent, child, kind="revolute", axis="0 0 1", xyz="0 0 0.3", mor
     )
 
 
+def chain(number):
+    """Links one after another, with joints between them."""
+    joints = (joint(f"j{i}", f"l{i - 1}", f"l{i}") for i in range(1, number))
+    return "".join([*(link(f"l{i}", BAR) for i in range(number)), *joints])
+
+
 BAR = "0 0 0.15", "0.1 0 0", '<box size="0.05 0.06 0.2"/>'
 # A box and a cylinder, a capsule and a sphere; a sliding joint, one that mimics the first, a finger
 # that is held.
@@ -241,6 +247,9 @@ MESH = "0 0 0", "0 0 0", '<mesh filename="{}"/>'
         (link("a", *[BAR] * 600), "601 collision shapes|600 collision shapes"),
         ("<link name='a'>" * 40 + "</link>" * 40, "nested more than"),
         ("<link name='a'>" * 300_000, "nested more than"),
+        ("<x/>" * 60_000, "more than 50,000 elements"),
+        (chain(34), "33 actuated joints, at most 32"),
+        (chain(110), "109 movable joints, at most 100"),  # PyBullet has no states of more
     ],
 )
 def test_unusable_urdf_is_rejected_with_its_reason(urdf, elements, reason):
@@ -289,7 +298,9 @@ def test_mesh_without_triangles_is_rejected(urdf, contents, ending):
 
 
 @pytest.mark.parametrize("kind", ["collision", "visual"])
-@pytest.mark.parametrize("face", ["1 2 9", "1 2 0", "1/1/1 2/2/2 9/3/3", "-1 -2 -9", "1 2 x"])
+@pytest.mark.parametrize(
+    "face", ["1 2 9", "1 2 0", "1/1/1 2/2/2 9/3/3", "-1 -2 -9", "1 2 x", f"1 2 {-(2**63)}"]
+)
 def test_face_with_a_missing_vertex_is_rejected(urdf, face, kind):
     path = urdf(TWO + joint("1", "a", "b") + link("c", (*MESH[:2], MESH[2].format("x.obj"))))
     text = path.read_text().replace("</robot>", joint("2", "b", "c") + "</robot>")
