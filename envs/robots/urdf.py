@@ -11,9 +11,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from roboarm_nmp.envs.robots.control import calibrate
+from roboarm_nmp.envs.robots.cache import cached
+from roboarm_nmp.envs.robots.control import GAINS, calibrate
 from roboarm_nmp.envs.robots.robot import Frame, Link, Robot, resolve
-from roboarm_nmp.envs.robots.self_collisions import disabled_pairs, sample_pairs
+from roboarm_nmp.envs.robots.self_collisions import SAMPLES, disabled_pairs, sample_pairs
 from roboarm_nmp.envs.robots.untrusted import RobotError, bullet_indices, read_xml
 
 MAX_LINKS = 200
@@ -172,15 +173,17 @@ def robot_from_urdf(
         tuple(sorted((link_index[a], link_index[b]))) for a, b in tree.neighbours(robot, link_index)
     }
     disabled = adjacent | (disabled_pairs(srdf, link_index) if srdf else set())
-    pairs, contact_free = sample_pairs(robot, disabled)
+    pairs, contact_free = cached(
+        "pairs", robot, [SAMPLES, sorted(disabled)], lambda: sample_pairs(robot, disabled)
+    )
     robot = dataclasses.replace(
         robot,
-        self_collision_pairs=pairs,
-        contact_free=contact_free,
-        observed_pose=contact_free,
+        self_collision_pairs=tuple(map(tuple, pairs)),
+        contact_free=tuple(contact_free),
+        observed_pose=tuple(contact_free),
     )
     if gain is None:
-        gain = calibrate(robot)[0]
+        gain = cached("gain", robot, [GAINS], lambda: calibrate(robot)[0])
         robot = dataclasses.replace(robot, gains=(gain,) * len(joints))
     return robot
 

@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+import roboarm_nmp.envs.robots.urdf
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.hulls import arm_hulls
 from roboarm_nmp.envs.robots.files import load_robot
@@ -486,6 +487,27 @@ def test_malformed_robot_file_is_rejected_with_its_reason(tmp_path, text, reason
     file.write_text(text)
     with pytest.raises(RobotError, match=reason):
         load_robot(file)
+
+
+def test_pairs_and_gain_are_cached_and_a_damaged_cache_is_made_again(urdf, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path))
+    arm = {"path": urdf(ARM), "end_effector": "tool"}
+    first = Robot.from_urdf(**arm)
+    files = list((tmp_path / "robots").iterdir())
+    assert len(files) == 2  # of the pairs and of the gain
+    with monkeypatch.context() as patch:
+        patch.setattr(roboarm_nmp.envs.robots.urdf, "sample_pairs", None)
+        patch.setattr(roboarm_nmp.envs.robots.urdf, "calibrate", None)
+        again = Robot.from_urdf(**arm)
+        # A box that has another size may collide elsewhere.
+        wider = urdf(ARM.replace("0.05 0.06 0.2", "0.05 0.07 0.2"))
+        with pytest.raises(TypeError):
+            Robot.from_urdf(wider, end_effector="tool")
+    assert again == first and again.self_collision_pairs == first.self_collision_pairs
+    assert again.gains == first.gains and again.contact_free == first.contact_free
+    for file in files:
+        file.write_bytes(b"[[1, ")
+    assert Robot.from_urdf(**arm) == first
 
 
 def test_pybullet_is_left_without_connections(urdf):
