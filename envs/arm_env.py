@@ -240,8 +240,18 @@ class RoboArmEnv(gym.Env):
 
     @property
     def scene(self):
-        """The `Scene` around the arm."""
+        """The `Scene` around the arm, with the motions of its obstacles."""
         return self.world.scene
+
+    @property
+    def time(self):
+        """Seconds since the reset, of simulated time: each step is `STEP_SECONDS`, 1/30 s."""
+        return self.world.time
+
+    @property
+    def current_scene(self):
+        """The static `Scene` at this time: `scene.at(time)`."""
+        return self.world.current_scene
 
     def set_scene(self, scene):
         """Put the arm into another `Scene`. This ends the episode. An equal one does nothing.
@@ -255,9 +265,9 @@ class RoboArmEnv(gym.Env):
         if self.world.set_scene(scene):
             self.start_configuration = None
 
-    def in_collision(self, configuration):
+    def in_collision(self, configuration, time=0.0, moving=True):
         """As `World.in_collision`. Continue with a reset."""
-        return self.world.in_collision(configuration)
+        return self.world.in_collision(configuration, time, moving)
 
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
         """As `World.is_feasible`. Continue with a reset."""
@@ -355,9 +365,10 @@ class RoboArmEnv(gym.Env):
                 quaternion is normalised.
 
         Raises:
-            ValueError: wrong size, not finite, outside the joint limits or in collision; a
-                quaternion of zeros; both or none of `goal` and `goal_pose`. A running episode then
-                goes on (unless the scene was changed).
+            ValueError: wrong size, not finite, outside the joint limits or in collision (moving
+                obstacles count at time 0, and only for the start); a quaternion of zeros; both or
+                none of `goal` and `goal_pose`. A running episode then goes on (unless the scene was
+                changed).
         """
         self.world.check_open()
         joints = self.robot.num_joints
@@ -377,7 +388,7 @@ class RoboArmEnv(gym.Env):
             self.set_scene(scene)
         ends = {"goal": goal, "start": start}
         ends = {name: e for name, e in ends.items() if e is not None and e.size == joints}
-        self.world.check_free(**ends)
+        self.world.check_free(["goal"], **ends)  # from which obstacles may move away
         return self._begin(start, goal, goal_pose)
 
     def _begin(self, start, goal, goal_pose=None):

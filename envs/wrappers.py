@@ -34,7 +34,7 @@ class SensorWrapper(gym.Wrapper):
     def _observe(self, observation):
         robot = self.unwrapped.robot
         configuration = robot.denormalise(observation["observation"][: robot.num_joints])
-        self._world.show(self.unwrapped.scene, configuration)
+        self._world.show(self.unwrapped.current_scene, configuration)
         self._observed = {
             name: sensor.observe(self._world) for name, sensor in self.sensors.items()
         }
@@ -102,7 +102,8 @@ class _ObservingWrapper(gym.Wrapper):
 class SceneEncodingWrapper(_ObservingWrapper):
     """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
 
-    A scene is encoded once. All attributes of the wrapped environment are available.
+    A scene is encoded once; one with moving obstacles in each step. All attributes of the wrapped
+    environment are available.
 
     Args:
         env: a `RoboArmEnv`.
@@ -118,7 +119,7 @@ class SceneEncodingWrapper(_ObservingWrapper):
         self.observation_space = gym.spaces.Dict(spaces)
 
     def _extend(self, observation):
-        z = self.encoder(self.unwrapped.scene)
+        z = self.encoder(self.unwrapped.current_scene)
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
 
@@ -174,14 +175,14 @@ class LinkDistancesWrapper(_ObservingWrapper):
     def link_distances_at(self, states, scene=None):
         """`link_distances` at normalised configurations (..., n): float32 (..., l, 1 + n).
 
-        `scene`: a `Scene`, by default that of the environment.
+        `scene`: a static `Scene`, by default that of the environment at this time.
         """
-        checker = self.geometry_source(self.unwrapped.scene if scene is None else scene)
+        checker = self.geometry_source(self.unwrapped.current_scene if scene is None else scene)
         return checker.link_distances(states)
 
     def fine_link_distances_at(self, states):
         """As `link_distances_at`, from the geometry source for approach paths."""
-        return self._fine_geometry_source(self.unwrapped.scene).link_distances(states)
+        return self._fine_geometry_source(self.unwrapped.current_scene).link_distances(states)
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         """As `RoboArmEnv.compute_reward`; warns if goals are relabelled."""
@@ -203,7 +204,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
             more["observation"] = np.concatenate(parts)
         if self._of_goals:
             goal = observation["desired_goal"][:joints]
-            key = self.unwrapped.scene, goal.tobytes()
+            key = self.unwrapped.current_scene, goal.tobytes()
             if self._goal != key:
                 self._goal, self._at_goal = key, self.link_distances_at(goal)
             more["goal_link_distances"] = self._at_goal.copy()

@@ -88,16 +88,16 @@ class CollisionChecker:
     batch's shape, (...), and is empty for an empty batch. Safe to use from several threads.
 
     Args:
-        scene: a `Scene`, whose robot has n joints.
+        scene: a static `Scene`, whose robot has n joints.
         points: m, (n, 3), in the base's frame: the centres of additional balls, for example an
             observed point cloud. An `ObservedScene` has its own points and radius instead.
         point_radius: m, of the balls, in [0, `MAX_MARGIN`).
 
     Raises:
         TypeError: `scene` is not a `Scene`.
-        ValueError: an obstacle, the table, the floor or a point has numbers that are not finite, or
-            a size that is not positive. From all methods: states of another shape, not finite, or
-            outside the limits; a margin out of its range.
+        ValueError: an obstacle has a motion; an obstacle, the table, the floor or a point has
+            numbers that are not finite, or a size that is not positive. From all methods: states of
+            another shape, not finite, or outside the limits; a margin out of its range.
     """
 
     def __init__(self, scene, points=(), point_radius=0.0):
@@ -105,6 +105,8 @@ class CollisionChecker:
             raise TypeError(
                 f"a scene must be a roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
             )
+        if not scene.is_static:
+            raise ValueError("obstacles of this scene move: check scene.at(t), at a time t")
         self.scene, self.robot = scene, scene.robot
         if isinstance(scene, ObservedScene):
             points, point_radius = scene.points, scene.point_radius

@@ -120,7 +120,7 @@ def _via_points(env, seed, tries, geometry_source):
     # Without a margin, which would reject more than it saves: with 3 mm, collision-free success was
     # 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
     def begin(number, query):
-        checker = geometry_source(query.scene)
+        checker = geometry_source(query.scene.at(0.0))
         configuration = _goal(env, query, checker)
         if configuration is None:
             return EpisodePolicy(None, plan_found=False)

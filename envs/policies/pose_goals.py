@@ -57,17 +57,17 @@ class ConfigurationGoals:
         """
         checker = None
         if self._has_distances:
-            checker = self.env.get_wrapper_attr("geometry_source")(query.scene)
+            checker = self.env.get_wrapper_attr("geometry_source")(query.scene.at(0.0))
         pose = self.robot.end_effector_pose(query.goal)
         goal = goal_configuration(self.robot, pose, query.start, checker)
         if goal is not None:
-            self._set(self.robot.normalise(goal), pose[:3], query.scene)
+            self._set(self.robot.normalise(goal), pose[:3], query.scene.at(0.0))
         return goal is not None
 
     def begin_anywhere(self):
         """Choose any goal, to see what the policy would observe."""
         goal = np.zeros(self.robot.num_joints)
-        self._set(goal, np.zeros(3), self.env.unwrapped.scene)
+        self._set(goal, np.zeros(3), self.env.unwrapped.current_scene)
 
     def _set(self, state, position, scene):
         self._more = {"desired_goal": goal_of(self.goal_type, state, position).astype(np.float32)}

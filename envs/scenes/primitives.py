@@ -8,6 +8,7 @@ import hashlib
 import json
 import math
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 
 import numpy as np
 
@@ -177,20 +178,28 @@ class Scene:
             return self
         if not is_number(t):
             raise ValueError(f"a time is a finite number of seconds, got {t!r}")
-        present = [o for o in self.obstacles if o.motion is None or o.motion.is_present(t)]
-        return replace(self, obstacles=[_at(obstacle, t) for obstacle in present])
+        return replace(self, obstacles=[o for o in map(_at, self.obstacles, repeat(t)) if o])
+
+
+def pose_at(obstacle, t):
+    """Position (3), m, and orientation (4) of an obstacle at a time (s); None: it is absent."""
+    orientation = IDENTITY if isinstance(obstacle, Sphere) else obstacle.orientation
+    if obstacle.motion is None:
+        return obstacle.position, orientation
+    if not obstacle.motion.is_present(t):
+        return None
+    return moved(obstacle.position, orientation, *obstacle.motion.pose(t))
 
 
 def _at(obstacle, t):
-    """An obstacle as it is at a time (s), without its motion."""
+    """An obstacle as it is at a time (s), without its motion; None: it is absent."""
     if obstacle.motion is None:
         return obstacle
-    displacement, rotation = obstacle.motion.pose(t)
-    if isinstance(obstacle, Sphere):
-        position, _ = moved(obstacle.position, IDENTITY, displacement, IDENTITY)
-        return replace(obstacle, position=position, motion=None)
-    position, orientation = moved(obstacle.position, obstacle.orientation, displacement, rotation)
-    return replace(obstacle, position=position, orientation=orientation, motion=None)
+    if (pose := pose_at(obstacle, t)) is None:
+        return None
+    position, orientation = pose
+    turned = {} if isinstance(obstacle, Sphere) else {"orientation": orientation}
+    return replace(obstacle, position=position, motion=None, **turned)
 
 
 POINT_RADIUS = 0.01

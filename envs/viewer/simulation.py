@@ -29,6 +29,7 @@ from roboarm_nmp.envs.datasets.trajectories import load_trajectory
 from roboarm_nmp.envs.policies.baselines import PLANNERS
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
 from roboarm_nmp.envs.policies.rollout import Episode
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
@@ -159,9 +160,9 @@ class KinematicWorld(World):
 
     def simulate(self):
         """Put the arm at its target. Returns whether it is in contact there."""
-        return self.in_collision(self._target)
+        return self.in_collision(self._target, self.time + STEP_SECONDS)
 
-    def check_free(self, **configurations):
+    def check_free(self, ignoring_motions=(), **configurations):
         """Allows contacts: obstacles may be moved into the arm."""
 
 
