@@ -5,13 +5,17 @@
 - via-points: straight to the goal configuration if that motion is free of collisions; otherwise
   through the first of some random configurations for which the motion is free; without such a
   configuration, straight to the goal;
-- planner: follows a plan of OMPL's RRT-Connect, which may search for a limited time.
+- planner: follows a plan of OMPL's RRT-Connect, which may search for a limited time;
+- replanning: follows a plan, watches it, and plans again whenever it is blocked
+  (`envs.policies.replanning`).
 
 Of a goal pose, the goal configuration is one that inverse kinematics finds, the nearest one to the
 start; `via-points` and `planner` need one without collisions.
 
-`via-points` and `planner` check collisions with the obstacles of a geometry source
-(`envs.perception.geometry_source`); with the ground truth they are privileged.
+`via-points`, `planner` and `replanning` check collisions with the obstacles of a geometry source
+(`envs.perception.geometry_source`); with the ground truth they are privileged. Where obstacles
+move, the first two plan around obstacles as they are at the start, and `replanning` around those of
+the present step.
 """
 
 import importlib
@@ -26,7 +30,10 @@ from roboarm_nmp.envs.subgoals import subgoals
 
 PLANNERS = ("via-points", "planner")
 """The baselines that look for a motion before they move."""
-BASELINES = ("go-to-goal", "random", *PLANNERS)
+REPLANNING = "replanning"
+CHECKING = (*PLANNERS, REPLANNING)
+"""The baselines that need a geometry source."""
+BASELINES = ("go-to-goal", "random", *CHECKING)
 TRIES = 16  # of `via-points`, by default
 TIME_LIMIT = 5.0  # s, of `planner`, by default
 # The module of `planner`'s `Planner`. It is built on `envs` and needs OMPL, so it is imported by
@@ -75,6 +82,8 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
     source = find_geometry_source(geometry_source, robot)
     if name == "via-points":
         return _via_points(env, seed, tries, source)
+    if name == REPLANNING:
+        return _replanning(env, seed, source)
     return _planner(env, seed, time_limit, source)
 
 
@@ -135,6 +144,25 @@ def _via_points(env, seed, tries, geometry_source):
                 path = robot.denormalise(np.stack([start, via, goal]))
                 return EpisodePolicy(_follow(path, robot), plan_found=True)
         return EpisodePolicy(_go_to_goal(configuration, robot), plan_found=False)
+
+    return begin
+
+
+def _replanning(env, seed, geometry_source):
+    from roboarm_nmp.envs.policies.replanning import Replanning
+
+    def current_checker():
+        return geometry_source(env.unwrapped.current_scene)
+
+    if "link_distances" in env.observation_space.spaces:
+        current_checker = env.get_wrapper_attr("current_checker")
+
+    def begin(number, query):
+        goal = _goal(env, query, geometry_source(query.scene.at(0.0)))
+        if goal is None:
+            return EpisodePolicy(None)
+        rng = np.random.default_rng([seed, number])
+        return EpisodePolicy(Replanning(env.robot, goal, current_checker, rng))
 
     return begin
 

@@ -46,7 +46,7 @@ import numpy as np
 from roboarm_nmp.envs.collision.checker import self_distances
 from roboarm_nmp.envs.collision.kernels import project
 from roboarm_nmp.envs.policies.approach_path import ApproachPaths
-from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 
@@ -54,7 +54,6 @@ from roboarm_nmp.envs.subgoals import MAX_STEP
 # arrivals counted as local minima, and the gain was the same near a goal as elsewhere.
 VERSION = 3
 
-STEP_SECONDS = SUBSTEPS * TIME_STEP
 LOOKAHEAD, MAX_LOOKAHEAD = 0.0, 1.0  # s, by default and at most
 # The numbers below were chosen on validation and fresh queries: docs/lab_notebook.md.
 ACTIVATION_DISTANCE = 0.15  # m. Links with larger distances are not constrained.

@@ -30,9 +30,10 @@ from roboarm_nmp.envs.metrics import motion_metrics, path_length, smoothness
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
-from roboarm_nmp.envs.policies.baselines import PLANNERS, TIME_LIMIT, TRIES
+from roboarm_nmp.envs.policies.baselines import CHECKING, PLANNERS, TIME_LIMIT, TRIES
 from roboarm_nmp.envs.policies.registry import (
     FOR_POSES,
+    filter_around,
     find_policy,
     make_policy,
     own_safety_filter,
@@ -116,7 +117,7 @@ def evaluate(policy, task=None, *, progress=False, **options):
     """Run a policy on a task's queries.
 
     Args:
-        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy network or of
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, the path of a policy network or of
             a folder with a `policy.pt`, the name of a pretrained policy, or a function from an
             observation (dict of `RoboArmEnv`) to an action (n,); with several workers, one that can
             be pickled.
@@ -278,6 +279,7 @@ def _in_use(policy, options):
     env["stop_on_collision"] = options.stop_on_collision
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
+    safety_filter = filter_around(policy, safety_filter)
     if safety_filter:
         env["link_distances"] = True
     source = options.geometry_source or env.get("geometry_source")
@@ -285,11 +287,11 @@ def _in_use(policy, options):
         source = env["geometry_source"] = source or GROUND_TRUTH
     elif env.get("encoder") == POINT_CLOUD and source != GROUND_TRUTH:
         source = env["geometry_source"] = source or POINT_CLOUD
-    elif policy in PLANNERS:
+    elif policy in CHECKING:
         source = source or GROUND_TRUTH
     elif options.geometry_source is not None:
         raise EvaluationError(
-            "geometry_source is for via-points, planner, a safety filter, and policies that "
+            "geometry_source is for via-points, planner, replanning, a safety filter, and policies that "
             "observe points or link distances"
         )
     return replace(options, env=env, geometry_source=source, safety_filter=safety_filter)
@@ -450,7 +452,7 @@ def _summary(job, outcomes):
         planning["planning_seconds_solved"] = mean(columns.planning_seconds, found)
         if job.policy == "via-points":
             planning["free_motion_rate"] = float(found.mean())
-    random = plans or job.policy == "random" or safety_filter
+    random = job.policy in (*CHECKING, "random") or safety_filter
     packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy == "planner")
     return {
         "policy": getattr(job.policy, "__name__", str(job.policy)),
@@ -474,7 +476,7 @@ def _summary(job, outcomes):
         "deviations": deviations(options.env),
         "geometry_source": options.geometry_source,
         "privileged": is_privileged(options.env)
-        or (plans and options.geometry_source == GROUND_TRUTH),
+        or (job.policy in CHECKING and options.geometry_source == GROUND_TRUTH),
         "safety_filter": safety_filter.to_metadata() | {"version": VERSION}
         if safety_filter
         else None,
