@@ -18,8 +18,8 @@ import numpy as np
 
 from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
-from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, first_in_cells, label_points
-from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, cardinal, observe_scene
+from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, farthest, first_in_cells, label_points
+from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, ObservedScene, floor_box
 
@@ -74,8 +74,21 @@ def _observe(scene):
 
 @functools.lru_cache(1)  # 500 kB; the coarse and the fine points of a scene are needed together
 def _clouds(scene):
-    clouds = observe_scene(scene, cardinal(PointCloud, scene.robot)).values()
-    return np.concatenate([one["points"][one["labels"] == OBSTACLE] for one in clouds])
+    world = SensorWorld()
+    world.show(scene, scene.robot.observed_pose)
+    return obstacle_points(world, cardinal(PointCloud, scene.robot).values())
+
+
+def obstacle_points(world, sensors):
+    """All points of obstacles that sensors observe: float32 (n, 3), m, in the base's frame.
+
+    Args:
+        world: an `envs.perception.sensors.SensorWorld`.
+        sensors: `PointCloud`s.
+    """
+    images = [(sensor, *world.cast(sensor, sensor.size)) for sensor in sensors]
+    points = [sensor.points_of_class(*image, OBSTACLE) for sensor, *image in images]
+    return np.concatenate([np.empty((0, 3), np.float32), *points])
 
 
 def one_per_cell(points, cell=CELL):
@@ -183,10 +196,5 @@ def farthest_points(points, number):
     no obstacle can be where the base is.
     """
     chosen = np.zeros((number, 3), np.float32)
-    distance = np.full(len(points), np.inf)
-    nearest = np.linalg.norm(points, axis=1)
-    for row in chosen[: len(points)]:
-        row[:] = points[nearest.argmax()]
-        distance = np.minimum(distance, np.linalg.norm(points - row, axis=1))
-        nearest = distance
+    farthest(np.require(points, np.float32, _AS_COMPILED), chosen)
     return chosen

@@ -1,8 +1,11 @@
 """Sensors: cameras and point clouds (paper, section 4).
 
 A sensor is plain data: its place, its viewing direction, its outputs. It observes a `SensorWorld`,
-a second simulation of the scene and the arm. So observing never changes an episode, and the goal's
-marker is invisible. `envs.wrappers.SensorWrapper` adds sensors to an environment.
+a scene with the arm at joint angles. So observing never changes an episode, and the goal's marker
+is invisible. `envs.wrappers.SensorWrapper` adds sensors to an environment.
+
+Depth, classes and points come from compiled ray casting (`envs.perception.ray_casting`), colours
+from PyBullet. Noise: `envs.perception.noise`.
 """
 
 import functools
@@ -13,13 +16,20 @@ from dataclasses import asdict, dataclass
 import gymnasium as gym
 import numpy as np
 
+from roboarm_nmp.envs.collision.kernels import AXES, EYE, VIEW, points_of_pixels
+from roboarm_nmp.envs.perception.noise import NO_NOISE, NoiseOfEpisode
+from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes of pixels)
+    NOTHING,
+    OBSTACLE,
+    ROBOT,
+    STATIC,
+    RayCaster,
+)
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
 
-# Classes (paper, appendix "Training and verifying the encoders").
-ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
 CLASSES = ("robot", "table and floor", "obstacle", "nothing")
 ROBOT_COLOUR = (0.90, 0.45, 0.15, 1)
 OUTPUTS = ("rgb", "depth", "segmentation")
@@ -89,9 +99,12 @@ class Camera:
 
     def observe(self, world):
         """Its observation of a `SensorWorld`: a dict of the outputs."""
-        rgb, depth, segmentation = world.render(self, self.size)
-        everything = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
-        return {name: everything[name] for name in self.outputs}
+        observed = {}
+        if "rgb" in self.outputs:
+            observed["rgb"] = world.render(self, self.size)
+        if "depth" in self.outputs or "segmentation" in self.outputs:
+            observed["depth"], observed["segmentation"] = world.cast(self, self.size)
+        return {name: observed[name] for name in self.outputs}
 
 
 @dataclass(frozen=True)
@@ -138,8 +151,7 @@ class PointCloud:
     @property
     def camera(self):
         """The camera whose pixels are the rays."""
-        edge = math.isqrt(self.num_samples)
-        fields = (self.eye, self.target, self.up, self.field_of_view, (edge, edge))
+        fields = self.eye, self.target, self.up, self.field_of_view, self.size
         return Camera(*fields, self.near, self.far, outputs=("depth", "segmentation"))
 
     def points(self, depth, segmentation):
@@ -150,16 +162,31 @@ class PointCloud:
         - `labels`: uint8 (num_samples,): the class of each hit, `ROBOT`, `STATIC` or `OBSTACLE`;
           then `NOTHING`.
         """
-        hit = segmentation != NOTHING
         points = np.zeros((self.num_samples, 3), np.float32)
         labels = np.full(self.num_samples, NOTHING, np.uint8)
-        points[: hit.sum()] = deproject(self, depth)[hit]
-        labels[: hit.sum()] = segmentation[hit]
+        depth = np.ascontiguousarray(depth, np.float32)
+        points_of_pixels(self._view, depth, segmentation, -1, NOTHING, points, labels)
         return {"points": points, "labels": labels}
+
+    def points_of_class(self, depth, segmentation, label):
+        """As `points`, those of one class alone, without zeros: float32 (n, 3), m."""
+        points = np.empty((self.num_samples, 3), np.float32)
+        labels = np.empty(self.num_samples, np.uint8)
+        given = self._view, depth, segmentation, label, NOTHING
+        return points[: points_of_pixels(*given, points, labels)]
+
+    @property
+    def size(self):
+        """(width, height) of the grid of rays."""
+        return (math.isqrt(self.num_samples),) * 2
+
+    @property
+    def _view(self):
+        return view_of(self, self.size)
 
     def observe(self, world):
         """Its observation of a `SensorWorld`: a dict of `points` and `labels`, see `points`."""
-        return self.points(**self.camera.observe(world))
+        return self.points(*world.cast(self, self.size))
 
 
 def cardinal(kind=Camera, robot=PANDA, **options):
@@ -182,8 +209,8 @@ def deproject(sensor, depth):
         sensor: a `Camera` or `PointCloud`.
         depth: (height, width), m along the viewing direction.
     """
-    right, up, forward = _axes(sensor)
     height, width = depth.shape
+    right, up, forward = view_of(sensor, (width, height))[AXES : AXES + 9].reshape(3, 3)
     half = math.tan(math.radians(sensor.field_of_view) / 2)
     # At distance 1. PyBullet's TinyRenderer looks through the lower left corners of the pixels.
     across = (2 * np.arange(width) / width - 1) * half * width / height
@@ -192,11 +219,11 @@ def deproject(sensor, depth):
     return np.array(sensor.eye) + depth[..., None] * rays
 
 
-def _axes(sensor):
-    """Unit vectors (right, up, forward) of a sensor's image."""
-    forward = np.subtract(sensor.target, sensor.eye).astype(np.float64)
+def _axes_of(eye, target, up):
+    """Unit vectors (right, up, forward) of an image."""
+    forward = np.subtract(target, eye).astype(np.float64)
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, sensor.up)
+    right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     return right, np.cross(right, forward), forward
 
@@ -223,51 +250,128 @@ def _check_view(sensor):
         )
 
 
-class SensorWorld(World):
+def view_of(sensor, size):
+    """A sensor's place and directions as `kernels.cast_rays` takes them: float64 (`VIEW`,).
+
+    `size`: (width, height) in pixels. Not to be changed.
+    """
+    place = (tuple(map(float, vector)) for vector in (sensor.eye, sensor.target, sensor.up))
+    return _view(*place, sensor.field_of_view, *size, sensor.near, sensor.far)
+
+
+@functools.lru_cache(maxsize=256)
+def _view(eye, target, up, field_of_view, width, height, near, far):
+    half = math.tan(math.radians(field_of_view) / 2)
+    view = np.empty(VIEW)
+    view[EYE:AXES], view[AXES : AXES + 9] = eye, np.ravel(_axes_of(eye, target, up))
+    view[AXES + 9 :] = half * width / height, half, near, far
+    return view
+
+
+class SensorWorld:
     """A scene with the arm in it, for sensors.
 
-    The arm is drawn as its collision meshes. Spheres and cylinders are drawn as polyhedra, up to a
-    tenth of their radius off the true surface.
+    Depth and classes need no PyBullet: `cast`. For colours, `render` opens a world of PyBullet's at
+    its first call, where the arm is drawn as its collision meshes, and spheres and cylinders as
+    polyhedra, up to a tenth of their radius off the true surface.
+
+    Args:
+        noise: an `envs.perception.noise.SensorNoise`; begin each episode by `begin_episode`.
+
+    Attributes:
+        scene: the `Scene`; None before `show`.
+        configuration: the arm's joint angles (n, rad).
     """
 
-    def _load_robot(self):
-        return self.robot.load_coarse(self.client, ROBOT_COLOUR)
+    def __init__(self, noise=NO_NOISE):
+        self.noise, self.scene, self.configuration = noise, None, None
+        self._caster = self._drawn = self._of_episode = None
+        if noise != NO_NOISE:
+            self.begin_episode()
+
+    @property
+    def robot(self):
+        """The scene's `Robot`."""
+        return self.scene.robot
+
+    @property
+    def client(self):
+        """PyBullet's number of a physics engine with the scene and the arm."""
+        return self._draw().client
+
+    def begin_episode(self, key=(), number=0):
+        """Draw the noise that stays the same for an episode.
+
+        Args:
+            key: int or sequence of ints from 0 on: equal keys give equal noise.
+            number: of cameras, of which `SensorNoise.missing_cameras` are missing.
+        """
+        self._of_episode = NoiseOfEpisode(self.noise, key, number)
 
     def show(self, scene, configuration):
         """Change to a `Scene` with the arm at joint angles (n, rad)."""
-        self.set_scene(scene)
-        self.robot.set_configuration(self.client, self.body, configuration)
+        self.scene, self.configuration, self._caster = scene, configuration, None
 
-    def render(self, sensor, size):
-        """Images from a sensor's place, with `size` (width, height) in pixels.
+    def cast(self, sensor, size):
+        """What rays from a sensor's place hit, with `size` (width, height) in pixels.
 
         Returns:
-            `rgb`, `depth` and `segmentation`, as `Camera` describes them.
+            `depth` and `segmentation`, as `Camera` describes them.
         """
-        self.check_open()
-        width, height = size
-        _, _, rgb, depth, bodies = p.getCameraImage(
+        if self._caster is None:
+            self._caster = RayCaster(self.scene, self.configuration)
+        view = view_of(sensor, size)
+        if self._of_episode is None:
+            return self._caster.image(view, size)
+        of_sensor = self._of_episode.of_sensor(view)
+        return of_sensor.apply(*self._caster.image(of_sensor.true_view(view), size), sensor.far)
+
+    def render(self, sensor, size):
+        """The colour image from a sensor's place, with `size` (width, height) in pixels.
+
+        Returns:
+            `rgb`, as `Camera` describes it.
+        """
+        client, (width, height) = self.client, size
+        place = sensor.eye, sensor.target, sensor.up
+        if self._of_episode is not None:
+            view = view_of(sensor, size)
+            of_sensor = self._of_episode.of_sensor(view)
+            if of_sensor.is_missing:
+                return np.zeros((height, width, 3), np.uint8)
+            view = of_sensor.true_view(view).tolist()
+            eye, up, forward = (view[i : i + 3] for i in (EYE, AXES + 3, AXES + 6))
+            place = eye, np.add(eye, forward).tolist(), up
+        image = p.getCameraImage(
             width,
             height,
-            p.computeViewMatrix(sensor.eye, sensor.target, sensor.up),
+            p.computeViewMatrix(*place),
             p.computeProjectionMatrixFOV(
                 sensor.field_of_view, width / height, sensor.near, sensor.far
             ),
             shadow=0,
             renderer=p.ER_TINY_RENDERER,
-            physicsClientId=self.client,
+            physicsClientId=client,
         )
-        rgb = image_array(rgb, width, height)
-        # From OpenGL's depth in [0, 1] to m.
-        depth = np.reshape(depth, (height, width)).astype(np.float64)
-        depth = sensor.far * sensor.near / (sensor.far - (sensor.far - sensor.near) * depth)
-        bodies = np.reshape(bodies, (height, width))
-        num_static = (self.scene.floor is not None) + (self.scene.table is not None)
-        segmentation = np.full((height, width), OBSTACLE, np.uint8)
-        segmentation[bodies == self.body] = ROBOT
-        segmentation[np.isin(bodies, self._bodies[:num_static])] = STATIC
-        segmentation[bodies < 0], depth[bodies < 0] = NOTHING, sensor.far
-        return rgb, depth.astype(np.float32), segmentation
+        return image_array(image[2], width, height)
+
+    def _draw(self):
+        if self._drawn is None:
+            self._drawn = _DrawnWorld(self.scene)
+        self._drawn.set_scene(self.scene)
+        self.robot.set_configuration(self._drawn.client, self._drawn.body, self.configuration)
+        return self._drawn
+
+    def close(self):
+        """Close PyBullet's world, if there is one."""
+        if self._drawn is not None:
+            self._drawn.close()
+            self._drawn = None
+
+
+class _DrawnWorld(World):
+    def _load_robot(self):
+        return self.robot.load_coarse(self.client, ROBOT_COLOUR)
 
 
 @functools.cache
