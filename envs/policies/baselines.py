@@ -151,6 +151,11 @@ def _via_points(env, seed, tries, geometry_source):
 def _replanning(env, seed, geometry_source):
     from roboarm_nmp.envs.policies.replanning import Replanning
 
+    # Compile here what is compiled at its first call: an action's time is for planning.
+    state = np.zeros(env.robot.num_joints)
+    checker = geometry_source(env.unwrapped.current_scene)
+    checker.find_path(state, state, np.random.default_rng(0), max_checks=1)
+
     def current_checker():
         return geometry_source(env.unwrapped.current_scene)
 

@@ -117,10 +117,10 @@ def evaluate(policy, task=None, *, progress=False, **options):
     """Run a policy on a task's queries.
 
     Args:
-        policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, the path of a policy network or of
-            a folder with a `policy.pt`, the name of a pretrained policy, or a function from an
-            observation (dict of `RoboArmEnv`) to an action (n,); with several workers, one that can
-            be pickled.
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, the path of a policy
+            network or of a folder with a `policy.pt`, the name of a pretrained policy, or a
+            function from an observation (dict of `RoboArmEnv`) to an action (n,); with several
+            workers, one that can be pickled.
         task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
             for the task that the policy was trained on, and for none with `problems`.
         progress: show a progress bar, with the success rate so far.
@@ -291,8 +291,8 @@ def _in_use(policy, options):
         source = source or GROUND_TRUTH
     elif options.geometry_source is not None:
         raise EvaluationError(
-            "geometry_source is for via-points, planner, replanning, a safety filter, and policies that "
-            "observe points or link distances"
+            "geometry_source is for via-points, planner, a safety filter, replanning, and policies "
+            "that observe points or link distances"
         )
     return replace(options, env=env, geometry_source=source, safety_filter=safety_filter)
 

@@ -351,7 +351,7 @@ class PolicyArm(_Arm):
         self._seed, self._filter = seed, safety_filter
         options = {"seed": seed, "time_limit": time_limit, "safety_filter": False}
         self._begin = make_policy(path, self.env, geometry_source=source or GROUND_TRUTH, **options)
-        self._number, self._plans = 0, path in CHECKING
+        self._number, self._plans = 0, path in PLANNERS
 
     def compile(self):
         """Have Numba compile what this arm needs, half a minute for the first time on a machine.
