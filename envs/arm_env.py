@@ -78,6 +78,8 @@ class RoboArmEnv(gym.Env):
         scene: a `Scene`, or a distribution of scenes: an object with `base`, the `Scene` without
             the obstacles that vary, and `sample(rng)`, which draws a `Scene` with a NumPy
             Generator (`envs.scenes.random_boxes.RandomBoxes` is one). `reset` then draws a new one.
+            With `animate`, `accepts` and `check_times` (`envs.scenes.moving_boxes.MovingScenes`) it
+            draws the obstacles' motions, too, for each start and goal.
         episodes_per_scene: number of resets until another scene is drawn; a reset with a seed
             always draws one.
         goal_type: `ee`, `config`, `combined` (reached like `ee`) or `pose`.
@@ -175,6 +177,8 @@ class RoboArmEnv(gym.Env):
         self._episodes_in_scene = self.episodes_per_scene
         if self.scene_distribution is not None:
             scene = self.scene_distribution.base
+        self.is_animated = hasattr(self.scene_distribution, "animate")
+        self._scene_at_rest = scene
         self.goal_type = goal_type
         self._tolerance = config_tolerance if goal_type == "config" else ee_tolerance
         self.ee_tolerance = ee_tolerance
@@ -322,7 +326,31 @@ class RoboArmEnv(gym.Env):
     def sample_scene(self, rng):
         """Change to a scene drawn from the task's distribution. A fixed scene stays."""
         if self.scene_distribution is not None:
-            self.set_scene(self.scene_distribution.sample(rng))
+            self._scene_at_rest = self.scene_distribution.sample(rng)
+            self.set_scene(self._scene_at_rest)
+
+    def sample_motions(self, start, goal, rng):
+        """Draw motions for the obstacles of the sampled scene, where its distribution has some.
+
+        Args:
+            start, goal: the query they are for, joint angles (n, rad).
+            rng: a NumPy Generator.
+
+        Returns:
+            Whether start and goal are free when they have to be; otherwise the scene stays at rest.
+        """
+        if not self.is_animated:
+            return True
+        distribution = self.scene_distribution
+        # Here, because Numba takes a while to import.
+        from roboarm_nmp.envs.collision.moving import free_over_time
+
+        scene = distribution.animate(self._scene_at_rest, start, goal, rng)
+        states = self.robot.normalise(np.array([start, goal]))
+        if not distribution.accepts(*free_over_time(scene, states, distribution.check_times)):
+            return False
+        self.set_scene(scene)
+        return True
 
     def reset(self, *, seed=None, options=None):
         """Start an episode from a random feasible start to a random feasible goal.
@@ -347,7 +375,12 @@ class RoboArmEnv(gym.Env):
             self.sample_scene(self.np_random)
             self._episodes_in_scene = 0
         self._episodes_in_scene += 1
-        return self._begin(*self.sample_query(self.np_random))
+        while True:
+            if self.is_animated:
+                self.set_scene(self._scene_at_rest)
+            start, goal = self.sample_query(self.np_random)
+            if self.sample_motions(start, goal, self.np_random):
+                return self._begin(start, goal)
 
     def reset_specific(self, start, goal=None, scene=None, goal_pose=None):
         """Start an episode on a given query.

@@ -15,6 +15,13 @@ from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.formats import WORLD_FILES, load_world
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
+from roboarm_nmp.envs.scenes.moving_boxes import (
+    AppearingBoxes,
+    BlockedGoals,
+    ChasedGoals,
+    MovingBoxes,
+    MovingScenes,
+)
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.utils.names import suggest
@@ -32,7 +39,7 @@ class Task:
         trainable: False for the tasks that are there to test generalisation (paper: "OOD").
     """
 
-    scene: Scene | RandomBoxes | MixedScenes
+    scene: Scene | RandomBoxes | MixedScenes | MovingScenes
     summary: str
     trainable: bool = True
 
@@ -243,6 +250,36 @@ TASKS = {
     "benchmaker_bookshelf_thin": Task(
         _bookshelf_thin(),
         "MotionBenchMaker's bookshelf_thin: six shelves, divided by a board",
+        trainable=False,
+    ),
+    "appearing_boxes": Task(
+        AppearingBoxes(),
+        "random_boxes_hard, half of the boxes appear in the first 3 s",
+        trainable=False,
+    ),
+    "moving_boxes_easy": Task(
+        MovingBoxes(share=1 / 3, periods=(6.0, 10.0)),
+        "random_boxes_hard, a third of the boxes oscillates with periods of 6 to 10 s",
+        trainable=False,
+    ),
+    "moving_boxes_medium": Task(
+        MovingBoxes(share=0.5, periods=(3.0, 8.0)),
+        "the same, half of the boxes, periods of 3 to 8 s",
+        trainable=False,
+    ),
+    "moving_boxes_hard": Task(
+        MovingBoxes(share=0.8, periods=(1.2, 3.2)),
+        "the same, four of five boxes, periods of 1.2 to 3.2 s",
+        trainable=False,
+    ),
+    "blocked_goals": Task(
+        BlockedGoals(),
+        "random_boxes_medium, and a box at the goal that leaves after 2 to 6 s",
+        trainable=False,
+    ),
+    "chased_goals": Task(
+        ChasedGoals(),
+        "random_boxes_medium, and one or two boxes that visit the goal again and again",
         trainable=False,
     ),
 }

@@ -11,11 +11,18 @@ number j there is row `np.flatnonzero(now.present)[j]`.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.hulls import shape_centres, shape_rows
+from roboarm_nmp.envs.collision.hulls import (
+    arm_hulls,
+    group_points,
+    shape_centres,
+    shape_rows,
+    world_shapes,
+)
 from roboarm_nmp.envs.collision.kernels import (
     AMPLITUDE,
     ANGLE,
@@ -26,6 +33,8 @@ from roboarm_nmp.envs.collision.kernels import (
     PHASE,
     REPEAT,
     WAYPOINTS,
+    free_batch,
+    moved_rows,
     obstacle_states,
 )
 from roboarm_nmp.envs.scenes.motions import REPEATS, Oscillation, Presence, Waypoints
@@ -109,3 +118,26 @@ def motion_arrays(obstacles):
             row[REPEAT] = REPEATS.index(motion.repeat)
         row[WAYPOINTS + 1] = len(waypoints)
     return own, np.reshape(waypoints, (-1, 8)), np.reshape(intervals, (-1, 2))
+
+
+def free_over_time(scene, states, times):
+    """Whether configurations are free of a scene's moving obstacles.
+
+    Args:
+        scene: a `Scene`. Its table, its floor and obstacles without a motion do not count.
+        states: normalised configurations (m, n).
+        times: s, (t,).
+
+    Returns:
+        bool (m, t).
+    """
+    moving = replace(scene, obstacles=[o for o in scene.obstacles if o.motion is not None])
+    rows, arm = world_shapes(moving.obstacles, arm_hulls(scene.robot))
+    own, shapes = MovingObstacles(moving), rows.copy()
+    world = rows, *group_points((), 0.0)
+    rule = np.zeros(4), np.empty((1, 0, scene.robot.num_joints + 1))
+    states, free = np.ascontiguousarray(states, float), np.empty((len(times), len(states)), bool)
+    for t, answers in zip(times, free, strict=True):
+        moved_rows(own.motions, own.centres, shapes, t, rows)
+        free_batch(states, *rule, arm, world, answers)
+    return free.T

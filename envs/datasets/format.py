@@ -8,7 +8,9 @@ task has queries from elsewhere, each with
 - where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
   uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
   scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`; where there are
-  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another.
+  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another;
+- where obstacles move, instead, `scene_seed`: uint32 (n,), from which each query's scene is drawn
+  (`AnimatedScenes`).
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
@@ -77,6 +79,7 @@ SCENE_ARRAYS = {
     "obstacle_count": ("<u4", None, "obstacle_count"),
     "obstacles": ("<f8", ROW, "obstacles"),
 }
+SEED_ARRAYS = {"scene_seed": ("<u4", None, "start")}  # where obstacles move
 HULL_ARRAYS = {"hull_vertices": ("<f8", 3, "hull_vertices")}  # where there are convex hulls
 QUERY_ARRAYS = {
     "start": ("<f4", JOINTS, "start"),
@@ -102,6 +105,8 @@ def array_formats(schema, names):
             arrays = {**arrays, **SCENE_ARRAYS, "scene": ("<u4", None, rows_of)}
             if f"{prefix}hull_vertices" in names:
                 arrays |= HULL_ARRAYS
+        if f"{prefix}scene_seed" in names:
+            arrays = {**arrays, **SEED_ARRAYS}
         return {
             prefix + name: (dtype, width, prefix + sibling)
             for name, (dtype, width, sibling) in arrays.items()
@@ -165,6 +170,43 @@ class QueryScenes:
         """The scenes of fewer queries, by slice or index array."""
         index = None if self.index is None else self.index[which]
         return QueryScenes(self.base, index, self.offsets, self.rows, self.vertices)
+
+
+class AnimatedScenes:
+    """The scenes of n queries with moving obstacles: drawn from a seed each, on access.
+
+    Attributes:
+        distribution: an `envs.scenes.moving_boxes.MovingScenes`, whose robot has j joints.
+        seeds: uint32 (n,).
+        start, goal: float32 (n, j), rad, of the queries.
+    """
+
+    def __init__(self, distribution, seeds, start, goal):
+        self.distribution, self.base = distribution, distribution.base
+        self.seeds, self.start, self.goal = seeds, start, goal
+
+    def __getitem__(self, i):
+        rest, motions = map(np.random.default_rng, scene_seeds(self.seeds[i]))
+        scene = self.distribution.sample(rest)
+        return self.distribution.animate(scene, self.start[i], self.goal[i], motions)
+
+    def take(self, which):
+        """As `QueryScenes.take`."""
+        given = self.seeds[which], self.start[which], self.goal[which]
+        return AnimatedScenes(self.distribution, *given)
+
+    def summary(self):
+        """Numbers (JSON-ready) that tell scenes of another version of the distribution from these.
+
+        The sums of all numbers of the first query's obstacles, at several times.
+        """
+        times, scene = (0.0, 1.0, 3.0, 6.0), self[0]
+        return [float(to_array(scene.at(t).obstacles).sum()) for t in times]
+
+
+def scene_seeds(seed):
+    """The seeds of a scene at rest, and of its motions, from a seed of `AnimatedScenes`."""
+    return (int(seed), 0), (int(seed), 1)
 
 
 def task_file(task, folder, suffix):
@@ -232,6 +274,8 @@ def scene_arrays(path, scenes_of, base, prefix=""):
     """Arrays for a sequence of `Scene`s, equal ones stored once; none for None."""
     if scenes_of is None:
         return {}
+    if isinstance(scenes_of, AnimatedScenes):
+        return {f"{prefix}scene_seed": scenes_of.seeds}
     numbers = {}  # scene -> its number, in the order of their first use
     index = [numbers.setdefault(scene, len(numbers)) for scene in scenes_of]
     for scene in numbers:
