@@ -111,7 +111,7 @@ def search(nodes, checker, last_step):
     lengths = np.linalg.norm(nodes - nodes[1], axis=1)
     to_goal = np.ceil(lengths / SUBGOAL_SPACING - 1e-9).astype(int)  # steps, at least
     first = intervals.of(0)
-    if not first or first[0][0] > 0:
+    if not first or first[0][0] > 0 or not intervals.of(1):
         return None
     # Entries: least arrival at the goal, arrival, node, number of its interval; from where.
     queue, came_from, closed = [(to_goal[0], 0, 0, 0)], {(0, 0): None}, set()

@@ -7,7 +7,9 @@
   configuration, straight to the goal;
 - planner: follows a plan of OMPL's RRT-Connect, which may search for a limited time;
 - replanning: follows a plan, watches it, and plans again whenever it is blocked
-  (`envs.policies.replanning`).
+  (`envs.policies.replanning`);
+- space-time: follows a plan that knows how the obstacles will move, the reference in scenes with
+  moving obstacles (`demo_generation.space_time`).
 
 Of a goal pose, the goal configuration is one that inverse kinematics finds, the nearest one to the
 start; `via-points` and `planner` need one without collisions.
@@ -15,7 +17,7 @@ start; `via-points` and `planner` need one without collisions.
 `via-points`, `planner` and `replanning` check collisions with the obstacles of a geometry source
 (`envs.perception.geometry_source`); with the ground truth they are privileged. Where obstacles
 move, the first two plan around obstacles as they are at the start, and `replanning` around those of
-the present step.
+the present step. `space-time` always has the ground truth, the future included.
 """
 
 import importlib
@@ -28,7 +30,10 @@ import numpy as np
 from roboarm_nmp.envs.policies.pose_goals import goal_configuration
 from roboarm_nmp.envs.subgoals import subgoals
 
-PLANNERS = ("via-points", "planner")
+SPACE_TIME = "space-time"
+OMPL_PLANNERS = ("planner", SPACE_TIME)
+"""Those of another package, with OMPL."""
+PLANNERS = ("via-points", *OMPL_PLANNERS)
 """The baselines that look for a motion before they move."""
 REPLANNING = "replanning"
 CHECKING = (*PLANNERS, REPLANNING)
@@ -39,6 +44,7 @@ TIME_LIMIT = 5.0  # s, of `planner`, by default
 # The module of `planner`'s `Planner`. It is built on `envs` and needs OMPL, so it is imported by
 # name, only when this baseline is used.
 PLANNING_MODULE = "roboarm_nmp.demo_generation.planning"
+SPACE_TIME_MODULE = "roboarm_nmp.demo_generation.space_time"
 
 
 class EpisodePolicy(NamedTuple):
@@ -80,6 +86,10 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
     from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 
     source = find_geometry_source(geometry_source, robot)
+    if name == SPACE_TIME:
+        if geometry_source != "ground_truth":
+            raise ValueError(f"space-time plans with the ground truth, not {geometry_source}")
+        return _space_time(env, seed, time_limit)
     if name == "via-points":
         return _via_points(env, seed, tries, source)
     if name == REPLANNING:
@@ -87,10 +97,10 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
     return _planner(env, seed, time_limit, source)
 
 
-def import_planning():
-    """The module `PLANNING_MODULE`. Raises ValueError: OMPL is not installed."""
+def import_planning(module=PLANNING_MODULE):
+    """The module `PLANNING_MODULE`, or another one. Raises ValueError: OMPL is not installed."""
     try:
-        return importlib.import_module(PLANNING_MODULE)
+        return importlib.import_module(module)
     except ImportError as error:
         raise ValueError(f"the policy planner needs OMPL: {error}") from error
 
@@ -184,6 +194,20 @@ def _planner(env, seed, time_limit, geometry_source):
         try:
             path = planner.plan(*given, **options)
         except planning.PlanningError:
+            return EpisodePolicy(None, plan_found=False)
+        return EpisodePolicy(_follow(path, env.robot), plan_found=True)
+
+    return begin
+
+
+def _space_time(env, seed, time_limit):
+    module = import_planning(SPACE_TIME_MODULE)
+    planner = module.SpaceTimePlanner(env)
+
+    def begin(number, query):
+        try:
+            path = planner.plan(*query, seed=[seed, number], time_limit=time_limit)
+        except module.PlanningError:
             return EpisodePolicy(None, plan_found=False)
         return EpisodePolicy(_follow(path, env.robot), plan_found=True)
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from roboarm_nmp.envs.policies.baselines import (
     BASELINES,
+    OMPL_PLANNERS,
     REPLANNING,
     TIME_LIMIT,
     TRIES,
@@ -74,9 +75,10 @@ def find_policy(name):
         name: one of `BASELINES`, which have no arguments, or a name or path as for `policy_file`.
 
     Raises:
-        PolicyError: there is no such policy, its file is not one, or `planner` lacks OMPL.
+        PolicyError: there is no such policy, its file is not one, or OMPL is missing, which
+            `planner` and `space-time` need.
     """
-    if name == "planner":
+    if name in OMPL_PLANNERS:
         try:
             import_planning()
         except ValueError as error:

@@ -30,7 +30,13 @@ from roboarm_nmp.envs.metrics import motion_metrics, path_length, smoothness
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
-from roboarm_nmp.envs.policies.baselines import CHECKING, PLANNERS, TIME_LIMIT, TRIES
+from roboarm_nmp.envs.policies.baselines import (
+    CHECKING,
+    OMPL_PLANNERS,
+    PLANNERS,
+    TIME_LIMIT,
+    TRIES,
+)
 from roboarm_nmp.envs.policies.registry import (
     FOR_POSES,
     filter_around,
@@ -72,7 +78,8 @@ class EvaluationOptions:
         stop_on_collision: end an episode at the first contact.
         seed: of random numbers, >= 0; each query has its own generator.
         tries: random configurations that `via-points` tries per query, >= 1.
-        time_limit: seconds that `planner` may search per query, > 0.
+        time_limit: seconds that `planner` and `space-time` may search per query,
+            > 0.
         geometry_source: where `planner`, `via-points`, the safety filter and the policy's
             observations take the obstacles from (`envs.perception.geometry_source`); None for the
             policy's own, otherwise `ground_truth`.
@@ -117,10 +124,10 @@ def evaluate(policy, task=None, *, progress=False, **options):
     """Run a policy on a task's queries.
 
     Args:
-        policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, the path of a policy
-            network or of a folder with a `policy.pt`, the name of a pretrained policy, or a
-            function from an observation (dict of `RoboArmEnv`) to an action (n,); with several
-            workers, one that can be pickled.
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, `space-time`, the
+            path of a policy network or of a folder with a `policy.pt`, the name of a pretrained
+            policy, or a function from an observation (dict of `RoboArmEnv`) to an action (n,); with
+            several workers, one that can be pickled.
         task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
             for the task that the policy was trained on, and for none with `problems`.
         progress: show a progress bar, with the success rate so far.
@@ -453,7 +460,7 @@ def _summary(job, outcomes):
         if job.policy == "via-points":
             planning["free_motion_rate"] = float(found.mean())
     random = job.policy in (*CHECKING, "random") or safety_filter
-    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy == "planner")
+    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy in OMPL_PLANNERS)
     return {
         "policy": getattr(job.policy, "__name__", str(job.policy)),
         "task": None if job.problems else job.task,
@@ -482,7 +489,7 @@ def _summary(job, outcomes):
         else None,
         "seed": options.seed if random else None,
         "tries": options.tries if job.policy == "via-points" else None,
-        "time_limit": options.time_limit if job.policy == "planner" else None,
+        "time_limit": options.time_limit if job.policy in OMPL_PLANNERS else None,
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in packages},
