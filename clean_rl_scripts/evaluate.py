@@ -79,6 +79,7 @@ from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.flags import (
     CORES,
     NonNegativeFloat,
+    NonNegativeInt,
     PositiveFloat,
     PositiveInt,
     Seed,
@@ -132,12 +133,24 @@ class Args:
     approach: bool = False
     """add approach paths to the safety filter: out of starts, and into goals, that are nearer to
     obstacles than its margin (docs/guide/safety_filter.md)"""
+    observe_every: PositiveInt | None = None
+    """steps from one observation of the scene to the next, with the arm where it is; by default
+    static scenes are observed once, and scenes with moving obstacles in every step"""
+    sensor_noise: tuple[str, ...] = ()
+    """NAME=VALUE pairs of sensor noise, e.g. `gaussian=0.005 dropout=0.1`
+    (docs/guide/perception.md, "Sensor noise")"""
     seed: Seed = 0
     """of random numbers: `random`, `via-points`, `planner`, escapes"""
     tries: PositiveInt = TRIES
     """random configurations that `via-points` tries per query"""
     time_limit: PositiveFloat = TIME_LIMIT
     """seconds that `planner` and `space-time` may search per query"""
+    action_delay: NonNegativeInt = 0
+    """steps after which an action takes effect, while the arm makes the step before it and then
+    holds its configuration; 0: the simulation waits for the policy"""
+    real_time: bool = False
+    """instead: as many steps of 1/30 s as an action, or a plan, takes to compute, at least 1; the
+    numbers depend on the machine and its load"""
     clearance: bool = False
     """also measure each successful episode's smallest distance from the ground-truth obstacles"""
     json: Path | None = None
@@ -159,7 +172,10 @@ def main(arguments=None):
 
         if args.task is None and args.robot is not None:
             raise ValueError("--robot goes with --task")
-        options = vars(args) | {"safety_filter": _safety_filter(args)}
+        from roboarm_nmp.envs.perception.noise import SensorNoise
+
+        noise = SensorNoise.parse(args.sensor_noise) if args.sensor_noise else None
+        options = vars(args) | {"safety_filter": _safety_filter(args), "sensor_noise": noise}
         options["task"] = task_with_robot(args.task, args.robot)
         filters = "safety_margin", "escape", "lookahead", "velocities", "approach"
         for name in ("robot", *filters, "json", "image"):
@@ -224,7 +240,7 @@ def _settings(result):
         if "lookahead" in safety_filter:
             ahead = safety_filter["lookahead"]
             margin += ", no velocities" if ahead is None else f", {ahead:g} s ahead"
-    limit = result["time_limit"]
+    limit, noise = result["time_limit"], result.get("sensor_noise", {})
     return {
         "robot": None if result["robot"] == PANDA.name else result["robot"],
         "queries": result["queries"],
@@ -233,10 +249,20 @@ def _settings(result):
         "geometry source": result["geometry_source"] or "none",
         "privileged": "yes" if result["privileged"] else None,
         "safety filter": margin,
+        "observed every": f"{result['observe_every']} steps" if "observe_every" in result else None,
+        "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",
         "tries": result["tries"],
+        "action delay": _delay(result["action_delay"]),
         "seed": result["seed"],
     }
+
+
+def _delay(steps):
+    """The delay in words; None for none."""
+    if steps == "real_time":
+        return "real time: the steps that each action takes to compute"
+    return f"{steps} steps" if steps else None
 
 
 def _table(result):

@@ -19,6 +19,8 @@ def make(
     link_distances=False,
     append_link_distances=False,
     goal_link_distances=True,
+    observe_every=None,
+    sensor_noise=None,
     **kwargs,
 ):
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
@@ -39,6 +41,9 @@ def make(
         append_link_distances: with `link_distances`: append them to `observation`, too, before z_E.
         goal_link_distances: with `link_distances`: add those at a goal that is a configuration. Use
             False with hindsight relabelling (docs/guide/environment.md, "Hindsight relabelling").
+        observe_every: steps from one observation of the scene to the next; None: static scenes are
+            observed once, others in every step (`envs.wrappers.ObservedSceneWrapper`).
+        sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:
@@ -66,6 +71,11 @@ def make(
         raise ValueError("geometry_source goes with link_distances, or the encoder point_cloud")
     env = RoboArmEnv(task if isinstance(task, Scene) else get_task(task).scene, **kwargs)
     # PyTorch and Numba take long to import, so they are imported only where they are needed.
+    observes = encoder is not None or link_distances
+    if observes or observe_every is not None or sensor_noise is not None:
+        from roboarm_nmp.envs.wrappers import ObservedSceneWrapper
+
+        env = ObservedSceneWrapper(env, observe_every, sensor_noise)
     if encoder is not None:
         from roboarm_nmp.envs.perception.encoders import make_encoder
         from roboarm_nmp.envs.wrappers import SceneEncodingWrapper

@@ -254,6 +254,11 @@ class World:
             self._current_scene = self.scene.at(self.time)
         return self._current_scene
 
+    def set_time(self, time):
+        """Put moving obstacles where they are at a time (s), whatever the arm does; for images."""
+        self.check_open()
+        self._move_obstacles(round(time / TIME_STEP))
+
     def _move_obstacles(self, substep):
         """Put moving obstacles where they are after so many physics steps, at rest."""
         self._substep, self._current_scene = substep, None

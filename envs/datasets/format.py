@@ -8,9 +8,11 @@ task has queries from elsewhere, each with
 - where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
   uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
   scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`; where there are
-  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another;
-- where obstacles move, instead, `scene_seed`: uint32 (n,), from which each query's scene is drawn
-  (`AnimatedScenes`).
+  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another; where
+  obstacles move, `motion_count`: uint32 (k,), how many numbers each one's motion has, and
+  `motions`: float64 (m,), the numbers (`envs.scenes.motions.motion_to_numbers`);
+- for tasks where obstacles move, instead, `scene_seed`: uint32 (n,), from which each query's scene
+  is drawn (`AnimatedScenes`).
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
@@ -20,7 +22,7 @@ A demonstration file, `envs/demos/<task>.h5`, has the arrays
   `envs.datasets.demonstrations.write_demos`); `length`: uint32 (n,), configurations in each;
 - `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
 - `collided`: uint8 (n,), whether the execution has a contact;
-- where scenes vary, `scene`, `obstacle_count`, `obstacles` and `hull_vertices`, as above.
+- where scenes vary, `scene`, `obstacle_count`, `obstacles`, `hull_vertices`, as above.
 
 j is the number of the robot's joints, 7 of the Panda.
 
@@ -49,10 +51,12 @@ from roboarm_nmp.envs.scenes.primitives import (
     check_obstacle,
     from_array,
     hull_vertices,
+    motion_numbers,
     scene_from_json,
     scene_to_json,
     to_array,
     vertex_counts,
+    with_motion,
 )
 from roboarm_nmp.envs.tasks import (
     TASKS,
@@ -81,6 +85,10 @@ SCENE_ARRAYS = {
 }
 SEED_ARRAYS = {"scene_seed": ("<u4", None, "start")}  # where obstacles move
 HULL_ARRAYS = {"hull_vertices": ("<f8", 3, "hull_vertices")}  # where there are convex hulls
+MOTION_ARRAYS = {  # where obstacles move
+    "motion_count": ("<u4", None, "obstacles"),
+    "motions": ("<f8", None, "motions"),
+}
 QUERY_ARRAYS = {
     "start": ("<f4", JOINTS, "start"),
     "goal": ("<f4", JOINTS, "start"),
@@ -105,6 +113,8 @@ def array_formats(schema, names):
             arrays = {**arrays, **SCENE_ARRAYS, "scene": ("<u4", None, rows_of)}
             if f"{prefix}hull_vertices" in names:
                 arrays |= HULL_ARRAYS
+            if f"{prefix}motion_count" in names:
+                arrays |= MOTION_ARRAYS
         if f"{prefix}scene_seed" in names:
             arrays = {**arrays, **SEED_ARRAYS}
         return {
@@ -150,11 +160,15 @@ class QueryScenes:
         offsets: int64 (s + 1,): the obstacles of scene j are `rows[offsets[j] : offsets[j + 1]]`.
         rows: float64 (k, 11), as of `envs.scenes.primitives.to_array`.
         vertices: float64 (v, 3), as of `envs.scenes.primitives.hull_vertices`.
+        motions: None, or the two arrays of `envs.scenes.primitives.motion_numbers`.
     """
 
-    def __init__(self, base, index=None, offsets=None, rows=None, vertices=()):
+    def __init__(self, base, index=None, offsets=None, rows=None, vertices=(), motions=None):
         self.base, self.index, self.offsets, self.rows = base, index, offsets, rows
-        self.vertices = vertices
+        self.vertices, self.motions = vertices, motions
+        if motions is not None:  # the numbers of row j begin at number `_motion_offsets[j]`
+            counts = motions[1].astype(np.int64)
+            self._motion_offsets = np.concatenate([[0], np.cumsum(counts)])
         if rows is not None:  # the vertices of row j begin at number `_vertex_offsets[j]`
             self._vertex_offsets = np.concatenate([[0], np.cumsum(vertex_counts(rows))])
 
@@ -164,12 +178,16 @@ class QueryScenes:
         first, last = self.offsets[self.index[i] :][:2]
         begin, end = self._vertex_offsets[[first, last]]
         obstacles = from_array(self.rows[first:last], self.vertices[begin:end])
+        if self.motions is not None:
+            ends = self._motion_offsets[first : last + 1]
+            numbers = [self.motions[0][i:j] for i, j in itertools.pairwise(ends)]
+            obstacles = map(with_motion, obstacles, numbers)
         return replace(self.base, obstacles=obstacles)
 
     def take(self, which):
         """The scenes of fewer queries, by slice or index array."""
         index = None if self.index is None else self.index[which]
-        return QueryScenes(self.base, index, self.offsets, self.rows, self.vertices)
+        return QueryScenes(self.base, index, self.offsets, self.rows, self.vertices, self.motions)
 
 
 class AnimatedScenes:
@@ -289,8 +307,12 @@ def scene_arrays(path, scenes_of, base, prefix=""):
         f"{prefix}obstacle_count": np.array([len(s.obstacles) for s in numbers], np.uint32),
         f"{prefix}obstacles": to_array(obstacles),
     }
-    vertices = hull_vertices(obstacles)
-    return arrays | ({f"{prefix}hull_vertices": vertices} if len(vertices) else {})
+    if len(vertices := hull_vertices(obstacles)):
+        arrays[f"{prefix}hull_vertices"] = vertices
+    numbers, counts = motion_numbers(obstacles)
+    if len(numbers):
+        arrays |= {f"{prefix}motion_count": counts, f"{prefix}motions": numbers}
+    return arrays
 
 
 def read_scenes(path, base, arrays, prefix=""):
@@ -314,7 +336,18 @@ def read_scenes(path, base, arrays, prefix=""):
         raise DatasetError(
             f"{path}: {prefix}obstacles has sizes that are not positive, or too large"
         )
-    return QueryScenes(base, index.astype(np.int64), offsets, rows, vertices)
+    motions = None
+    if f"{prefix}motion_count" in arrays:
+        motions = arrays[f"{prefix}motions"], arrays[f"{prefix}motion_count"]
+        if motions[1].sum(dtype=np.int64) != len(motions[0]):
+            raise DatasetError(f"{path}: {prefix}motion_count does not fit {prefix}motions")
+    scenes = QueryScenes(base, index.astype(np.int64), offsets, rows, vertices, motions)
+    try:
+        for i in np.unique(scenes.index, return_index=True)[1] if motions else ():
+            scenes[i]
+    except ValueError as error:
+        raise DatasetError(f"{path}: {prefix}motions: {error}") from error
+    return scenes
 
 
 def read_base_scene(path, text, robot):
@@ -353,7 +386,8 @@ def _same_scene(one, other):
             if here is not there:
                 return False
             continue
-        if field == "obstacles":  # rows may have different lengths, those of convex hulls
+        if field == "obstacles":  # rows may have different lengths, of convex hulls and motions
+            here, there = ([_flat(row) for row in rows] for rows in (here, there))
             if [len(row) for row in here] != [len(row) for row in there]:
                 return False
             here, there = (list(itertools.chain(*rows)) for rows in (here, there))
@@ -361,6 +395,11 @@ def _same_scene(one, other):
         if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SCENE_TOLERANCE):
             return False
     return True
+
+
+def _flat(row):
+    """A row of `envs.scenes.primitives.to_lists` without the list of a motion in it."""
+    return [*row[:-1], *row[-1]] if isinstance(row[-1], list) else row
 
 
 def _checksum(attributes, arrays):

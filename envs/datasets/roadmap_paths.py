@@ -89,6 +89,8 @@ def shard_bytes(task, seed, first, scenes, paths, made_by):
     """
     flat = [path for of_scene in paths for path in of_scene]
     base = get_task(task).base_scene
+    if not all(scene.is_static for scene in scenes):
+        raise DatasetError("roadmap paths are of static scenes: obstacles of this task move")
     obstacles = [o for scene in scenes for o in scene.obstacles]
     arrays = {
         "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),

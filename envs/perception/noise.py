@@ -96,9 +96,9 @@ class SensorNoise:
         return {name: value for name, value in asdict(self).items() if value}
 
     @property
-    def of_images(self):
-        """This noise without latency: what changes images."""
-        return SensorNoise(**asdict(self) | {"latency": 0})
+    def changes_images(self):
+        """Whether there is more than latency."""
+        return any(value for name, value in asdict(self).items() if name not in ("latency", "seed"))
 
 
 NO_NOISE = SensorNoise()
@@ -109,25 +109,22 @@ class NoiseOfEpisode:
 
     Args:
         noise: a `SensorNoise`.
-        key: int or sequence of ints from 0 on, of the episode.
+        key: int from 0 on, of the episode.
         number: of cameras.
     """
 
     def __init__(self, noise, key, number):
-        self._noise, self._key = noise, np.ravel(key).astype(np.int64).tolist()
-        missing = np.random.default_rng([noise.seed, Stream.SENSOR_NOISE, *self._key])
-        missing = missing.permutation(number)[: noise.missing_cameras]
-        self._missing, self._sensors = set(missing.tolist()), {}
+        self._noise, self._key = noise, key
+        order = _rng(noise, key).permutation(number)
+        self._missing, self._sensors = set(order[: noise.missing_cameras].tolist()), {}
 
     def of_sensor(self, view):
         """The noise of the camera with a view: in the order in which they observe first."""
         place = view[: AXES + 9].tobytes()
         if place not in self._sensors:
             number = len(self._sensors)
-            rng = np.random.default_rng(
-                [self._noise.seed, Stream.SENSOR_NOISE, *self._key, 1 + number]
-            )
-            self._sensors[place] = NoiseOfSensor(self._noise, rng, number in self._missing)
+            missing = number in self._missing
+            self._sensors[place] = NoiseOfSensor(self._noise, (self._key, 1 + number), missing)
         return self._sensors[place]
 
 
@@ -138,11 +135,11 @@ class NoiseOfSensor:
         is_missing: whether it observes nothing.
     """
 
-    def __init__(self, noise, rng, is_missing):
-        self._noise, self._rng, self.is_missing = noise, rng, is_missing
+    def __init__(self, noise, key, is_missing):
+        self._noise, self._key, self.is_missing = noise, key, is_missing
+        rng = _rng(noise, *key)
         self._shift = 1e-3 * noise.calibration_mm * rng.standard_normal(3)
-        turn = math.radians(noise.calibration_degrees) * rng.standard_normal(3)
-        self._turn = _rotation(turn)
+        self._turn = _rotation(math.radians(noise.calibration_degrees) * rng.standard_normal(3))
 
     def true_view(self, view):
         """Where the camera really is (`kernels.VIEW`): its assumed view with the errors."""
@@ -154,9 +151,12 @@ class NoiseOfSensor:
         view[AXES : AXES + 9] = (view[AXES : AXES + 9].reshape(3, 3) @ self._turn.T).ravel()
         return view
 
-    def apply(self, depth, classes, far):
-        """A depth image (m) and its classes with noise; both may be changed in place."""
-        noise, rng = self._noise, self._rng
+    def apply(self, depth, classes, far, number):
+        """A depth image (m) and its classes with noise.
+
+        `number`: of the observation in its episode, from 0 on.
+        """
+        noise, rng = self._noise, _rng(self._noise, *self._key, 1 + number)
         if self.is_missing:
             return np.full_like(depth, far), np.full_like(classes, NOTHING)
         hit = classes != NOTHING
@@ -176,6 +176,10 @@ class NoiseOfSensor:
             hit &= rng.random(depth.shape, np.float32) >= noise.dropout
         hit &= (depth > 0) & (depth < far)
         return np.where(hit, depth, np.float32(far)), np.where(hit, classes, np.uint8(NOTHING))
+
+
+def _rng(noise, *key):
+    return np.random.default_rng([noise.seed, Stream.SENSOR_NOISE, *key])
 
 
 def _rotation(vector):

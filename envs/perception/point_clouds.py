@@ -19,7 +19,13 @@ import numpy as np
 from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
 from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, farthest, first_in_cells, label_points
-from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, SensorWorld, cardinal
+from roboarm_nmp.envs.perception.sensors import (
+    OBSTACLE,
+    PointCloud,
+    SceneObservation,
+    cardinal,
+    world_of,
+)
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, ObservedScene, floor_box
 
@@ -49,7 +55,8 @@ def observed_points(scene):
     """Points of a `Scene`'s obstacles: float32 (n, 3), m, in the base's frame; not to be changed.
 
     One per cube of `CELL`; none, (0, 3), where no obstacle is visible. The last scenes are cached.
-    Those of an `ObservedScene` are its own.
+    Those of an `ObservedScene` are its own. A `SceneObservation` says where the arm is, and which
+    noise there is; with noise, outliers are removed as by `prepare_cloud`.
     """
     if isinstance(scene, ObservedScene):
         return scene.points
@@ -64,19 +71,25 @@ def remember_points(scene):
 
 def fine_observed_points(scene):
     """As `observed_points`, one per cube of `FINE_CELL`."""
-    return one_per_cell(_clouds(scene), scale_of(scene.robot) * FINE_CELL)
+    return _thin(scene, FINE_CELL)
 
 
 @functools.lru_cache(CACHED_SCENES)
 def _observe(scene):
-    return one_per_cell(_clouds(scene), scale_of(scene.robot) * CELL)
+    return _thin(scene, CELL)
+
+
+def _thin(scene, cell):
+    points, scale = _clouds(scene), scale_of(scene.robot)
+    if isinstance(scene, SceneObservation) and scene.noise.changes_images:
+        points = without_outliers(points, scale * CELL, MIN_POINTS)
+    return one_per_cell(points, scale * cell)
 
 
 @functools.lru_cache(1)  # 500 kB; the coarse and the fine points of a scene are needed together
 def _clouds(scene):
-    world = SensorWorld()
-    world.show(scene, scene.robot.observed_pose)
-    return obstacle_points(world, cardinal(PointCloud, scene.robot).values())
+    sensors = cardinal(PointCloud, scene.robot).values()
+    return obstacle_points(world_of(scene, len(sensors)), sensors)
 
 
 def obstacle_points(world, sensors):
@@ -99,6 +112,15 @@ def one_per_cell(points, cell=CELL):
     kind = points.dtype if points.dtype in (np.float32, np.float64) else np.float64
     numbers = np.require(points, kind, _AS_COMPILED)
     return points[first_in_cells(numbers, numbers.dtype.type(cell))[0]]
+
+
+def without_outliers(points, cell, min_points):
+    """Those of float32 points (n, 3), m, that have enough points around them, themselves included.
+
+    Their cube with edges of `cell` (m) and the 26 around it have at least `min_points`.
+    """
+    _, cubes, around = first_in_cells(points, np.float32(cell))
+    return points[(around >= min_points)[cubes]]
 
 
 class PreparedCloud(NamedTuple):
@@ -181,8 +203,7 @@ def prepare_cloud(
     removed = dict(zip(STEPS, counts, strict=False))
     points = points[labels == OF_OBSTACLE]
     # Not the cubes of `cell`: of a fine one, most points of a surface would be alone.
-    _, cubes, around = first_in_cells(points, np.float32(scale_of(robot) * CELL))
-    dense = points[(around >= min_points)[cubes]]
+    dense = without_outliers(points, scale_of(robot) * CELL, min_points)
     thin = one_per_cell(dense, cell)
     removed["outliers"] = len(points) - len(dense)
     removed["thinned out"] = len(dense) - len(thin)

@@ -11,13 +11,13 @@ from PyBullet. Noise: `envs.perception.noise`.
 import functools
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 import gymnasium as gym
 import numpy as np
 
 from roboarm_nmp.envs.collision.kernels import AXES, EYE, VIEW, points_of_pixels
-from roboarm_nmp.envs.perception.noise import NO_NOISE, NoiseOfEpisode
+from roboarm_nmp.envs.perception.noise import NO_NOISE, NoiseOfEpisode, SensorNoise
 from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes of pixels)
     NOTHING,
     OBSTACLE,
@@ -26,7 +26,7 @@ from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes
     RayCaster,
 )
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
-from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
+from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, is_number
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
 
@@ -276,7 +276,7 @@ class SensorWorld:
     polyhedra, up to a tenth of their radius off the true surface.
 
     Args:
-        noise: an `envs.perception.noise.SensorNoise`; begin each episode by `begin_episode`.
+        noise: an `envs.perception.noise.SensorNoise`, from the first `begin_episode` on.
 
     Attributes:
         scene: the `Scene`; None before `show`.
@@ -286,8 +286,7 @@ class SensorWorld:
     def __init__(self, noise=NO_NOISE):
         self.noise, self.scene, self.configuration = noise, None, None
         self._caster = self._drawn = self._of_episode = None
-        if noise != NO_NOISE:
-            self.begin_episode()
+        self._number = 0
 
     @property
     def robot(self):
@@ -299,18 +298,23 @@ class SensorWorld:
         """PyBullet's number of a physics engine with the scene and the arm."""
         return self._draw().client
 
-    def begin_episode(self, key=(), number=0):
+    def begin_episode(self, key, number):
         """Draw the noise that stays the same for an episode.
 
         Args:
-            key: int or sequence of ints from 0 on: equal keys give equal noise.
+            key: int from 0 on: equal keys give equal noise.
             number: of cameras, of which `SensorNoise.missing_cameras` are missing.
         """
-        self._of_episode = NoiseOfEpisode(self.noise, key, number)
+        if self.noise.changes_images:
+            self._of_episode = NoiseOfEpisode(self.noise, key, number)
 
-    def show(self, scene, configuration):
-        """Change to a `Scene` with the arm at joint angles (n, rad)."""
-        self.scene, self.configuration, self._caster = scene, configuration, None
+    def show(self, scene, configuration, number=0):
+        """Change to a `Scene` with the arm at joint angles (n, rad).
+
+        `number`: of the observation in its episode, for noise.
+        """
+        self.scene, self.configuration, self._number = scene, configuration, number
+        self._caster = None
 
     def cast(self, sensor, size):
         """What rays from a sensor's place hit, with `size` (width, height) in pixels.
@@ -324,7 +328,8 @@ class SensorWorld:
         if self._of_episode is None:
             return self._caster.image(view, size)
         of_sensor = self._of_episode.of_sensor(view)
-        return of_sensor.apply(*self._caster.image(of_sensor.true_view(view), size), sensor.far)
+        image = self._caster.image(of_sensor.true_view(view), size)
+        return of_sensor.apply(*image, sensor.far, self._number)
 
     def render(self, sensor, size):
         """The colour image from a sensor's place, with `size` (width, height) in pixels.
@@ -374,23 +379,66 @@ class _DrawnWorld(World):
         return self.robot.load_coarse(self.client, ROBOT_COLOUR)
 
 
-@functools.cache
-def _shared_world():
-    return SensorWorld()
+@dataclass(frozen=True)
+class SceneObservation(Scene):
+    """A `Scene` as sensors observe it at one time, with the arm where it is, and noise.
+
+    In a plain `Scene`, they observe the arm in its `observed_pose`, without noise. Whatever takes a
+    `Scene` also takes this: encoders, geometry sources, `observed_points`.
+
+    Attributes:
+        configuration: the arm's joint angles, n floats, rad.
+        noise: an `envs.perception.noise.SensorNoise`.
+        key: int from 0 on, of the episode: equal keys give equal noise.
+        number: of the observation in its episode, from 0 on.
+    """
+
+    configuration: tuple[float, ...] = ()
+    noise: SensorNoise = NO_NOISE
+    key: int = 0
+    number: int = 0
+
+    @classmethod
+    def of(cls, scene, configuration, noise=NO_NOISE, key=0, number=0):
+        """The observation of a static `Scene` with the arm at joint angles (n, rad)."""
+        given = {field.name: getattr(scene, field.name) for field in fields(Scene)}
+        return cls(
+            **given,
+            configuration=tuple(map(float, configuration)),
+            noise=noise,
+            key=key,
+            number=number,
+        )
+
+
+@functools.lru_cache(maxsize=8)
+def _shared_world(noise):
+    return SensorWorld(noise)
+
+
+def world_of(scene, number):
+    """A `SensorWorld` that shows a `Scene`, or a `SceneObservation`, for so many sensors."""
+    if not isinstance(scene, SceneObservation):
+        world = _shared_world(NO_NOISE)
+        world.show(scene, scene.robot.observed_pose)
+        return world
+    world = _shared_world(scene.noise)
+    world.begin_episode(scene.key, number)
+    world.show(scene, scene.configuration, scene.number)
+    return world
 
 
 def observe_scene(scene, sensors):
     """Observations of a `Scene` with the arm in its robot's `observed_pose`.
 
     Args:
-        scene: a `Scene`.
+        scene: a `Scene`, or a `SceneObservation`, which has a configuration and noise.
         sensors: dict of name -> sensor.
 
     Returns:
         Dict of name -> the sensor's observation, a dict.
     """
-    world = _shared_world()
-    world.show(scene, scene.robot.observed_pose)
+    world = world_of(scene, len(sensors))
     return {name: sensor.observe(world) for name, sensor in sensors.items()}
 
 

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs.policies.pose_goals import goal_configuration
+from roboarm_nmp.envs.policies.pose_goals import goal_configuration, observed_at_start
 from roboarm_nmp.envs.subgoals import subgoals
 
 SPACE_TIME = "space-time"
@@ -139,7 +139,7 @@ def _via_points(env, seed, tries, geometry_source):
     # Without a margin, which would reject more than it saves: with 3 mm, collision-free success was
     # 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
     def begin(number, query):
-        checker = geometry_source(query.scene.at(0.0))
+        checker = geometry_source(observed_at_start(env, query))
         configuration = _goal(env, query, checker)
         if configuration is None:
             return EpisodePolicy(None, plan_found=False)
@@ -184,9 +184,15 @@ def _replanning(env, seed, geometry_source):
 
 def _planner(env, seed, time_limit, geometry_source):
     planning = import_planning()
+    scene = None  # that of the query, as it is observed
     planner = planning.Planner(env, geometry_source=geometry_source)
 
     def begin(number, query):
+        nonlocal planner, scene
+        if (observed := observed_at_start(env, query)) is not query.scene:
+            # A planner has one checker per scene, but this one is of a single episode.
+            scene = observed
+            planner = planning.Planner(env, geometry_source=lambda _: geometry_source(scene))
         options, given = {"seed": [seed, number], "time_limit": time_limit}, query
         if env.goal_type == "pose":
             options["goal_pose"] = env.robot.end_effector_pose(query.goal)

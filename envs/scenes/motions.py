@@ -209,6 +209,56 @@ Motion = Oscillation | Waypoints | Presence
 _NO_MOTION = (0.0, 0.0, 0.0), IDENTITY
 
 
+# --- Motions as lists of numbers, for files
+
+
+def motion_to_numbers(motion):
+    """A motion as a list of floats; empty for None.
+
+    The first number is the kind. 0, an oscillation: amplitude 3, period, phase, axis 3, angle. 1,
+    waypoints: how they repeat (0 once, 1 back and forth, 2 cyclic), whether they turn, their
+    number, all times, all displacements, all rotations. 2, presence: the number of intervals, their
+    times, and the numbers of another motion, if any.
+    """
+    if motion is None:
+        return []
+    if isinstance(motion, Oscillation):
+        return [0.0, *motion.amplitude, motion.period, motion.phase, *motion.axis, motion.angle]
+    if isinstance(motion, Waypoints):
+        begin = 1.0, float(REPEATS.index(motion.repeat)), float(bool(motion.rotations))
+        rows = *motion.displacements, *motion.rotations
+        return [*begin, float(len(motion.times)), *motion.times, *itertools.chain(*rows)]
+    times = itertools.chain(*motion.intervals)
+    return [2.0, float(len(motion.intervals)), *times, *motion_to_numbers(motion.motion)]
+
+
+def motion_from_numbers(numbers):
+    """The inverse of `motion_to_numbers`. Raises ValueError: there is no such motion."""
+    numbers = [float(number) for number in numbers]
+    if not numbers:
+        return None
+    kind = numbers[0]
+    if kind == 0 and len(numbers) == 10:
+        _, a, b, c, period, phase, *axis, angle = numbers
+        return Oscillation((a, b, c), period, phase, tuple(axis), angle)
+    if kind == 1 and len(numbers) > 4:
+        _, repeat, turns, count, *rest = numbers
+        width = 8 if turns else 4
+        if repeat in (0, 1, 2) and turns in (0, 1) and len(rest) == width * count:
+            n = int(count)
+            triples, quadruples = rest[n : 4 * n], rest[4 * n :]
+            displacements = tuple(zip(*[iter(triples)] * 3, strict=True))
+            rotations = tuple(zip(*[iter(quadruples)] * 4, strict=True))
+            return Waypoints(tuple(rest[:n]), displacements, rotations, REPEATS[int(repeat)])
+    if kind == 2 and len(numbers) > 3 and numbers[1] in range(1, (len(numbers) - 2) // 2 + 1):
+        end = 2 + 2 * int(numbers[1])
+        intervals = tuple(zip(*[iter(numbers[2:end])] * 2, strict=True))
+        inner = numbers[end:]
+        if not inner or inner[0] != 2:
+            return Presence(intervals, motion_from_numbers(inner))
+    raise ValueError("numbers of a motion that make no sense")
+
+
 def _set(motion, name, value):
     object.__setattr__(motion, name, value)
 

@@ -14,7 +14,12 @@ import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
-from roboarm_nmp.envs.scenes.motions import Motion, moved
+from roboarm_nmp.envs.scenes.motions import (
+    Motion,
+    motion_from_numbers,
+    motion_to_numbers,
+    moved,
+)
 from roboarm_nmp.envs.scenes.numbers import (
     IDENTITY,
     MAX_LENGTH,
@@ -178,7 +183,9 @@ class Scene:
             return self
         if not is_number(t):
             raise ValueError(f"a time is a finite number of seconds, got {t!r}")
-        return replace(self, obstacles=[o for o in map(_at, self.obstacles, repeat(t)) if o])
+        return replace(
+            self, obstacles=[o for o in map(obstacle_at, self.obstacles, repeat(t)) if o]
+        )
 
 
 def pose_at(obstacle, t):
@@ -191,7 +198,7 @@ def pose_at(obstacle, t):
     return moved(obstacle.position, orientation, *obstacle.motion.pose(t))
 
 
-def _at(obstacle, t):
+def obstacle_at(obstacle, t):
     """An obstacle as it is at a time (s), without its motion; None: it is absent."""
     if obstacle.motion is None:
         return obstacle
@@ -347,7 +354,7 @@ def to_array(obstacles):
 
     Kinds: 0 box, 1 cylinder, 2 sphere, 3 convex hull. Sizes: a box's three edges; (radius, radius,
     length) of a cylinder; three times the radius of a sphere; three times the number of a hull's
-    vertices, which are in `hull_vertices`.
+    vertices, which are in `hull_vertices`. A motion has no place in a row (`motion_numbers`).
     """
     rows = np.zeros((len(obstacles), ROW))
     for row, obstacle in zip(rows, obstacles, strict=True):
@@ -371,6 +378,22 @@ def hull_vertices(obstacles):
     return np.array([vertex for vertices in hulls for vertex in vertices]).reshape(-1, 3)
 
 
+def motion_numbers(obstacles):
+    """The motions of obstacles as numbers, one after another, and how many numbers each has.
+
+    Returns: float64 (m,) and uint32 (n,); see `envs.scenes.motions.motion_to_numbers`.
+    """
+    numbers = [motion_to_numbers(obstacle.motion) for obstacle in obstacles]
+    flat = [number for of_one in numbers for number in of_one]
+    return np.array(flat, np.float64), np.array([len(of_one) for of_one in numbers], np.uint32)
+
+
+def with_motion(obstacle, numbers):
+    """An obstacle with the motion that numbers describe. Raises ValueError: there is none."""
+    motion = motion_from_numbers(numbers)
+    return obstacle if motion is None else replace(obstacle, motion=motion)
+
+
 def vertex_counts(rows):
     """How many of `hull_vertices` each row of `to_array` has: int64 (n,). Raises ValueError."""
     counts = np.where(rows[:, 0] == HULL, rows[:, 8], 0)
@@ -382,8 +405,10 @@ def vertex_counts(rows):
 def padded_rows(obstacles, number):
     """Obstacles -> float32 array (number, 12): 1 and a row of `to_array`, then rows of zeros.
 
-    Raises ValueError: a `ConvexHull`, whose vertices a row cannot have.
+    Raises ValueError: a `ConvexHull`, whose vertices a row cannot have, or a motion.
     """
+    if any(obstacle.motion is not None for obstacle in obstacles):
+        raise ValueError("obstacles of this scene move: describe scene.at(t), at a time t")
     if any(isinstance(obstacle, ConvexHull) for obstacle in obstacles):
         raise ValueError("convex hulls cannot be described by rows of 12 numbers: use a sensor")
     rows = np.zeros((number, 1 + ROW), np.float32)
@@ -427,18 +452,26 @@ def from_array(rows, vertices=()):
 
 
 def to_lists(obstacles):
-    """Obstacles as JSON's lists: rows of `to_array`, a hull's followed by its vertices' numbers."""
+    """Obstacles as JSON's lists: rows of `to_array`, a hull's followed by its vertices' numbers.
+
+    The last entry of one that moves is a list, the numbers of its motion.
+    """
     rows = to_array(obstacles).tolist()
     for row, obstacle in zip(rows, obstacles, strict=True):
         if isinstance(obstacle, ConvexHull):
             row += [float(number) for vertex in obstacle.vertices for number in vertex]
+        if obstacle.motion is not None:
+            row.append(motion_to_numbers(obstacle.motion))
     return rows
 
 
 def from_lists(rows):
     """The inverse of `to_lists`. Raises ValueError, TypeError: as `from_array`."""
+    motions = [row[-1] if row and isinstance(row[-1], list) else [] for row in rows]
+    rows = [row[:-1] if motion else row for row, motion in zip(rows, motions, strict=True)]
     vertices = np.array([number for row in rows for number in row[ROW:]]).reshape(-1, 3)
-    return from_array(np.array([row[:ROW] for row in rows]).reshape(-1, ROW), vertices)
+    obstacles = from_array(np.array([row[:ROW] for row in rows]).reshape(-1, ROW), vertices)
+    return tuple(map(with_motion, obstacles, motions))
 
 
 def scene_to_json(scene):

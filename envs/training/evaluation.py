@@ -29,6 +29,7 @@ from roboarm_nmp.envs.datasets.queries import Query, load_queries, validate
 from roboarm_nmp.envs.metrics import motion_metrics, path_length, smoothness
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
+from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
 from roboarm_nmp.envs.policies.baselines import (
     CHECKING,
@@ -45,8 +46,9 @@ from roboarm_nmp.envs.policies.registry import (
     own_safety_filter,
     own_task,
 )
-from roboarm_nmp.envs.policies.rollout import render_strip, rollout
+from roboarm_nmp.envs.policies.rollout import REAL_TIME, render_strip, rollout
 from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.envs.utils import workers
@@ -85,6 +87,13 @@ class EvaluationOptions:
             policy's own, otherwise `ground_truth`.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
             one that the policy includes, if any; False for none.
+        observe_every: steps from one observation of the scene to the next; None: static scenes are
+            observed once (`envs.wrappers.ObservedSceneWrapper`).
+        sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
+        action_delay: steps after which an action takes effect; 0: the simulation waits for the
+            policy (`envs.policies.rollout.rollout`).
+        real_time: instead of `action_delay`, as many steps as an action, or a plan, takes to
+            compute, at least 1. Results then depend on the machine and its load.
         clearance: also measure each episode's smallest distance from the ground-truth obstacles.
         workers: processes, >= 1. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
@@ -106,6 +115,10 @@ class EvaluationOptions:
     time_limit: float = TIME_LIMIT
     geometry_source: str | None = None
     safety_filter: SafetyFilter | bool | None = None
+    observe_every: int | None = None
+    sensor_noise: SensorNoise | None = None
+    action_delay: int = 0
+    real_time: bool = False
     clearance: bool = False
     workers: int = 1
     env: dict | None = None
@@ -114,6 +127,10 @@ class EvaluationOptions:
         for name in ("workers", "tries"):
             if getattr(self, name) < 1:
                 raise EvaluationError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.action_delay < 0:
+            raise EvaluationError(f"action_delay must not be negative, got {self.action_delay}")
+        if self.action_delay and self.real_time:
+            raise EvaluationError("action_delay and real_time: give one of them")
         if not 0 < self.time_limit < math.inf:
             raise EvaluationError(
                 f"time_limit must be a positive number of seconds, got {self.time_limit}"
@@ -149,9 +166,10 @@ def evaluate(policy, task=None, *, progress=False, **options):
         - `policy`, `task`, `robot` (its name), `goal_type`, `split`, `queries` (the file, if it is
           not the task's own), `problems` (their file and its SHA-256), `num_queries`, `env`,
           `deviations` (from the standard rules), `safety_filter`, `seed`, `tries`, `time_limit`,
-          `versions`;
+          `action_delay` (steps, or `real_time`), `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
-          whether policy, filter or observations received the ground-truth obstacles.
+          whether policy, filter or observations received the ground-truth obstacles;
+        - `observe_every`, `sensor_noise` (a dict), where they were given.
 
     Raises:
         EvaluationError: the policy, the task or the queries cannot be used.
@@ -168,7 +186,7 @@ def first_episode_image(policy, task=None, frames=8, **options):
     job = _prepare(policy, task, EvaluationOptions(**options))
     env, begin = job.make(render_mode="rgb_array")
     query = job.query(0)
-    actions = rollout(env, query, begin(0, query).act).actions
+    actions = rollout(env, query, begin(0, query).act, job.delay).actions
     steps = np.linspace(0, len(actions), frames).round().astype(int)
     image = render_strip(env, query, actions, sorted(set(steps.tolist())))
     env.close()
@@ -220,10 +238,17 @@ class _Job:
 
     def make(self, **kwargs):
         """The environment, and the policy in it as `make_policy` returns it."""
-        env, o = envs.make(self.task, **self.options.env, **kwargs), self.options
+        o = self.options
+        kwargs |= {"observe_every": o.observe_every, "sensor_noise": o.sensor_noise}
+        env = envs.make(self.task, **o.env, **kwargs)
         source, safety_filter = o.geometry_source or GROUND_TRUTH, o.safety_filter or False
         options = o.seed, o.tries, o.time_limit, source, safety_filter
         return env, make_policy(self.policy, env, *options)
+
+    @property
+    def delay(self):
+        """As of `rollout`."""
+        return REAL_TIME if self.options.real_time else self.options.action_delay
 
     def query(self, index):
         return Query(self.start[index], self.goal[index], self.scenes[index])
@@ -301,6 +326,13 @@ def _in_use(policy, options):
             "geometry_source is for via-points, planner, a safety filter, replanning, and policies "
             "that observe points or link distances"
         )
+    noise = options.sensor_noise
+    unseen = (None, GROUND_TRUTH), (None, ORACLE)
+    if noise and noise.changes_images and source in unseen[0] and env.get("encoder") in unseen[1]:
+        raise EvaluationError(
+            "sensor_noise: nothing is observed by sensors; choose the geometry source point_cloud, "
+            "or a policy that receives an encoded scene"
+        )
     return replace(options, env=env, geometry_source=source, safety_filter=safety_filter)
 
 
@@ -375,11 +407,11 @@ class _Worker:
         began = time.perf_counter()
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
-        trajectory = rollout(self.env, query, act)
+        trajectory = rollout(self.env, query, act, self.job.delay, planning_seconds)
         lengths = [np.nan, np.nan, (np.nan,) * len(MOTION_METRICS)]
         if trajectory.success:
             configurations = trajectory.configurations
-            motion = motion_metrics(trajectory, self._checker(query.scene))
+            motion = motion_metrics(trajectory, self._checker(query.scene, len(trajectory)))
             lengths = [path_length(configurations), smoothness(configurations)]
             lengths.append(tuple(motion[name] for name in MOTION_METRICS))
         return _Outcome(
@@ -392,14 +424,16 @@ class _Worker:
             plan_found,
         )
 
-    def _checker(self, scene):
-        """For the clearance in a scene; None where it is not measured."""
+    def _checker(self, scene, steps):
+        """For the clearance in an episode; None where it is not measured."""
         if not self.job.options.clearance:
             return None
         # Here, because Numba takes a while to import.
         from roboarm_nmp.envs.collision.checker import CollisionChecker
 
-        return CollisionChecker(scene)
+        if scene.is_static:
+            return CollisionChecker(scene)
+        return [CollisionChecker(scene.at(step * STEP_SECONDS)) for step in range(steps + 1)]
 
 
 def _run(job, progress):
@@ -482,6 +516,8 @@ def _summary(job, outcomes):
         "env": options.env,
         "deviations": deviations(options.env),
         "geometry_source": options.geometry_source,
+        **({"observe_every": options.observe_every} if options.observe_every else {}),
+        **({"sensor_noise": options.sensor_noise.to_metadata()} if options.sensor_noise else {}),
         "privileged": is_privileged(options.env)
         or (job.policy in CHECKING and options.geometry_source == GROUND_TRUTH),
         "safety_filter": safety_filter.to_metadata() | {"version": VERSION}
@@ -490,6 +526,7 @@ def _summary(job, outcomes):
         "seed": options.seed if random else None,
         "tries": options.tries if job.policy == "via-points" else None,
         "time_limit": options.time_limit if job.policy in OMPL_PLANNERS else None,
+        "action_delay": job.delay,
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in packages},

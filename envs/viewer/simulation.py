@@ -226,6 +226,11 @@ class _Arm:
         self.wanted, self.action, self.correction, self.escaping = None, None, None, False
 
     @property
+    def time(self):
+        """Seconds of simulated time since the start, or the last edit."""
+        return self.steps * STEP_SECONDS
+
+    @property
     def in_contact(self):
         """Whether the last step had a contact."""
         return bool(self.contacts.links)
@@ -289,7 +294,7 @@ class RecordedArm(_Arm):
         self.steps += 1
         self.state = self._states[self.steps]
         self.trace.append(self.state)
-        self._world.in_collision(self._world.robot.denormalise(self.state))
+        self._world.in_collision(self._world.robot.denormalise(self.state), self.time)
         self.contacts = contacts_in(self._world)
         self.contact_steps += self.in_contact
         self.ended = self.success = self.steps == len(self._states) - 1
@@ -381,7 +386,7 @@ class PolicyArm(_Arm):
             self._kinematics = KinematicWorld(query.scene, drawn=False)
         self.env.unwrapped.world = self._kinematics
         self._kinematics.set_scene(query.scene)
-        collides = self._kinematics.in_collision(query.goal)
+        collides = self._kinematics.in_collision(query.goal, moving=False)
         self._start(query._replace(start=self.env.unwrapped.robot.denormalise(self.state)))
         self.kinematic = True
         if collides:

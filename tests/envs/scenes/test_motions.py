@@ -1,6 +1,8 @@
 """Motions of obstacles as values: where an obstacle is at each time, and what is rejected."""
 
 import copy
+import dataclasses
+import json
 import math
 import pickle
 
@@ -8,14 +10,29 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from roboarm_nmp.envs.datasets.format import DatasetError, read_scenes, scene_arrays
+from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
 from roboarm_nmp.envs.scenes.motions import (
     MAX_SPEED,
     MAX_WAYPOINTS,
     Oscillation,
     Presence,
     Waypoints,
+    motion_from_numbers,
+    motion_to_numbers,
 )
-from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere, convex_hull
+from roboarm_nmp.envs.scenes.primitives import (
+    Box,
+    Cylinder,
+    Scene,
+    Sphere,
+    convex_hull,
+    from_lists,
+    padded_rows,
+    scene_from_json,
+    scene_to_json,
+    to_lists,
+)
 
 pytestmark = pytest.mark.fast
 
@@ -183,3 +200,137 @@ def test_motion_of_another_type_is_rejected():
         Scene(table=Box(PLACE, SIZE, motion=VISIT))
     with pytest.raises(ValueError, match="finite number of seconds"):
         Scene((Box(PLACE, SIZE, motion=VISIT),)).at(math.nan)
+
+
+# --- Files
+
+TURNING = Oscillation((0.1, 0.0, 1 / 3), 1.7, 0.3, (0.1, 0.2, 0.3), 0.7)
+CYCLE = Waypoints(
+    (0.1, 1.0, 2.0),
+    ((0, 0, 0), (0, 0.4, 0), (0, 0, 0)),
+    ((0, 0, 0, 1), QUARTER, (0, 0, 0, 1)),
+    "cyclic",
+)
+MOTIONS = [
+    TURNING,
+    CYCLE,
+    VISIT,
+    Waypoints((1.0,), ((0.1, 0.2, 1 / 3),)),
+    Waypoints(VISIT.times, VISIT.displacements, repeat="back_and_forth"),
+    Presence(((0.1, 1 / 3), (2, 4)), TURNING),
+    Presence(((0.1, math.inf),), VISIT),
+    Presence(((0, 1), (2, math.inf))),
+]
+HULL = dataclasses.replace(convex_hull(CORNERS, PLACE), motion=TURNING)
+MOVING = Scene(
+    (
+        *(Box(PLACE, SIZE, TURN, motion) for motion in MOTIONS),
+        Cylinder(PLACE, 0.1, 0.2, motion=CYCLE),
+        Box(PLACE, SIZE),
+        HULL,
+        Sphere(PLACE, 0.1, VISIT),
+    )
+)
+
+
+@pytest.mark.parametrize("motion", [None, *MOTIONS])
+def test_motion_of_numbers_is_exact(motion):
+    assert motion_from_numbers(motion_to_numbers(motion)) == motion
+
+
+def test_scene_file_of_moving_obstacles_is_exact(tmp_path):
+    save_scene(MOVING, tmp_path / "scene.yaml")
+    assert load_scene(tmp_path / "scene.yaml") == MOVING
+
+
+def test_json_of_moving_obstacles_is_exact():
+    assert scene_from_json(scene_to_json(MOVING)) == MOVING
+    assert from_lists(json.loads(json.dumps(to_lists(MOVING.obstacles)))) == MOVING.obstacles
+
+
+def test_query_file_of_moving_scenes_is_exact(tmp_path):
+    path = tmp_path / "queries.h5"
+    scenes = [MOVING, Scene(MOVING.obstacles[:2]), MOVING]
+    still = [Scene((Box(PLACE, SIZE),))] * 3
+    arrays = scene_arrays(path, scenes, Scene())
+    found = read_scenes(path, Scene(), arrays)
+    assert [found[i] for i in range(3)] == scenes
+    assert [found.take(np.array([1, 0]))[i] for i in range(2)] == [scenes[1], MOVING]
+    assert not {"motions", "motion_count"} & scene_arrays(path, still, Scene()).keys()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda arrays: arrays["motions"].__setitem__(0, 7.0),
+        lambda arrays: arrays["motions"].__setitem__(1, np.nan),
+        lambda arrays: arrays["motion_count"].__setitem__(0, 9),
+    ],
+)
+def test_damaged_motions_are_rejected(tmp_path, change):
+    arrays = scene_arrays(tmp_path / "q.h5", [MOVING], Scene())
+    change(arrays)
+    with pytest.raises(DatasetError, match="q.h5: motion"):
+        read_scenes(tmp_path / "q.h5", Scene(), arrays)
+
+
+def test_rows_for_encoders_have_no_place_for_motions():
+    with pytest.raises(ValueError, match=r"scene\.at\(t\)"):
+        padded_rows(MOVING.obstacles[:1], 4)
+
+
+BOX = "obstacles:\n- box: {position: [0.5, 0, 0.3], size: [0.1, 0.1, 0.1],\n    motion: "
+
+
+@pytest.mark.parametrize(
+    ("text", "motion"),
+    [
+        ("{oscillation: {period: 2}}", Oscillation(period=2)),
+        (
+            "{oscillation: {amplitude: [0, 0.2, 0], period: 2, phase: 1}, present: [[0, 1], [2]]}",
+            Presence(((0, 1), (2, math.inf)), Oscillation((0, 0.2, 0), 2, 1)),
+        ),
+        (
+            "{waypoints: {times: [1, 2], displacements: [[0, 0, 0], [0, 0.3, 0]]}}",
+            Waypoints((1, 2), ((0, 0, 0), (0, 0.3, 0))),
+        ),
+        ("{present: [[2]]}", Presence(((2, math.inf),))),
+    ],
+)
+def test_motion_in_a_scene_file(tmp_path, text, motion):
+    path = tmp_path / "scene.yaml"
+    path.write_text(BOX + text + "}\n")
+    assert load_scene(path).obstacles[0].motion == motion
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("2", "motion of box must be a mapping with keys oscillation, waypoints, present"),
+        ("{}", "motion of box must be one of oscillation, waypoints, or present"),
+        ("{spin: {period: 2}}", "unknown key spin"),
+        ("{oscillation: {amplitude: [0, 1, 0]}}", "oscillation lacks period"),
+        ("{oscillation: {period: 0}}", "motion of box: the period .* must be positive"),
+        ("{oscillation: {period: .nan}}", "period of oscillation must be a finite number"),
+        ("{oscillation: {amplitude: [0, 9, 0], period: 1}}", "motion of box: .* too fast"),
+        ("{waypoints: {times: [1, 1], displacements: [[0, 0, 0], [0, 0, 0]]}}", "ascend"),
+        ("{waypoints: {times: [1], displacements: [[0, 0]]}}", "must be a list of 3 numbers"),
+        ("{waypoints: {times: [1], displacements: [[0, 0, 0]], repeat: [1]}}", "got a list"),
+        ("{waypoints: {times: 1, displacements: []}}", "times of waypoints must be a list"),
+        ("{present: [[]]}", "an interval of presence is two times"),
+        ("{present: [[1], [2, 3]]}", "ascend"),
+        ("{present: [[0, .inf]]}", "must be a finite number"),
+    ],
+)
+def test_mistake_in_a_motion_is_reported_with_its_line(tmp_path, text, reason):
+    path = tmp_path / "scene.yaml"
+    path.write_text(BOX + text + "}\n")
+    with pytest.raises(SceneFileError, match=f"scene.yaml:3: .*{reason}"):
+        load_scene(path)
+
+
+def test_table_of_a_scene_file_cannot_move(tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_text("table: {position: [0, 0, 0], size: [1, 1, 1], motion: {present: [[0]]}}\n")
+    with pytest.raises(SceneFileError, match="scene.yaml:1: the table cannot move"):
+        load_scene(path)
