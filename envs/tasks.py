@@ -283,6 +283,8 @@ TASKS = {
         trainable=False,
     ),
 }
+STATIC_TASKS = {name: task for name, task in TASKS.items() if not hasattr(task.scene, "animate")}
+"""The tasks whose obstacles do not move."""
 # Not a task of the benchmark: it has no queries. Paths in these scenes are training data.
 TRAINING_SCENES = {
     "mixed_scenes": Task(MixedScenes(), "random boxes, walls with gaps, or racks of shelves")
