@@ -287,7 +287,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
 
     def current_checker(self):
         """The `CollisionChecker` of what is observed now; the same as long as nothing changes."""
-        return self.geometry_source(self.unwrapped.current_scene)
+        return self.geometry_source(observed_scene(self.env))
 
     def link_distances_at(self, states, scene=None):
         """`link_distances` at normalised configurations (..., n): float32 (..., l, 1 + n).

@@ -160,6 +160,7 @@ def _via_points(env, seed, tries, geometry_source):
 
 def _replanning(env, seed, geometry_source):
     from roboarm_nmp.envs.policies.replanning import Replanning
+    from roboarm_nmp.envs.wrappers import observed_scene
 
     # Compile here what is compiled at its first call: an action's time is for planning.
     state = np.zeros(env.robot.num_joints)
@@ -167,13 +168,10 @@ def _replanning(env, seed, geometry_source):
     checker.find_path(state, state, np.random.default_rng(0), max_checks=1)
 
     def current_checker():
-        return geometry_source(env.unwrapped.current_scene)
-
-    if "link_distances" in env.observation_space.spaces:
-        current_checker = env.get_wrapper_attr("current_checker")
+        return geometry_source(observed_scene(env))
 
     def begin(number, query):
-        goal = _goal(env, query, geometry_source(query.scene.at(0.0)))
+        goal = _goal(env, query, geometry_source(observed_at_start(env, query)))
         if goal is None:
             return EpisodePolicy(None)
         rng = np.random.default_rng([seed, number])
@@ -208,7 +206,7 @@ def _planner(env, seed, time_limit, geometry_source):
 
 def _space_time(env, seed, time_limit):
     module = import_planning(SPACE_TIME_MODULE)
-    planner = module.SpaceTimePlanner(env)
+    planner = module.SpaceTimePlanner(env.unwrapped)
 
     def begin(number, query):
         try:

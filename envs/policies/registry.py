@@ -163,7 +163,6 @@ def make_policy(
         time_limit: seconds that `planner` may search per query.
         geometry_source: where `via-points`, `planner` and `replanning` take the obstacles from:
             `ground_truth`, `point_cloud` or an encoder's name (`envs.perception.geometry_source`).
-            `replanning` with a safety filter takes those of the environment's link distances.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
             one that a trained policy includes, if any; False for none. The environment must have
             `link_distances`, whose geometry source is the filter's.

@@ -1,6 +1,6 @@
 """Replanning: a policy that follows a plan, watches it, and plans again when it is blocked.
 
-    current_checker = lambda: find_geometry_source("point_cloud")(env.unwrapped.current_scene)
+    current_checker = lambda: find_geometry_source("point_cloud")(observed_scene(env))
     act = Replanning(robot, goal, current_checker, rng)          # at the start of an episode
     action = act(observation)
 
