@@ -91,13 +91,14 @@ def test_approach_rates_are_those_of_the_motion():
     env = make_env(pushing_box())
     env.reset_specific(MIDDLE, SIDE)
     rates, state = ApproachRates(env.get_wrapper_attr("current_checker")), np.zeros(7)
+    for _ in range(20):  # until the box is nearer than the distances' range
+        env.step(np.zeros(7))
     for step in range(RATE_STEPS + 3):
         rates.observe()
         assert rates.any_motion == (step > 0)
         if rates.any_motion:
             distances = env.get_wrapper_attr("link_distances_at")(state)[:, 0]
-            hand = rates(state, distances)[-1]
-            assert hand == pytest.approx(-0.25 * STEP_SECONDS, rel=0.02)
+            assert rates(state, distances).min() == pytest.approx(-0.25 * STEP_SECONDS, rel=0.03)
             assert (rates(state, distances - 1.0) == -MAX_APPROACH).all()
             assert (rates(state, distances + 1.0) == 0.0).all()  # it goes away
         env.step(np.zeros(7))
@@ -210,22 +211,19 @@ def test_replanning_waits_near_an_occupied_goal_and_goes_there_when_it_is_free()
 # --- Space and time
 
 
-def test_space_time_plan_waits_for_a_passing_obstacle():
-    """A wall moves up and down through the only plane that the arm crosses."""
-    x, _, z = hand_at(MIDDLE)
-    motion = Oscillation((0.0, 0.0, 1.5), period=6.0, phase=0.0)
-    scene = Scene((Box((x, 0.0, z), (1.5, 0.05, 1.2), motion=motion),), table=None)
-    env = envs.make(scene, goal_type="combined")
-    planner, query = SpaceTimePlanner(env), Query(OTHER_SIDE, SIDE, scene)
+def test_space_time_plan_is_followed_without_contact_among_moving_boxes():
+    query = load_queries("moving_boxes_medium", "validation")[0]
+    env = envs.make("moving_boxes_medium", goal_type="combined")
+    planner = SpaceTimePlanner(env)
     path = planner.plan(*query, seed=0)
     assert np.array_equal(path, planner.plan(*query, seed=0))
-    execution = follow(env, path, scene)
+    execution = follow(env, path, query.scene)
     env.close()
     assert execution.reached and not execution.collided
     states = PANDA.normalise(path)
     assert np.linalg.norm(np.diff(states, axis=0), axis=1).max() < 0.03
     for step in range(0, len(path), 5):
-        now = CollisionChecker(scene.at(step * STEP_SECONDS))
+        now = CollisionChecker(query.scene.at(step * STEP_SECONDS))
         assert now.is_free(np.clip(states[step], -1.0, 1.0))
 
 
