@@ -285,6 +285,10 @@ class LinkDistancesWrapper(_ObservingWrapper):
         self.observation_space = gym.spaces.Dict(spaces)
         self._goal, self._at_goal = None, None
 
+    def current_checker(self):
+        """The `CollisionChecker` of what is observed now; the same as long as nothing changes."""
+        return self.geometry_source(observed_scene(self.env))
+
     def link_distances_at(self, states, scene=None):
         """`link_distances` at normalised configurations (..., n): float32 (..., l, 1 + n).
 

@@ -1022,6 +1022,7 @@ def project(
     actions,
     link_distances,
     margins,
+    rates,
     max_step,
     cbf_gain,
     activation_distance,
@@ -1031,7 +1032,7 @@ def project(
     """Change actions (m, n) in place: `envs.policies.safety_filter.SafetyFilter.__call__`.
 
     Each sweep projects an action onto one link's half-space after the other.
-    `link_distances`: (m, l, 1 + n); `margins`: m, (m, l).
+    `link_distances`: (m, l, 1 + n); `margins`: m, (m, l); `rates`: m per step, (m, l).
     """
     for i in range(actions.shape[0]):
         action = actions[i]
@@ -1045,7 +1046,8 @@ def project(
                 for j in range(action.shape[0]):
                     squared += row[1 + j] * row[1 + j]
                     along += row[1 + j] * action[j]
-                short = min(cbf_gain * (margins[i, link] - row[0]), max_recovery) - along
+                short = min(cbf_gain * (margins[i, link] - row[0]), max_recovery)
+                short = short - rates[i, link] - along
                 if short > 0.0 and squared > 1e-12:
                     for j in range(action.shape[0]):
                         action[j] += row[1 + j] * short / squared
@@ -1061,6 +1063,361 @@ def _shorten(action, max_step):
     if squared > max_step * max_step:
         for j in range(action.shape[0]):
             action[j] *= max_step / np.sqrt(squared)
+
+
+# --- Moving obstacles
+# `motions` is a tuple of float64 arrays, see `envs.collision.moving.motion_arrays`:
+# - a row of `OWN_COLUMNS` per obstacle: its own pose (position 3, quaternion 4); of an oscillation
+#   amplitude 3, angular frequency (rad/s), phase, axis 3, angle (zeros without one); the first of
+#   its waypoints and the one after the last, and how they repeat; the same of its intervals (none:
+#   it is always there);
+# - waypoints (w, 8): time (s), displacement 3, quaternion 4; intervals (i, 2), s.
+AMPLITUDE, FREQUENCY, PHASE, AXIS, ANGLE, WAYPOINTS, REPEAT, INTERVALS = (
+    7,
+    10,
+    11,
+    12,
+    15,
+    16,
+    18,
+    19,
+)
+OWN_COLUMNS = 21
+# m. An obstacle that is not there is moved by this much along z where rows cannot be left out.
+ABSENT = 1e6
+
+
+@compiled
+def obstacle_states(motions, times, present, poses, velocities):
+    """Write where obstacles are: `envs.collision.moving.MovingObstacles.at`.
+
+    `times`: (t,), s. `present`: bool (t, n). `poses`: (t, n, 7), position and quaternion.
+    `velocities`: (t, n, 6), linear and angular.
+    """
+    for k in range(times.shape[0]):
+        for i in range(motions[0].shape[0]):
+            present[k, i] = _is_present(motions, i, times[k])
+            obstacle_state(motions, i, times[k], poses[k, i], velocities[k, i])
+
+
+@compiled
+def moved_rows(motions, centres, shapes, t, rows):
+    """Write `shape_rows` of n moving obstacles at a time (s) to `rows[:n]`.
+
+    `shapes`: (n, `ROW`), the rows at their own poses. `centres`: m, (n, 3), of the shapes in the
+    obstacles' own frames (zeros but for convex hulls). Absent obstacles are `ABSENT` away.
+    """
+    pose, velocity = np.empty(7), np.empty(6)
+    for i in range(shapes.shape[0]):
+        obstacle_state(motions, i, t, pose, velocity)
+        row = rows[i]
+        row[:] = shapes[i]
+        x, y, z, w = pose[3], pose[4], pose[5], pose[6]
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        x, y, z, w = x / norm, y / norm, z / norm, w / norm
+        row[4], row[5], row[6] = (
+            1.0 - 2.0 * (y * y + z * z),
+            2.0 * (x * y - z * w),
+            2.0 * (x * z + y * w),
+        )
+        row[7], row[8], row[9] = (
+            2.0 * (x * y + z * w),
+            1.0 - 2.0 * (x * x + z * z),
+            2.0 * (y * z - x * w),
+        )
+        row[10], row[11], row[12] = (
+            2.0 * (x * z - y * w),
+            2.0 * (y * z + x * w),
+            1.0 - 2.0 * (x * x + y * y),
+        )
+        a, b, c = centres[i, 0], centres[i, 1], centres[i, 2]
+        for j in range(3):
+            row[1 + j] = pose[j] + row[4 + 3 * j] * a + row[5 + 3 * j] * b + row[6 + 3 * j] * c
+        if not _is_present(motions, i, t):
+            row[3] += ABSENT
+
+
+@compiled
+def _is_present(motions, i, t):
+    """Whether obstacle i is there at a time (s)."""
+    own, intervals = motions[0][i], motions[2]
+    begin, end = int(own[INTERVALS]), int(own[INTERVALS + 1])
+    for k in range(begin, end):
+        if intervals[k, 0] <= t < intervals[k, 1]:
+            return True
+    return begin == end
+
+
+@compiled
+def obstacle_state(motions, i, t, pose, velocity):
+    """Write pose (7,) and velocity (6,), linear and angular, of obstacle i at a time (s)."""
+    own, waypoints = motions[0][i], motions[1]
+    a, b, c, d = 0.0, 0.0, 0.0, 1.0  # the rotation away from its own orientation
+    phase = own[FREQUENCY] * t + own[PHASE]
+    share, rate = math.sin(phase), own[FREQUENCY] * math.cos(phase)
+    for j in range(3):
+        pose[j] = own[j] + own[AMPLITUDE + j] * share
+        velocity[j] = own[AMPLITUDE + j] * rate
+        velocity[3 + j] = own[AXIS + j] * own[ANGLE] * rate
+    if own[ANGLE] != 0.0:
+        half = 0.5 * own[ANGLE] * share
+        sine, d = math.sin(half), math.cos(half)
+        a, b, c = own[AXIS] * sine, own[AXIS + 1] * sine, own[AXIS + 2] * sine
+    first, last = int(own[WAYPOINTS]), int(own[WAYPOINTS + 1]) - 1
+    if last >= first:
+        begin, end, direction = waypoints[first, 0], waypoints[last, 0], 1.0
+        span = end - begin
+        if own[REPEAT] != 0.0 and t > begin:
+            t -= begin
+            if own[REPEAT] == 2.0:
+                t -= span * math.floor(t / span)
+            else:
+                t -= 2.0 * span * math.floor(t / (2.0 * span))
+                if t >= span:
+                    t, direction = 2.0 * span - t, -1.0
+            t += begin
+        low, high = first, last  # the waypoint before this time, and the one after it
+        while high - low > 1:
+            middle = (low + high) // 2
+            later = waypoints[middle, 0] > t or (direction < 0.0 and waypoints[middle, 0] == t)
+            if later:
+                high = middle
+            else:
+                low = middle
+        before, after, share, rate = waypoints[low], waypoints[high], 0.0, 0.0
+        if last > first:
+            seconds = after[0] - before[0]
+            share = min(max((t - before[0]) / seconds, 0.0), 1.0)
+            if own[REPEAT] != 0.0 and t >= begin or begin <= t < end:
+                rate = direction / seconds
+        for j in range(3):
+            pose[j] += before[1 + j] + share * (after[1 + j] - before[1 + j])
+            velocity[j] += (after[1 + j] - before[1 + j]) * rate
+        a, b, c, d = _between(before, after, share, rate, velocity)
+    x, y, z, w = own[3], own[4], own[5], own[6]
+    pose[3] = d * x + a * w + b * z - c * y
+    pose[4] = d * y - a * z + b * w + c * x
+    pose[5] = d * z + a * y - b * x + c * w
+    pose[6] = d * w - a * x - b * y - c * z
+
+
+@compiled
+def _between(before, after, share, rate, velocity):
+    """The rotation between two waypoints; writes the angular velocity of `rate` ways per second."""
+    a, b, c, d = before[4], before[5], before[6], before[7]
+    e, f, g, h = after[4], after[5], after[6], after[7]
+    if a * e + b * f + c * g + d * h < 0.0:
+        e, f, g, h = -e, -f, -g, -h
+    apart = math.sqrt((a - e) ** 2 + (b - f) ** 2 + (c - g) ** 2 + (d - h) ** 2)
+    together = math.sqrt((a + e) ** 2 + (b + f) ** 2 + (c + g) ** 2 + (d + h) ** 2)
+    angle = 2.0 * math.atan2(apart, together)  # half of that between the orientations
+    sine = math.sin(angle)
+    if sine <= 1e-9:
+        return a, b, c, d
+    speed = 2.0 * angle * rate / sine  # about the vector part of after * inverse(before)
+    velocity[3] += speed * (d * e - h * a + b * g - c * f)
+    velocity[4] += speed * (d * f - h * b + c * e - a * g)
+    velocity[5] += speed * (d * g - h * c + a * f - b * e)
+    first, second = math.sin((1.0 - share) * angle) / sine, math.sin(share * angle) / sine
+    return (
+        first * a + second * e,
+        first * b + second * f,
+        first * c + second * g,
+        first * d + second * h,
+    )
+
+
+# --- Replanning: RRT-Connect and shortcuts, within a number of checks
+
+
+@compiled
+def _nearest_node(nodes, count, q):
+    """Index of the nearest of the first `count` nodes (L2), and its distance."""
+    least, found = FAR, 0
+    for i in range(count):
+        squared = 0.0
+        for j in range(q.shape[0]):
+            squared += (nodes[i, j] - q[j]) ** 2
+        if squared < least:
+            least, found = squared, i
+    return found, math.sqrt(least)
+
+
+@compiled
+def _towards(start, end, reach, distance, new):
+    """Write the state at most `reach` from `start` towards `end`. Returns whether it is `end`."""
+    if distance <= reach:
+        new[:] = end
+        return True
+    for j in range(start.shape[0]):
+        new[j] = start[j] + (end[j] - start[j]) * reach / distance
+    return False
+
+
+@compiled
+def rrt_connect(start, goals, samples, reach, max_checks, rule, endpoint_margins, arm, world):
+    """A path from `start` (n,) to one of `goals` (m, n) by RRT-Connect (Kuffner and LaValle, 2000).
+
+    `samples`: (s, n), the random states towards which the trees grow, after the goals themselves.
+    `reach`: L2, the longest edge. `rule`, `endpoint_margins`: as for `motion`.
+
+    Returns the path (k, n), (0, n) if there is none within `samples` and about `max_checks`, and
+    the number of checks.
+    """
+    n, m = start.shape[0], goals.shape[0]
+    capacity = max_checks + m + samples.shape[0] + 2  # an edge takes at least one check
+    nodes, parents = np.empty((2, capacity, n)), np.full((2, capacity), -1)
+    size = np.array([1, m])
+    nodes[0, 0], nodes[1, :m] = start, goals
+    new, checks, tree = np.empty(n), 0, 0
+    for i in range(m + samples.shape[0]):
+        if checks >= max_checks:
+            break
+        if i < m:
+            tree, target = 0, goals[i]
+        else:
+            target = samples[i - m]
+        near, distance = _nearest_node(nodes[tree], size[tree], target)
+        other = 1 - tree
+        _towards(nodes[tree, near], target, reach, distance, new)
+        more = motion(rule, endpoint_margins, arm, world, False, nodes[tree, near], new)
+        checks += abs(more)
+        if more > 0:
+            a = size[tree]
+            nodes[tree, a], parents[tree, a] = new, near
+            size[tree] += 1
+            # The other tree grows to the new node, as far as it can.
+            b, distance = _nearest_node(nodes[other], size[other], nodes[tree, a])
+            arrived = distance < 1e-9
+            while not arrived and checks < max_checks:
+                arrived = _towards(nodes[other, b], nodes[tree, a], reach, distance, new)
+                more = motion(rule, endpoint_margins, arm, world, False, nodes[other, b], new)
+                checks += abs(more)
+                if more <= 0:
+                    arrived = False
+                    break
+                nodes[other, size[other]], parents[other, size[other]] = new, b
+                b = size[other]
+                size[other] += 1
+                distance -= reach
+            if arrived:
+                if tree == 1:
+                    a, b = b, a
+                return _joined_path(nodes, parents, a, b), checks
+        tree = other
+    return np.empty((0, n)), checks
+
+
+@compiled
+def _joined_path(nodes, parents, a, b):
+    """The path from the first tree's root to its node a, then from node b to the other's root.
+
+    Both nodes are the same state.
+    """
+    length, node = 0, parents[0, a]
+    while node >= 0:
+        length, node = length + 1, parents[0, node]
+    before, node = length, b
+    while node >= 0:
+        length, node = length + 1, parents[1, node]
+    path, node = np.empty((length, nodes.shape[2])), parents[0, a]
+    for i in range(before - 1, -1, -1):
+        path[i] = nodes[0, node]
+        node = parents[0, node]
+    node = b
+    for i in range(before, length):
+        path[i] = nodes[1, node]
+        node = parents[1, node]
+    return path
+
+
+@compiled
+def shortcut(path, chords, rule, endpoint_margins, arm, world):
+    """Shorten a path (k, n) by straight motions between two of its points, where they are free.
+
+    `chords`: (c, 2), shares of the path's length at which a shortcut begins and ends, in any order.
+    Returns the path and the number of checks.
+    """
+    checks, n = 0, path.shape[1]
+    for c in range(chords.shape[0]):
+        k = path.shape[0]
+        length = np.zeros(k)
+        for i in range(1, k):
+            length[i] = length[i - 1] + math.sqrt(np.sum((path[i] - path[i - 1]) ** 2))
+        ends, edges = np.empty((2, n)), np.zeros(2, np.int64)
+        for end in range(2):
+            share = min(chords[c]) if end == 0 else max(chords[c])
+            along = share * length[-1]
+            edge = 0
+            while edge < k - 2 and length[edge + 1] <= along:
+                edge += 1
+            part = (along - length[edge]) / max(length[edge + 1] - length[edge], 1e-12)
+            ends[end] = path[edge] + (path[edge + 1] - path[edge]) * part
+            edges[end] = edge
+        if edges[0] == edges[1]:
+            continue
+        more = motion(rule, endpoint_margins, arm, world, False, ends[0], ends[1])
+        checks += abs(more)
+        if more > 0:
+            path = np.concatenate((path[: edges[0] + 1], ends, path[edges[1] + 1 :]))
+    return path, checks
+
+
+# --- Planning in time: obstacles whose motion is known
+
+
+@compiled
+def rows_in_time(motions, centres, shapes, times, rows):
+    """Write the rows of all shapes at times (t,), s, to `rows` (t, r, `ROW`).
+
+    `shapes`: (r, `ROW`), of which the first ones have `motions` and `centres`, as of `moved_rows`.
+    """
+    moving = centres.shape[0]
+    for k in range(times.shape[0]):
+        rows[k] = shapes
+        moved_rows(motions, centres, shapes[:moving], times[k], rows[k])
+
+
+@compiled
+def free_in_time(states, steps, rule, endpoint_margins, arm, rows, cloud, free):
+    """Write whether states (m, n) are free at `steps` (m,) and one step later to `free` (m,).
+
+    `rows`: (t, r, `ROW`), of each step. `cloud`: points, groups and ball of `world`.
+    """
+    memory, last = _memory(arm[0], arm[1]), rows.shape[0] - 1
+    points, groups, ball = cloud
+    for i in range(states.shape[0]):
+        free[i] = True
+        for step in range(steps[i], steps[i] + 2):
+            world = rows[min(step, last)], points, groups, ball
+            if not _is_free(states[i], rule, endpoint_margins, arm, world, memory):
+                free[i] = False
+                break
+
+
+@compiled
+def first_departure(start, end, length, first, last, rule, endpoint_margins, arm, rows, cloud):
+    """The first step from `first` to `last` at which a motion may begin; -1 if there is none.
+
+    The motion takes `length` steps of equal size. Its states are checked as by `free_in_time`.
+    """
+    n = start.shape[0]
+    state, step, free = np.empty((1, n)), np.empty(1, np.int64), np.empty(1, np.bool_)
+    departure = first
+    while departure <= last:
+        blocked = False
+        for i in range(1, length + 1):
+            for j in range(n):
+                state[0, j] = start[j] + (end[j] - start[j]) * i / length
+            step[0] = departure + i
+            free_in_time(state, step, rule, endpoint_margins, arm, rows, cloud, free)
+            if not free[0]:
+                blocked = True
+                break
+        if not blocked:
+            return departure
+        departure += 1
+    return -1
 
 
 # --- Ray casting for sensors (`envs.perception.ray_casting`)
@@ -1370,165 +1727,3 @@ def edge_pixels(depth, classes, nothing, edge):
             if most - least > edge:
                 front[row, column], back[row, column] = least, most
     return front, back
-
-
-# --- Moving obstacles
-# `motions` is a tuple of float64 arrays, see `envs.collision.moving.motion_arrays`:
-# - a row of `OWN_COLUMNS` per obstacle: its own pose (position 3, quaternion 4); of an oscillation
-#   amplitude 3, angular frequency (rad/s), phase, axis 3, angle (zeros without one); the first of
-#   its waypoints and the one after the last, and how they repeat; the same of its intervals (none:
-#   it is always there);
-# - waypoints (w, 8): time (s), displacement 3, quaternion 4; intervals (i, 2), s.
-AMPLITUDE, FREQUENCY, PHASE, AXIS, ANGLE, WAYPOINTS, REPEAT, INTERVALS = (
-    7,
-    10,
-    11,
-    12,
-    15,
-    16,
-    18,
-    19,
-)
-OWN_COLUMNS = 21
-# m. An obstacle that is not there is moved by this much along z where rows cannot be left out.
-ABSENT = 1e6
-
-
-@compiled
-def obstacle_states(motions, times, present, poses, velocities):
-    """Write where obstacles are: `envs.collision.moving.MovingObstacles.at`.
-
-    `times`: (t,), s. `present`: bool (t, n). `poses`: (t, n, 7), position and quaternion.
-    `velocities`: (t, n, 6), linear and angular.
-    """
-    for k in range(times.shape[0]):
-        for i in range(motions[0].shape[0]):
-            present[k, i] = _is_present(motions, i, times[k])
-            obstacle_state(motions, i, times[k], poses[k, i], velocities[k, i])
-
-
-@compiled
-def moved_rows(motions, centres, shapes, t, rows):
-    """Write `shape_rows` of n moving obstacles at a time (s) to `rows[:n]`.
-
-    `shapes`: (n, `ROW`), the rows at their own poses. `centres`: m, (n, 3), of the shapes in the
-    obstacles' own frames (zeros but for convex hulls). Absent obstacles are `ABSENT` away.
-    """
-    pose, velocity = np.empty(7), np.empty(6)
-    for i in range(shapes.shape[0]):
-        obstacle_state(motions, i, t, pose, velocity)
-        row = rows[i]
-        row[:] = shapes[i]
-        x, y, z, w = pose[3], pose[4], pose[5], pose[6]
-        norm = math.sqrt(x * x + y * y + z * z + w * w)
-        x, y, z, w = x / norm, y / norm, z / norm, w / norm
-        row[4], row[5], row[6] = (
-            1.0 - 2.0 * (y * y + z * z),
-            2.0 * (x * y - z * w),
-            2.0 * (x * z + y * w),
-        )
-        row[7], row[8], row[9] = (
-            2.0 * (x * y + z * w),
-            1.0 - 2.0 * (x * x + z * z),
-            2.0 * (y * z - x * w),
-        )
-        row[10], row[11], row[12] = (
-            2.0 * (x * z - y * w),
-            2.0 * (y * z + x * w),
-            1.0 - 2.0 * (x * x + y * y),
-        )
-        a, b, c = centres[i, 0], centres[i, 1], centres[i, 2]
-        for j in range(3):
-            row[1 + j] = pose[j] + row[4 + 3 * j] * a + row[5 + 3 * j] * b + row[6 + 3 * j] * c
-        if not _is_present(motions, i, t):
-            row[3] += ABSENT
-
-
-@compiled
-def _is_present(motions, i, t):
-    """Whether obstacle i is there at a time (s)."""
-    own, intervals = motions[0][i], motions[2]
-    begin, end = int(own[INTERVALS]), int(own[INTERVALS + 1])
-    for k in range(begin, end):
-        if intervals[k, 0] <= t < intervals[k, 1]:
-            return True
-    return begin == end
-
-
-@compiled
-def obstacle_state(motions, i, t, pose, velocity):
-    """Write pose (7,) and velocity (6,), linear and angular, of obstacle i at a time (s)."""
-    own, waypoints = motions[0][i], motions[1]
-    a, b, c, d = 0.0, 0.0, 0.0, 1.0  # the rotation away from its own orientation
-    phase = own[FREQUENCY] * t + own[PHASE]
-    share, rate = math.sin(phase), own[FREQUENCY] * math.cos(phase)
-    for j in range(3):
-        pose[j] = own[j] + own[AMPLITUDE + j] * share
-        velocity[j] = own[AMPLITUDE + j] * rate
-        velocity[3 + j] = own[AXIS + j] * own[ANGLE] * rate
-    if own[ANGLE] != 0.0:
-        half = 0.5 * own[ANGLE] * share
-        sine, d = math.sin(half), math.cos(half)
-        a, b, c = own[AXIS] * sine, own[AXIS + 1] * sine, own[AXIS + 2] * sine
-    first, last = int(own[WAYPOINTS]), int(own[WAYPOINTS + 1]) - 1
-    if last >= first:
-        begin, end, direction = waypoints[first, 0], waypoints[last, 0], 1.0
-        span = end - begin
-        if own[REPEAT] != 0.0 and t > begin:
-            t -= begin
-            if own[REPEAT] == 2.0:
-                t -= span * math.floor(t / span)
-            else:
-                t -= 2.0 * span * math.floor(t / (2.0 * span))
-                if t >= span:
-                    t, direction = 2.0 * span - t, -1.0
-            t += begin
-        low, high = first, last  # the waypoint before this time, and the one after it
-        while high - low > 1:
-            middle = (low + high) // 2
-            later = waypoints[middle, 0] > t or (direction < 0.0 and waypoints[middle, 0] == t)
-            if later:
-                high = middle
-            else:
-                low = middle
-        before, after, share, rate = waypoints[low], waypoints[high], 0.0, 0.0
-        if last > first:
-            seconds = after[0] - before[0]
-            share = min(max((t - before[0]) / seconds, 0.0), 1.0)
-            if own[REPEAT] != 0.0 and t >= begin or begin <= t < end:
-                rate = direction / seconds
-        for j in range(3):
-            pose[j] += before[1 + j] + share * (after[1 + j] - before[1 + j])
-            velocity[j] += (after[1 + j] - before[1 + j]) * rate
-        a, b, c, d = _between(before, after, share, rate, velocity)
-    x, y, z, w = own[3], own[4], own[5], own[6]
-    pose[3] = d * x + a * w + b * z - c * y
-    pose[4] = d * y - a * z + b * w + c * x
-    pose[5] = d * z + a * y - b * x + c * w
-    pose[6] = d * w - a * x - b * y - c * z
-
-
-@compiled
-def _between(before, after, share, rate, velocity):
-    """The rotation between two waypoints; writes the angular velocity of `rate` ways per second."""
-    a, b, c, d = before[4], before[5], before[6], before[7]
-    e, f, g, h = after[4], after[5], after[6], after[7]
-    if a * e + b * f + c * g + d * h < 0.0:
-        e, f, g, h = -e, -f, -g, -h
-    apart = math.sqrt((a - e) ** 2 + (b - f) ** 2 + (c - g) ** 2 + (d - h) ** 2)
-    together = math.sqrt((a + e) ** 2 + (b + f) ** 2 + (c + g) ** 2 + (d + h) ** 2)
-    angle = 2.0 * math.atan2(apart, together)  # half of that between the orientations
-    sine = math.sin(angle)
-    if sine <= 1e-9:
-        return a, b, c, d
-    speed = 2.0 * angle * rate / sine  # about the vector part of after * inverse(before)
-    velocity[3] += speed * (d * e - h * a + b * g - c * f)
-    velocity[4] += speed * (d * f - h * b + c * e - a * g)
-    velocity[5] += speed * (d * g - h * c + a * f - b * e)
-    first, second = math.sin((1.0 - share) * angle) / sine, math.sin(share * angle) / sine
-    return (
-        first * a + second * e,
-        first * b + second * f,
-        first * c + second * g,
-        first * d + second * h,
-    )

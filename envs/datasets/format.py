@@ -11,8 +11,13 @@ task has queries from elsewhere, each with
   convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another; where
   obstacles move, `motion_count`: uint32 (k,), how many numbers each one's motion has, and
   `motions`: float64 (m,), the numbers (`envs.scenes.motions.motion_to_numbers`);
+<<<<<<< HEAD
+- for tasks where obstacles move, instead, `scene_seed`: uint32 (n,), from which each query's scene
+  is drawn (`AnimatedScenes`).
+=======
 - of tasks with moving obstacles, instead of these, `scene_seed`: uint32 (n,), from which each
   query's scene is drawn (`AnimatedScenes`).
+>>>>>>> main
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 

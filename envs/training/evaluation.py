@@ -31,10 +31,17 @@ from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
-from roboarm_nmp.envs.policies.baselines import PLANNERS, TIME_LIMIT, TRIES
+from roboarm_nmp.envs.policies.baselines import (
+    CHECKING,
+    OMPL_PLANNERS,
+    PLANNERS,
+    TIME_LIMIT,
+    TRIES,
+)
 from roboarm_nmp.envs.policies.pose_goals import goal_configuration
 from roboarm_nmp.envs.policies.registry import (
     FOR_POSES,
+    filter_around,
     find_policy,
     make_policy,
     own_safety_filter,
@@ -76,7 +83,8 @@ class EvaluationOptions:
         stop_on_collision: end an episode at the first contact.
         seed: of random numbers, >= 0; each query has its own generator.
         tries: random configurations that `via-points` tries per query, >= 1.
-        time_limit: seconds that `planner` may search per query, > 0.
+        time_limit: seconds that `planner` and `space-time` may search per query,
+            > 0.
         geometry_source: where `planner`, `via-points`, the safety filter and the policy's
             observations take the obstacles from (`envs.perception.geometry_source`); None for the
             policy's own, otherwise `ground_truth`.
@@ -136,10 +144,10 @@ def evaluate(policy, task=None, *, progress=False, **options):
     """Run a policy on a task's queries.
 
     Args:
-        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy network or of
-            a folder with a `policy.pt`, the name of a pretrained policy, or a function from an
-            observation (dict of `RoboArmEnv`) to an action (n,); with several workers, one that can
-            be pickled.
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, `space-time`, the
+            path of a policy network or of a folder with a `policy.pt`, the name of a pretrained
+            policy, or a function from an observation (dict of `RoboArmEnv`) to an action (n,); with
+            several workers, one that can be pickled.
         task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
             for the task that the policy was trained on, and for none with `problems`.
         progress: show a progress bar, with the success rate so far.
@@ -331,6 +339,7 @@ def _in_use(policy, options):
     env["stop_on_collision"] = options.stop_on_collision
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
+    safety_filter = filter_around(policy, safety_filter)
     if safety_filter:
         env["link_distances"] = True
     source = options.geometry_source or env.get("geometry_source")
@@ -338,12 +347,12 @@ def _in_use(policy, options):
         source = env["geometry_source"] = source or GROUND_TRUTH
     elif env.get("encoder") == POINT_CLOUD and source != GROUND_TRUTH:
         source = env["geometry_source"] = source or POINT_CLOUD
-    elif policy in PLANNERS:
+    elif policy in CHECKING:
         source = source or GROUND_TRUTH
     elif options.geometry_source is not None:
         raise EvaluationError(
-            "geometry_source is for via-points, planner, a safety filter, and policies that "
-            "observe points or link distances"
+            "geometry_source is for via-points, planner, a safety filter, replanning, and policies "
+            "that observe points or link distances"
         )
     noise = options.sensor_noise
     unseen = (None, GROUND_TRUTH), (None, ORACLE)
@@ -512,8 +521,8 @@ def _summary(job, outcomes):
         planning["planning_seconds_solved"] = mean(columns.planning_seconds, found)
         if job.policy == "via-points":
             planning["free_motion_rate"] = float(found.mean())
-    random = plans or job.policy == "random" or safety_filter
-    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy == "planner")
+    random = job.policy in (*CHECKING, "random") or safety_filter
+    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy in OMPL_PLANNERS)
     return {
         "policy": getattr(job.policy, "__name__", str(job.policy)),
         "task": None if job.problems else job.task,
@@ -538,13 +547,13 @@ def _summary(job, outcomes):
         **({"observe_every": options.observe_every} if options.observe_every else {}),
         **({"sensor_noise": options.sensor_noise.to_metadata()} if options.sensor_noise else {}),
         "privileged": is_privileged(options.env)
-        or (plans and options.geometry_source == GROUND_TRUTH),
+        or (job.policy in CHECKING and options.geometry_source == GROUND_TRUTH),
         "safety_filter": safety_filter.to_metadata() | {"version": VERSION}
         if safety_filter
         else None,
         "seed": options.seed if random else None,
         "tries": options.tries if job.policy == "via-points" else None,
-        "time_limit": options.time_limit if job.policy == "planner" else None,
+        "time_limit": options.time_limit if job.policy in OMPL_PLANNERS else None,
         "action_delay": job.delay,
         "versions": {
             "python": platform.python_version(),

@@ -26,7 +26,7 @@ from roboarm_nmp.envs.datasets.format import ORIGINAL, SPLITS, DatasetError
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.datasets.trajectories import load_trajectory
-from roboarm_nmp.envs.policies.baselines import PLANNERS
+from roboarm_nmp.envs.policies.baselines import CHECKING, PLANNERS
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
 from roboarm_nmp.envs.policies.rollout import Episode
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
@@ -346,7 +346,7 @@ class PolicyArm(_Arm):
             source = arguments["geometry_source"] = source or GROUND_TRUTH
         elif arguments.get("encoder") == "point_cloud" and source != GROUND_TRUTH:
             source = arguments["geometry_source"] = source or "point_cloud"
-        elif path in PLANNERS:
+        elif path in CHECKING:
             source = source or GROUND_TRUTH
         else:
             source = None
