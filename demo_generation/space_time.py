@@ -18,6 +18,7 @@ import math
 import time
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import MARGIN_GROWTH, PlanningError
@@ -106,13 +107,13 @@ def search(nodes, checker, last_step):
     Returns:
         float64 (k, n), normalised: the states at steps 0 to k - 1.
     """
-    neighbours = _neighbours(nodes)
     intervals = _Intervals(nodes, checker, last_step + SETTLING)
     lengths = np.linalg.norm(nodes - nodes[1], axis=1)
     to_goal = np.ceil(lengths / SUBGOAL_SPACING - 1e-9).astype(int)  # steps, at least
     first = intervals.of(0)
     if not first or first[0][0] > 0 or not intervals.of(1):
         return None
+    neighbours = _neighbours(nodes)
     # Entries: least arrival at the goal, arrival, node, number of its interval; from where.
     queue, came_from, closed = [(to_goal[0], 0, 0, 0)], {(0, 0): None}, set()
     arrivals = {(0, 0): 0}
@@ -150,16 +151,13 @@ def search(nodes, checker, last_step):
 
 
 def _neighbours(nodes):
-    """The nearest nodes of each node, both ways, and start and goal to each other: lists."""
-    squared = np.square(nodes).sum(1)
+    """The nearest nodes of each node, both ways, and of the start also the goal: lists."""
+    near = cKDTree(nodes).query(nodes, NUM_NEIGHBOURS + 1)[1]  # one is the node itself
     neighbours = [set() for _ in nodes]
-    for i, node in enumerate(nodes):
-        distances = squared - 2.0 * nodes @ node
-        for j in np.argpartition(distances, min(NUM_NEIGHBOURS, len(nodes) - 1))[
-            : NUM_NEIGHBOURS + 1
-        ]:
+    for i, others in enumerate(near.tolist()):
+        for j in others:
             if i != j:
-                neighbours[i].add(int(j))
+                neighbours[i].add(j)
                 neighbours[j].add(i)
     neighbours[0].add(1)
     return [sorted(found) for found in neighbours]
