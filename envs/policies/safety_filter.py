@@ -306,14 +306,14 @@ class ApproachRates:
         return len(self._observed) > 1
 
     def __call__(self, state, distances):
-        """Changes of link distances, m per step, (l,), from -`MAX_APPROACH` to 0.
+        """Changes of link distances, m per step, (..., l), from -`MAX_APPROACH` to 0.
 
         Args:
-            state: normalised configuration (n,).
-            distances: m, (l,), from the obstacles of the last observation.
+            state: normalised configuration (n,), or several, (..., n).
+            distances: m, (..., l), there, from the obstacles of the last observation.
         """
         (then, before), (now, _) = self._observed[0], self._observed[-1]
-        change = distances - before.link_distances(state)[:, 0]
+        change = distances - before.link_distances(state)[..., 0]
         return np.clip(change / (now - then), -MAX_APPROACH, 0.0)
 
 
