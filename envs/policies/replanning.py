@@ -8,14 +8,17 @@ In each step, the policy checks the remaining path against the obstacles as they
 the next second of it, and from time to time all of it. A blocked path is replaced by a plan from
 where the arm is, if one is found within a number of checks, which a step has time for; otherwise
 it is kept. The arm waits where the next steps are blocked, or will be, if obstacles continue to
-approach as they do now. The safety filter (`envs.policies.safety_filter`) moves the arm out of the
-way, and the policy returns to its path.
+approach as they do now. If they come close to a waiting arm, it goes back along the way it came, as
+far as that leads away from them. The safety filter (`envs.policies.safety_filter`) moves the arm
+out of the way of what comes closer, and the policy returns to its path.
 
 While the goal is occupied, the policy plans to a configuration near it that is clear of obstacles,
 and waits there.
 
 A limit of checks, unlike one of time, gives the same actions on every machine.
 """
+
+from collections import deque
 
 import numpy as np
 
@@ -29,9 +32,14 @@ CHECK_MARGIN = 0.003  # m
 # Steps ahead at which obstacles are predicted; slower approaches (m per step) are neglected.
 PREDICTED, LEAST_APPROACH = np.arange(1, 17, 3), 0.002
 # What a plan keeps clear, m: between links and from obstacles, from obstacles in addition; and how
-# many checks it may take until the next ones are tried: after each failure twice as many, up to
-# MAX_EFFORT times. Steps from a failed plan to the next one, as many times.
+# many checks it may take until the next ones are tried. After each failure twice as many checks, up
+# to MAX_EFFORT times, with as much smaller margins. Steps from a failed plan to the next one, as
+# many times.
 LEVELS = ((0.01, 0.015, 2_000), (0.01, 0.0, 3_000), (0.003, 0.0, 3_000))
+# A waiting arm goes back if it will be nearer to an obstacle than RETREAT_DISTANCE (m) in
+# RETREAT_STEPS, and if that distance is larger by RETREAT_GAIN (m) at one of the last places.
+RETREAT_DISTANCE, RETREAT_STEPS, RETREAT_GAIN = 0.05, 10, 0.01
+TRAIL = 100  # places that are remembered
 MARGIN_GROWTH = 0.03  # as `demo_generation.planning.MARGIN_GROWTH`
 RETRY, MAX_EFFORT = 3, 8
 STRAYED = 0.15  # L2, normalised, from the path: farther away, a new plan is made
@@ -65,6 +73,7 @@ class Replanning:
         self._path = self._waits_at = None  # sub-goals (m, n); whether they lead to a waiting place
         self._due, self._step, self._next_try, self._strayed = 0, 0, 0, False
         self._approach, self._effort = ApproachRates(current_checker), 1
+        self._trail = deque(maxlen=TRAIL)  # states, at least a sub-goal's spacing apart
         self._checked = None  # the checker against which the whole path was checked last
         self.plans = 0
 
@@ -78,8 +87,26 @@ class Replanning:
             self._advance(state)
         self._step += 1
         if self._path is None or self._must_wait(checker, here):
-            return np.zeros(len(state))
+            return self._retreat(checker, here)
+        if not self._trail or np.linalg.norm(here - self._trail[-1]) >= SUBGOAL_SPACING:
+            self._trail.append(here)
         return self._path[self._due] - state
+
+    def _retreat(self, checker, here):
+        """The action of a waiting arm: none, or back along the way it came."""
+        if self._approach.any_motion and len(self._trail) > 1:
+            states = np.array([here, *list(self._trail)[: -SEARCHED - 1 : -1]])
+            distances = checker.link_distances(states)[..., 0]
+            rates = self._approach(states, distances)
+            rates[rates > -LEAST_APPROACH] = 0.0
+            clearance = (distances + RETREAT_STEPS * rates).min(-1)
+            if clearance[0] < min(RETREAT_DISTANCE, clearance[1:].max() - RETREAT_GAIN):
+                while len(self._trail) > 1 and (
+                    np.linalg.norm(self._trail[-1] - here) < SUBGOAL_SPACING
+                ):
+                    self._trail.pop()
+                return self._trail[-1] - here
+        return np.zeros(len(here))
 
     def _must_wait(self, checker, here):
         """Whether one of the next sub-goals is blocked, or will be when the arm is there."""
@@ -143,8 +170,9 @@ class Replanning:
         path = None
         for margin, clearance, max_checks in LEVELS if goal is not None else ():
             near = self._endpoint_margins(checker, here, goal)
+            margins = margin / self._effort, clearance / self._effort
             limits = {"endpoint_margins": near, "max_checks": self._effort * max_checks}
-            path, _ = checker.find_path(here, goal, self._rng, margin, clearance, **limits)
+            path, _ = checker.find_path(here, goal, self._rng, *margins, **limits)
             if path is not None:
                 break
         if path is None:
