@@ -36,7 +36,7 @@ PREDICTED, LEAST_APPROACH = np.arange(1, 17, 3), 0.002
 # to MAX_EFFORT times, with as much smaller margins. Steps from a failed plan to the next one, as
 # many times.
 LEVELS = ((0.01, 0.015, 2_000), (0.01, 0.0, 3_000), (0.003, 0.0, 3_000))
-# A waiting arm goes back if it will be nearer to an obstacle than RETREAT_DISTANCE (m) in
+# A waiting arm goes back if it will be nearer to what approaches than RETREAT_DISTANCE (m) in
 # RETREAT_STEPS, and if that distance is larger by RETREAT_GAIN (m) at one of the last places.
 RETREAT_DISTANCE, RETREAT_STEPS, RETREAT_GAIN = 0.05, 10, 0.01
 TRAIL = 100  # places that are remembered
@@ -98,8 +98,9 @@ class Replanning:
             states = np.array([here, *list(self._trail)[: -SEARCHED - 1 : -1]])
             distances = checker.link_distances(states)[..., 0]
             rates = self._approach(states, distances)
-            rates[rates > -LEAST_APPROACH] = 0.0
-            clearance = (distances + RETREAT_STEPS * rates).min(-1)
+            # From what approaches alone: the way back may be narrow.
+            predicted = distances + RETREAT_STEPS * rates
+            clearance = np.where(rates < -LEAST_APPROACH, predicted, np.inf).min(-1)
             if clearance[0] < min(RETREAT_DISTANCE, clearance[1:].max() - RETREAT_GAIN):
                 while len(self._trail) > 1 and (
                     np.linalg.norm(self._trail[-1] - here) < SUBGOAL_SPACING
