@@ -166,7 +166,9 @@ def keep(run):
     """Put a run's policy where it is found by name, in half precision, with how it was made."""
     training = json.loads((run / "result.json").read_text())
     args = training["args"]
-    scenes = load_roadmap_paths(Path(args["paths"])).task  # that it learned from
+    # Those that it learned from: a folder, or the first of several.
+    paths = args["paths"][0] if isinstance(args["paths"], list) else args["paths"]
+    scenes = load_roadmap_paths(Path(paths)).task
     name = f"dagger-{args['goal_type']}-{args['encoder']}-{scenes}-s{args['seed']}"
     to_float16(run / "policy.pt", POLICIES / f"{name}.pt")
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}

@@ -76,15 +76,6 @@ from roboarm_nmp.envs.policies.baselines import TIME_LIMIT, TRIES
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import (
-    CORES,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    Seed,
-    Workers,
-)
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
@@ -109,9 +100,9 @@ class Args:
     problems: Path | None = None
     """a file or folder of problems to use instead of a task's queries: `problems.h5` of `roboarm
     import`, or a file that it reads (docs/customise/problems.md); no task is needed"""
-    num_queries: PositiveInt | None = None
+    num_queries: flags.PositiveInt | None = None
     """only the first so many queries of the split"""
-    workers: Workers = CORES
+    workers: flags.Workers = flags.CORES
     """processes, one core each; by default as many as there are cores"""
     stop_on_collision: bool = False
     """end an episode at the first contact"""
@@ -119,12 +110,12 @@ class Args:
     """where `planner`, `via-points`, `replanning`, the safety filter and the policy's observations
     take the obstacles from: `ground_truth`, `point_cloud`, or an encoder with a decoder (a name or
     path); by default the policy's own, otherwise `ground_truth`"""
-    safety_margin: NonNegativeFloat | None = None
+    safety_margin: flags.NonNegativeFloat | None = None
     """put a safety filter with this margin (m) around the policy, e.g. 0.01; 0 for no filter; by
     default the filter that the policy includes, if any"""
     escape: bool = True
     """the safety filter escapes local minima, in a random direction"""
-    lookahead: NonNegativeFloat = 0.0
+    lookahead: flags.NonNegativeFloat = 0.0
     """s: the safety filter takes distances as they will be after this time, if obstacles continue
     to approach as they do now"""
     velocities: bool = True
@@ -133,19 +124,19 @@ class Args:
     approach: bool = False
     """add approach paths to the safety filter: out of starts, and into goals, that are nearer to
     obstacles than its margin (docs/guide/safety_filter.md)"""
-    observe_every: PositiveInt | None = None
+    observe_every: flags.PositiveInt | None = None
     """steps from one observation of the scene to the next, with the arm where it is; by default
     static scenes are observed once, and scenes with moving obstacles in every step"""
     sensor_noise: tuple[str, ...] = ()
     """NAME=VALUE pairs of sensor noise, e.g. `gaussian=0.005 dropout=0.1`
     (docs/guide/perception.md, "Sensor noise")"""
-    seed: Seed = 0
+    seed: flags.Seed = 0
     """of random numbers: `random`, `via-points`, `planner`, escapes"""
-    tries: PositiveInt = TRIES
+    tries: flags.PositiveInt = TRIES
     """random configurations that `via-points` tries per query"""
-    time_limit: PositiveFloat = TIME_LIMIT
+    time_limit: flags.PositiveFloat = TIME_LIMIT
     """seconds that `planner` and `space-time` may search per query"""
-    action_delay: NonNegativeInt = 0
+    action_delay: flags.NonNegativeInt = 0
     """steps after which an action takes effect, while the arm makes the step before it and then
     holds its configuration; 0: the simulation waits for the policy"""
     real_time: bool = False
@@ -164,15 +155,11 @@ def main(arguments=None):
     args = flags.parse(Args, arguments)
     try:
         flags.check(args)
-        for path in (args.json, args.image):
-            if path is not None:
-                check_writable(path)
+        for path in filter(None, (args.json, args.image)):
+            check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
-        from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
-
-        if args.task is None and args.robot is not None:
-            raise ValueError("--robot goes with --task")
         from roboarm_nmp.envs.perception.noise import SensorNoise
+        from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
 
         noise = SensorNoise.parse(args.sensor_noise) if args.sensor_noise else None
         options = vars(args) | {"safety_filter": _safety_filter(args), "sensor_noise": noise}
@@ -305,8 +292,7 @@ def _table(result):
             row("planning time", result["planning_seconds"], "s"),
             row("  ... if found", result["planning_seconds_solved"], "s"),
         ]
-    if result["free_motion_rate"] is not None:
-        lines.append(row("free motion", result["free_motion_rate"]))
+    lines += [row("free motion", result["free_motion_rate"])] * (result["tries"] is not None)
     return "\n".join(lines)
 
 

@@ -9,6 +9,7 @@ from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import TASKS, get_task
 
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
+ANY_TASK = "RoboArmNMP/Task-v0"
 
 
 def make(
@@ -95,15 +96,22 @@ def make(
 
 
 def gymnasium_id(task):
-    """The Gymnasium id of a task: "double_walls" -> "RoboArmNMP/DoubleWalls-v0"."""
-    return f"RoboArmNMP/{task.title().replace('_', '')}-v0"
+    """The Gymnasium id of a task: "double_walls" -> "RoboArmNMP/DoubleWalls-v0".
+
+    Tasks that are not in `TASKS`, of scene files and other arms, share the id `ANY_TASK`, whose
+    argument `task` is that of `make`.
+    """
+    return f"RoboArmNMP/{task.title().replace('_', '')}-v0" if task in TASKS else ANY_TASK
 
 
-for _name in TASKS:
+for _id, _kwargs in {
+    **{gymnasium_id(name): {"task": name} for name in TASKS},
+    ANY_TASK: {},
+}.items():
     gymnasium.register(
-        gymnasium_id(_name),
+        _id,
         entry_point="roboarm_nmp.envs:make",
-        kwargs={"task": _name},
+        kwargs=_kwargs,
         # Without wrappers `reset_specific` and all other attributes are reached directly. The env
         # itself refuses a step before a reset; the checker would warn of unbounded observations.
         order_enforce=False,

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.containers import Containers
 from roboarm_nmp.envs.scenes.formats import WORLD_FILES, load_world
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
 from roboarm_nmp.envs.scenes.moving_boxes import (
@@ -39,7 +40,7 @@ class Task:
         trainable: False for the tasks that are there to test generalisation (paper: "OOD").
     """
 
-    scene: Scene | RandomBoxes | MixedScenes | MovingScenes
+    scene: Scene | RandomBoxes | MixedScenes | Containers | MovingScenes
     summary: str
     trainable: bool = True
 
@@ -97,10 +98,12 @@ def split_robot(task):
 def task_with_robot(task, robot):
     """`TASK@ROBOT`, of the flags `--task` and `--robot`; the task itself if the robot is None.
 
-    Raises ValueError: the task names a robot, too.
+    Raises ValueError: the task names a robot, too, or there is a robot without a task.
     """
     if robot is None:
         return task
+    if task is None:
+        raise ValueError("--robot goes with --task")
     if split_robot(task)[1] is not None:
         raise ValueError(f"--robot {robot}: the task names a robot already, {task}")
     return f"{task}@{robot}"
@@ -287,5 +290,6 @@ STATIC_TASKS = {name: task for name, task in TASKS.items() if not hasattr(task.s
 """The tasks whose obstacles do not move."""
 # Not a task of the benchmark: it has no queries. Paths in these scenes are training data.
 TRAINING_SCENES = {
-    "mixed_scenes": Task(MixedScenes(), "random boxes, walls with gaps, or racks of shelves")
+    "mixed_scenes": Task(MixedScenes(), "random boxes, walls with gaps, or racks of shelves"),
+    "containers": Task(Containers(), "open boxes, shelves with compartments, cluttered tables"),
 }

@@ -49,6 +49,7 @@ import h5py
 import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.motions import motion_from_numbers
 from roboarm_nmp.envs.scenes.primitives import (
     MAX_LENGTH,
     ROW,
@@ -346,13 +347,13 @@ def read_scenes(path, base, arrays, prefix=""):
         motions = arrays[f"{prefix}motions"], arrays[f"{prefix}motion_count"]
         if motions[1].sum(dtype=np.int64) != len(motions[0]):
             raise DatasetError(f"{path}: {prefix}motion_count does not fit {prefix}motions")
-    scenes = QueryScenes(base, index.astype(np.int64), offsets, rows, vertices, motions)
-    try:
-        for i in np.unique(scenes.index, return_index=True)[1] if motions else ():
-            scenes[i]
-    except ValueError as error:
-        raise DatasetError(f"{path}: {prefix}motions: {error}") from error
-    return scenes
+        ends = np.concatenate([[0], np.cumsum(motions[1].astype(np.int64))])
+        try:
+            for first, last in itertools.pairwise(ends.tolist()):
+                motion_from_numbers(motions[0][first:last])
+        except ValueError as error:
+            raise DatasetError(f"{path}: {prefix}motions: {error}") from error
+    return QueryScenes(base, index.astype(np.int64), offsets, rows, vertices, motions)
 
 
 def read_base_scene(path, text, robot):

@@ -281,12 +281,15 @@ class SensorWorld:
     Attributes:
         scene: the `Scene`; None before `show`.
         configuration: the arm's joint angles (n, rad).
+
+    Raises:
+        RuntimeError: of `cast` and `render`: it is closed.
     """
 
     def __init__(self, noise=NO_NOISE):
         self.noise, self.scene, self.configuration = noise, None, None
         self._caster = self._drawn = self._of_episode = None
-        self._number = 0
+        self._number, self._is_closed = 0, False
 
     @property
     def robot(self):
@@ -308,6 +311,10 @@ class SensorWorld:
         if self.noise.changes_images:
             self._of_episode = NoiseOfEpisode(self.noise, key, number)
 
+    def _check_open(self):
+        if self._is_closed:
+            raise RuntimeError("this sensor world is closed")
+
     def show(self, scene, configuration, number=0):
         """Change to a `Scene` with the arm at joint angles (n, rad).
 
@@ -322,6 +329,7 @@ class SensorWorld:
         Returns:
             `depth` and `segmentation`, as `Camera` describes them.
         """
+        self._check_open()
         if self._caster is None:
             self._caster = RayCaster(self.scene, self.configuration)
         view = view_of(sensor, size)
@@ -361,6 +369,7 @@ class SensorWorld:
         return image_array(image[2], width, height)
 
     def _draw(self):
+        self._check_open()
         if self._drawn is None:
             self._drawn = _DrawnWorld(self.scene)
         self._drawn.set_scene(self.scene)
@@ -368,7 +377,8 @@ class SensorWorld:
         return self._drawn
 
     def close(self):
-        """Close PyBullet's world, if there is one."""
+        """Close it, and PyBullet's world, if there is one. Closing twice is allowed."""
+        self._is_closed = True
         if self._drawn is not None:
             self._drawn.close()
             self._drawn = None

@@ -439,9 +439,11 @@ def _orientation(fields, what):
 
 def _motion(fields, what):
     """The motion of an obstacle; None without one."""
-    if "motion" not in fields:
+    node = fields.get("motion")
+    if node is None:
         return None
-    node = fields["motion"]
+    if hasattr(node, "motion"):  # an alias: a small file may have many of a long motion
+        return node.motion
     kinds = {"oscillation": _oscillation, "waypoints": _waypoints}
     parts = _mapping(node, f"motion of {what}", optional=(*kinds, "present"))
     chosen = [kind for kind in kinds if kind in parts]
@@ -453,6 +455,7 @@ def _motion(fields, what):
             motion = Presence(_intervals(parts["present"]), motion)
     except ValueError as error:
         raise _mistake(node, f"motion of {what}: {error}") from error
+    node.motion = motion
     return motion
 
 

@@ -38,6 +38,7 @@ from roboarm_nmp.envs.policies.baselines import (
     TIME_LIMIT,
     TRIES,
 )
+from roboarm_nmp.envs.policies.pose_goals import goal_configuration
 from roboarm_nmp.envs.policies.registry import (
     FOR_POSES,
     filter_around,
@@ -54,6 +55,7 @@ from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 
+LEAST_CLEARANCE = 0.001  # m, of a goal among several; the checks may differ from PyBullet's by less
 CHUNK = 10  # queries a worker takes at a time
 
 
@@ -74,7 +76,8 @@ class EvaluationOptions:
             `envs.datasets.queries.Queries`. Without `scenes` they are in the task's scene, which
             must then not be random.
         problems: path of a file or folder of problems instead of queries
-            (`envs.datasets.problems`), in their own scenes. The goal is the first one of each.
+            (`envs.datasets.problems`), in their own scenes. Of several goals, the goal is the one
+            nearest to the start that is free; of a pose, a free configuration that has it.
         split: `test`, `validation` or `original`; which queries of the file.
         num_queries: only the first so many of them; None for all.
         stop_on_collision: end an episode at the first contact.
@@ -300,8 +303,33 @@ def _with_problems(task, options):
             f"{len(problems.rejected)} problems cannot be used: {problems.rejected[0].reason}; "
             f"`roboarm import` writes a file of the others"
         )
+    problems = replace(problems, all=tuple(_with_one_goal(one) for one in problems.all))
     said = {"file": Path(options.problems).name, "sha256": problems.digest}
     return replace(options, queries=problems), said
+
+
+def _with_one_goal(problem):
+    """A problem with a single goal configuration; one of several, or of its goal pose.
+
+    Ground-truth obstacles decide which are free, as they decide where episodes may begin.
+    """
+    if len(problem.goals) == 1:
+        return problem
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
+
+    robot, checker = problem.scene.robot, ground_truth_checker(problem.scene)
+    if len(problem.goals) == 0:
+        goal = goal_configuration(robot, problem.goal_pose, problem.start, checker)
+        if goal is None:
+            raise EvaluationError(f"problem {problem.name}: its goal pose cannot be reached freely")
+        return problem._replace(goals=goal[None].astype(np.float64))
+    states = robot.normalise(problem.goals)
+    free = np.flatnonzero(checker.is_free(np.clip(states, -1.0, 1.0), margin=LEAST_CLEARANCE))
+    if not len(free):
+        raise EvaluationError(f"problem {problem.name}: all of its goals are in collision")
+    distances = np.linalg.norm(states[free] - robot.normalise(problem.start), axis=1)
+    return problem._replace(goals=problem.goals[free[distances.argmin()]][None])
 
 
 def _in_use(policy, options):

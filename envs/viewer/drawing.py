@@ -8,6 +8,7 @@ import numpy as np
 
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, find_geometry_source
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
+from roboarm_nmp.envs.perception.sensors import SceneObservation
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, Cylinder, hull_faces, obstacle_at
 from roboarm_nmp.envs.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, arm_joints, link_meshes
@@ -279,12 +280,18 @@ class Drawing:
 
     def _draw_overlays(self, place, arm):
         robot = self.simulation.robot
-        self._points(place, "observed", OBSERVED_COLOUR, arm, _observed)
+        observed = _observed if self.simulation.query.scene.is_static else self._observed_now
+        self._points(place, "observed", OBSERVED_COLOUR, arm, observed)
         self._points(place, "decoded", DECODED_COLOUR, arm, _decoded)
         self._lines(place, "distances", 0.004, lambda: _distance_lines(arm, self.simulation))
         self._lines(place, "correction", 0.012, lambda: _arrows(arm, robot), arrows=True)
         self._lines(place, "trace", 0.006, lambda: _trace(arm, robot))
         self._contacts(place, arm)
+
+    def _observed_now(self, scene, arm):
+        """Of moving obstacles, with the arm where it is."""
+        configuration = self.simulation.robot.denormalise(arm.state)
+        return observed_points(SceneObservation.of(scene, configuration))
 
     def _points(self, place, name, colour, arm, find):
         scene = self.simulation.query.scene.at(arm.time)

@@ -329,6 +329,18 @@ def test_mistake_in_a_motion_is_reported_with_its_line(tmp_path, text, reason):
         load_scene(path)
 
 
+def test_aliases_of_a_motion_are_read_once(tmp_path):
+    """10,000 aliases of a motion of 1,000 waypoints would take minutes, and gigabytes."""
+    times = ", ".join(map(str, range(MAX_WAYPOINTS)))
+    ways = ", ".join(["[0, 0, 0]"] * MAX_WAYPOINTS)
+    motion = f"&m {{waypoints: {{times: [{times}], displacements: [{ways}]}}}}"
+    sphere = "\n- sphere: {position: [1, 0, 0], radius: 0.1, motion: "
+    path = tmp_path / "scene.yaml"
+    path.write_text(f"obstacles:{sphere}{motion}}}" + f"{sphere}*m}}" * 500)
+    motions = {id(obstacle.motion) for obstacle in load_scene(path).obstacles}
+    assert len(motions) == 1
+
+
 def test_table_of_a_scene_file_cannot_move(tmp_path):
     path = tmp_path / "scene.yaml"
     path.write_text("table: {position: [0, 0, 0], size: [1, 1, 1], motion: {present: [[0]]}}\n")
