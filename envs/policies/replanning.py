@@ -22,7 +22,12 @@ from collections import deque
 
 import numpy as np
 
-from roboarm_nmp.envs.policies.safety_filter import ApproachRates
+from roboarm_nmp.envs.policies.safety_filter import (
+    PATIENCE,
+    PROGRESS,
+    PROGRESS_SHARE,
+    ApproachRates,
+)
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING
 
 # The numbers below were chosen on fresh queries: docs/lab_notebook.md.
@@ -40,6 +45,7 @@ LEVELS = ((0.01, 0.015, 2_000), (0.01, 0.0, 3_000), (0.003, 0.0, 3_000))
 # RETREAT_STEPS, and if that distance is larger by RETREAT_GAIN (m) at one of the last places.
 RETREAT_DISTANCE, RETREAT_STEPS, RETREAT_GAIN = 0.05, 10, 0.01
 TRAIL = 100  # places that are remembered
+PLANNED = 90  # steps that `ReplanWhenStuck` follows a plan
 MARGIN_GROWTH = 0.03  # as `demo_generation.planning.MARGIN_GROWTH`
 RETRY, MAX_EFFORT = 3, 8
 STRAYED = 0.15  # L2, normalised, from the path: farther away, a new plan is made
@@ -91,6 +97,11 @@ class Replanning:
         if not self._trail or np.linalg.norm(here - self._trail[-1]) >= SUBGOAL_SPACING:
             self._trail.append(here)
         return self._path[self._due] - state
+
+    def forget(self):
+        """Plan anew in the next step, after steps of another policy."""
+        self._path = self._waits_at = None
+        self._trail.clear()
 
     def _retreat(self, checker, here):
         """The action of a waiting arm: none, or back along the way it came."""
@@ -195,6 +206,39 @@ class Replanning:
             if free.any():
                 return places[np.where(free, away, np.inf).argmin()]
         return None
+
+
+class ReplanWhenStuck:
+    """A policy that follows a plan for `PLANNED` steps whenever it is stuck, for one episode.
+
+    Stuck is what local minima are to `envs.policies.safety_filter`, whose random escapes this
+    replaces.
+
+    Args:
+        act: the policy, a function from an observation to an action (n,).
+        replanning: a `Replanning` of the same episode.
+        goal: normalised, (n,).
+    """
+
+    def __init__(self, act, replanning, goal):
+        self._act, self._replanning, self._goal = act, replanning, goal
+        self._states, self._left = deque(maxlen=PATIENCE + 1), 0
+
+    def __call__(self, observation):
+        state = observation["observation"][: len(self._goal)]
+        self._states.append(state)
+        if self._left == 0 and len(self._states) > PATIENCE:
+            moved = np.linalg.norm(state - self._states[0])
+            remaining = np.linalg.norm(self._goal - self._states[0])
+            if moved < min(PROGRESS, PROGRESS_SHARE * remaining):
+                self._left = PLANNED
+                self._replanning.forget()
+        if self._left == 0:
+            return self._act(observation)
+        self._left -= 1
+        if self._left == 0:
+            self._states.clear()
+        return self._replanning(observation)
 
 
 def dense(path):
