@@ -115,6 +115,9 @@ class Args:
     default the filter that the policy includes, if any"""
     escape: bool = True
     """the safety filter escapes local minima, in a random direction"""
+    replan: bool = False
+    """whenever the policy is stuck, follow a plan for 90 steps, as `replanning` does, among the
+    obstacles of the geometry source; the safety filter then makes no escapes"""
     lookahead: flags.NonNegativeFloat = 0.0
     """s: the safety filter takes distances as they will be after this time, if obstacles continue
     to approach as they do now"""
@@ -236,6 +239,7 @@ def _settings(result):
         "geometry source": result["geometry_source"] or "none",
         "privileged": "yes" if result["privileged"] else None,
         "safety filter": margin,
+        "replans": "when stuck" if result.get("replan") else None,
         "observed every": f"{result['observe_every']} steps" if "observe_every" in result else None,
         "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",

@@ -53,7 +53,7 @@ SEARCHED = 12  # sub-goals from the last one, among which the nearest to the arm
 PASSED = 0.01  # L2, normalised: a sub-goal nearer than this is passed
 # m: a goal with a smaller distance from obstacles is occupied. (An observed cloud takes up a few
 # millimetres more than the obstacles.)
-OCCUPIED = -0.005
+OCCUPIED = -0.012
 # Of the places to wait at: tries, their largest distance from the goal (normalised, per joint), and
 # their clearances (m), the first that any of them has.
 WAITING_TRIES, WAITING_RADIUS, WAITING_CLEARANCES = 128, 0.6, (0.08, 0.03, 0.01)

@@ -69,7 +69,7 @@ PROJECTION_SWEEPS = 12  # of cyclic projection
 RATE_STEPS = 3
 MAX_APPROACH = 0.05  # m per step, 1.5 m/s
 # m. A goal with smaller link distances is occupied: around it, margins do not shrink.
-OCCUPIED = -0.005
+OCCUPIED = -0.012
 
 # A local minimum is a configuration where PATIENCE steps moved the arm by less than PROGRESS (L2,
 # normalised). Close to the goal, they also have to be less than this share of the remaining

@@ -208,6 +208,18 @@ def test_replanning_waits_near_an_occupied_goal_and_goes_there_when_it_is_free()
     assert 3.0 < len(trajectory) * STEP_SECONDS < 5.0
 
 
+def test_stuck_policy_follows_a_plan():
+    env = make_env(wall_in_the_way(0.0))
+    query = Query(OTHER_SIDE, SIDE, env.unwrapped.scene)
+    success = {}
+    for replan in (False, True):
+        options = {"safety_filter": SafetyFilter(escape=False), "replan": replan}
+        trajectory = rollout(env, query, make_policy("go-to-goal", env, **options)(0, query).act)
+        success[replan] = trajectory.success and not trajectory.collides
+    env.close()
+    assert success == {False: False, True: True}
+
+
 # --- Space and time
 
 
