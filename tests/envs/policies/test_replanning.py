@@ -209,9 +209,8 @@ def test_replanning_waits_near_an_occupied_goal_and_goes_there_when_it_is_free()
 
 
 def test_stuck_policy_follows_a_plan():
-    env = make_env(wall_in_the_way(0.0))
-    query = Query(OTHER_SIDE, SIDE, env.unwrapped.scene)
-    success = {}
+    query = load_queries("random_boxes_hard", "validation")[4]
+    env, success = make_env(query.scene, horizon=250), {}
     for replan in (False, True):
         options = {"safety_filter": SafetyFilter(escape=False), "replan": replan}
         trajectory = rollout(env, query, make_policy("go-to-goal", env, **options)(0, query).act)
