@@ -88,6 +88,9 @@ class Args:
     default the filter that the policy includes, if any"""
     escape: bool = True
     """the safety filter escapes local minima, in a random direction"""
+    replan: bool = False
+    """whenever the policy is stuck, follow a plan for 90 steps, as `replanning` does, among the
+    obstacles of the geometry source; the safety filter then makes no escapes"""
     lookahead: flags.NonNegativeFloat = 0.0
     """s: the safety filter takes distances as they will be after this time, if obstacles continue
     to approach as they do now"""

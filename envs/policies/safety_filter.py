@@ -69,7 +69,7 @@ PROJECTION_SWEEPS = 12  # of cyclic projection
 RATE_STEPS = 3
 MAX_APPROACH = 0.05  # m per step, 1.5 m/s
 # m. A goal with smaller link distances is occupied: around it, margins do not shrink.
-OCCUPIED = -0.005
+OCCUPIED = -0.012
 
 # A local minimum is a configuration where PATIENCE steps moved the arm by less than PROGRESS (L2,
 # normalised). Close to the goal, they also have to be less than this share of the remaining
@@ -306,14 +306,14 @@ class ApproachRates:
         return len(self._observed) > 1
 
     def __call__(self, state, distances):
-        """Changes of link distances, m per step, (l,), from -`MAX_APPROACH` to 0.
+        """Changes of link distances, m per step, (..., l), from -`MAX_APPROACH` to 0.
 
         Args:
-            state: normalised configuration (n,).
-            distances: m, (l,), from the obstacles of the last observation.
+            state: normalised configuration (n,), or several, (..., n).
+            distances: m, (..., l), there, from the obstacles of the last observation.
         """
         (then, before), (now, _) = self._observed[0], self._observed[-1]
-        change = distances - before.link_distances(state)[:, 0]
+        change = distances - before.link_distances(state)[..., 0]
         return np.clip(change / (now - then), -MAX_APPROACH, 0.0)
 
 
