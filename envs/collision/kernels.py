@@ -20,7 +20,8 @@ BULLET_MARGIN = 0.001
 FAR = 1e9  # m: farther than anything
 # A row describes a convex shape: kind, centre 3, rotation 9 (row-major), half edges of its core 3,
 # rounding, and the body's index if it is a link. The shape is the set of points within `rounding`
-# of its core: a box or a cylinder less its rounding, a sphere's centre, or a link's hull.
+# of its core: a box or a cylinder less its rounding, a sphere's centre, or a link's hull. Obstacles'
+# rows may have another column for each body of the arm, which is 1 if that may touch the shape.
 # Kinds are those of `envs.scenes.primitives.to_array`, and `LINK`.
 CYLINDER, SPHERE, LINK = 1, 2, 3
 ROW = 18
@@ -389,7 +390,7 @@ def _is_free(q, rule, endpoint_margins, arm, world, memory):
     chain, bodies, pairs, vertices, cells = arm
     rows, points, groups, ball = world
     frames, centres, pose, s, other = memory
-    joints = endpoint_margins.shape[1] - 1
+    joints, touching = endpoint_margins.shape[1] - 1, rows.shape[1] > ROW
     margin, clearance, growth = rule[0], rule[1], rule[2]
     for i in range(endpoint_margins.shape[0]):
         squared = 0.0
@@ -401,6 +402,8 @@ def _is_free(q, rule, endpoint_margins, arm, world, memory):
         if bodies[k, LINK_ROW] < 0.0:  # the base stands where it stands
             break
         for j in range(rows.shape[0]):
+            if touching and rows[j, ROW + k] != 0.0:
+                continue
             gap = margin + clearance + rows[j, 16] + bodies[k, ROUNDING]
             reach = bodies[k, RADIUS] + gap
             if reach > 0.0 and _sphere_gap(rows, j, centres, k) >= reach * reach:
@@ -756,7 +759,7 @@ def signed_distances_batch(
         np.empty((_EPA_FACES, 2), np.int64),
     )
     gaps = np.empty(groups.shape[0]), np.empty(points.shape[0])
-    of_arm = rows.shape[0]
+    of_arm, touching = rows.shape[0], rows.shape[1] > ROW
     distance[:], normal[:], witness[:], geometry[:] = within, 0.0, 0.0, of_arm + 2
     for i in range(states.shape[0]):
         _place(states[i], chain, bodies, frames, centres)
@@ -772,6 +775,8 @@ def signed_distances_batch(
                     first, least = j, squared
             for n in range(rows.shape[0]):
                 j = first if n == 0 else n - 1 if n <= first else n
+                if touching and rows[j, ROW + k] != 0.0:
+                    continue
                 rounding = rows[j, 16] + bodies[k, ROUNDING]
                 far = min(distance[i, link] + rounding, FAR)
                 core = _signed_distance(

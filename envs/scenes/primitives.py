@@ -7,7 +7,7 @@ import functools
 import hashlib
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +19,8 @@ MAX_LENGTH, MAX_SCENE_OBSTACLES = 1000.0, 10_000
 """Limits of sizes and coordinates (m), and of a scene's obstacles: more is a mistake."""
 MAX_HULL_VERTICES = 256
 """Of a `ConvexHull`."""
+MAX_TOUCHING = 200
+"""Names of links that one obstacle may touch."""
 # Quaternions: of up to the first deviation of the norm from 1, they stay as they are, bit for bit;
 # up to the second, such as (0, 0, 0.7071, 0.7071), they are normalised.
 _EXACT_NORM, _ROUNDED_NORM = 1e-6, 0.01
@@ -59,11 +61,26 @@ def _normalise(body):
             object.__setattr__(body, name, tuple(value))
     if hasattr(body, "orientation"):
         object.__setattr__(body, "orientation", unit_quaternion(body.orientation))
+    if body.may_touch not in ((), True):
+        object.__setattr__(body, "may_touch", _link_names(body.may_touch, "may_touch"))
+
+
+def _link_names(names, what):
+    """Names of links as a sorted tuple; False is none. Raises ValueError."""
+    if names is False:
+        return ()
+    names = tuple(names) if isinstance(names, (tuple, list, set, frozenset)) else (None,)
+    if not all(isinstance(name, str) for name in names) or len(names) > MAX_TOUCHING:
+        raise ValueError(f"{what} must be names of up to {MAX_TOUCHING} links, got {names!r}")
+    return tuple(sorted(set(names)))
 
 
 @dataclass(frozen=True)
 class Box:
     """A box: centre, full edges, and orientation as a quaternion (x, y, z, w).
+
+    `may_touch`: names of the arm's links whose contacts with this obstacle are no collisions, with
+    the objects attached to them; True: `Robot.hand_links`. Other obstacles have it, too.
 
     Raises ValueError: the norm of the quaternion differs from 1 by more than 1 %. It is normalised
     otherwise.
@@ -72,6 +89,7 @@ class Box:
     position: tuple[float, float, float]
     size: tuple[float, float, float]
     orientation: tuple[float, float, float, float] = IDENTITY
+    may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
 
@@ -84,6 +102,7 @@ class Cylinder:
     radius: float
     length: float
     orientation: tuple[float, float, float, float] = IDENTITY
+    may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
 
@@ -94,6 +113,7 @@ class Sphere:
 
     position: tuple[float, float, float]
     radius: float
+    may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
 
@@ -111,6 +131,7 @@ class ConvexHull:
     position: tuple[float, float, float]
     vertices: tuple[tuple[float, float, float], ...]
     orientation: tuple[float, float, float, float] = IDENTITY
+    may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     def __post_init__(self):
         _normalise(self)
@@ -120,6 +141,48 @@ class ConvexHull:
 
 
 Obstacle = Box | Cylinder | Sphere | ConvexHull
+
+
+@dataclass(frozen=True)
+class Attached:
+    """An object that the arm carries, as a part of one of its links; see `Robot.with_attached`.
+
+    Attributes:
+        shape: a `Box`, `Cylinder`, `Sphere` or `ConvexHull`, in the frame of the link in the URDF.
+        link: the link's name; None: the link with the end effector.
+        touch_links: names of links whose contacts with the object are no collisions. Those that
+            move with the object never collide with it.
+
+    Raises:
+        TypeError: another type.
+        ValueError: as of a `Scene`'s obstacles; or the shape has `may_touch`.
+    """
+
+    shape: Obstacle
+    link: str | None = None
+    touch_links: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if not isinstance(self.shape, Obstacle):
+            raise TypeError(
+                f"an attached shape must be Box, Cylinder, Sphere or ConvexHull, got {self.shape!r}"
+            )
+        check_obstacle(self.shape)
+        if self.shape.may_touch:
+            raise ValueError("an attached shape has no may_touch: give the object touch_links")
+        if self.link is not None and not isinstance(self.link, str):
+            raise TypeError(f"link must be the name of a link, or None, got {self.link!r}")
+        object.__setattr__(self, "touch_links", _link_names(self.touch_links, "touch_links"))
+
+    @property
+    def triangles(self):
+        """The triangles of a `ConvexHull`'s surface: `hull_faces`."""
+        return hull_faces(self.shape.vertices)
+
+    def described(self):
+        """All of it as lists, for files and fingerprints: row of `to_lists`, link, touch_links."""
+        return [to_lists([self.shape])[0], self.link, list(self.touch_links)]
+
 
 # The arm stands on the table's top (z = 0).
 TABLE = Box(position=(0.2, 0.0, -0.02), size=(1.0, 1.0, 0.04))
@@ -159,18 +222,25 @@ class Scene:
                     f"obstacles must be Box, Cylinder, Sphere or ConvexHull, got {obstacle!r}"
                 )
             check_obstacle(obstacle)
+            self._check_links(obstacle)
         if len(self.obstacles) > MAX_SCENE_OBSTACLES:
             raise ValueError(f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
         if self.table is not None:
             if not isinstance(self.table, Box):
                 raise TypeError(f"table must be a Box or None, got {self.table!r}")
             check_obstacle(self.table)
+            self._check_links(self.table)
         if self.floor is not None and not _is_length(self.floor):
             raise ValueError(f"floor must be a height in m or None, got {self.floor!r}")
         if not (is_number(self.friction) and self.friction >= 0):
             raise ValueError(f"friction must be a number from 0 on, got {self.friction!r}")
         if not isinstance(self.robot, Robot):
             raise TypeError(f"robot must be a Robot, got {self.robot!r}")
+
+    def _check_links(self, obstacle):
+        """Raise ValueError if an obstacle may touch a link that the robot does not have."""
+        if obstacle.may_touch and isinstance(self.robot, Robot):
+            self.robot.links_called(obstacle.may_touch)
 
 
 POINT_RADIUS = 0.01
@@ -398,18 +468,26 @@ def from_array(rows, vertices=()):
 
 
 def to_lists(obstacles):
-    """Obstacles as JSON's lists: rows of `to_array`, a hull's followed by its vertices' numbers."""
+    """Obstacles as JSON's lists: rows of `to_array`, a hull's followed by its vertices' numbers.
+
+    `may_touch`, where there is any, is the last entry: True or a list of names.
+    """
     rows = to_array(obstacles).tolist()
     for row, obstacle in zip(rows, obstacles, strict=True):
         if isinstance(obstacle, ConvexHull):
             row += [float(number) for vertex in obstacle.vertices for number in vertex]
+        if obstacle.may_touch:
+            row.append(obstacle.may_touch if obstacle.may_touch is True else [*obstacle.may_touch])
     return rows
 
 
 def from_lists(rows):
     """The inverse of `to_lists`. Raises ValueError, TypeError: as `from_array`."""
+    touching = [row[-1] if row and isinstance(row[-1], (bool, list)) else () for row in rows]
+    rows = [row[:-1] if may else row for row, may in zip(rows, touching, strict=True)]
     vertices = np.array([number for row in rows for number in row[ROW:]]).reshape(-1, 3)
-    return from_array(np.array([row[:ROW] for row in rows]).reshape(-1, ROW), vertices)
+    obstacles = from_array(np.array([row[:ROW] for row in rows]).reshape(-1, ROW), vertices)
+    return with_may_touch(obstacles, touching)
 
 
 def scene_to_json(scene):
@@ -418,15 +496,17 @@ def scene_to_json(scene):
         raise ValueError("a scene with points cannot be written: save the points as .npy instead")
     fields = {
         "obstacles": to_lists(scene.obstacles),
-        "table": None if scene.table is None else to_array([scene.table])[0].tolist(),
+        "table": None if scene.table is None else to_lists([scene.table])[0],
         "floor": scene.floor,
     }
     if scene.friction != FRICTION:
         fields["friction"] = scene.friction
     if scene.robot.arm != PANDA:
         fields["robot"] = scene.robot.arm.name, scene.robot.arm.fingerprint
-    if scene.robot.described:
+    if scene.robot.held_positions != scene.robot.arm.held_positions:
         fields["held"] = scene.robot.held
+    if scene.robot.attached:
+        fields["attached"] = [one.described() for one in scene.robot.attached]
     return json.dumps(fields, sort_keys=True)
 
 
@@ -436,7 +516,20 @@ def scene_from_json(text, robot=PANDA):
     `robot` is the scene's arm: the text has only its fingerprint, and where joints are held.
     """
     fields = json.loads(text)
-    table = fields["table"] and from_array([fields["table"]])[0]
+    table = fields["table"] and from_lists([fields["table"]])[0]
     friction = fields.get("friction", FRICTION)
     robot = robot.arm.with_held(fields["held"]) if "held" in fields else robot.arm
+    robot = robot.with_attached(map(_attached, fields.get("attached", ())))
     return Scene(from_lists(fields["obstacles"]), table, fields["floor"], friction, robot)
+
+
+def _attached(fields):
+    """The inverse of `Attached.described`."""
+    row, link, touch_links = fields
+    return Attached(*from_lists([row]), link, touch_links)
+
+
+def with_may_touch(obstacles, touching):
+    """Obstacles, each with its `may_touch`, a tuple. Raises ValueError: of another number."""
+    pairs = zip(obstacles, touching, strict=True)
+    return tuple(replace(one, may_touch=may) if may else one for one, may in pairs)
