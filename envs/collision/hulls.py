@@ -63,7 +63,14 @@ def arm_hulls(robot):
         centre = (mesh.min(0) + mesh.max(0)) / 2
         mesh = mesh - centre
         radius = np.linalg.norm(mesh, axis=1).max()
-        body = 1 + link.frame, *centre, radius, *mesh.max(0), rounding, robot.link_rows.get(link.index, -1)
+        body = (
+            1 + link.frame,
+            *centre,
+            radius,
+            *mesh.max(0),
+            rounding,
+            robot.link_rows.get(link.index, -1),
+        )
         of_link[link.index].append(len(bodies))
         bodies.append(body)
         meshes.append(mesh)

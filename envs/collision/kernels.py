@@ -20,8 +20,8 @@ BULLET_MARGIN = 0.001
 FAR = 1e9  # m: farther than anything
 # A row describes a convex shape: kind, centre 3, rotation 9 (row-major), half edges of its core 3,
 # rounding, and the body's index if it is a link. The shape is the set of points within `rounding`
-# of its core: a box or a cylinder less its rounding, a sphere's centre, or a link's hull. Obstacles'
-# rows may have another column for each body of the arm, which is 1 if that may touch the shape.
+# of its core: a box or a cylinder less its rounding, a sphere's centre, or a link's hull. Rows of
+# obstacles may have a column more for each body of the arm, which is 1 if that may touch the shape.
 # Kinds are those of `envs.scenes.primitives.to_array`, and `LINK`.
 CYLINDER, SPHERE, LINK = 1, 2, 3
 ROW = 18

@@ -8,7 +8,8 @@ task has queries from elsewhere, each with
 - where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
   uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
   scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`; where there are
-  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another.
+  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another; where there
+  are obstacles with `may_touch`, that of all k obstacles: uint8 (b,), a list as JSON.
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
@@ -18,7 +19,7 @@ A demonstration file, `envs/demos/<task>.h5`, has the arrays
   `envs.datasets.demonstrations.write_demos`); `length`: uint32 (n,), configurations in each;
 - `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
 - `collided`: uint8 (n,), whether the execution has a contact;
-- where scenes vary, `scene`, `obstacle_count`, `obstacles` and `hull_vertices`, as above.
+- where scenes vary, `scene`, `obstacle_count`, `obstacles`, `hull_vertices`, `may_touch`, as above.
 
 j is the number of the robot's joints, 7 of the Panda.
 
@@ -51,6 +52,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     scene_to_json,
     to_array,
     vertex_counts,
+    with_may_touch,
 )
 from roboarm_nmp.envs.tasks import (
     TASKS,
@@ -77,7 +79,9 @@ SCENE_ARRAYS = {
     "obstacle_count": ("<u4", None, "obstacle_count"),
     "obstacles": ("<f8", ROW, "obstacles"),
 }
-HULL_ARRAYS = {"hull_vertices": ("<f8", 3, "hull_vertices")}  # where there are convex hulls
+# Where there are convex hulls, and where there are obstacles with `may_touch`.
+HULL_ARRAYS = {"hull_vertices": ("<f8", 3, "hull_vertices")}
+TOUCH_ARRAYS = {"may_touch": ("<u1", None, "may_touch")}
 QUERY_ARRAYS = {
     "start": ("<f4", JOINTS, "start"),
     "goal": ("<f4", JOINTS, "start"),
@@ -102,6 +106,8 @@ def array_formats(schema, names):
             arrays = {**arrays, **SCENE_ARRAYS, "scene": ("<u4", None, rows_of)}
             if f"{prefix}hull_vertices" in names:
                 arrays |= HULL_ARRAYS
+            if f"{prefix}may_touch" in names:
+                arrays |= TOUCH_ARRAYS
         return {
             prefix + name: (dtype, width, prefix + sibling)
             for name, (dtype, width, sibling) in arrays.items()
@@ -145,11 +151,12 @@ class QueryScenes:
         offsets: int64 (s + 1,): the obstacles of scene j are `rows[offsets[j] : offsets[j + 1]]`.
         rows: float64 (k, 11), as of `envs.scenes.primitives.to_array`.
         vertices: float64 (v, 3), as of `envs.scenes.primitives.hull_vertices`.
+        may_touch: a list, `may_touch` of each of the k obstacles; None if it is () for all.
     """
 
-    def __init__(self, base, index=None, offsets=None, rows=None, vertices=()):
+    def __init__(self, base, index=None, offsets=None, rows=None, vertices=(), may_touch=None):
         self.base, self.index, self.offsets, self.rows = base, index, offsets, rows
-        self.vertices = vertices
+        self.vertices, self.may_touch = vertices, may_touch
         if rows is not None:  # the vertices of row j begin at number `_vertex_offsets[j]`
             self._vertex_offsets = np.concatenate([[0], np.cumsum(vertex_counts(rows))])
 
@@ -159,12 +166,14 @@ class QueryScenes:
         first, last = self.offsets[self.index[i] :][:2]
         begin, end = self._vertex_offsets[[first, last]]
         obstacles = from_array(self.rows[first:last], self.vertices[begin:end])
+        if self.may_touch is not None:
+            obstacles = with_may_touch(obstacles, self.may_touch[first:last])
         return replace(self.base, obstacles=obstacles)
 
     def take(self, which):
         """The scenes of fewer queries, by slice or index array."""
         index = None if self.index is None else self.index[which]
-        return QueryScenes(self.base, index, self.offsets, self.rows, self.vertices)
+        return QueryScenes(self.base, index, self.offsets, self.rows, self.vertices, self.may_touch)
 
 
 def task_file(task, folder, suffix):
@@ -246,7 +255,12 @@ def scene_arrays(path, scenes_of, base, prefix=""):
         f"{prefix}obstacles": to_array(obstacles),
     }
     vertices = hull_vertices(obstacles)
-    return arrays | ({f"{prefix}hull_vertices": vertices} if len(vertices) else {})
+    if len(vertices):
+        arrays[f"{prefix}hull_vertices"] = vertices
+    if any(obstacle.may_touch for obstacle in obstacles):
+        text = json.dumps([obstacle.may_touch for obstacle in obstacles])
+        arrays[f"{prefix}may_touch"] = np.frombuffer(text.encode(), np.uint8)
+    return arrays
 
 
 def read_scenes(path, base, arrays, prefix=""):
@@ -259,10 +273,15 @@ def read_scenes(path, base, arrays, prefix=""):
         raise DatasetError(f"{path}: {prefix}scene does not fit the number of scenes or obstacles")
     vertices = arrays.get(f"{prefix}hull_vertices", np.empty((0, 3)))
     try:
-        for obstacle in from_array(rows, vertices):
+        obstacles, may_touch = from_array(rows, vertices), None
+        if f"{prefix}may_touch" in arrays:
+            may_touch = json.loads(arrays[f"{prefix}may_touch"].tobytes())
+            obstacles = with_may_touch(obstacles, may_touch)
+        for obstacle in obstacles:
+            base.robot.links_called(obstacle.may_touch)
             if isinstance(obstacle, ConvexHull):
                 check_obstacle(obstacle)
-    except ValueError as error:
+    except (RecursionError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: {prefix}obstacles: {error}") from error
     if not np.isfinite(rows).all():
         raise DatasetError(f"{path}: {prefix}obstacles has numbers that are not finite")
@@ -270,7 +289,7 @@ def read_scenes(path, base, arrays, prefix=""):
         raise DatasetError(
             f"{path}: {prefix}obstacles has sizes that are not positive, or too large"
         )
-    return QueryScenes(base, index.astype(np.int64), offsets, rows, vertices)
+    return QueryScenes(base, index.astype(np.int64), offsets, rows, vertices, may_touch)
 
 
 def read_base_scene(path, text, robot):
@@ -301,7 +320,9 @@ def read_base_scene(path, text, robot):
 def _same_scene(one, other):
     """Whether two scenes (JSON) are equal up to rounding."""
     one, other = json.loads(one), json.loads(other)
-    if any(one.get(field) != other.get(field) for field in ("robot", "held")):
+    if any(one.get(field) != other.get(field) for field in ("robot", "held", "attached")):
+        return False
+    if _names_in(one) != _names_in(other):
         return False
     for field in ("obstacles", "table", "floor", "friction"):
         here, there = one.get(field), other.get(field)
@@ -313,10 +334,22 @@ def _same_scene(one, other):
             if [len(row) for row in here] != [len(row) for row in there]:
                 return False
             here, there = (list(itertools.chain(*rows)) for rows in (here, there))
+        if field in ("obstacles", "table"):
+            here, there = ([x for x in row if not _is_touch(x)] for row in (here, there))
         a, b = np.array(here, dtype=float), np.array(there, dtype=float)
         if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SCENE_TOLERANCE):
             return False
     return True
+
+
+def _is_touch(entry):
+    """Whether an entry of a row of `to_lists` is its `may_touch`."""
+    return isinstance(entry, (bool, list))
+
+
+def _names_in(scene):
+    """`may_touch` of a scene's obstacles and table (JSON)."""
+    return [[x for x in row if _is_touch(x)] for row in (*scene["obstacles"], scene["table"] or ())]
 
 
 def _checksum(attributes, arrays):

@@ -79,6 +79,8 @@ def shard_bytes(task, seed, first, sensors, scenes, configurations, observations
         made_by: the command line that makes the shards.
     """
     obstacles = [o for scene in scenes for o in scene.obstacles]
+    if any(obstacle.may_touch for obstacle in obstacles):
+        raise DatasetError("files of observations cannot have random obstacles with may_touch")
     arrays = {
         "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
         "obstacles": to_array(obstacles),

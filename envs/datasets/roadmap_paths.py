@@ -90,6 +90,8 @@ def shard_bytes(task, seed, first, scenes, paths, made_by):
     flat = [path for of_scene in paths for path in of_scene]
     base = get_task(task).base_scene
     obstacles = [o for scene in scenes for o in scene.obstacles]
+    if any(obstacle.may_touch for obstacle in obstacles):
+        raise DatasetError("files of roadmap paths cannot have random obstacles with may_touch")
     arrays = {
         "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
         "obstacles": to_array(obstacles),

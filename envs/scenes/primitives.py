@@ -61,7 +61,7 @@ def _normalise(body):
             object.__setattr__(body, name, tuple(value))
     if hasattr(body, "orientation"):
         object.__setattr__(body, "orientation", unit_quaternion(body.orientation))
-    if body.may_touch not in ((), True):
+    if body.may_touch is not True and (type(body.may_touch) is not tuple or body.may_touch):
         object.__setattr__(body, "may_touch", _link_names(body.may_touch, "may_touch"))
 
 
