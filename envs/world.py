@@ -30,7 +30,7 @@ HOLD_STEPS = 5
 HOLD_DRIFT = 1e-3
 # Colour and friction.
 FLOOR_STYLE, TABLE_STYLE = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
-OBSTACLE_COLOUR, TOUCHABLE_COLOUR = (0.36, 0.50, 0.65, 1), (0.85, 0.65, 0.30, 1)
+OBSTACLE_COLOUR, TOUCHABLE_COLOUR = (0.36, 0.50, 0.65, 1), (0.59, 0.47, 0.67, 1)
 MAX_SAMPLING_TRIES = 10_000
 MAX_EDGE = 4096  # pixels of an image: 20,000 by 20,000 would need all of a machine's memory
 # PyBullet keeps about 4 kB of each body that is removed, so the world is made anew after this many

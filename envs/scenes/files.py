@@ -23,7 +23,7 @@ An obstacle can be a mesh of a file in this file's folder, or below: `mesh: {fil
 0.001, decompose: true, position: [0.5, 0, 0.2]}`. `scale` is 1 and `decompose` false if left out:
 then a mesh's convex hull takes its place (`envs.scenes.meshes`).
 
-An obstacle may have `may_touch`: `true`, or names of links, such as `[panda_hand]`, whose contacts
+Obstacles may have `may_touch`: `true`, or names of links, such as `[panda_hand]`, whose contacts
 with it are no collisions; `true` means the hand and its fingers. Objects that the arm carries are
 listed like obstacles under the key `attached`, placed in the frame of a link: `- box: {link:
 panda_hand, position: [0, 0, 0.1], size: [0.05, 0.05, 0.2], touch_links: []}`. `link` is the one
