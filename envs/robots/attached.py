@@ -19,7 +19,7 @@ from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 COLOUR = "0.85 0.55 0.2 1"
 MAX_ATTACHED = 100
-SAMPLES = 10_000  # configurations among which one without contacts is looked for
+SAMPLES = 1_000  # configurations among which one without contacts is looked for
 
 
 @functools.lru_cache(64)

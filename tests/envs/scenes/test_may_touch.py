@@ -109,7 +109,8 @@ def test_query_file_of_varying_scenes_keeps_the_links(tmp_path):
     for touching in (True, False):
         path = tmp_path / f"{touching}.h5"
         found = [replace(base, obstacles=(replace(CAN, may_touch=touching),)), base]
-        splits = {name: (ends, ends[::-1], found) for name in ("test", "validation")}
+        splits = {"test": (ends, ends[::-1], found)}
+        splits["validation"] = ends + np.float32(0.01), ends[::-1], found
         write_queries(path, "random_boxes_easy", 0, splits, "", {})
         queries = load_queries(path, "test")
         assert [queries[i].scene for i in range(2)] == found
