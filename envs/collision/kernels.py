@@ -775,14 +775,12 @@ def signed_distances_batch(
                     first, least = j, squared
             for n in range(rows.shape[0]):
                 j = first if n == 0 else n - 1 if n <= first else n
-                if touching and rows[j, ROW + k] != 0.0:
-                    continue
                 rounding = rows[j, 16] + bodies[k, ROUNDING]
                 far = min(distance[i, link] + rounding, FAR)
                 core = _signed_distance(
                     bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope
                 )
-                if core < far:
+                if core < far and not (touching and rows[j, ROW + k] != 0.0):
                     distance[i, link], geometry[i, link] = core - rounding, j
                     _to_base(frames, f, centres, k, s, 1.0, 0.0, normal[i, link], witness[i, link])
             rounding = ball[0, 16] + bodies[k, ROUNDING]

@@ -161,11 +161,12 @@ class SafetyFilter:
     def _filter_actions(self, act, env, rng):
         """`filter_policy` without approach paths."""
         link_distances_at, max_step = env.get_wrapper_attr("link_distances_at"), env.max_step
-        robot, joints = env.robot, env.robot.num_joints
+        joints = env.robot.num_joints
         local_minima, goal_distances = _LocalMinima(rng, max_step, joints), None
 
         def act_safely(observation):
             nonlocal goal_distances
+            robot = env.robot  # an episode's scene may have another gripper opening, or objects
             state, goal = observation["observation"][:joints], None
             here = np.concatenate([observation["link_distances"], _self_distances(robot, state)])
             margins, cbf_gain = np.broadcast_to(self.margin, len(here)), CBF_GAIN

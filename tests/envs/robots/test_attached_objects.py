@@ -14,8 +14,10 @@ from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import ARM, CollisionChecker
 from roboarm_nmp.envs.datasets.problem_formats import Problem
 from roboarm_nmp.envs.datasets.problems import load_problems, write_problems
+from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.networks.exported_networks import check_robot
 from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
+from roboarm_nmp.envs.policies.rollout import Episode
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
 from roboarm_nmp.envs.scenes.primitives import (
@@ -172,6 +174,13 @@ def test_episode_with_an_object_is_that_of_its_copy_and_of_a_new_environment():
     one, two = (e.step(np.full(7, 0.01))[0]["observation"] for e in (env, other))
     np.testing.assert_array_equal(one, two)
     assert not np.array_equal(expected[0], expected[-1])
+
+
+def test_episode_has_the_arm_of_its_scene():
+    env = RoboArmEnv()
+    scene = Scene(robot=PANDA.with_attached([BOARD]))
+    assert Episode(env, Query(START, GOAL, scene)).trajectory().robot == scene.robot
+    env.close()
 
 
 def test_files_keep_objects(tmp_path):
