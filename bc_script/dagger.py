@@ -12,9 +12,10 @@ the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a safety filter
 under `# ALGO LOGIC`. The part between `# SHARED` and `# END SHARED` is the same in `bc.py`.
 """
 
+import functools
+import itertools
 import math
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -25,15 +26,15 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs.arm_env import end_effector_size
-from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.perception.encoders import make_encoder
-from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, ground_truth_checker
+from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.training import flags, protocol, runs
+from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
+from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.progress import progress_bar
 from roboarm_nmp.envs.utils.random_streams import Stream
 
@@ -41,16 +42,15 @@ from roboarm_nmp.envs.utils.random_streams import Stream
 @dataclass
 class Args(protocol.PolicyFlags):
     # More flags are in `envs/training/protocol.py` (task) and `envs/training/runs.py` (run).
-    exp_name: str = "dagger"
-    """name of the experiment, part of the name of the run's folder"""
     task: str = "random_boxes_hard"
     """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
     goal_type: Literal["config", "combined", "pose"] = "combined"
-    """what the goal is: configuration, that and the end-effector's position, or end-effector
-    pose"""
-    paths: Path = Path("roadmaps")
-    """folder of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any task of the
+    """what the goal is: configuration, that and end-effector position, or end-effector pose"""
+    paths: tuple[Path, ...] = (Path("roadmaps"),)
+    """folders of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any tasks of the
     same robot"""
+    initial_policy: str | None = None
+    """begin with the weights of this policy of the same sizes: a name, a run's folder or a file"""
 
     # The algorithm
     total_updates: flags.PositiveInt = 24_000
@@ -66,6 +66,9 @@ class Args(protocol.PolicyFlags):
     evaluated and saved (1: no averaging)"""
     pool_size: flags.PositiveInt = 200_000
     """examples in memory, from which batches are sampled"""
+    workers: flags.Helpers = flags.CORES
+    """processes that draw examples, by default as many as there are cores (0: none beside this
+    one); results do not depend on their number"""
     examples_per_update: flags.PositiveInt = 256
     """new examples per update, all of one scene, which replace the oldest ones; with an eighth of a
     batch, reusing them too often causes overfitting (docs/lab_notebook.md)"""
@@ -90,6 +93,8 @@ class Args(protocol.PolicyFlags):
     """number of residual blocks"""
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
+    compile: bool = True
+    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
 
     # The safety filter
     safety_margin: flags.NonNegativeFloat = 0.01
@@ -106,7 +111,6 @@ class Args(protocol.PolicyFlags):
     """number of states that are labelled, of those that the policy visits on a query"""
     round_weight: flags.NonNegativeFloat = 5.0
     """probability of a visited state in a batch, relative to an example of the pool"""
-
     eval_every: flags.PositiveInt = 4_000
     """updates between evaluations on validation queries; the best policy is saved"""
 
@@ -195,9 +199,9 @@ class Actor(nn.Module):
         inputs += [torch.sin(angles), torch.cos(angles), distances.flatten(1)]
         return torch.cat(inputs, dim=1)
 
-    def outputs(self, observation, desired_goal, link_distances, goal_link_distances=None):
+    def outputs(self, observation, desired_goal, **distances):
         """The direction (N, n), of any length, and the remaining length of the path (N,)."""
-        features = self.features(observation, desired_goal, link_distances, goal_link_distances)
+        features = self.features(observation, desired_goal, **distances)
         joints = self.num_joints
         tokens = observation[:, self.arm_size :].unflatten(1, (-1, self.token_size))
         fused = F.relu(self.token_in(tokens) + self.arm_in(features).unsqueeze(1))
@@ -212,12 +216,10 @@ class Actor(nn.Module):
         direction = F.normalize(to_goal, dim=1) + outputs[:, :joints]
         return direction, to_goal.norm(dim=1) + F.softplus(outputs[:, joints])
 
-    def forward(
-        self, observation, achieved_goal, desired_goal, link_distances, goal_link_distances=None
-    ):
+    def forward(self, observation, achieved_goal, desired_goal, **distances):
         """The action (N, n); policy.pt contains this function."""
-        given = observation, desired_goal, link_distances, goal_link_distances
-        (direction, length), joints = self.outputs(*given), self.num_joints
+        direction, length = self.outputs(observation, desired_goal, **distances)
+        joints = self.num_joints
         if self.goal_is_pose:
             return F.normalize(direction, dim=1) * length.unsqueeze(1).clamp(max=MAX_STEP)
         to_goal = (desired_goal[:, :joints] - observation[:, :joints]).norm(dim=1, keepdim=True)
@@ -226,15 +228,15 @@ class Actor(nn.Module):
 
 # ALGO LOGIC: one update
 def update(actor, optimizer, batch, length_weight):
-    """One step on a batch of examples. Returns the losses before it, of direction and length."""
+    """One step on a batch of examples. Returns the losses before it."""
     inputs = ("observation", "desired_goal", "link_distances", "goal_link_distances")
-    direction, length = actor.outputs(*(batch[name] for name in inputs))
+    direction, length = actor.outputs(**{name: batch[name] for name in inputs})
     direction_loss = 1.0 - F.cosine_similarity(direction, batch["direction"]).mean()
     length_loss = F.smooth_l1_loss(length, batch["length"])
     optimizer.zero_grad()
     (direction_loss + length_weight * length_loss).backward()
     optimizer.step()
-    return direction_loss, length_loss
+    return {"losses/direction": direction_loss, "losses/length": length_loss}
 
 
 # ALGO LOGIC: a round of DAgger
@@ -253,13 +255,9 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         visited.append(observation["observation"][0, : robot.num_joints].cpu().numpy())
         return actor(**observation)
 
-    bar = progress_bar(None, "round", args.round_queries, unit="query", transient=True)
-    while len(reached) < args.round_queries:
-        number, first, last = examples.choose_paths(rng, 1)
-        scene, ends = examples.paths.scenes[number], examples.paths.points[np.r_[first, last]]
-        if not ground_truth_checker(scene).is_free(ends, margin=0.001).all():
-            continue  # rounding might make the environment reject it
-        query = Query(*robot.denormalise(ends).astype(np.float32), scene)
+    for _ in progress_bar(range(args.round_queries), "round", unit="query", transient=True):
+        number, ends = examples.random_query(rng)
+        query = Query(*robot.denormalise(ends).astype(np.float32), examples.paths.scenes[number])
         visited.clear()
         seed = int(rng.integers(2**32))  # of the random-walk escapes
         result = protocol.evaluate(act, [env], [query], device, safety_filter, seed)
@@ -271,14 +269,12 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         count = min(args.round_labels, len(states))
         states = states[rng.choice(len(states), count, False, weights / weights.sum())]
         parts.append(examples.label(number, states, np.repeat(ends[1:], count, axis=0), rng))
-        bar.update()
-    bar.close()
     return concat([on_device(part, device) for part in parts]), np.mean(reached)
 
 
 # ALGO LOGIC: batches, dicts of tensors
 def on_device(examples, device):
-    return {name: torch.as_tensor(array, device=device) for name, array in examples.items()}
+    return {name: cuda_graphs.to_device(array, device) for name, array in examples.items()}
 
 
 def concat(parts):
@@ -291,53 +287,46 @@ def sample(examples, number):
     return {name: tensor[rows] for name, tensor in examples.items()}
 
 
-def with_scene(batch, latents, token_size):
-    """The batch with encoded scenes (scenes, z) in observations, without tokens that all lack."""
-    tokens = latents[batch["scene"]].unflatten(1, (-1, token_size))
-    tokens = tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)]
-    observation = torch.cat([batch["observation"], tokens.flatten(1)], dim=1)
-    return batch | {"observation": observation}
+def without_padding(latents, token_size):
+    """Encoded scenes (scenes, z), without the tokens at the end that no scene has."""
+    tokens = latents.unflatten(1, (-1, token_size))
+    return tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)].flatten(1)
 
 
 if __name__ == "__main__":
-    args = runs.parse_args(Args, may_change={"test_queries"})
+    args = runs.parse_args(Args, may_change={"test_queries", "workers"})
     device = runs.seed_torch(args)
     validation, test = protocol.load_task(args)
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:
         sys.exit("--pool-size must be at least --examples-per-update")
     robot = validation.scenes.base.robot
-    try:
+    with runs.errors_of("--encoder"):
         encoder = make_encoder(args.encoder, args.num_points)
         encoder.check_robot(robot)
-    except ValueError as error:
-        sys.exit(f"--encoder: {error}")
-    try:
+    with runs.errors_of("--geometry-source"):
         geometry_source = args.geometry_source or encoder.geometry_source
         find_checker = find_geometry_source(geometry_source, robot)
-    except ValueError as error:
-        sys.exit(f"--geometry-source: {error}")
-    try:
+    with runs.errors_of("--paths"):
         paths = load_roadmap_paths(args.paths, robot)
-    except DatasetError as error:
-        sys.exit(f"--paths: {error}")
-    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
-    env_arguments |= {"num_points": args.num_points, "geometry_source": geometry_source}
-    env_arguments |= {"link_distances": True}
+    env_arguments = {name: getattr(args, name) for name in ("goal_type", "encoder", "num_points")}
+    env_arguments |= {"geometry_source": geometry_source, "link_distances": True}
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     safety_filter = SafetyFilter(args.safety_margin, args.escape)
 
     # ALGO LOGIC: network and optimiser
     actor = Actor(args, eval_envs[0]).to(device)
+    if args.initial_policy is not None:
+        protocol.copy_weights(args.initial_policy, actor)
     actor_average = Actor(args, eval_envs[0]).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
-    optimizer = torch.optim.Adam(actor.parameters(), lr=args.learning_rate, fused=True)
+    optimizer = cuda_graphs.adam(actor.parameters(), args.learning_rate, args, device)
+    learn = cuda_graphs.graphed(functools.partial(update, actor, optimizer), args, device)
     visited = {}  # examples of all rounds
     state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
     state |= {"visited": visited}
-    run = protocol.PolicyRun(
-        args, state, device, env_arguments, eval_envs, validation, safety_filter
-    )
+    task = env_arguments, eval_envs, validation, safety_filter
+    run = protocol.PolicyRun(args, state, device, *task)
     visited |= on_device(visited, device)
 
     # Here, because SciPy and Numba take a while to import, which --help would wait for.
@@ -345,42 +334,37 @@ if __name__ == "__main__":
 
     # ALGO LOGIC: data. The pool is not in checkpoints: a resumed run draws the same examples again.
     latents = torch.as_tensor(eval_envs[0].encoder.encode_demos(paths), device=device)
+    latents = without_padding(latents, actor.token_size)
     examples = RoadmapExamples(paths, find_checker, args.seed, args.goal_type)
-
-    def draw(number):
-        return on_device(examples.draw(number, args.examples_per_update, args.noise), device)
-
-    pool = [None] * num_draws
-    numbers = range(run.step, run.step + num_draws)
-    for number in progress_bar(numbers, "drawing examples", unit="batch"):
-        pool[number % num_draws] = draw(number)
-    pool = concat(pool)
-    background = ThreadPoolExecutor(1)
+    draw = functools.partial(examples.draw, count=args.examples_per_update, noise=args.noise)
+    draws = workers.in_order(draw, itertools.count(run.step), args.workers)
+    pool = [next(draws) for _ in progress_bar(range(num_draws), "drawing examples", unit="batch")]
+    first = run.step % num_draws
+    pool = concat([on_device(one, device) for one in pool[-first:] + pool[:-first]])
     run.start(args.total_updates, "update")
 
     while run.step < args.total_updates:
         # ALGO LOGIC: learn, while the next examples are drawn
-        drawn = background.submit(draw, run.step + num_draws)
         if args.anneal:
             remaining = 1.0 - run.step / args.total_updates
-            optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
+            cuda_graphs.set_learning_rate(optimizer, args.learning_rate * remaining)
         batch = sample(pool, args.batch_size)
         if visited and len(visited["scene"]):
             weight = args.round_weight * len(visited["scene"])
             count = int(args.batch_size * weight / (weight + len(pool["scene"])))
             batch = concat([sample(visited, count), batch])
             batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
-        batch = with_scene(batch, latents, actor.token_size)
-        direction_loss, length_loss = update(actor, optimizer, batch, args.length_weight)
+        scenes = latents[batch.pop("scene")]
+        batch["observation"] = torch.cat([batch["observation"], scenes], dim=1)
+        losses = learn(batch, args.length_weight)
         polyak_update(actor_average, actor, args.policy_average)
         oldest = run.step % num_draws * args.examples_per_update
-        for name, tensor in drawn.result().items():
+        for name, tensor in on_device(next(draws), device).items():
             pool[name][oldest : oldest + len(tensor)] = tensor
         step = run.advance()
         if step % 100 == 0:
             learning_rate = optimizer.param_groups[0]["lr"]
-            run.log({"losses/direction": direction_loss, "losses/length": length_loss})
-            run.log({"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
+            run.log(losses | {"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
 
         # ALGO LOGIC: a round of DAgger
         if args.round_every and step % args.round_every == 0 and step < args.total_updates:
@@ -396,5 +380,5 @@ if __name__ == "__main__":
             run.save_policy(actor_average)
         if evaluating or run.interrupted:
             run.checkpoint()
-    background.shutdown()
+    draws.close()
     run.final_test(test)

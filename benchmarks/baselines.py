@@ -25,8 +25,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from markdown_tables import NOTHING, share, table, write
 
-from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.queries import load_queries, query_path
+from roboarm_nmp.envs.tasks import STATIC_TASKS
 from roboarm_nmp.envs.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -84,13 +84,13 @@ def papers_go_to_goal():
 
 def tables(results, unseen):
     """Name -> Markdown. `unseen`: results of benchmarks/unseen_obstacles.py."""
-    results = {task: dict(results.get(task, {})) for task in envs.TASKS}
+    results = {task: dict(results.get(task, {})) for task in STATIC_TASKS}
     for task, found in unseen.items():
         if REACTIVE in found:
             results[task][REACTIVE] = found[REACTIVE]
     papers = {task: share(value) for task, value in papers_go_to_goal().items()}
     success = matrix(results, "success_rate", share)
-    for row, task in zip(success, envs.TASKS, strict=True):
+    for row, task in zip(success, STATIC_TASKS, strict=True):
         row.insert(1, papers.get(task, NOTHING))
     names = [SHOWN.get(name, name) for name in COLUMNS]
     head = ["task", *names]
@@ -111,7 +111,7 @@ def tables(results, unseen):
 def matrix(results, key, form, names=None):
     """Rows: a task each, and one quantity of each policy."""
     rows = []
-    for task in envs.TASKS:
+    for task in STATIC_TASKS:
         values = [results[task].get(name, {}).get(key) for name in names or COLUMNS]
         shown = [NOTHING if value is None else form(value) for value in values]
         rows.append([f"`{task}`", *shown])
@@ -137,7 +137,7 @@ def policies(results):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", nargs="+", choices=list(envs.TASKS), metavar="TASK")
+    parser.add_argument("--only", nargs="+", choices=list(STATIC_TASKS), metavar="TASK")
     parser.add_argument("--policies", nargs="+", default=list(CELLS), choices=list(CELLS))
     parser.add_argument("--num", type=int, default=1000, help="queries for those that search")
     parser.add_argument("--workers", type=int, default=1)
@@ -146,7 +146,7 @@ def main():
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     if not args.table:
         # A task without a pretrained query file has no cells.
-        tasks = args.only or [task for task in envs.TASKS if query_path(task).exists()]
+        tasks = args.only or [task for task in STATIC_TASKS if query_path(task).exists()]
         run(results, tasks, args.policies, args.num, args.workers)
     unseen = json.loads(UNSEEN.read_text()) if UNSEEN.exists() else {}
     write(tables(results, unseen))

@@ -48,7 +48,7 @@ from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.primitives import Scene
-from roboarm_nmp.envs.tasks import with_robot
+from roboarm_nmp.envs.tasks import STATIC_TASKS, with_robot
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
 CONTACT_RANGE = 0.01  # m
@@ -65,8 +65,8 @@ def scenes_of(task, split):
 
 def groups_of_panda():
     """Names of groups of scenes, with the scenes: of validation queries and original problems."""
-    groups = [(task, "validation") for task in envs.TASKS]
-    groups += [(task, "original") for task in envs.TASKS if task.startswith("benchmaker")]
+    groups = [(task, "validation") for task in STATIC_TASKS]
+    groups += [(task, "original") for task in STATIC_TASKS if task.startswith("benchmaker")]
     for task, split in groups:
         scenes = scenes_of(task, split)
         yield f"{task}, {split}", scenes[:SCENES] if split == "validation" else scenes
@@ -74,7 +74,7 @@ def groups_of_panda():
 
 def groups_of(robot, files, rng):
     """Likewise for another arm."""
-    for name, task in envs.TASKS.items():
+    for name, task in STATIC_TASKS.items():
         scene = with_robot(task.scene, robot)
         if isinstance(scene, Scene):
             yield f"the obstacles of {name}", [scene]

@@ -3,11 +3,11 @@
     pip install -c constraints.txt -e ".[bench]"
     python benchmarks/keep_encoders.py runs/RUN ...    # of vae.py, vqvae.py, pointnet2.py, field.py
 
-Of each finished run, `encoder.pt` becomes `envs/perception/pretrained/<exp_name>.pt`, which
-`--encoder <exp_name>` finds, and its decoder, if there is one, `<exp_name>.decoder.pt`. With
+Of each finished run, `encoder.pt` becomes `envs/perception/pretrained/<script>.pt`, which
+`--encoder <script>` finds, and its decoder, if there is one, `<script>.decoder.pt`. With
 `--float16` they are in half precision; then policies that use the encoder have to be evaluated
 again. The JSON beside it has data, updates, scores on validation scenes and flags;
-`docs/figures/encoder_<exp_name>.png` is TensorBoard's image of a validation scene at the update of
+`docs/figures/encoder_<script>.png` is TensorBoard's image of a validation scene at the update of
 the encoder.
 """
 
@@ -48,7 +48,7 @@ def validation_image(run, step):
 def keep(run, encoders, figures, float16=False):
     """Copy one run's encoder, write its JSON and its figure; returns the JSON's dict."""
     trained = json.loads((run / "result.json").read_text())
-    name = trained["args"]["exp_name"]
+    name = trained["script"]
     result = {key: value for key, value in trained.items() if key not in ("args", "encoder")}
     result |= {"date": datetime.date.today().isoformat(), "commit": commit()}
     with open_shard(shard_path(trained["args"]["observations"], 0)) as shard:

@@ -23,6 +23,7 @@ from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.show import render_configurations
+from roboarm_nmp.envs.tasks import STATIC_TASKS
 from roboarm_nmp.envs.utils.files import write_atomically
 
 matplotlib.use("Agg")
@@ -135,7 +136,7 @@ def bars(results):
 def by_task(results):
     """A PNG file's bytes: success and its interval per task. `results`: task -> cell -> result."""
     figure, axes = plt.subplots(figsize=(10, 3.8), layout="constrained")
-    tasks, best = list(envs.TASKS), papers_best()
+    tasks, best = list(STATIC_TASKS), papers_best()
     shifts = np.linspace(-0.28, 0.28, len(BY_TASK))
     for (label, cell, marker), shift in zip(BY_TASK, shifts, strict=True):
         found = [results[task].get(cell) for task in tasks]

@@ -26,12 +26,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from markdown_tables import NOTHING, interval, share, table, write
 
-from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.networks.exported_networks import to_float16
 from roboarm_nmp.envs.perception.encoders import PRETRAINED
 from roboarm_nmp.envs.policies.registry import PolicyError, find_policy
 from roboarm_nmp.envs.policies.safety_filter import VERSION
+from roboarm_nmp.envs.tasks import STATIC_TASKS
 from roboarm_nmp.envs.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -134,7 +134,7 @@ SHOWN = {
     "dagger, oracle": "DAgger, privileged",
 }
 UNSEEN = [
-    name for name, task in envs.TASKS.items() if name.startswith("random") or not task.trainable
+    name for name, task in STATIC_TASKS.items() if name.startswith("random") or not task.trainable
 ]
 # Results of benchmarks/results/baselines.json, which do not depend on the goal type: `combined` is
 # reached like `ee`.
@@ -166,7 +166,9 @@ def keep(run):
     """Put a run's policy where it is found by name, in half precision, with how it was made."""
     training = json.loads((run / "result.json").read_text())
     args = training["args"]
-    scenes = load_roadmap_paths(Path(args["paths"])).task  # that it learned from
+    # Those that it learned from: a folder, or the first of several.
+    paths = args["paths"][0] if isinstance(args["paths"], list) else args["paths"]
+    scenes = load_roadmap_paths(Path(paths)).task
     name = f"dagger-{args['goal_type']}-{args['encoder']}-{scenes}-s{args['seed']}"
     to_float16(run / "policy.pt", POLICIES / f"{name}.pt")
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
@@ -299,7 +301,7 @@ def others_results(baselines):
 
 def tables(results, others):
     """Name -> Markdown. `others` are the results of `others_results`."""
-    results = {task: others.get(task, {}) | results.get(task, {}) for task in envs.TASKS}
+    results = {task: others.get(task, {}) | results.get(task, {}) for task in STATIC_TASKS}
     hard = results[HARD]
     found = {
         "unseen-policies": policies_table(hard),
@@ -307,7 +309,7 @@ def tables(results, others):
         "unseen-seeds": seeds_table(hard),
     }
     for name, columns, tasks in (
-        ("unseen-tasks", ("go-to-goal", *EVERYWHERE), list(envs.TASKS)),
+        ("unseen-tasks", ("go-to-goal", *EVERYWHERE), list(STATIC_TASKS)),
         ("unseen-encoders", WITH_ENCODERS, UNSEEN),
     ):
         found[f"{name}-success"] = matrix(results, "success_rate", columns, tasks, papers_best())
@@ -394,7 +396,7 @@ def _mark(result):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", nargs="+", choices=list(envs.TASKS), metavar="TASK")
+    parser.add_argument("--only", nargs="+", choices=list(STATIC_TASKS), metavar="TASK")
     parser.add_argument("--cells", nargs="+", choices=list(CELLS), metavar="CELL")
     parser.add_argument("--num", type=int, default=1000, help="queries of a cell")
     parser.add_argument("--workers", type=int, default=1)
@@ -406,7 +408,7 @@ def main():
     if not args.table:
         if args.only is None or HARD in args.only:
             run([HARD], args.cells or CELLS, args.num, args.workers)
-        others = [task for task in args.only or envs.TASKS if task != HARD]
+        others = [task for task in args.only or STATIC_TASKS if task != HARD]
         run(others, args.cells or EVERYWHERE, args.num, args.workers)
         if args.cells is None:
             unseen = [task for task in others if task in UNSEEN]

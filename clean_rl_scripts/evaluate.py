@@ -4,6 +4,7 @@
     roboarm evaluate --policy sac-ee-wall-p1-s1                  # on the task it was trained on
     roboarm evaluate --policy runs/my_run --task wall --json result.json
     roboarm evaluate --policy planner --problems problems.h5     # of other programs' files
+    roboarm evaluate --policy replanning --task moving_boxes_medium --geometry-source point_cloud
     python clean_rl_scripts/evaluate.py --policy random --task boxes    # the same script
 
 An episode is one query, in the query's scene, under the task's standard rules: goal tolerances,
@@ -24,14 +25,19 @@ Baselines to compare a trained policy with:
 - planner: follows a plan of OMPL's RRT-Connect, which may search for `--time-limit` seconds per
   query. The longer the search, the smaller the margin around obstacles. (Shortening a plan may take
   a few more milliseconds.) Without a plan the episode is a failure of 0 steps. The limit is
-  wall-clock time, so the numbers may depend on the machine and its load.
+  wall-clock time, so the numbers may depend on the machine and its load;
+- replanning: follows a plan, checks it in each step against the obstacles as they are then, and
+  plans again whenever it is blocked. Each plan may take a few thousand checks. It waits near a goal
+  that is occupied;
+- space-time: follows a plan that knows how obstacles will move, the reference where they do.
 
-The last two check collisions with the obstacles of a geometry source (`--geometry-source`):
+The last four check collisions with the obstacles of a geometry source (`--geometry-source`):
 `ground_truth` by default, which a trained policy does not receive; `point_cloud` to plan from the
 observed point cloud; or an encoder with a decoder, e.g. `field`, to plan from its latent code.
 
 Around any policy, `--safety-margin` puts a safety filter (`envs.policies.safety_filter`): it
-enforces a minimum clearance (m) on every link as far as possible, and escapes local minima. Its
+enforces a minimum clearance (m) on every link as far as possible, retreats from approaching
+obstacles, and escapes local minima (but around `replanning`, which waits on purpose). Its
 link distances have a geometry source, too: the policy's own, otherwise `ground_truth`. Results that
 used the ground truth are `privileged`, in the header of the table and in the JSON.
 
@@ -48,7 +54,7 @@ Metrics:
 - clearance, with `--clearance`: the episode's smallest distance from an obstacle, in m, likewise;
 - time per action: of the policy alone, without the simulator and without planning.
 
-Also of `via-points` and `planner`:
+Also of `via-points`, `planner` and `space-time`:
 
 - planning time, in s, before moving: mean over all queries, and over those with a motion found;
 - free motion (only `via-points`): share of queries with a motion found.
@@ -70,14 +76,6 @@ from roboarm_nmp.envs.policies.baselines import TIME_LIMIT, TRIES
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import (
-    CORES,
-    NonNegativeFloat,
-    PositiveFloat,
-    PositiveInt,
-    Seed,
-    Workers,
-)
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
@@ -85,8 +83,9 @@ from roboarm_nmp.envs.utils.signals import end_with_one_line
 @dataclass
 class Args:
     policy: str
-    """`go-to-goal`, `random`, `via-points`, `planner` (see above), a policy network, a run's folder
-    with a `policy.pt` in it, or the name of a pretrained policy (`roboarm policies`)"""
+    """`go-to-goal`, `random`, `via-points`, `planner`, `replanning`, `space-time` (see above), a
+    policy network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy
+    (`roboarm policies`)"""
     task: str | None = None
     """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); by default the one that the
     policy was trained on"""
@@ -101,30 +100,48 @@ class Args:
     problems: Path | None = None
     """a file or folder of problems to use instead of a task's queries: `problems.h5` of `roboarm
     import`, or a file that it reads (docs/customise/problems.md); no task is needed"""
-    num_queries: PositiveInt | None = None
+    num_queries: flags.PositiveInt | None = None
     """only the first so many queries of the split"""
-    workers: Workers = CORES
+    workers: flags.Workers = flags.CORES
     """processes, one core each; by default as many as there are cores"""
     stop_on_collision: bool = False
     """end an episode at the first contact"""
     geometry_source: str | None = None
-    """where `planner`, `via-points`, the safety filter and the policy's observations take the
-    obstacles from: `ground_truth`, `point_cloud`, or an encoder with a decoder (a name or path); by
-    default the policy's own, otherwise `ground_truth`"""
-    safety_margin: NonNegativeFloat | None = None
+    """where `planner`, `via-points`, `replanning`, the safety filter and the policy's observations
+    take the obstacles from: `ground_truth`, `point_cloud`, or an encoder with a decoder (a name or
+    path); by default the policy's own, otherwise `ground_truth`"""
+    safety_margin: flags.NonNegativeFloat | None = None
     """put a safety filter with this margin (m) around the policy, e.g. 0.01; 0 for no filter; by
     default the filter that the policy includes, if any"""
     escape: bool = True
     """the safety filter escapes local minima, in a random direction"""
+    lookahead: flags.NonNegativeFloat = 0.0
+    """s: the safety filter takes distances as they will be after this time, if obstacles continue
+    to approach as they do now"""
+    velocities: bool = True
+    """the safety filter takes the velocities of obstacles into account, estimated from successive
+    observations; otherwise each observation counts as if nothing moved"""
     approach: bool = False
     """add approach paths to the safety filter: out of starts, and into goals, that are nearer to
     obstacles than its margin (docs/guide/safety_filter.md)"""
-    seed: Seed = 0
+    observe_every: flags.PositiveInt | None = None
+    """steps from one observation of the scene to the next, with the arm where it is; by default
+    static scenes are observed once, and scenes with moving obstacles in every step"""
+    sensor_noise: tuple[str, ...] = ()
+    """NAME=VALUE pairs of sensor noise, e.g. `gaussian=0.005 dropout=0.1`
+    (docs/guide/perception.md, "Sensor noise")"""
+    seed: flags.Seed = 0
     """of random numbers: `random`, `via-points`, `planner`, escapes"""
-    tries: PositiveInt = TRIES
+    tries: flags.PositiveInt = TRIES
     """random configurations that `via-points` tries per query"""
-    time_limit: PositiveFloat = TIME_LIMIT
-    """seconds that `planner` may search per query"""
+    time_limit: flags.PositiveFloat = TIME_LIMIT
+    """seconds that `planner` and `space-time` may search per query"""
+    action_delay: flags.NonNegativeInt = 0
+    """steps after which an action takes effect, while the arm makes the step before it and then
+    holds its configuration; 0: the simulation waits for the policy"""
+    real_time: bool = False
+    """instead: as many steps of 1/30 s as an action, or a plan, takes to compute, at least 1; the
+    numbers depend on the machine and its load"""
     clearance: bool = False
     """also measure each successful episode's smallest distance from the ground-truth obstacles"""
     json: Path | None = None
@@ -138,17 +155,17 @@ def main(arguments=None):
     args = flags.parse(Args, arguments)
     try:
         flags.check(args)
-        for path in (args.json, args.image):
-            if path is not None:
-                check_writable(path)
+        for path in filter(None, (args.json, args.image)):
+            check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
+        from roboarm_nmp.envs.perception.noise import SensorNoise
         from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
 
-        if args.task is None and args.robot is not None:
-            raise ValueError("--robot goes with --task")
-        options = vars(args) | {"safety_filter": _safety_filter(args)}
+        noise = SensorNoise.parse(args.sensor_noise) if args.sensor_noise else None
+        options = vars(args) | {"safety_filter": _safety_filter(args), "sensor_noise": noise}
         options["task"] = task_with_robot(args.task, args.robot)
-        for name in ("robot", "safety_margin", "escape", "approach", "json", "image"):
+        filters = "safety_margin", "escape", "lookahead", "velocities", "approach"
+        for name in ("robot", *filters, "json", "image"):
             del options[name]
         result = evaluate(**options, progress=True)
     except ValueError as error:
@@ -173,16 +190,26 @@ def _safety_filter(args):
     from roboarm_nmp.envs.policies.registry import find_policy, own_safety_filter
     from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 
+    lookahead = args.lookahead if args.velocities else None
     if args.safety_margin is not None:
-        options = args.safety_margin, args.escape, args.approach
+        options = args.safety_margin, args.escape, args.approach, lookahead
         return SafetyFilter(*options) if args.safety_margin else False
-    if args.escape and not args.approach:
+    flags_given = {
+        "--no-escape": not args.escape,
+        "--approach": args.approach,
+        "--lookahead": args.lookahead != 0.0,
+        "--no-velocities": not args.velocities,
+    }
+    given = [flag for flag, is_given in flags_given.items() if is_given]
+    if not given:
         return None
     own = own_safety_filter(find_policy(args.policy)[0])
     if own is None:
-        flag = "--approach" if args.escape else "--no-escape"
-        raise ValueError(f"{flag}: the policy has no safety filter; --safety-margin adds one")
-    return replace(own, escape=own.escape and args.escape, approach=own.approach or args.approach)
+        raise ValueError(f"{given[0]}: the policy has no safety filter; --safety-margin adds one")
+    if not {"--lookahead", "--no-velocities"} & set(given):
+        lookahead = own.lookahead
+    options = {"approach": own.approach or args.approach, "lookahead": lookahead}
+    return replace(own, escape=own.escape and args.escape, **options)
 
 
 def _settings(result):
@@ -197,7 +224,10 @@ def _settings(result):
         escape = "escapes local minima" if safety_filter["escape"] else "no escape"
         margin = f"margin {safety_filter['margin']:g} m, {escape}"
         margin += ", approach paths" * ("approach" in safety_filter)
-    limit = result["time_limit"]
+        if "lookahead" in safety_filter:
+            ahead = safety_filter["lookahead"]
+            margin += ", no velocities" if ahead is None else f", {ahead:g} s ahead"
+    limit, noise = result["time_limit"], result.get("sensor_noise", {})
     return {
         "robot": None if result["robot"] == PANDA.name else result["robot"],
         "queries": result["queries"],
@@ -206,10 +236,20 @@ def _settings(result):
         "geometry source": result["geometry_source"] or "none",
         "privileged": "yes" if result["privileged"] else None,
         "safety filter": margin,
+        "observed every": f"{result['observe_every']} steps" if "observe_every" in result else None,
+        "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",
         "tries": result["tries"],
+        "action delay": _delay(result["action_delay"]),
         "seed": result["seed"],
     }
+
+
+def _delay(steps):
+    """The delay in words; None for none."""
+    if steps == "real_time":
+        return "real time: the steps that each action takes to compute"
+    return f"{steps} steps" if steps else None
 
 
 def _table(result):
@@ -252,8 +292,7 @@ def _table(result):
             row("planning time", result["planning_seconds"], "s"),
             row("  ... if found", result["planning_seconds_solved"], "s"),
         ]
-    if result["free_motion_rate"] is not None:
-        lines.append(row("free motion", result["free_motion_rate"]))
+    lines += [row("free motion", result["free_motion_rate"])] * (result["tries"] is not None)
     return "\n".join(lines)
 
 

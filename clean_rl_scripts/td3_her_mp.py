@@ -9,7 +9,6 @@ paper's sections 2 and 5. For an algorithm of your own, copy this file and chang
 `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are the same in `sac_her_mp.py`.
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,16 +17,13 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs.datasets.episodes import demo_transitions, transition
 from roboarm_nmp.envs.networks.poses import pose_difference
-from roboarm_nmp.envs.training import flags, protocol, runs
+from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
 
 
 @dataclass
 class Args(protocol.PolicyFlags, protocol.EnvFlags):
     # More flags are in `envs/training/protocol.py` (task, MDP) and `envs/training/runs.py` (run).
-    exp_name: str = "td3_her_mp"
-    """name of the experiment, part of the name of the run's folder"""
     num_envs: flags.Environments = 4
     """environments stepped together; every one of their steps counts"""
     total_timesteps: flags.PositiveInt = 1_000_000
@@ -36,8 +32,6 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """environment steps with random actions before the first update"""
     updates_per_step: flags.NonNegativeFloat = 0.5
     """updates of the critics per environment step (CleanRL: 1)"""
-    buffer_size: flags.PositiveInt = 1_000_000
-    """transitions in the replay buffer"""
     batch_size: flags.PositiveInt = 256
     """transitions per update"""
     her_probability: flags.Share = 0.8
@@ -73,6 +67,8 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not twice `max_step`)"""
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
+    compile: bool = True
+    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
     eval_every: flags.PositiveInt = 25_000
     """environment steps between evaluations on validation queries; the best policy is saved"""
     stop_at_success: flags.Share | None = None
@@ -199,6 +195,9 @@ class Actor(nn.Module):
 
 # ALGO LOGIC: replay buffer
 # SHARED: replay buffer
+BUFFER_SIZE = 1_000_000  # transitions; memory is taken as they come
+
+
 class HerReplayBuffer:
     """Transitions of finished episodes in a ring; goals are relabelled when they are sampled.
 
@@ -264,7 +263,7 @@ class HerReplayBuffer:
         """Yield `number` batches, dicts of tensors; up to 64 are sampled together, for speed."""
         for first in range(0, number, 64):
             data = self.sample(min(64, number - first) * batch_size)
-            parts = [torch.as_tensor(a, device=device).split(batch_size) for a in data.values()]
+            parts = [cuda_graphs.to_device(a, device).split(batch_size) for a in data.values()]
             for batch in zip(*parts, strict=True):
                 yield dict(zip(data, batch, strict=True))
 
@@ -305,24 +304,24 @@ class TD3:
         self.critics, self.critics_target = critics
         self.critics_target.load_state_dict(self.critics.state_dict())
         parameters = self.actor.parameters()
-        self.actor_optimizer = torch.optim.Adam(parameters, lr=args.policy_lr, fused=True)
-        self.q_optimizer = torch.optim.Adam(self.critics.parameters(), lr=args.q_lr, fused=True)
+        self.actor_optimizer = cuda_graphs.adam(parameters, args.policy_lr, args, device)
+        self.q_optimizer = cuda_graphs.adam(self.critics.parameters(), args.q_lr, args, device)
 
     def checkpoint_state(self):
         """The parts of a checkpoint, by name."""
         return {name: part for name, part in vars(self).items() if name != "args"}
 
     @torch.no_grad()
-    def explore(self, **observation):
-        """Noisy actions (N, n), a NumPy array, for training."""
+    def explore(self, data):
+        """From observations, (N, ...) each, to a dict with noisy `actions` (N, n)."""
         self.actor.eval()
-        actions, scale = self.actor(**observation), self.actor.action_scale
+        actions, scale = self.actor(**data), self.actor.action_scale
         self.actor.train()
         noise = self.args.exploration_noise * torch.randn_like(actions)
-        return (actions + scale * noise).clamp(-scale, scale).cpu().numpy()
+        return {"actions": (actions + scale * noise).clamp(-scale, scale)}
 
-    def update(self, data, number):
-        """Update number `number` of the run, on a batch. Returns tensors whose means are logged."""
+    def update(self, data, of_policy):
+        """An update on a batch, `of_policy` or not. Returns tensors whose means are logged."""
         args, scale = self.args, self.actor.action_scale
         features = self.actor.features(data["observation"], data["desired_goal"])
         with torch.no_grad():
@@ -342,7 +341,7 @@ class TD3:
         losses = {"qf1_values": qf_values[0], "qf2_values": qf_values[1], "qf_loss": qf_losses}
         losses |= {"qf1_loss": qf_losses[0], "qf2_loss": qf_losses[1]}
 
-        if number % args.policy_frequency == 0:
+        if of_policy:
             self.critics.requires_grad_(False)  # they need no gradient of the policy's loss
             actions, preactivation = self.actor.get_action(features)
             qf1 = self.critics(features, actions, number=1)
@@ -363,8 +362,6 @@ if __name__ == "__main__":
     # SHARED: checks and environments
     args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = runs.seed_torch(args)
-    if args.buffer_size < args.horizon:
-        sys.exit(f"--buffer-size {args.buffer_size}: an episode has {args.horizon} transitions")
     validation, test = protocol.load_task(args)
     env_arguments = protocol.env_arguments_of(args)
     envs = protocol.make_training_envs(args, args.demo_prob, args.demos)
@@ -373,51 +370,43 @@ if __name__ == "__main__":
 
     agent = TD3(args, eval_envs[0], device)
     # SHARED: run and episodes
+    explore, update = (cuda_graphs.graphed(f, args, device) for f in (agent.explore, agent.update))
     rng = np.random.default_rng(args.seed)
-    rb = HerReplayBuffer(eval_envs[0], args.buffer_size, args.her_probability, rng)
+    rb = HerReplayBuffer(eval_envs[0], BUFFER_SIZE, args.her_probability, rng)
     counts, losses = {"updates": 0, "demos_injected": 0}, {}
     state = agent.checkpoint_state() | {"buffer": rb, "rng": rng, "counts": counts}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
-    protocol.encode_demos(envs)
+    envs.encode_demos()
     run.start(args.total_timesteps, "step")
-    obs = protocol.begin_episodes(envs, args.seed, run.step)
-    episodes, returns = [[] for _ in envs], [0.0 for _ in envs]  # of the running episodes
+    envs.begin_episodes(args.seed, run.step)
     # END SHARED
 
     while run.step < args.total_timesteps and not run.reached(args.stop_at_success):
         # ALGO LOGIC: act
         if run.step < args.learning_starts:
-            actions = 2 * torch.rand(args.num_envs, *envs[0].action_space.shape) - 1
+            actions = 2 * torch.rand(args.num_envs, *eval_envs[0].action_space.shape) - 1
             actions = actions.numpy() * agent.actor.action_scale
         else:
-            actions = agent.explore(**protocol.stack(obs, device))
+            actions = explore(protocol.stack(envs.observations, device))["actions"].cpu().numpy()
 
         # SHARED: a step in every environment
         runs.check_finite("the policy's actions", actions)
-        for i, env in enumerate(envs):
-            next_obs, reward, termination, truncation, info = env.step(actions[i])
-            episodes[i].append(transition(obs[i], actions[i], next_obs, info["collision"]))
-            returns[i] += reward
-            obs[i] = next_obs
-            if termination or truncation:
-                rb.add_episode(episodes[i])
-                run.log_episode(run.step + i + 1, returns[i], info)
-                if args.demo_prob is not None:
-                    if not info["is_success"] and env.np_random.random() < args.demo_prob:
-                        rb.add_episode(demo_transitions(env.demo, env.env))
-                        counts["demos_injected"] += 1
-                    run.log({"charts/demos_injected": counts["demos_injected"]}, run.step + i + 1)
-                episodes[i], returns[i], obs[i] = [], 0.0, env.reset()[0]
+        for episode in envs.step(actions):
+            rb.add_episode(episode.transitions)
+            if episode.demo is not None:
+                rb.add_episode(episode.demo)
+                counts["demos_injected"] += 1
+            run.log_episode(episode, counts["demos_injected"])
         global_step = run.advance(args.num_envs)
 
         # ALGO LOGIC: learn
         due = updates_due(global_step, args) if rb.size > 0 else 0
         for data in rb.batches(due, args.batch_size, device):
-            losses |= agent.update(data, counts["updates"])
+            losses |= update(data, counts["updates"] % args.policy_frequency == 0)
             counts["updates"] += 1
             if counts["updates"] % 1000 == 0:
-                run.log({f"losses/{name}": value for name, value in losses.items()})
-                run.log({"charts/SPS": int(run.rate)})
+                named = {f"losses/{name}": value for name, value in losses.items()}
+                run.log(named | {"charts/SPS": int(run.rate)})
 
         # Evaluate, save the best policy, checkpoint
         evaluating = run.step % args.eval_every < args.num_envs or run.step >= args.total_timesteps
@@ -425,10 +414,8 @@ if __name__ == "__main__":
             run.save_policy(agent.actor_average)
         if evaluating or run.interrupted:
             # New episodes begin, in this run as in one that is resumed from the checkpoint.
-            for episode in filter(None, episodes):
-                rb.add_episode(episode)
+            for transitions in envs.begin_episodes(args.seed, run.step):
+                rb.add_episode(transitions)
             run.checkpoint()
-            obs = protocol.begin_episodes(envs, args.seed, global_step)
-            episodes, returns = [[] for _ in envs], [0.0 for _ in envs]
     run.final_test(test)
     # END SHARED

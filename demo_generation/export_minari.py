@@ -2,6 +2,7 @@
 
     pip install -e ".[minari]"
     roboarm minari --task double_walls --goal-type ee
+    roboarm minari --task no_obstacles --robot arm.yaml
 
 Then `minari.load_dataset("roboarm-nmp/double_walls/ee-v0")` has the demonstrations as episodes of
 the task's environment, each up to the first step that reaches its goal. The dataset is in Minari's
@@ -11,8 +12,9 @@ Demonstration files round configurations to 0.0002 of the normalised space. That
 training, but the errors accumulate when the actions of an episode are replayed: one episode in a
 hundred ends just short of its goal. With --exact, replaying the actions repeats the episode.
 
-Minari makes the environment again from its Gymnasium id alone. So this works for the tasks of
-`envs.TASKS` with a fixed scene, not for scenes that vary, scene files, or other arms.
+Minari makes the environment again from its Gymnasium id and arguments. So this works for fixed
+scenes, not for scenes that vary. Files of a scene or of another arm are named by their absolute
+paths: on another machine, `recover_environment(task=...)` names them.
 """
 
 import contextlib
@@ -34,6 +36,7 @@ from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_episode
 from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
+from roboarm_nmp.envs.tasks import has_name, split_robot, task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.utils.progress import progress_bar
 from roboarm_nmp.envs.utils.signals import end_with_one_line
@@ -44,13 +47,17 @@ PREFIX = ".exporting-"  # of incomplete folders; Minari ignores hidden ones
 @dataclass
 class Args:
     task: str | None = None
-    """Name of a task with a fixed scene: export its pretrained demonstrations."""
+    """Task with a fixed scene, a name or a scene file: export its demonstrations."""
+    robot: Path | None = None
+    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     file: Path | None = None
-    """Demonstration file to export instead."""
+    """Demonstration file to export instead of the task's own. Those of a scene file, or of another
+    arm, need --task, too."""
     goal_type: Literal["ee", "config", "combined", "pose"] = "ee"
     """Kind of the goals."""
     dataset_id: str | None = None
-    """Minari's name for the dataset. The default is `roboarm-nmp/<task>/<goal type>-v0`."""
+    """Minari's name for the dataset. The default is `roboarm-nmp/<task>/<goal type>-v0`, or
+    `roboarm-nmp/<task>-<robot>/<goal type>-v0`."""
     exact: bool = False
     """Follow the plans again for exact configurations (about 50 episodes a second)."""
     overwrite: bool = False
@@ -103,18 +110,26 @@ def episode(demo, env):
     }
 
 
-def _check_recoverable(demos):
-    """Raise ValueError unless Minari could make the environment of every episode again."""
-    if demos.task not in envs.TASKS:
-        raise ValueError(
-            f"the demonstrations' task {demos.task!r} is not in envs.TASKS: Minari can recover "
-            f"registered environments only"
-        )
+def _recoverable(demos, task):
+    """The id and arguments with which Minari makes the environment of every episode again.
+
+    Raises ValueError: it could not.
+    """
     if demos.scenes.index is not None:
         raise ValueError(
             f"the scenes of {demos.task} vary, and a Minari episode does not store its scene: only "
             f"demonstrations in a fixed scene can be exported"
         )
+    if demos.task in envs.TASKS:
+        return envs.gymnasium_id(demos.task), {}
+    if task is None:
+        raise ValueError(
+            f"the demonstrations' task {demos.task!r} is not in envs.TASKS: name its scene file, "
+            f"or the robot's file, with --task"
+        )
+    parts = (part for part in split_robot(task) if part is not None)
+    task = "@".join(part if has_name(part) else str(Path(part).resolve()) for part in parts)
+    return envs.gymnasium_id(task), {"task": task}
 
 
 @contextlib.contextmanager
@@ -136,7 +151,15 @@ def _clear_leftovers(root):
                 shutil.rmtree(folder)
 
 
-def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False, progress=True):
+def export(
+    demos,
+    goal_type="ee",
+    dataset_id=None,
+    exact=False,
+    overwrite=False,
+    progress=True,
+    task=None,
+):
     """Write `Demos` into Minari's local storage; returns the dataset's id and number of steps.
 
     Args:
@@ -146,15 +169,16 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
         exact: follow the plans again, see above.
         overwrite: replace a dataset of this name. The old one stays until the new one is complete.
         progress: show a progress bar.
+        task: path of the scene file, or `TASK@ROBOT`, that the demonstrations are for, unless their
+            task is in `envs.TASKS`.
 
     Raises:
         ImportError: Minari is not installed.
-        ValueError: the demonstrations are for a scene file, or their scenes vary; Minari does not
-            allow the name, or there is a dataset of this name; or, with `exact`, the executions
-            differ on this machine.
+        ValueError: the scenes vary, or `task` is missing; Minari does not allow the name, or there
+            is a dataset of this name; or, with `exact`, the executions differ on this machine.
         OSError: the dataset cannot be written.
     """
-    _check_recoverable(demos)
+    gymnasium_id, arguments = _recoverable(demos, task)
     if importlib.util.find_spec("minari") is None:
         raise ImportError('this needs the extra `minari`: pip install -e ".[minari]"')
     import minari
@@ -164,7 +188,7 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
     from minari.namespace import create_namespace, list_local_namespaces
     from minari.storage.datasets_root_dir import get_dataset_path
 
-    dataset_id = dataset_id or f"roboarm-nmp/{demos.task}/{goal_type}-v0"
+    dataset_id = dataset_id or f"roboarm-nmp/{demos.task.replace('@', '-')}/{goal_type}-v0"
     try:
         namespace, _, _ = parse_dataset_id(dataset_id)
     except (TypeError, ValueError) as error:  # a TypeError if there is no version
@@ -174,7 +198,7 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
     if path.exists() and not overwrite:
         raise ValueError(f"the dataset {dataset_id} exists ({path}); --overwrite replaces it")
     planner = demos.parameters.get("options", {}).get("planner", "a planner")
-    env = gymnasium.make(envs.gymnasium_id(demos.task), goal_type=goal_type)
+    env = gymnasium.make(gymnasium_id, goal_type=goal_type, **arguments)
     bar = progress_bar(range(len(demos)), dataset_id, unit="episode", disable=not progress)
     root = get_dataset_path().resolve()
     _clear_leftovers(root)
@@ -210,12 +234,12 @@ def export(demos, goal_type="ee", dataset_id=None, exact=False, overwrite=False,
 
 def main(args):
     try:
-        if (args.task is None) == (args.file is None):
-            raise ValueError("give --task or --file, one of them")
-        demos = load_demos(args.file or demo_path(args.task), args.task)
-        dataset_id, steps = export(
-            demos, args.goal_type, args.dataset_id, args.exact, args.overwrite
-        )
+        if args.task is None and (args.file is None or args.robot is not None):
+            raise ValueError("give --task, or the --file of a named task of the Panda")
+        task = args.task and task_with_robot(args.task, args.robot)
+        demos = load_demos(args.file or demo_path(task), task)
+        options = args.goal_type, args.dataset_id, args.exact, args.overwrite
+        dataset_id, steps = export(demos, *options, task=task)
     except (ImportError, OSError, ValueError) as error:  # a DatasetError is a ValueError
         sys.exit(f"error: {error}")
     print(f"{dataset_id}: {len(demos)} episodes, {steps} steps")

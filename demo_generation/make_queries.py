@@ -16,6 +16,9 @@ have room in every scene.
 With `--limits datasheet`, starts and goals are inside the position limits of the arm's datasheet,
 where these are narrower than the URDF's. Others are left out. Plans of `--solvable` stay inside.
 
+Where obstacles move (`envs.scenes.moving_boxes`), each query has a scene of its own, and the file
+stores its seed. Queries whose start or goal is blocked when it has to be free are left out.
+
 Where scenes vary, `--queries-per-scene` queries in a row share a scene, which makes smaller files.
 
 Query i of a split depends only on the seed, the split and i, so the file is the same on every
@@ -36,7 +39,7 @@ import tyro
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
 from roboarm_nmp.demo_generation.planning import Planner
-from roboarm_nmp.envs.datasets.format import ORIGINAL
+from roboarm_nmp.envs.datasets.format import ORIGINAL, AnimatedScenes, scene_seeds
 from roboarm_nmp.envs.datasets.journal import Journal, journal_of
 from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.datasets.queries import query_path, write_queries
@@ -111,15 +114,21 @@ class Sampler:
         """Query `number` of a split, as a JSON-ready dict.
 
         Its `rejected` counts the samples that the simulated arm does not hold for long enough
-        (`unheld`), those that the planner does not solve (`unsolved`), and those outside the limits
-        of a datasheet (`outside`).
+        (`unheld`), those that the planner does not solve (`unsolved`), those outside the limits of
+        a datasheet (`outside`), and those whose start or goal is blocked by moving obstacles when
+        it has to be free (`blocked`).
         """
         seed, split, number = job
         scene = [seed, STREAMS[split], number // self.queries_per_scene]
         self.env.sample_scene(np.random.default_rng([*scene, SCENES]))
         rng = np.random.default_rng([seed, STREAMS[split], number])
+        moving, scene_seed, motions = self.env.is_animated, None, rng
         rejected = Counter()
         for _ in range(MAX_QUERIES):
+            if moving:  # a scene for each query: its motions depend on start and goal
+                scene_seed = int(rng.integers(2**32))
+                at_rest, motions = map(np.random.default_rng, scene_seeds(scene_seed))
+                self.env.sample_scene(at_rest)
             start, goal = self._sample_query(rng)
             ends, robot = np.array([start, goal]), self.env.robot
             if self.limits != "urdf" and not robot.is_within(ends, self.limits).all():
@@ -128,14 +137,14 @@ class Sampler:
                 rejected["unheld"] += 1
             elif self.planner and not demonstrate(self.planner, start, goal, rng, SOLVE_ATTEMPTS):
                 rejected["unsolved"] += 1
+            elif not self.env.sample_motions(start, goal, motions):
+                rejected["blocked"] += 1
             else:
-                return {
-                    "index": f"{split}/{number}",
-                    "start": start.tolist(),
-                    "goal": goal.tolist(),
-                    "obstacles": to_lists(self.env.scene.obstacles),
-                    "rejected": rejected,
-                }
+                scene = {"obstacles": to_lists(self.env.scene.obstacles)}
+                if moving:
+                    scene = {"scene_seed": scene_seed}
+                ends = {"start": start.tolist(), "goal": goal.tolist()}
+                return {"index": f"{split}/{number}", **ends, **scene, "rejected": rejected}
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
 
     def _sample_query(self, rng):
@@ -233,11 +242,15 @@ def make_queries(
             made = [journal.entries[f"{split}/{number}"] for number in range(num)]
             for query in made:
                 rejected.update(query["rejected"])
-            start, goal, rows = (
-                [query[name] for query in made] for name in ("start", "goal", "obstacles")
+            start, goal = (
+                np.array([query[name] for query in made], np.float32) for name in ("start", "goal")
             )
-            splits[split] = (np.array(start, np.float32), np.array(goal, np.float32))
-            if not isinstance(distribution, Scene):
+            splits[split] = (start, goal)
+            if hasattr(distribution, "animate"):
+                seeds = np.array([query["scene_seed"] for query in made], np.uint32)
+                splits[split] += (AnimatedScenes(distribution, seeds, start, goal),)
+            elif not isinstance(distribution, Scene):
+                rows = [query["obstacles"] for query in made]
                 scenes = [replace(base, obstacles=from_lists(row)) for row in rows]
                 splits[split] += (scenes,)
         parameters = {
@@ -306,6 +319,13 @@ def _check(args):
             )
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
+        if hasattr(envs.get_task(task).scene, "animate") and (
+            args.solvable or args.queries_per_scene > 1
+        ):
+            raise ValueError(
+                f"--solvable and --queries-per-scene are not for {task}: its obstacles move, "
+                "for each query in a way of their own"
+            )
         envs.get_task(task).base_scene.robot.position_limits(args.limits)  # or it raises
         query_path(task)  # rejects an unknown task, also with --output
         check_writable(path)

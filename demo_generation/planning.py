@@ -235,7 +235,7 @@ class Planner:
         self.env, self.planner, self.clearance = env, planner, clearance
         self.planner_range, self.simplify = planner_range, simplify
         self.max_checks, self._geometry_source = max_checks, geometry_source
-        self._scene, self._checker = env.scene, geometry_source(env.scene)
+        self._scene, self._checker = env.scene, geometry_source(env.scene.at(0.0))
         # Compile here what is compiled at its first call: a plan's time is for planning.
         state = (0.0,) * env.robot.num_joints
         self._checker.signed_distances(state)
@@ -397,7 +397,8 @@ class Planner:
 
     def _current_checker(self):
         if self._scene is not self.env.scene:
-            self._scene, self._checker = self.env.scene, self._geometry_source(self.env.scene)
+            self._scene = self.env.scene
+            self._checker = self._geometry_source(self._scene.at(0.0))
         return self._checker
 
     def _validity(self, start, goals, deadline):

@@ -22,6 +22,7 @@ import numpy as np
 
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
 from roboarm_nmp.envs.datasets.episodes import observed
+from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 from roboarm_nmp.envs.utils.random_streams import Stream
 
 AHEAD = 0.1  # normalised: an example's direction is to the point of its path so far ahead
@@ -53,6 +54,19 @@ class RoadmapExamples:
         scene = int(rng.choice(self._scenes))
         path = rng.integers(*self.paths.path_offsets[scene : scene + 2], number)
         return scene, self.paths.offsets[path], self.paths.offsets[path + 1] - 1
+
+    def random_query(self, rng):
+        """The two ends of a random path that the environment accepts as start and goal.
+
+        Returns:
+            The index of the scene, and the ends, normalised (2, j).
+        """
+        while True:
+            scene, first, last = self.choose_paths(rng, 1)
+            ends = self.paths.points[np.r_[first, last]]
+            # Rounding might make the environment reject a path that is only just free.
+            if ground_truth_checker(self.paths.scenes[scene]).is_free(ends, margin=0.001).all():
+                return scene, ends
 
     def draw(self, number, count, noise):
         """Examples at random configurations near the paths of one scene.

@@ -35,6 +35,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.place_configurations import place_configurations
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.datasets import shards
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
@@ -62,6 +63,10 @@ JOINED = 30
 # Where there is no path: the number of nodes that are added near the ends, and the largest standard
 # deviation of each joint (normalised) around them.
 GROWN, GROWN_SCALE = 400, 0.6
+# Nodes around each configuration on the way out of a place.
+AROUND = 5
+# Standard deviation (normalised, each joint) of starts around the arm's observed pose.
+POSE_NOISE = 0.15
 # Spacing (normalised) of the points at which paths through narrow places measure their room.
 DENSE = 0.15
 # `random_paths`: goals per path (each costs a search of the whole roadmap), queries per path, and
@@ -87,13 +92,14 @@ class Roadmap:
         num_nodes: random free configurations.
         num_neighbours: nearest nodes to which each node is joined.
         margin: m, at least `NODE_MARGIN`: distance of paths from obstacles and from the arm itself.
+        more_nodes: (n, j): more nodes at those of these configurations that are free.
 
     Raises:
         ValueError: the margin is smaller.
         RuntimeError: the scene leaves no room for the arm.
     """
 
-    def __init__(self, scene, rng, num_nodes=1000, num_neighbours=14, margin=0.015):
+    def __init__(self, scene, rng, num_nodes=1000, num_neighbours=14, margin=0.015, more_nodes=()):
         if not margin >= NODE_MARGIN:
             raise ValueError(f"margin must be at least {NODE_MARGIN} m, got {margin!r}")
         self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
@@ -106,6 +112,8 @@ class Roadmap:
         self._edges, self._edge_costs = np.empty((2, 0), np.int64), np.empty((2, 0))
         self._kept, self._is_checked = np.empty(0, np.int64), np.empty(0, bool)
         self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
+        if len(more_nodes):
+            self._add_nodes(more_nodes[self._checker.is_free(more_nodes, NODE_MARGIN)])
 
     def _add_nodes(self, nodes):
         """Add free configurations (n, j) as nodes, with edges to their nearest nodes."""
@@ -150,18 +158,30 @@ class Roadmap:
             raise RuntimeError("the scene leaves no room for the arm")
         return np.concatenate(found)
 
-    def random_paths(self, number, rng):
+    def random_paths(self, number, rng, ends=()):
         """`number` smoothed paths between random free configurations: a list of float32 (k, j).
 
-        Fewer, where hardly any two configurations have a path between them.
+        Fewer, where hardly any two configurations have a path between them. With `ends` (n, j),
+        the goals are those, but for one in five, and so are a third of the starts; a quarter of the
+        starts is near the pose in which the arm is observed, where that is free.
         """
-        goals = self.sample(int(np.ceil(GOALS_PER_PATH * number)), rng)
+        goals = self.sample(_goal_count(number), rng)
+        if len(ends):
+            goals = np.concatenate([goals[: -(-len(goals) // 5)], ends])
         paths = []
         for _ in range(MAX_ROUNDS):
             tried = int(np.ceil(SPARE * (number - len(paths))))
             which = rng.integers(len(goals), size=tried)
-            found = self.paths(self.sample(tried, rng), goals[which], rng)
-            paths += [path for path in found if path is not None]
+            starts = self.sample(tried, rng)
+            if len(ends):
+                drawn = rng.random(tried)
+                starts[drawn < 1 / 3] = ends[rng.integers(len(ends), size=(drawn < 1 / 3).sum())]
+                pose = self.scene.robot.normalise(np.array(self.scene.robot.observed_pose))
+                poses = pose + POSE_NOISE * rng.standard_normal(starts.shape)
+                usual = (drawn > 3 / 4) & self._checker.is_free(poses.clip(-1.0, 1.0), NODE_MARGIN)
+                starts[usual] = poses[usual].clip(-1.0, 1.0)
+            found = self.paths(starts, goals[which], rng)
+            paths += [p for p in found if p is not None and (p[0] != p[-1]).any()]
             if len(paths) >= number:
                 break
         return paths[:number]
@@ -456,8 +476,8 @@ class Args:
     output: Path
     """Folder to write to."""
     task: str = "random_boxes_hard"
-    """Name of a task, `mixed_scenes`, or path of a scene file. Each scene has a roadmap of its own,
-    also where scenes do not vary."""
+    """Name of a task, `mixed_scenes`, `containers`, or path of a scene file. Each scene has a
+    roadmap of its own, also where scenes do not vary."""
     robot: Path | None = None
     """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
     scenes: PositiveInt = 6000
@@ -496,10 +516,30 @@ def random_paths_of_scene(index, options):
     """`(Scene, paths)` of scene `index` of a collection. `options`: a dict with keys `OPTIONS`."""
     rng = np.random.default_rng([options["seed"], Stream.ROADMAPS, index])
     scene = envs.get_task(options["task"]).scene
-    scene = scene if isinstance(scene, Scene) else scene.sample(rng)
+    number, ends, on_ways = options["paths_per_scene"], (), ()
     arguments = {name: options[name] for name in ("num_nodes", "num_neighbours", "margin")}
-    roadmap = Roadmap(scene, rng, **arguments)
-    return scene, roadmap.random_paths(options["paths_per_scene"], rng)
+    if hasattr(scene, "sample_with_places"):
+        scene, places = scene.sample_with_places(rng)
+        ends, on_ways = place_configurations(scene, places, rng, _goal_count(number))
+        on_ways = _around(on_ways, rng)
+    elif not isinstance(scene, Scene):
+        scene = scene.sample(rng)
+    roadmap = Roadmap(scene, rng, **arguments, more_nodes=on_ways)
+    return scene, roadmap.random_paths(number, rng, ends)
+
+
+def _around(states, rng):
+    """The configurations (n, j), and more around them."""
+    centres = np.repeat(states, AROUND, axis=0)
+    scale = rng.uniform(0.0, GROWN_SCALE / 2, (len(centres), 1))
+    return np.concatenate([states, centres + scale * rng.standard_normal(centres.shape)]).clip(
+        -1, 1
+    )
+
+
+def _goal_count(number):
+    """Goals of so many paths."""
+    return int(np.ceil(GOALS_PER_PATH * number))
 
 
 class Collector:

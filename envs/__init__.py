@@ -9,6 +9,7 @@ from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import TASKS, get_task
 
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
+ANY_TASK = "RoboArmNMP/Task-v0"
 
 
 def make(
@@ -19,6 +20,8 @@ def make(
     link_distances=False,
     append_link_distances=False,
     goal_link_distances=True,
+    observe_every=None,
+    sensor_noise=None,
     **kwargs,
 ):
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
@@ -39,6 +42,9 @@ def make(
         append_link_distances: with `link_distances`: append them to `observation`, too, before z_E.
         goal_link_distances: with `link_distances`: add those at a goal that is a configuration. Use
             False with hindsight relabelling (docs/guide/environment.md, "Hindsight relabelling").
+        observe_every: steps from one observation of the scene to the next; None: static scenes are
+            observed once, others in every step (`envs.wrappers.ObservedSceneWrapper`).
+        sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
         kwargs: arguments of `RoboArmEnv`.
 
     Raises:
@@ -66,6 +72,11 @@ def make(
         raise ValueError("geometry_source goes with link_distances, or the encoder point_cloud")
     env = RoboArmEnv(task if isinstance(task, Scene) else get_task(task).scene, **kwargs)
     # PyTorch and Numba take long to import, so they are imported only where they are needed.
+    observes = encoder is not None or link_distances
+    if observes or observe_every is not None or sensor_noise is not None:
+        from roboarm_nmp.envs.wrappers import ObservedSceneWrapper
+
+        env = ObservedSceneWrapper(env, observe_every, sensor_noise)
     if encoder is not None:
         from roboarm_nmp.envs.perception.encoders import make_encoder
         from roboarm_nmp.envs.wrappers import SceneEncodingWrapper
@@ -85,15 +96,22 @@ def make(
 
 
 def gymnasium_id(task):
-    """The Gymnasium id of a task: "double_walls" -> "RoboArmNMP/DoubleWalls-v0"."""
-    return f"RoboArmNMP/{task.title().replace('_', '')}-v0"
+    """The Gymnasium id of a task: "double_walls" -> "RoboArmNMP/DoubleWalls-v0".
+
+    Tasks that are not in `TASKS`, of scene files and other arms, share the id `ANY_TASK`, whose
+    argument `task` is that of `make`.
+    """
+    return f"RoboArmNMP/{task.title().replace('_', '')}-v0" if task in TASKS else ANY_TASK
 
 
-for _name in TASKS:
+for _id, _kwargs in {
+    **{gymnasium_id(name): {"task": name} for name in TASKS},
+    ANY_TASK: {},
+}.items():
     gymnasium.register(
-        gymnasium_id(_name),
+        _id,
         entry_point="roboarm_nmp.envs:make",
-        kwargs={"task": _name},
+        kwargs=_kwargs,
         # Without wrappers `reset_specific` and all other attributes are reached directly. The env
         # itself refuses a step before a reset; the checker would warn of unbounded observations.
         order_enforce=False,

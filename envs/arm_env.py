@@ -78,6 +78,8 @@ class RoboArmEnv(gym.Env):
         scene: a `Scene`, or a distribution of scenes: an object with `base`, the `Scene` without
             the obstacles that vary, and `sample(rng)`, which draws a `Scene` with a NumPy
             Generator (`envs.scenes.random_boxes.RandomBoxes` is one). `reset` then draws a new one.
+            With `animate`, `accepts` and `check_times` (`envs.scenes.moving_boxes.MovingScenes`) it
+            draws the obstacles' motions, too, for each start and goal.
         episodes_per_scene: number of resets until another scene is drawn; a reset with a seed
             always draws one.
         goal_type: `ee`, `config`, `combined` (reached like `ee`) or `pose`.
@@ -175,6 +177,8 @@ class RoboArmEnv(gym.Env):
         self._episodes_in_scene = self.episodes_per_scene
         if self.scene_distribution is not None:
             scene = self.scene_distribution.base
+        self.is_animated = hasattr(self.scene_distribution, "animate")
+        self._scene_at_rest = scene
         self.goal_type = goal_type
         self._tolerance = config_tolerance if goal_type == "config" else ee_tolerance
         self.ee_tolerance = ee_tolerance
@@ -240,8 +244,18 @@ class RoboArmEnv(gym.Env):
 
     @property
     def scene(self):
-        """The `Scene` around the arm."""
+        """The `Scene` around the arm, with the motions of its obstacles."""
         return self.world.scene
+
+    @property
+    def time(self):
+        """Seconds since the reset, of simulated time: each step is `STEP_SECONDS`, 1/30 s."""
+        return self.world.time
+
+    @property
+    def current_scene(self):
+        """The static `Scene` at this time: `scene.at(time)`."""
+        return self.world.current_scene
 
     def set_scene(self, scene):
         """Put the arm into another `Scene`. This ends the episode. An equal one does nothing.
@@ -255,9 +269,9 @@ class RoboArmEnv(gym.Env):
         if self.world.set_scene(scene):
             self.start_configuration = None
 
-    def in_collision(self, configuration):
+    def in_collision(self, configuration, time=0.0, moving=True):
         """As `World.in_collision`. Continue with a reset."""
-        return self.world.in_collision(configuration)
+        return self.world.in_collision(configuration, time, moving)
 
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
         """As `World.is_feasible`. Continue with a reset."""
@@ -312,7 +326,31 @@ class RoboArmEnv(gym.Env):
     def sample_scene(self, rng):
         """Change to a scene drawn from the task's distribution. A fixed scene stays."""
         if self.scene_distribution is not None:
-            self.set_scene(self.scene_distribution.sample(rng))
+            self._scene_at_rest = self.scene_distribution.sample(rng)
+            self.set_scene(self._scene_at_rest)
+
+    def sample_motions(self, start, goal, rng):
+        """Draw motions for the obstacles of the sampled scene, where its distribution has some.
+
+        Args:
+            start, goal: the query they are for, joint angles (n, rad).
+            rng: a NumPy Generator.
+
+        Returns:
+            Whether start and goal are free when they have to be; otherwise the scene stays at rest.
+        """
+        if not self.is_animated:
+            return True
+        distribution = self.scene_distribution
+        # Here, because Numba takes a while to import.
+        from roboarm_nmp.envs.collision.moving import free_over_time
+
+        scene = distribution.animate(self._scene_at_rest, start, goal, rng)
+        states = self.robot.normalise(np.array([start, goal]))
+        if not distribution.accepts(*free_over_time(scene, states, distribution.check_times)):
+            return False
+        self.set_scene(scene)
+        return True
 
     def reset(self, *, seed=None, options=None):
         """Start an episode from a random feasible start to a random feasible goal.
@@ -337,7 +375,12 @@ class RoboArmEnv(gym.Env):
             self.sample_scene(self.np_random)
             self._episodes_in_scene = 0
         self._episodes_in_scene += 1
-        return self._begin(*self.sample_query(self.np_random))
+        while True:
+            if self.is_animated:
+                self.set_scene(self._scene_at_rest)
+            start, goal = self.sample_query(self.np_random)
+            if self.sample_motions(start, goal, self.np_random):
+                return self._begin(start, goal)
 
     def reset_specific(self, start, goal=None, scene=None, goal_pose=None):
         """Start an episode on a given query.
@@ -355,9 +398,10 @@ class RoboArmEnv(gym.Env):
                 quaternion is normalised.
 
         Raises:
-            ValueError: wrong size, not finite, outside the joint limits or in collision; a
-                quaternion of zeros; both or none of `goal` and `goal_pose`. A running episode then
-                goes on (unless the scene was changed).
+            ValueError: wrong size, not finite, outside the joint limits or in collision (moving
+                obstacles count at time 0, and only for the start); a quaternion of zeros; both or
+                none of `goal` and `goal_pose`. A running episode then goes on (unless the scene was
+                changed).
         """
         self.world.check_open()
         joints = self.robot.num_joints
@@ -377,7 +421,7 @@ class RoboArmEnv(gym.Env):
             self.set_scene(scene)
         ends = {"goal": goal, "start": start}
         ends = {name: e for name, e in ends.items() if e is not None and e.size == joints}
-        self.world.check_free(**ends)
+        self.world.check_free(["goal"], **ends)  # from which obstacles may move away
         return self._begin(start, goal, goal_pose)
 
     def _begin(self, start, goal, goal_pose=None):

@@ -25,7 +25,8 @@ def motion_metrics(trajectory, checker=None):
     Args:
         trajectory: a `JointTrajectory`, or an episode, an `envs.policies.rollout.Trajectory`, with
             `STEP_SECONDS` between its configurations.
-        checker: a `CollisionChecker` of the scene, for `min_clearance`.
+        checker: a `CollisionChecker` of the scene, for `min_clearance`; of an episode with moving
+            obstacles a list of them, one for each configuration.
 
     Returns:
         - `duration`: s;
@@ -60,8 +61,13 @@ def motion_metrics(trajectory, checker=None):
     clearance = None
     if checker is not None:
         states = np.clip(robot.normalise(configurations), -1.0, 1.0)
-        distances = checker.signed_distances(states, self_collisions=False).distance
-        clearance = float(distances.min())
+        pairs = (
+            zip(checker, states, strict=True) if isinstance(checker, list) else [(checker, states)]
+        )
+        clearance = min(
+            float(one.signed_distances(at, self_collisions=False).distance.min())
+            for one, at in pairs
+        )
     return {
         "duration": float(duration),
         "path_length": path_length(configurations),

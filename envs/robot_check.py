@@ -41,6 +41,7 @@ MAX_DISAGREEMENT, MAX_DEPTH = 0.001, 0.002  # share of configurations; m
 MIN_EXECUTED, MIN_HELD = 0.7, 0.9  # shares
 POSE_SIZE, WORKSPACE_SIZE, NUM_POSES, NUM_POSITIONS = (360, 300), (540, 450), 3, 6_000
 BEAD = 0.006  # share of the reach: half the edge of a position's cube
+MOTION_LIMITS = {"velocity": 10, "acceleration": 14, "jerk": 10}  # columns and their widths
 MAY_COLLIDE, NEVER = (235, 120, 40), (232, 232, 232)
 
 
@@ -126,15 +127,19 @@ def describe(robot):
     """The description of a robot: text of several lines."""
     lines = [
         f"{robot.name}: {robot.num_joints} joints, reach {robot.reach:.2f} m, {robot.urdf}",
-        f"{'joint':<28}{'lower':>9}{'upper':>9}{'velocity':>10}{'effort':>9}",
+        f"{'joint':<28}{'lower':>9}{'upper':>9}"
+        + "".join(f"{name:>{width}}" for name, width in MOTION_LIMITS.items())
+        + f"{'effort':>9}",
     ]
-    velocity = [None] * robot.num_joints if robot.velocity is None else robot.velocity.tolist()
-    for row in zip(
-        robot.joint_names, robot.lower, robot.upper, velocity, robot.effort, strict=True
-    ):
-        name, low, high, fastest, effort = row
-        fastest = "unknown" if fastest is None else f"{fastest:.2f}"
-        lines.append(f"{name:<28}{low:>9.3f}{high:>9.3f}{fastest:>10}{effort:>9.0f}")
+    for i, name in enumerate(robot.joint_names):
+        line = f"{name:<28}{robot.lower[i]:>9.3f}{robot.upper[i]:>9.3f}"
+        for limit, width in MOTION_LIMITS.items():
+            values = getattr(robot, limit)
+            line += f"{'unknown':>{width}}" if values is None else f"{values[i]:>{width}.2f}"
+        lines.append(f"{line}{robot.effort[i]:>9.0f}")
+    if robot.datasheet_lower is not None:
+        pairs = zip(robot.datasheet_lower, robot.datasheet_upper, strict=True)
+        lines.append(f"datasheet: {', '.join(f'{low:.3f} to {high:.3f}' for low, high in pairs)}")
     _, names = robot.bullet_names
     still = [names[link.index] for link in robot.links if link.frame < 0]
     offset = ", ".join(f"{x:g}" for x in robot.end_effector_offset)

@@ -174,10 +174,13 @@ def render_query(env, query, size=SIZE, points=(), camera=None):
     return next(render_configurations(env, query, [query.start], size, points, camera))
 
 
-def render_configurations(env, query, configurations, size=SIZE, points=(), camera=None):
+def render_configurations(
+    env, query, configurations, size=SIZE, points=(), camera=None, times=None
+):
     """Images as of `render_query`, from one point of view, with the arm in each configuration.
 
     Args:
+        times: s, (k,), of each configuration, for moving obstacles; by default 0.
         configurations: (k, n), joint angles in rad, e.g. of a `Trajectory`.
         env, query, size, points, camera: see `render_query`.
 
@@ -186,20 +189,23 @@ def render_configurations(env, query, configurations, size=SIZE, points=(), came
     """
     env.world.draw()
     env.reset_specific(*query)
-    yield from _render(env, query.goal, configurations, size, points, camera)
+    yield from _render(env, query.goal, configurations, size, points, camera, times)
 
 
-def _render(env, goal, configurations, size, points, view):
+def _render(env, goal, configurations, size, points, view, times):
     """`render_configurations` in the present scene, whose goal is marked."""
     has_ghost = env.goal_type != "ee"
-    points = np.concatenate([_visible(env, goal, configurations), np.reshape(points, (-1, 3))])
+    times = np.zeros(len(configurations)) if times is None else times
+    visible = _visible(env, goal, configurations, times)
+    points = np.concatenate([visible, np.reshape(points, (-1, 3))])
     slope = math.tan(math.radians(FIELD_OF_VIEW / 2))
-    camera = _camera(env, points, (slope * size[0] / size[1], slope), view)
-    if has_ghost:
-        env.robot.set_configuration(env.client, env.body, goal)
-        ghost = _shoot(env, camera, size)
-        tinted = ghost.colour.mean(-1, keepdims=True) * GHOST_COLOUR
-    for configuration in configurations:
+    camera, ghost = _camera(env, points, (slope * size[0] / size[1], slope), view), None
+    for configuration, seconds in zip(configurations, times, strict=True):
+        env.world.set_time(seconds)
+        if has_ghost and (ghost is None or not env.scene.is_static):
+            env.robot.set_configuration(env.client, env.body, goal)
+            ghost = _shoot(env, camera, size)
+            tinted = ghost.colour.mean(-1, keepdims=True) * GHOST_COLOUR
         env.robot.set_configuration(env.client, env.body, configuration)
         shot = _shoot(env, camera, size)
         pixels = shot.colour
@@ -210,18 +216,20 @@ def _render(env, goal, configurations, size, points, view):
         yield np.asarray(Image.fromarray(pixels.astype(np.uint8)).reduce(OVERSAMPLING))
 
 
-def _visible(env, goal, configurations):
+def _visible(env, goal, configurations, times=(0.0,)):
     """Points (n, 3), m, that must be visible: as `_extent`, and at the goal the arm or a point."""
     if env.goal_type != "ee":
-        return _extent(env, [*configurations, goal])
+        return _extent(env, [*configurations, goal], times)
     if len(goal) == env.robot.num_joints:
         goal = env.robot.forward_kinematics(goal)
-    return np.concatenate([_extent(env, configurations), [goal]])
+    return np.concatenate([_extent(env, configurations, times), [goal]])
 
 
-def _extent(env, configurations):
+def _extent(env, configurations, times=(0.0,)):
     """Corners (n, 3), m, of boxes around the obstacles, the table, and the arm in all its poses."""
-    solids = [*env.scene.obstacles, *[env.scene.table] * (env.scene.table is not None)]
+    scenes = [env.scene] if env.scene.is_static else [env.scene.at(seconds) for seconds in times]
+    solids = [obstacle for scene in scenes for obstacle in scene.obstacles]
+    solids += [env.scene.table] * (env.scene.table is not None)
     hulls = [solid for solid in solids if isinstance(solid, ConvexHull)]
     rows = to_array([solid for solid in solids if not isinstance(solid, ConvexHull)])
     # From the sizes in a row to half edges, for each kind: box, cylinder, sphere.
@@ -502,13 +510,14 @@ def _draw(args, env, queries, begin):
     print(f"{args.output}: written, {args.task}, {queries.name} {args.query}{until}")
 
 
-def _images(args, env, queries, query, configurations):
+def _images(args, env, queries, query, configurations, times=None):
     """Images of configurations (k, n), rad, in the scene of a query, with its goal."""
+    options = args.size, (), args.camera, times
     if queries.replay is None:
-        yield from render_configurations(env, query, configurations, args.size, (), args.camera)
+        yield from render_configurations(env, query, configurations, *options)
         return
     _place(env, query)
-    yield from _render(env, query.goal, configurations, args.size, (), args.camera)
+    yield from _render(env, query.goal, configurations, *options)
 
 
 def _place(env, query):
@@ -528,7 +537,8 @@ def _animate(args, env, queries, begin):
     text = _outcome(args, env, queries, args.query, query, configurations, trajectory)
     last = len(configurations) - 1
     steps = [*range(0, last, max(1, math.ceil(last / MAX_FRAMES))), last]
-    frames = _images(args, env, queries, query, configurations[steps])
+    times = np.array(steps) * STEP_SECONDS
+    frames = _images(args, env, queries, query, configurations[steps], times)
     bar = progress_bar(frames, "drawing", len(steps), unit="frame", transient=True)
     frames = [Image.fromarray(frame) for frame in bar]
     # One palette and no dithering: still parts of the scene have the same pixels in all frames.
@@ -589,7 +599,8 @@ def _window(args, env, queries, begin):
                 configurations = trajectory.configurations
             else:
                 configurations = queries.replay(number)
-                for configuration in configurations:
+                for step, configuration in enumerate(configurations):
+                    env.world.set_time(step * STEP_SECONDS)
                     env.robot.set_configuration(client, env.body, configuration)
                     time.sleep(1 / env.metadata["render_fps"])
             text = _outcome(args, env, queries, number, query, configurations, trajectory)
@@ -605,7 +616,8 @@ def _outcome(args, env, queries, number, query, configurations, trajectory):
     steps = len(configurations) - 1
     if args.trajectory is not None:
         env.set_scene(query.scene)
-        colliding = sum(map(env.in_collision, configurations))
+        times = np.arange(len(configurations)) * STEP_SECONDS
+        colliding = sum(map(env.in_collision, configurations, times))
         contact = f"in collision in {colliding} of {steps + 1} configurations"
         contact = contact if colliding else "collision-free"
         return f"{args.trajectory}: {steps * STEP_SECONDS:.1f} s, {contact}"

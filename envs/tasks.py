@@ -13,8 +13,16 @@ from pathlib import Path
 
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.containers import Containers
 from roboarm_nmp.envs.scenes.formats import WORLD_FILES, load_world
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
+from roboarm_nmp.envs.scenes.moving_boxes import (
+    AppearingBoxes,
+    BlockedGoals,
+    ChasedGoals,
+    MovingBoxes,
+    MovingScenes,
+)
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.utils.names import suggest
@@ -32,7 +40,7 @@ class Task:
         trainable: False for the tasks that are there to test generalisation (paper: "OOD").
     """
 
-    scene: Scene | RandomBoxes | MixedScenes
+    scene: Scene | RandomBoxes | MixedScenes | Containers | MovingScenes
     summary: str
     trainable: bool = True
 
@@ -90,10 +98,12 @@ def split_robot(task):
 def task_with_robot(task, robot):
     """`TASK@ROBOT`, of the flags `--task` and `--robot`; the task itself if the robot is None.
 
-    Raises ValueError: the task names a robot, too.
+    Raises ValueError: the task names a robot, too, or there is a robot without a task.
     """
     if robot is None:
         return task
+    if task is None:
+        raise ValueError("--robot goes with --task")
     if split_robot(task)[1] is not None:
         raise ValueError(f"--robot {robot}: the task names a robot already, {task}")
     return f"{task}@{robot}"
@@ -245,8 +255,41 @@ TASKS = {
         "MotionBenchMaker's bookshelf_thin: six shelves, divided by a board",
         trainable=False,
     ),
+    "appearing_boxes": Task(
+        AppearingBoxes(),
+        "random_boxes_hard, half of the boxes appear in the first 3 s",
+        trainable=False,
+    ),
+    "moving_boxes_easy": Task(
+        MovingBoxes(share=1 / 3, periods=(6.0, 10.0)),
+        "random_boxes_hard, a third of the boxes oscillates with periods of 6 to 10 s",
+        trainable=False,
+    ),
+    "moving_boxes_medium": Task(
+        MovingBoxes(share=0.5, periods=(3.0, 8.0)),
+        "the same, half of the boxes, periods of 3 to 8 s",
+        trainable=False,
+    ),
+    "moving_boxes_hard": Task(
+        MovingBoxes(share=0.8, periods=(1.2, 3.2)),
+        "the same, four of five boxes, periods of 1.2 to 3.2 s",
+        trainable=False,
+    ),
+    "blocked_goals": Task(
+        BlockedGoals(),
+        "random_boxes_medium, and a box at the goal that leaves after 2 to 6 s",
+        trainable=False,
+    ),
+    "chased_goals": Task(
+        ChasedGoals(),
+        "random_boxes_medium, and one or two boxes that visit the goal again and again",
+        trainable=False,
+    ),
 }
+STATIC_TASKS = {name: task for name, task in TASKS.items() if not hasattr(task.scene, "animate")}
+"""The tasks whose obstacles do not move."""
 # Not a task of the benchmark: it has no queries. Paths in these scenes are training data.
 TRAINING_SCENES = {
-    "mixed_scenes": Task(MixedScenes(), "random boxes, walls with gaps, or racks of shelves")
+    "mixed_scenes": Task(MixedScenes(), "random boxes, walls with gaps, or racks of shelves"),
+    "containers": Task(Containers(), "open boxes, shelves with compartments, cluttered tables"),
 }

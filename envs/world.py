@@ -21,6 +21,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     Scene,
     floor_box,
     hull_faces,
+    pose_at,
 )
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 
@@ -37,6 +38,8 @@ MAX_EDGE = 4096  # pixels of an image: 20,000 by 20,000 would need all of a mach
 # bodies. That takes as long as 100 changes of scene.
 MAX_BODIES_MADE = 5_000
 FAR_AWAY, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.0, 1.0)  # a place without contacts (m)
+# Where obstacles are that have disappeared, or not appeared yet (m).
+ABSENT = (0.0, 0.0, -10_000.0), NO_TURN
 # A program that connects to the X server, and how long (s) it may take.
 OPEN_DISPLAY = """
 import ctypes, sys
@@ -78,6 +81,9 @@ def image_array(pixels, width, height):
 class World:
     """A scene with the arm in it, in a physics engine of its own.
 
+    Obstacles with a motion move in every physics step, along their path and whatever is in the way,
+    and contacts push the arm with their velocity. `place` sets the time.
+
     Copies (`copy.deepcopy`, pickle) are independent worlds in the same state, with the same future,
     bit for bit, contacts included: they repeat all commands since the arm was placed. A world
     stores 0.3 kB per environment step for that. A copy has no window, of which PyBullet allows one
@@ -94,7 +100,7 @@ class World:
         client: PyBullet's number of the engine; None once it is closed.
         robot: the scene's `Robot`.
         body: PyBullet's number of the arm's body.
-        scene: the `Scene`; `set_scene` changes it.
+        scene: the `Scene`, with its motions; `set_scene` changes it.
         has_window: whether PyBullet's window is open.
 
     Raises:
@@ -170,13 +176,13 @@ class World:
         """Where the arm was placed, its commands since then, and its present state."""
         joints = p.getJointStates(self.body, self.robot.reset_indices, physicsClientId=self.client)
         joint_states = [joint[:2] for joint in joints]  # angles and velocities
-        return self._start, self._events, self._target, joint_states
+        return self._start, self._events, self._target, self._substep, joint_states
 
     def _restore(self, snapshot):
         """Repeat a snapshot's commands, which restores contacts, too, bit for bit."""
-        start, events, target, joint_states = snapshot
+        start, events, target, substep, joint_states = snapshot
         if start is not None:
-            self.place(start)
+            self.place(*start)
             for event in events:
                 if event is None:
                     self._detect_collisions()
@@ -186,6 +192,8 @@ class World:
                     self.simulate()
         if target:
             self.command(target)
+        if self._substep != substep:
+            self._move_obstacles(substep)
         if self._snapshot()[-1] != joint_states:  # it was moved by other means
             p.resetJointStatesMultiDof(
                 self.body,
@@ -229,7 +237,54 @@ class World:
         self._bodies = self._bodies[:same]
         for part in self._parts[same:]:
             self._add(*part)
+        pairs = zip(self._bodies, self._parts, strict=True)
+        self._movers = {body: part[0] for body, part in pairs if part[0].motion is not None}
+        self._move_obstacles(0)
         return True
+
+    # --- Moving obstacles
+
+    @property
+    def time(self):
+        """Seconds since the arm was placed, of simulated time; or as `place` was told."""
+        return self._substep * TIME_STEP
+
+    @property
+    def current_scene(self):
+        """The static `Scene` at this time."""
+        if self._current_scene is None:
+            self._current_scene = self.scene.at(self.time)
+        return self._current_scene
+
+    def set_time(self, time):
+        """Put moving obstacles where they are at a time (s), whatever the arm does; for images."""
+        self.check_open()
+        self._move_obstacles(round(time / TIME_STEP))
+
+    def _move_obstacles(self, substep):
+        """Put moving obstacles where they are after so many physics steps, at rest."""
+        self._substep, self._current_scene = substep, None
+        self._poses = {body: pose_at(o, self.time) for body, o in self._movers.items()}
+        for body, pose in self._poses.items():
+            p.resetBasePositionAndOrientation(body, *(pose or ABSENT), physicsClientId=self.client)
+
+    def _step_physics(self):
+        """One physics step. Obstacles have their velocity in it, and are then at their new pose."""
+        before, self._substep = self._poses, self._substep + 1
+        if not self._movers:
+            p.stepSimulation(physicsClientId=self.client)
+            return
+        self._poses = {body: pose_at(o, self.time) for body, o in self._movers.items()}
+        for body, pose in self._poses.items():
+            if pose is not None and before[body] is not None:
+                velocities = _velocities(before[body], pose)
+                p.resetBaseVelocity(body, *velocities, physicsClientId=self.client)
+        p.stepSimulation(physicsClientId=self.client)
+        self._current_scene = None
+        for body, pose in self._poses.items():  # their velocity is zero again
+            if pose is not None or before[body] is not None:
+                pose = pose or ABSENT
+                p.resetBasePositionAndOrientation(body, *pose, physicsClientId=self.client)
 
     def _add(self, obstacle, colour, friction):
         orientation = NO_TURN
@@ -253,7 +308,7 @@ class World:
         if self._drawn:
             shape = p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client)
         body = p.createMultiBody(
-            0.0,  # kg: it never moves
+            0.0,  # kg: nothing moves it
             p.createCollisionShape(kind, **collision, physicsClientId=client),
             shape,
             basePosition=obstacle.position,
@@ -278,17 +333,24 @@ class World:
 
     # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
 
-    def in_collision(self, configuration):
+    def in_collision(self, configuration, time=0.0, moving=True):
         """Whether the arm at joint angles (n, rad, inside the limits) overlaps the scene or itself.
 
         Moves the arm: call it between episodes, or continue with a reset.
+
+        Args:
+            time: s, of moving obstacles.
+            moving: whether obstacles with a motion count.
         """
-        self.place(configuration)
+        self.place(configuration, time)
         self._detect_collisions()
-        return any(
-            contact[8] < 0.0
-            for contact in p.getContactPoints(bodyA=self.body, physicsClientId=self.client)
-        )
+        return bool(self._overlapping(moving))
+
+    def _overlapping(self, moving):
+        """The bodies that the arm overlaps."""
+        contacts = p.getContactPoints(bodyA=self.body, physicsClientId=self.client)
+        bodies = {contact[2] for contact in contacts if contact[8] < 0.0}
+        return bodies if moving else bodies - self._movers.keys()
 
     def _detect_collisions(self):
         p.performCollisionDetection(physicsClientId=self.client)
@@ -297,8 +359,9 @@ class World:
     def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
         """Whether joint angles (n, rad) are inside the limits, collision free and held.
 
-        Held: the position controller keeps the arm there for `hold_steps` environment steps. Moves
-        the arm: call it between episodes, or continue with a reset.
+        Held: the position controller keeps the arm there for `hold_steps` environment steps, in
+        which moving obstacles begin to move. Moves the arm: call it between episodes, or continue
+        with a reset.
         """
         if np.any(configuration < self.robot.lower) or np.any(configuration > self.robot.upper):
             return False
@@ -322,40 +385,39 @@ class World:
                 return configuration
         raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
 
-    def check_free(self, **configurations):
+    def check_free(self, ignoring_motions=(), **configurations):
         """Raise ValueError, naming the contacts, if one of the configurations is in collision.
 
         The episode then continues as if it had not been checked; otherwise the arm has moved. E.g.
-        `check_free(start=start)`, joint angles (n, rad).
+        `check_free(start=start)`, joint angles (n, rad). Obstacles with a motion count, where they
+        are at time 0, but for the names in `ignoring_motions`.
         """
         self.check_open()
         before = self._snapshot()
         for name, configuration in configurations.items():
-            if self.in_collision(configuration):
-                contacts = self.contact_names()
+            moving = name not in ignoring_motions
+            if self.in_collision(configuration, moving=moving):
+                contacts = self.contact_names(moving)
                 self._restore(before)
                 raise ValueError(f"{name} is in collision: {contacts}")
 
-    def contact_names(self):
-        """The pairs in contact, in words; after `in_collision`."""
-        names = set()
-        for contact in p.getContactPoints(bodyA=self.body, physicsClientId=self.client):
-            if contact[8] < 0.0:
-                body = contact[2]
-                if body == self.body:
-                    names.add("the arm with itself")
-                else:
-                    index = self._bodies.index(body)
-                    kinds = ["the floor"] * (self.scene.floor is not None)
-                    kinds += ["the table"] * (self.scene.table is not None)
-                    kinds += [f"obstacle {i}" for i in range(len(self.scene.obstacles))]
-                    names.add(f"the arm with {kinds[index]}")
-        return ", ".join(sorted(names))
+    def contact_names(self, moving=True):
+        """The pairs in contact, in words; after `in_collision`, with the same `moving`."""
+        kinds = ["the floor"] * (self.scene.floor is not None)
+        kinds += ["the table"] * (self.scene.table is not None)
+        kinds += [f"obstacle {i}" for i in range(len(self.scene.obstacles))]
+        names = {
+            body: f"the arm with {kind}" for body, kind in zip(self._bodies, kinds, strict=True)
+        }
+        names[self.body] = "the arm with itself"
+        return ", ".join(sorted(names[body] for body in self._overlapping(moving)))
 
     # --- The arm
 
-    def place(self, configuration):
+    def place(self, configuration, time=0.0):
         """Teleport the arm to joint angles (n, rad), at rest, leaving no old contact points.
+
+        `time`: s, from which on obstacles move, as a multiple of `TIME_STEP`.
 
         Bullet keeps the contact points of two bodies while these move little against each other.
         So a configuration could inherit points from an earlier one that brought the same two links
@@ -365,10 +427,11 @@ class World:
         client, body, robot = self.client, self.body, self.robot
         p.resetBasePositionAndOrientation(body, FAR_AWAY, NO_TURN, physicsClientId=client)
         robot.set_configuration(client, body, robot.contact_free)
+        self._move_obstacles(round(time / TIME_STEP))
         p.performCollisionDetection(physicsClientId=client)
         p.resetBasePositionAndOrientation(body, *self._in_place, physicsClientId=client)
         robot.set_configuration(client, body, configuration)
-        self._start, self._events = tuple(configuration), []
+        self._start, self._events = (tuple(configuration), self.time), []
 
     def command(self, configuration):
         """Set the targets of the arm's position controllers: joint angles (list of n, rad)."""
@@ -382,7 +445,7 @@ class World:
         self._record(self._target)
         contact = False
         for _ in range(SUBSTEPS):
-            p.stepSimulation(physicsClientId=self.client)
+            self._step_physics()
             if not contact:
                 # A contact also counts at distance zero, when the surfaces push on each other.
                 points = p.getContactPoints(bodyA=self.body, physicsClientId=self.client)
@@ -437,6 +500,20 @@ class World:
             with contextlib.suppress(TypeError):  # at the end of the process PyBullet is gone
                 if p.isConnected(self.client):
                     p.disconnect(physicsClientId=self.client)
+
+
+def _velocities(before, after):
+    """The velocities (3,), m/s and rad/s, from one pose to the next, one physics step later."""
+    (position, (a, b, c, d)), (there, (x, y, z, w)) = before, after
+    linear = [(new - old) / TIME_STEP for old, new in zip(position, there, strict=True)]
+    # The vector part of after * inverse(before), half of the angle, which is small.
+    turn = 2.0 / TIME_STEP * (1.0 if a * x + b * y + c * z + d * w > 0.0 else -1.0)
+    angular = (
+        turn * (d * x - w * a + b * z - c * y),
+        turn * (d * y - w * b + c * x - a * z),
+        turn * (d * z - w * c + a * y - b * x),
+    )
+    return linear, angular
 
 
 def _check_scene(scene):

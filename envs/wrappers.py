@@ -1,12 +1,16 @@
 """Wrappers that add to observations: what sensors observe, an encoded scene, link distances."""
 
+import hashlib
 import math
 import warnings
+from collections import deque
 
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.envs.perception.sensors import SensorWorld, cardinal
+from roboarm_nmp.envs.perception.noise import NO_NOISE, SensorNoise
+from roboarm_nmp.envs.perception.sensors import SceneObservation, SensorWorld, cardinal
+from roboarm_nmp.envs.scenes.primitives import ObservedScene
 
 
 class SensorWrapper(gym.Wrapper):
@@ -16,28 +20,31 @@ class SensorWrapper(gym.Wrapper):
         env: a `RoboArmEnv`, possibly wrapped.
         sensors: dict of name -> sensor: an `envs.perception.sensors.Camera` or `PointCloud`, or
             any object with their `space` and `observe`; by default four cameras (`cardinal`).
-        every_step: observe in every step; otherwise once per episode, at its start, with the arm in
-            the start configuration (paper, appendix "Prediction times investigation").
+        observe_every: steps from one observation to the next; None: in a static scene once per
+            episode, at its start, with the arm in the start configuration (paper, appendix
+            "Prediction times investigation"), otherwise in every step.
+        sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
+
+    Raises:
+        ValueError: `observe_every` or `sensor_noise` is out of its range.
     """
 
-    def __init__(self, env, sensors=None, every_step=False):
+    def __init__(self, env, sensors=None, observe_every=None, sensor_noise=None):
         super().__init__(env)
         self.sensors = cardinal(robot=env.unwrapped.robot) if sensors is None else dict(sensors)
-        self.every_step = every_step
+        self._schedule = _Schedule(observe_every, sensor_noise)
         spaces = {name: sensor.space for name, sensor in self.sensors.items()}
         self.observation_space = gym.spaces.Dict(
             {**env.observation_space.spaces, "sensors": gym.spaces.Dict(spaces)}
         )
-        self._world = SensorWorld()
+        self._world = SensorWorld(self._schedule.noise)
         self._observed = None
 
-    def _observe(self, observation):
-        robot = self.unwrapped.robot
-        configuration = robot.denormalise(observation["observation"][: robot.num_joints])
-        self._world.show(self.unwrapped.scene, configuration)
-        self._observed = {
-            name: sensor.observe(self._world) for name, sensor in self.sensors.items()
-        }
+    def _observe(self, number):
+        env = self.unwrapped
+        configuration = _configuration(env) if number else env.start_configuration
+        self._world.show(env.current_scene, configuration, number)
+        return {name: sensor.observe(self._world) for name, sensor in self.sensors.items()}
 
     def _with_sensors(self, observation):
         observed = {  # copies, because the user may change an observation
@@ -46,13 +53,13 @@ class SensorWrapper(gym.Wrapper):
         }
         return {**observation, "sensors": observed}
 
-    def _begin(self, observation, info):
-        self._observe(observation)
-        return self._with_sensors(observation), info
-
     def reset(self, *, seed=None, options=None):
         """As `RoboArmEnv.reset`."""
-        return self._begin(*self.env.reset(seed=seed, options=options))
+        observation, info = self.env.reset(seed=seed, options=options)
+        env = self.unwrapped
+        self._world.begin_episode(_key(env.start_configuration), len(self.sensors))
+        self._observed = self._schedule.begin(env.scene.is_static, self._observe)
+        return self._with_sensors(observation), info
 
     def reset_specific(self, start, goal=None, scene=None, goal_pose=None):
         """As `RoboArmEnv.reset_specific`."""
@@ -62,13 +69,54 @@ class SensorWrapper(gym.Wrapper):
     def step(self, action):
         """As `RoboArmEnv.step`."""
         observation, *rest = self.env.step(action)
-        if self.every_step:
-            self._observe(observation)
+        self._observed = self._schedule.step(self._observe)
         return self._with_sensors(observation), *rest
 
     def close(self):
         self._world.close()
         super().close()
+
+
+class _Schedule:
+    """When a wrapper observes, and when it receives what it observed.
+
+    Arguments as of `SensorWrapper`.
+    """
+
+    def __init__(self, observe_every, sensor_noise):
+        self.noise = NO_NOISE if sensor_noise is None else sensor_noise
+        if not isinstance(self.noise, SensorNoise):
+            raise ValueError(f"sensor_noise must be a SensorNoise or None, got {sensor_noise!r}")
+        whole = isinstance(observe_every, (int, np.integer)) and not isinstance(observe_every, bool)
+        if observe_every is not None and not (whole and observe_every >= 1):
+            raise ValueError(f"observe_every must be at least 1 step, got {observe_every!r}")
+        self.observe_every = observe_every
+
+    def begin(self, static, observe):
+        """The first observation of an episode, `observe(0)`; `static`: whether its scene is."""
+        self._every = self.observe_every or (0 if static else 1)
+        self._steps, self._due = 0, deque()
+        self._received = observe(0)
+        return self._received
+
+    def step(self, observe):
+        """The last observation received after one more step; `observe(number)` makes new ones."""
+        self._steps += 1
+        if self._every and self._steps % self._every == 0:
+            number = self._steps // self._every
+            self._due.append((self._steps + self.noise.latency, observe(number)))
+        while self._due and self._due[0][0] <= self._steps:
+            self._received = self._due.popleft()[1]
+        return self._received
+
+
+def _configuration(env):
+    return env.robot.denormalise(env.world.read_arm()[0])
+
+
+def _key(start):
+    """Of an episode's noise, from its start (n,), rad: the same in whatever order they come."""
+    return int.from_bytes(hashlib.sha256(np.float32(start).tobytes()).digest()[:8], "big")
 
 
 class _ObservingWrapper(gym.Wrapper):
@@ -99,10 +147,80 @@ class _ObservingWrapper(gym.Wrapper):
         return self._extend(observation), *rest
 
 
+class ObservedSceneWrapper(_ObservingWrapper):
+    """The scene as it is observed during an episode, which encoders and geometry sources receive.
+
+    In a static scene, without noise and without `observe_every`, that is the scene itself, of which
+    encoders and geometry sources observe the arm in its robot's `observed_pose`. Otherwise the
+    scene of the moment is observed with the arm where it is. Observations do not change.
+
+    Args:
+        env: a `RoboArmEnv`.
+        observe_every, sensor_noise: as of a `SensorWrapper`. Noise acts on what sensors observe;
+            latency also on the obstacles of the geometry source `ground_truth`.
+
+    Raises:
+        ValueError: `observe_every` or `sensor_noise` is out of its range.
+    """
+
+    def __init__(self, env, observe_every=None, sensor_noise=None):
+        super().__init__(env)
+        self._schedule, self._observed = _Schedule(observe_every, sensor_noise), None
+        self._observes_once = observe_every is None and self._schedule.noise == NO_NOISE
+
+    @property
+    def observed_scene(self):
+        """The last observation received: a `Scene`, possibly a `SceneObservation`."""
+        env = self.unwrapped
+        is_itself = self._observed is None or self._is_received(env.scene)
+        return env.current_scene if is_itself else self._observed
+
+    def _is_received(self, scene):
+        """Whether a scene itself is received."""
+        return isinstance(scene, ObservedScene) or (self._observes_once and scene.is_static)
+
+    def observed_at_start(self, scene, start):
+        """The `observed_scene` after a reset to a `Scene` and a start (n,), rad."""
+        if self._is_received(scene):
+            return scene.at(0.0)
+        return SceneObservation.of(scene.at(0.0), start, self._schedule.noise, _key(start))
+
+    def _observe(self, number):
+        env = self.unwrapped
+        start = env.start_configuration
+        if number == 0:
+            return self.observed_at_start(env.scene, start)
+        scene, noise = env.current_scene, self._schedule.noise
+        if self._is_received(env.scene):
+            return scene
+        return SceneObservation.of(scene, _configuration(env), noise, _key(start), number)
+
+    def reset(self, *, seed=None, options=None):
+        """As `RoboArmEnv.reset`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._observed = self._schedule.begin(self.unwrapped.scene.is_static, self._observe)
+        return observation, info
+
+    def step(self, action):
+        """As `RoboArmEnv.step`."""
+        result = self.env.step(action)
+        self._observed = self._schedule.step(self._observe)
+        return result
+
+
+def observed_scene(env):
+    """What encoders and geometry sources receive of the scene in an environment: a `Scene`."""
+    try:
+        return env.get_wrapper_attr("observed_scene")
+    except AttributeError:  # no `ObservedSceneWrapper`
+        return env.unwrapped.current_scene
+
+
 class SceneEncodingWrapper(_ObservingWrapper):
     """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
 
-    A scene is encoded once. All attributes of the wrapped environment are available.
+    A scene is encoded once; one with moving obstacles in each step. All attributes of the wrapped
+    environment are available.
 
     Args:
         env: a `RoboArmEnv`.
@@ -118,7 +236,7 @@ class SceneEncodingWrapper(_ObservingWrapper):
         self.observation_space = gym.spaces.Dict(spaces)
 
     def _extend(self, observation):
-        z = self.encoder(self.unwrapped.scene)
+        z = self.encoder(observed_scene(self.env))
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
 
@@ -167,17 +285,21 @@ class LinkDistancesWrapper(_ObservingWrapper):
         self.observation_space = gym.spaces.Dict(spaces)
         self._goal, self._at_goal = None, None
 
+    def current_checker(self):
+        """The `CollisionChecker` of what is observed now; the same as long as nothing changes."""
+        return self.geometry_source(observed_scene(self.env))
+
     def link_distances_at(self, states, scene=None):
         """`link_distances` at normalised configurations (..., n): float32 (..., l, 1 + n).
 
-        `scene`: a `Scene`, by default that of the environment.
+        `scene`: a `Scene`, by default the one that is observed in the environment.
         """
-        checker = self.geometry_source(self.unwrapped.scene if scene is None else scene)
+        checker = self.geometry_source(observed_scene(self.env) if scene is None else scene)
         return checker.link_distances(states)
 
     def fine_link_distances_at(self, states):
         """As `link_distances_at`, from the geometry source for approach paths."""
-        return self._fine_geometry_source(self.unwrapped.scene).link_distances(states)
+        return self._fine_geometry_source(observed_scene(self.env)).link_distances(states)
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         """As `RoboArmEnv.compute_reward`; warns if goals are relabelled."""
@@ -199,7 +321,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
             more["observation"] = np.concatenate(parts)
         if self._of_goals:
             goal = observation["desired_goal"][:joints]
-            key = self.unwrapped.scene, goal.tobytes()
+            key = observed_scene(self.env), goal.tobytes()
             if self._goal != key:
                 self._goal, self._at_goal = key, self.link_distances_at(goal)
             more["goal_link_distances"] = self._at_goal.copy()

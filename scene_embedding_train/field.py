@@ -63,9 +63,6 @@ SECTORS = 8
 
 @dataclass
 class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
-    exp_name: str = "field"
-    """name of the experiment, part of the run's folder"""
-
     # The algorithm
     total_updates: PositiveInt = 20_000
     """batches of the whole run"""

@@ -50,8 +50,6 @@ from roboarm_nmp.scene_embedding_train.clouds import (
 @dataclass
 class Args(training_data.EncoderFlags):
     # More flags are in `training_data.py` and `envs/training/runs.py`.
-    exp_name: str = "pointnet2"
-    """name of the experiment, part of the run's folder"""
 
     # The algorithm
     total_updates: PositiveInt = 10_000

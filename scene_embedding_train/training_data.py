@@ -19,7 +19,7 @@ from roboarm_nmp.envs.perception.sensors import sensors_to_json
 from roboarm_nmp.envs.robots.files import RobotError, load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training.flags import PositiveInt, Share
-from roboarm_nmp.envs.training.runs import RunFlags
+from roboarm_nmp.envs.training.runs import RunFlags, script_name
 from roboarm_nmp.envs.utils.files import new_contents
 from roboarm_nmp.envs.utils.progress import progress_bar
 
@@ -70,7 +70,7 @@ def load_observations(args):
 def encoder_metadata(args, observations, names):
     """The metadata of an encoder that receives the outputs of the sensors `names`: a dict."""
     sensors = sensors_to_json({name: observations.sensors[name] for name in names})
-    metadata = {"kind": "encoder", "script": args.exp_name, "task": observations.task}
+    metadata = {"kind": "encoder", "script": script_name(), "task": observations.task}
     metadata |= robot_metadata(observations.base_scene.robot)
     return metadata | {"sensors": sensors, "seed": args.seed}
 

@@ -42,9 +42,6 @@ from roboarm_nmp.scene_embedding_train.training_data import (
 
 @dataclass
 class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
-    exp_name: str = "vqvae"
-    """name of the experiment, part of the run's folder"""
-
     # The algorithm
     total_updates: PositiveInt = 20_000
     """batches of the whole run"""

@@ -39,6 +39,8 @@ from roboarm_nmp.envs.collision.kernels import (
     link_distances_batch,
     motion,
     motion_batch,
+    rrt_connect,
+    shortcut,
     signed_distances_batch,
 )
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -48,6 +50,8 @@ from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scen
 RESOLUTION = 0.021
 """Motions are checked at points at most this far apart, L2 in the normalised space: less than one
 step of the arm (0.03)."""
+REACH = 0.6
+"""L2, normalised: the longest edge of `CollisionChecker.find_path`'s trees."""
 LINK_DISTANCE_RANGE = 0.3
 """m. Observed link distances are clipped to this, and beyond it their gradient is zero."""
 NOTHING, TABLE, FLOOR, ARM, POINT = -1, -2, -3, -4, -5
@@ -85,16 +89,16 @@ class CollisionChecker:
     batch's shape, (...), and is empty for an empty batch. Safe to use from several threads.
 
     Args:
-        scene: a `Scene`, whose robot has n joints.
+        scene: a static `Scene`, whose robot has n joints.
         points: m, (n, 3), in the base's frame: the centres of additional balls, for example an
             observed point cloud. An `ObservedScene` has its own points and radius instead.
         point_radius: m, of the balls, in [0, `MAX_MARGIN`).
 
     Raises:
         TypeError: `scene` is not a `Scene`.
-        ValueError: an obstacle, the table, the floor or a point has numbers that are not finite, or
-            a size that is not positive. From all methods: states of another shape, not finite, or
-            outside the limits; a margin out of its range.
+        ValueError: an obstacle has a motion; an obstacle, the table, the floor or a point has
+            numbers that are not finite, or a size that is not positive. From all methods: states of
+            another shape, not finite, or outside the limits; a margin out of its range.
     """
 
     def __init__(self, scene, points=(), point_radius=0.0):
@@ -102,6 +106,8 @@ class CollisionChecker:
             raise TypeError(
                 f"a scene must be a roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
             )
+        if not scene.is_static:
+            raise ValueError("obstacles of this scene move: check scene.at(t), at a time t")
         self.scene, self.robot = scene, scene.robot
         if isinstance(scene, ObservedScene):
             points, point_radius = scene.points, scene.point_radius
@@ -216,6 +222,46 @@ class CollisionChecker:
         """
         rule, endpoint_margins = self._rule(margin, clearance, endpoint_margins, resolution)
         return functools.partial(motion, rule, endpoint_margins[0], self._arm, self._world, False)
+
+    def find_path(
+        self,
+        start,
+        goals,
+        rng,
+        margin=0.0,
+        clearance=0.0,
+        endpoint_margins=None,
+        reach=REACH,
+        max_checks=4_000,
+        chords=40,
+    ):
+        """A path by RRT-Connect, within about `max_checks` checks, in milliseconds.
+
+        The same arguments and generator give the same path. `demo_generation.planning` plans more
+        thoroughly; this is for planning again in each step.
+
+        Args:
+            start: (n,), normalised; it is not checked.
+            goals: (m, n), normalised, or one goal (n,); they are not checked.
+            rng: a NumPy Generator.
+            margin, clearance, endpoint_margins: as for `is_free`.
+            reach: L2, normalised, of the longest edge of a tree.
+            max_checks: configurations, >= 1. Shortcuts may take a few more.
+            chords: shortcuts that are tried.
+
+        Returns:
+            The path, float64 (k, n), None if none was found; and the number of checks.
+        """
+        start, goals = self._states("start", start), np.atleast_2d(self._states("goals", goals))
+        rule, endpoint_margins = self._rule(margin, clearance, endpoint_margins)
+        rule = rule, endpoint_margins[0], self._arm, self._world
+        # Most samples take more than one check: there are as many as can be needed.
+        samples = rng.uniform(-1.0, 1.0, (max_checks, len(start)))
+        path, checks = rrt_connect(start, goals, samples, reach, max_checks, *rule)
+        if not len(path):
+            return None, checks
+        path, more = shortcut(path, rng.uniform(size=(chords, 2)), *rule)
+        return path, checks + more
 
     def signed_distances(self, states, self_collisions=True, within=math.inf):
         """The `SignedDistances` of the robot's `collision_links` from the nearest geometry.

@@ -59,7 +59,7 @@ def arm_hulls(robot):
         )
         row[POSITION:] = *frame.position, *_exact(frame.rotation)
     bodies, meshes, of_link = [], [], {link.index: [] for link in robot.links}
-    for link, mesh, rounding in link_shapes(robot):
+    for link, mesh, rounding, _ in link_shapes(robot):
         centre = (mesh.min(0) + mesh.max(0)) / 2
         mesh = mesh - centre
         radius = np.linalg.norm(mesh, axis=1).max()
@@ -85,24 +85,29 @@ def arm_hulls(robot):
 
 
 def link_shapes(robot):
-    """Each `Link` of a robot with each of its shapes: vertices (v, 3), m, in its frame; rounding.
+    """Each `Link` of a robot with each of its shapes.
 
     PyBullet is asked for them: it replaces a mesh, and a cylinder, by its convex hull.
+
+    Yields:
+        The link; the vertices (v, 3), m, of the shape's core, in the link's frame; rounding, m; the
+        vertices of its surface. The latter differ from the core's only for boxes. A sphere has one
+        vertex, a capsule two.
     """
     client = p.connect(p.DIRECT)
     try:
         body = robot.load(client, drawn=False)
         for link in robot.links:
-            for mesh, rounding in _shapes(client, robot, body, link.index):
+            for mesh, rounding, surface in _shapes(client, robot, body, link.index):
                 for placement in link.placements:
-                    mesh = _moved(mesh, *placement)
-                yield link, mesh, rounding
+                    mesh, surface = _moved(mesh, *placement), _moved(surface, *placement)
+                yield link, mesh, rounding, surface
     finally:
         p.disconnect(physicsClientId=client)
 
 
 def _shapes(client, robot, body, link):
-    """The shapes of a link of a body: vertices (v, 3), m, in the link's frame, and rounding."""
+    """The shapes of a link of a body, in the link's frame: core, rounding, surface."""
     shapes = p.getCollisionShapeData(body, link, physicsClientId=client)
     if len(shapes) > 1 or any(len(_objects(shape[4].decode())) > 1 for shape in shapes):
         # PyBullet returns the vertices of all hulls as one, so each is loaded alone.
@@ -122,11 +127,13 @@ def _shapes(client, robot, body, link):
             if not mesh:  # one of several, without triangles
                 continue
             mesh, rounding = np.array(mesh), BULLET_MARGIN
+            surface = mesh
         else:
-            mesh, rounding = _primitive(shape)
+            mesh, rounding, surface = _primitive(shape)
         if any(quaternion[:3]):
-            mesh = _moved(mesh, (0.0, 0.0, 0.0), matrix(quaternion).ravel())
-        yield mesh + position, rounding
+            turn = (0.0, 0.0, 0.0), matrix(quaternion).ravel()
+            mesh, surface = _moved(mesh, *turn), _moved(surface, *turn)
+        yield mesh + position, rounding, surface + position
 
 
 _ONE_SHAPE = """<robot name="shape"><link name="shape"><inertial><mass value="1"/>
@@ -165,19 +172,22 @@ def _one_by_one(element):
 
 
 def _primitive(shape):
-    """A box, sphere or capsule as vertices, relative to the centre of mass, and rounding."""
+    """A box, sphere or capsule, relative to the centre of mass: core, rounding, surface."""
     kind, size, position, quaternion = shape[2], shape[3], shape[5], shape[6]
     if kind == p.GEOM_BOX:
         rounding = min(BULLET_MARGIN, min(size) / 2)
-        half = np.array(size) / 2 - rounding
-        mesh = half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        mesh, surface = (np.array(size) / 2 - rounding) * signs, np.array(size) / 2 * signs
     elif kind == p.GEOM_SPHERE:
         mesh, rounding = np.zeros((1, 3)), size[0]
+        surface = mesh
     elif kind == p.GEOM_CAPSULE:
         mesh, rounding = np.array([(0.0, 0.0, -size[0] / 2), (0.0, 0.0, size[0] / 2)]), size[1]
+        surface = mesh
     else:
         raise ValueError(f"a link has a collision shape of PyBullet's kind {kind}")
-    return _moved(mesh, position, matrix(quaternion).ravel()), rounding
+    pose = position, matrix(quaternion).ravel()
+    return _moved(mesh, *pose), rounding, _moved(surface, *pose)
 
 
 def _moved(mesh, position, rotation):
@@ -282,13 +292,15 @@ def shape_rows(obstacles):
     """Obstacles -> float64 (n, `ROW`); `world_shapes` adds the bodies of convex hulls."""
     rows = np.zeros((len(obstacles), ROW))
     for obstacle, numbers, row in zip(obstacles, to_array(obstacles), rows, strict=True):
-        (kind,), position, quaternion, size = np.split(numbers, (1, 4, 8))
-        norm = math.sqrt(quaternion @ quaternion)
-        half = np.array(size) if isinstance(obstacle, Sphere) else size / 2
+        quaternion = numbers[4:8]
+        # Python's floats: NumPy's are ten times as slow one by one, and scenes that move have a
+        # checker per step.
+        x, y, z, w = (quaternion / math.sqrt(quaternion @ quaternion)).tolist()
+        kind, *position = numbers[:4].tolist()
+        half = [size if isinstance(obstacle, Sphere) else size / 2 for size in numbers[8:].tolist()]
         if isinstance(obstacle, Cylinder):
-            half[:2] = obstacle.radius
-        rounding = half[0] if isinstance(obstacle, Sphere) else min(BULLET_MARGIN, half.min())
-        x, y, z, w = quaternion / norm
+            half[:2] = obstacle.radius, obstacle.radius
+        rounding = half[0] if isinstance(obstacle, Sphere) else min(BULLET_MARGIN, *half)
         rotation = (
             *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
             *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
@@ -296,10 +308,19 @@ def shape_rows(obstacles):
         )
         if isinstance(obstacle, ConvexHull):
             centre, mesh, _ = _hull(obstacle.vertices)
-            kind, rounding, half = LINK, BULLET_MARGIN, mesh.max(0) + BULLET_MARGIN
+            kind, rounding, half = LINK, BULLET_MARGIN, (mesh.max(0) + BULLET_MARGIN).tolist()
             position = position + np.reshape(rotation, (3, 3)) @ centre
-        row[:] = (kind, *position, *rotation, *half - rounding, rounding, 0)
+        row[:] = (kind, *position, *rotation, *(edge - rounding for edge in half), rounding, 0)
     return rows
+
+
+def shape_centres(obstacles):
+    """The centres of obstacles' shapes in their own frames: float64 (n, 3), m."""
+    hulls = [isinstance(obstacle, ConvexHull) for obstacle in obstacles]
+    centres = np.zeros((len(obstacles), 3))
+    for i in np.flatnonzero(hulls):
+        centres[i] = _hull(obstacles[i].vertices)[0]
+    return centres
 
 
 def group_points(points, radius):

@@ -1,4 +1,4 @@
-"""All that Numba compiles: collision checks, signed distances, point clouds, the safety filter.
+"""All that Numba compiles: collision checks, distances, point clouds, the safety filter, sensors.
 
 One file holds all of it, because Numba's cache on disk does not notice changes in other files.
 
@@ -957,6 +957,32 @@ def first_in_cells(points, cell):
 
 
 @compiled
+def farthest(points, chosen):
+    """Write the points of `envs.perception.point_clouds.farthest_points` to `chosen` (k, 3).
+
+    `points`: float32 (n, 3), m. Squares are added in NumPy's order, for the same last bits.
+    """
+    n = points.shape[0]
+    nearest = np.empty(n, np.float32)
+    for k in range(min(chosen.shape[0], n)):
+        best, found = np.float32(-1.0), 0
+        for i in range(n):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            if k > 0:
+                x, y, z = x - chosen[k - 1, 0], y - chosen[k - 1, 1], z - chosen[k - 1, 2]
+            distance = np.sqrt(x * x + y * y + z * z)
+            if k < 2 or distance < nearest[i]:
+                nearest[i] = distance
+            if nearest[i] > best:
+                best, found = nearest[i], i
+        chosen[k, 0], chosen[k, 1], chosen[k, 2] = (
+            points[found, 0],
+            points[found, 1],
+            points[found, 2],
+        )
+
+
+@compiled
 def decompress_lzf(compressed, result):
     """Write the bytes of LZF data (uint8) to `result`; returns how many, -1 if it is damaged."""
     i, n = 0, 0
@@ -999,6 +1025,7 @@ def project(
     actions,
     link_distances,
     margins,
+    rates,
     max_step,
     cbf_gain,
     activation_distance,
@@ -1008,7 +1035,7 @@ def project(
     """Change actions (m, n) in place: `envs.policies.safety_filter.SafetyFilter.__call__`.
 
     Each sweep projects an action onto one link's half-space after the other.
-    `link_distances`: (m, l, 1 + n); `margins`: m, (m, l).
+    `link_distances`: (m, l, 1 + n); `margins`: m, (m, l); `rates`: m per step, (m, l).
     """
     for i in range(actions.shape[0]):
         action = actions[i]
@@ -1022,7 +1049,8 @@ def project(
                 for j in range(action.shape[0]):
                     squared += row[1 + j] * row[1 + j]
                     along += row[1 + j] * action[j]
-                short = min(cbf_gain * (margins[i, link] - row[0]), max_recovery) - along
+                short = min(cbf_gain * (margins[i, link] - row[0]), max_recovery)
+                short = short - rates[i, link] - along
                 if short > 0.0 and squared > 1e-12:
                     for j in range(action.shape[0]):
                         action[j] += row[1 + j] * short / squared
@@ -1038,3 +1066,667 @@ def _shorten(action, max_step):
     if squared > max_step * max_step:
         for j in range(action.shape[0]):
             action[j] *= max_step / np.sqrt(squared)
+
+
+# --- Moving obstacles
+# `motions` is a tuple of float64 arrays, see `envs.collision.moving.motion_arrays`:
+# - a row of `OWN_COLUMNS` per obstacle: its own pose (position 3, quaternion 4); of an oscillation
+#   amplitude 3, angular frequency (rad/s), phase, axis 3, angle (zeros without one); the first of
+#   its waypoints and the one after the last, and how they repeat; the same of its intervals (none:
+#   it is always there);
+# - waypoints (w, 8): time (s), displacement 3, quaternion 4; intervals (i, 2), s.
+AMPLITUDE, FREQUENCY, PHASE, AXIS, ANGLE, WAYPOINTS, REPEAT, INTERVALS = (
+    7,
+    10,
+    11,
+    12,
+    15,
+    16,
+    18,
+    19,
+)
+OWN_COLUMNS = 21
+# m. An obstacle that is not there is moved by this much along z where rows cannot be left out.
+ABSENT = 1e6
+
+
+@compiled
+def obstacle_states(motions, times, present, poses, velocities):
+    """Write where obstacles are: `envs.collision.moving.MovingObstacles.at`.
+
+    `times`: (t,), s. `present`: bool (t, n). `poses`: (t, n, 7), position and quaternion.
+    `velocities`: (t, n, 6), linear and angular.
+    """
+    for k in range(times.shape[0]):
+        for i in range(motions[0].shape[0]):
+            present[k, i] = _is_present(motions, i, times[k])
+            obstacle_state(motions, i, times[k], poses[k, i], velocities[k, i])
+
+
+@compiled
+def moved_rows(motions, centres, shapes, t, rows):
+    """Write `shape_rows` of n moving obstacles at a time (s) to `rows[:n]`.
+
+    `shapes`: (n, `ROW` or more), the rows at their own poses. `centres`: m, (n, 3), of the shapes
+    in the obstacles' own frames (zeros but for convex hulls). Absent obstacles are `ABSENT` away.
+    """
+    pose, velocity = np.empty(7), np.empty(6)
+    for i in range(shapes.shape[0]):
+        obstacle_state(motions, i, t, pose, velocity)
+        row = rows[i]
+        row[:] = shapes[i]
+        x, y, z, w = pose[3], pose[4], pose[5], pose[6]
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        x, y, z, w = x / norm, y / norm, z / norm, w / norm
+        row[4], row[5], row[6] = (
+            1.0 - 2.0 * (y * y + z * z),
+            2.0 * (x * y - z * w),
+            2.0 * (x * z + y * w),
+        )
+        row[7], row[8], row[9] = (
+            2.0 * (x * y + z * w),
+            1.0 - 2.0 * (x * x + z * z),
+            2.0 * (y * z - x * w),
+        )
+        row[10], row[11], row[12] = (
+            2.0 * (x * z - y * w),
+            2.0 * (y * z + x * w),
+            1.0 - 2.0 * (x * x + y * y),
+        )
+        a, b, c = centres[i, 0], centres[i, 1], centres[i, 2]
+        for j in range(3):
+            row[1 + j] = pose[j] + row[4 + 3 * j] * a + row[5 + 3 * j] * b + row[6 + 3 * j] * c
+        if not _is_present(motions, i, t):
+            row[3] += ABSENT
+
+
+@compiled
+def _is_present(motions, i, t):
+    """Whether obstacle i is there at a time (s)."""
+    own, intervals = motions[0][i], motions[2]
+    begin, end = int(own[INTERVALS]), int(own[INTERVALS + 1])
+    for k in range(begin, end):
+        if intervals[k, 0] <= t < intervals[k, 1]:
+            return True
+    return begin == end
+
+
+@compiled
+def obstacle_state(motions, i, t, pose, velocity):
+    """Write pose (7,) and velocity (6,), linear and angular, of obstacle i at a time (s)."""
+    own, waypoints = motions[0][i], motions[1]
+    a, b, c, d = 0.0, 0.0, 0.0, 1.0  # the rotation away from its own orientation
+    phase = own[FREQUENCY] * t + own[PHASE]
+    share, rate = math.sin(phase), own[FREQUENCY] * math.cos(phase)
+    for j in range(3):
+        pose[j] = own[j] + own[AMPLITUDE + j] * share
+        velocity[j] = own[AMPLITUDE + j] * rate
+        velocity[3 + j] = own[AXIS + j] * own[ANGLE] * rate
+    if own[ANGLE] != 0.0:
+        half = 0.5 * own[ANGLE] * share
+        sine, d = math.sin(half), math.cos(half)
+        a, b, c = own[AXIS] * sine, own[AXIS + 1] * sine, own[AXIS + 2] * sine
+    first, last = int(own[WAYPOINTS]), int(own[WAYPOINTS + 1]) - 1
+    if last >= first:
+        begin, end, direction = waypoints[first, 0], waypoints[last, 0], 1.0
+        span = end - begin
+        if own[REPEAT] != 0.0 and t > begin:
+            t -= begin
+            if own[REPEAT] == 2.0:
+                t -= span * math.floor(t / span)
+            else:
+                t -= 2.0 * span * math.floor(t / (2.0 * span))
+                if t >= span:
+                    t, direction = 2.0 * span - t, -1.0
+            t += begin
+        low, high = first, last  # the waypoint before this time, and the one after it
+        while high - low > 1:
+            middle = (low + high) // 2
+            later = waypoints[middle, 0] > t or (direction < 0.0 and waypoints[middle, 0] == t)
+            if later:
+                high = middle
+            else:
+                low = middle
+        before, after, share, rate = waypoints[low], waypoints[high], 0.0, 0.0
+        if last > first:
+            seconds = after[0] - before[0]
+            share = min(max((t - before[0]) / seconds, 0.0), 1.0)
+            if own[REPEAT] != 0.0 and t >= begin or begin <= t < end:
+                rate = direction / seconds
+        for j in range(3):
+            pose[j] += before[1 + j] + share * (after[1 + j] - before[1 + j])
+            velocity[j] += (after[1 + j] - before[1 + j]) * rate
+        a, b, c, d = _between(before, after, share, rate, velocity)
+    x, y, z, w = own[3], own[4], own[5], own[6]
+    pose[3] = d * x + a * w + b * z - c * y
+    pose[4] = d * y - a * z + b * w + c * x
+    pose[5] = d * z + a * y - b * x + c * w
+    pose[6] = d * w - a * x - b * y - c * z
+
+
+@compiled
+def _between(before, after, share, rate, velocity):
+    """The rotation between two waypoints; writes the angular velocity of `rate` ways per second."""
+    a, b, c, d = before[4], before[5], before[6], before[7]
+    e, f, g, h = after[4], after[5], after[6], after[7]
+    if a * e + b * f + c * g + d * h < 0.0:
+        e, f, g, h = -e, -f, -g, -h
+    apart = math.sqrt((a - e) ** 2 + (b - f) ** 2 + (c - g) ** 2 + (d - h) ** 2)
+    together = math.sqrt((a + e) ** 2 + (b + f) ** 2 + (c + g) ** 2 + (d + h) ** 2)
+    angle = 2.0 * math.atan2(apart, together)  # half of that between the orientations
+    sine = math.sin(angle)
+    if sine <= 1e-9:
+        return a, b, c, d
+    speed = 2.0 * angle * rate / sine  # about the vector part of after * inverse(before)
+    velocity[3] += speed * (d * e - h * a + b * g - c * f)
+    velocity[4] += speed * (d * f - h * b + c * e - a * g)
+    velocity[5] += speed * (d * g - h * c + a * f - b * e)
+    first, second = math.sin((1.0 - share) * angle) / sine, math.sin(share * angle) / sine
+    return (
+        first * a + second * e,
+        first * b + second * f,
+        first * c + second * g,
+        first * d + second * h,
+    )
+
+
+# --- Replanning: RRT-Connect and shortcuts, within a number of checks
+
+
+@compiled
+def _nearest_node(nodes, count, q):
+    """Index of the nearest of the first `count` nodes (L2), and its distance."""
+    least, found = FAR, 0
+    for i in range(count):
+        squared = 0.0
+        for j in range(q.shape[0]):
+            squared += (nodes[i, j] - q[j]) ** 2
+        if squared < least:
+            least, found = squared, i
+    return found, math.sqrt(least)
+
+
+@compiled
+def _towards(start, end, reach, distance, new):
+    """Write the state at most `reach` from `start` towards `end`. Returns whether it is `end`."""
+    if distance <= reach:
+        new[:] = end
+        return True
+    for j in range(start.shape[0]):
+        new[j] = start[j] + (end[j] - start[j]) * reach / distance
+    return False
+
+
+@compiled
+def rrt_connect(start, goals, samples, reach, max_checks, rule, endpoint_margins, arm, world):
+    """A path from `start` (n,) to one of `goals` (m, n) by RRT-Connect (Kuffner and LaValle, 2000).
+
+    `samples`: (s, n), the random states towards which the trees grow, after the goals themselves.
+    `reach`: L2, the longest edge. `rule`, `endpoint_margins`: as for `motion`.
+
+    Returns the path (k, n), (0, n) if there is none within `samples` and about `max_checks`, and
+    the number of checks.
+    """
+    n, m = start.shape[0], goals.shape[0]
+    capacity = max_checks + m + samples.shape[0] + 2  # an edge takes at least one check
+    nodes, parents = np.empty((2, capacity, n)), np.full((2, capacity), -1)
+    size = np.array([1, m])
+    nodes[0, 0], nodes[1, :m] = start, goals
+    new, checks, tree = np.empty(n), 0, 0
+    for i in range(m + samples.shape[0]):
+        if checks >= max_checks:
+            break
+        if i < m:
+            tree, target = 0, goals[i]
+        else:
+            target = samples[i - m]
+        near, distance = _nearest_node(nodes[tree], size[tree], target)
+        other = 1 - tree
+        _towards(nodes[tree, near], target, reach, distance, new)
+        more = motion(rule, endpoint_margins, arm, world, False, nodes[tree, near], new)
+        checks += abs(more)
+        if more > 0:
+            a = size[tree]
+            nodes[tree, a], parents[tree, a] = new, near
+            size[tree] += 1
+            # The other tree grows to the new node, as far as it can.
+            b, distance = _nearest_node(nodes[other], size[other], nodes[tree, a])
+            arrived = distance < 1e-9
+            while not arrived and checks < max_checks:
+                arrived = _towards(nodes[other, b], nodes[tree, a], reach, distance, new)
+                more = motion(rule, endpoint_margins, arm, world, False, nodes[other, b], new)
+                checks += abs(more)
+                if more <= 0:
+                    arrived = False
+                    break
+                nodes[other, size[other]], parents[other, size[other]] = new, b
+                b = size[other]
+                size[other] += 1
+                distance -= reach
+            if arrived:
+                if tree == 1:
+                    a, b = b, a
+                return _joined_path(nodes, parents, a, b), checks
+        tree = other
+    return np.empty((0, n)), checks
+
+
+@compiled
+def _joined_path(nodes, parents, a, b):
+    """The path from the first tree's root to its node a, then from node b to the other's root.
+
+    Both nodes are the same state.
+    """
+    length, node = 0, parents[0, a]
+    while node >= 0:
+        length, node = length + 1, parents[0, node]
+    before, node = length, b
+    while node >= 0:
+        length, node = length + 1, parents[1, node]
+    path, node = np.empty((length, nodes.shape[2])), parents[0, a]
+    for i in range(before - 1, -1, -1):
+        path[i] = nodes[0, node]
+        node = parents[0, node]
+    node = b
+    for i in range(before, length):
+        path[i] = nodes[1, node]
+        node = parents[1, node]
+    return path
+
+
+@compiled
+def shortcut(path, chords, rule, endpoint_margins, arm, world):
+    """Shorten a path (k, n) by straight motions between two of its points, where they are free.
+
+    `chords`: (c, 2), shares of the path's length at which a shortcut begins and ends, in any order.
+    Returns the path and the number of checks.
+    """
+    checks, n = 0, path.shape[1]
+    for c in range(chords.shape[0]):
+        k = path.shape[0]
+        length = np.zeros(k)
+        for i in range(1, k):
+            length[i] = length[i - 1] + math.sqrt(np.sum((path[i] - path[i - 1]) ** 2))
+        ends, edges = np.empty((2, n)), np.zeros(2, np.int64)
+        for end in range(2):
+            share = min(chords[c]) if end == 0 else max(chords[c])
+            along = share * length[-1]
+            edge = 0
+            while edge < k - 2 and length[edge + 1] <= along:
+                edge += 1
+            part = (along - length[edge]) / max(length[edge + 1] - length[edge], 1e-12)
+            ends[end] = path[edge] + (path[edge + 1] - path[edge]) * part
+            edges[end] = edge
+        if edges[0] == edges[1]:
+            continue
+        more = motion(rule, endpoint_margins, arm, world, False, ends[0], ends[1])
+        checks += abs(more)
+        if more > 0:
+            path = np.concatenate((path[: edges[0] + 1], ends, path[edges[1] + 1 :]))
+    return path, checks
+
+
+# --- Planning in time: obstacles whose motion is known
+
+
+@compiled
+def rows_in_time(motions, centres, shapes, times, rows):
+    """Write the rows of all shapes at times (t,), s, to `rows` (t, r, `ROW` or more).
+
+    `shapes`: (r, `ROW`), of which the first ones have `motions` and `centres`, as of `moved_rows`.
+    """
+    moving = centres.shape[0]
+    for k in range(times.shape[0]):
+        rows[k] = shapes
+        moved_rows(motions, centres, shapes[:moving], times[k], rows[k])
+
+
+@compiled
+def free_in_time(states, steps, rule, endpoint_margins, arm, rows, cloud, free):
+    """Write whether states (m, n) are free at `steps` (m,) and one step later to `free` (m,).
+
+    `rows`: (t, r, `ROW`), of each step. `cloud`: points, groups and ball of `world`.
+    """
+    memory, last = _memory(arm[0], arm[1]), rows.shape[0] - 1
+    points, groups, ball = cloud
+    for i in range(states.shape[0]):
+        free[i] = True
+        for step in range(steps[i], steps[i] + 2):
+            world = rows[min(step, last)], points, groups, ball
+            if not _is_free(states[i], rule, endpoint_margins, arm, world, memory):
+                free[i] = False
+                break
+
+
+@compiled
+def first_departure(start, end, length, first, last, rule, endpoint_margins, arm, rows, cloud):
+    """The first step from `first` to `last` at which a motion may begin; -1 if there is none.
+
+    The motion takes `length` steps of equal size. Its states are checked as by `free_in_time`.
+    """
+    n = start.shape[0]
+    state, step, free = np.empty((1, n)), np.empty(1, np.int64), np.empty(1, np.bool_)
+    departure = first
+    while departure <= last:
+        blocked = False
+        for i in range(1, length + 1):
+            for j in range(n):
+                state[0, j] = start[j] + (end[j] - start[j]) * i / length
+            step[0] = departure + i
+            free_in_time(state, step, rule, endpoint_margins, arm, rows, cloud, free)
+            if not free[0]:
+                blocked = True
+                break
+        if not blocked:
+            return departure
+        departure += 1
+    return -1
+
+
+# --- Ray casting for sensors (`envs.perception.ray_casting`)
+
+# Columns of a surface: its shape, the frame that moves it (-1: none), its position there 3, its
+# rotation 9 (row-major), its size 3, the polyhedron, the class that its pixels get. A polyhedron is
+# scaled by the size. A cylinder's size is (radius, radius, half length); a sphere's, its radius.
+POLYHEDRON, ROUND, BALL = range(3)
+SHAPE, MOVED_BY, PLACE, TURN, SIZE, MESH, CLASS, SURFACE_COLUMNS = 0, 1, 2, 5, 14, 17, 18, 19
+# Numbers of a view: eye 3, right 3, up 3, forward 3, the tangents of half the angles across and
+# upwards, nearest and farthest visible distance along the viewing direction (m).
+EYE, AXES, ACROSS, UPWARDS, NEAREST, FARTHEST, VIEW = 0, 3, 12, 13, 14, 15, 16
+_ON_EDGE = 1e-9  # pixels: a ray on the edge of two faces hits at least one of them
+
+
+@compiled
+def cast_rays(view, q, chain, bodies, surfaces, polyhedra, inverse, classes):
+    """Write a sensor's depth image, as 1 / depth (1/m), and the classes of its pixels.
+
+    The result is that of one ray per pixel. As each surface is convex, its faces that are turned to
+    the eye are filled row by row instead: along a row, 1 / depth of a plane is linear.
+
+    Args:
+        view: float64 (`VIEW`,).
+        q: normalised configuration (n,).
+        chain, bodies: as in `_place`; `bodies` may be empty.
+        surfaces: float64 (s, `SURFACE_COLUMNS`).
+        polyhedra: `vertices` float64 (v, 3), m; `vertex_ends` int64 (p + 1,), where the vertices of
+            each begin; `face_ends` int64 (p + 1,), likewise; `corners` int64 (f, 4), of each face,
+            counterclockwise from outside; three of them where the last is -1.
+        inverse: float64 (height, width): 1 / depth; of a ray without a hit, 1 / farthest.
+        classes: uint8 (height, width), unchanged where a ray hits nothing.
+    """
+    vertices, vertex_ends, face_ends, corners = polyhedra
+    frames, centres = np.empty((chain.shape[0], 12)), np.empty((bodies.shape[0], 3))
+    _place(q, chain, bodies, frames, centres)
+    most = 0
+    for i in range(vertex_ends.shape[0] - 1):
+        most = max(most, vertex_ends[i + 1] - vertex_ends[i])
+    # A vertex: its position along right, up and forward (m), its column and row.
+    seen, polygon, pose = np.empty((max(most, 8), 5)), np.empty((2, 8, 5)), np.empty(12)
+    height, width = inverse.shape
+    inverse[:] = 1.0 / view[FARTHEST]
+    for s in range(surfaces.shape[0]):
+        surface = surfaces[s]
+        _pose_in_view(view, surface, frames, pose)
+        kind, label = int(surface[SHAPE]), np.uint8(surface[CLASS])
+        if kind != POLYHEDRON:
+            area = _pixels_around(view, surface, pose, seen, height, width)
+            if kind == BALL:
+                _draw_ball(view, surface[SIZE], pose, area, label, inverse, classes)
+            else:
+                _draw_cylinder(view, surface, pose, area, label, inverse, classes)
+            continue
+        mesh = int(surface[MESH])
+        first, behind, outside = vertex_ends[mesh], 0, 0
+        number = vertex_ends[mesh + 1] - first
+        for i in range(number):
+            x = vertices[first + i, 0] * surface[SIZE]
+            y = vertices[first + i, 1] * surface[SIZE + 1]
+            z = vertices[first + i, 2] * surface[SIZE + 2]
+            for j in range(3):
+                seen[i, j] = pose[9 + j] + pose[3 * j] * x + pose[3 * j + 1] * y
+                seen[i, j] += pose[3 * j + 2] * z
+            behind += seen[i, 2] < view[NEAREST]
+            _project(view, height, width, seen[i])
+        if behind == number:
+            continue
+        if behind == 0:
+            left = top = FAR
+            right = bottom = -FAR
+            for i in range(number):
+                left, right = min(left, seen[i, 3]), max(right, seen[i, 3])
+                top, bottom = min(top, seen[i, 4]), max(bottom, seen[i, 4])
+            outside = right < 0.0 or left > width - 1 or bottom < 0.0 or top > height - 1
+        if outside:
+            continue
+        for face in range(face_ends[mesh], face_ends[mesh + 1]):
+            a, b, c = seen[corners[face, 0]], seen[corners[face, 1]], seen[corners[face, 2]]
+            ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+            vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            away = nx * a[0] + ny * a[1] + nz * a[2]
+            if away <= 0.0:  # turned away from the eye (right, up, forward are left-handed)
+                continue
+            n = 0
+            for i in range(4):
+                if corners[face, i] >= 0:
+                    polygon[0, n] = seen[corners[face, i]]
+                    n += 1
+            outline = polygon[0]
+            if behind > 0:
+                n = _clip(view, height, width, polygon, n)
+                outline = polygon[1]
+            plane = nx / away, ny / away, nz / away
+            _fill(view, outline, n, plane, label, inverse, classes)
+
+
+@compiled
+def _pose_in_view(view, surface, frames, pose):
+    """Write a surface's rotation (row-major) and position along right, up and forward to `pose`."""
+    frame = int(surface[MOVED_BY])
+    for i in range(3):
+        a, b, c = view[AXES + 3 * i], view[AXES + 3 * i + 1], view[AXES + 3 * i + 2]
+        place = -(a * view[EYE] + b * view[EYE + 1] + c * view[EYE + 2])
+        if frame >= 0:
+            f = frames[frame]
+            place += a * f[9] + b * f[10] + c * f[11]
+            a, b, c = (
+                a * f[0] + b * f[3] + c * f[6],
+                a * f[1] + b * f[4] + c * f[7],
+                a * f[2] + b * f[5] + c * f[8],
+            )
+        pose[9 + i] = place + a * surface[PLACE] + b * surface[PLACE + 1] + c * surface[PLACE + 2]
+        for j in range(3):
+            pose[3 * i + j] = a * surface[TURN + j] + b * surface[TURN + 3 + j]
+            pose[3 * i + j] += c * surface[TURN + 6 + j]
+
+
+@compiled
+def _project(view, height, width, point):
+    """Write a point's column and row behind its position. PyBullet's pixels: see `deproject`."""
+    point[3] = (point[0] / (point[2] * view[ACROSS]) + 1.0) * (0.5 * width)
+    point[4] = (1.0 - point[1] / (point[2] * view[UPWARDS])) * (0.5 * height) - 1.0
+
+
+@compiled
+def _clip(view, height, width, polygon, n):
+    """Write the part of `polygon[0]`, n corners, that is not too near to `polygon[1]`."""
+    given, left, count = polygon[0], polygon[1], 0
+    for i in range(n):
+        one, other = given[i], given[(i + 1) % n]
+        if one[2] >= view[NEAREST]:
+            left[count] = one
+            count += 1
+        if (one[2] >= view[NEAREST]) != (other[2] >= view[NEAREST]):
+            share = (view[NEAREST] - one[2]) / (other[2] - one[2])
+            for j in range(3):
+                left[count, j] = one[j] + share * (other[j] - one[j])
+            left[count, 2] = view[NEAREST]
+            _project(view, height, width, left[count])
+            count += 1
+    return count
+
+
+@compiled
+def _fill(view, outline, n, plane, label, inverse, classes):
+    """Draw a convex polygon of n corners in a plane, of which `plane` is 1 / depth per ray."""
+    height, width = inverse.shape
+    top, bottom = FAR, -FAR
+    for i in range(n):
+        top, bottom = min(top, outline[i, 4]), max(bottom, outline[i, 4])
+    begin = int(math.ceil(max(top - _ON_EDGE, 0.0)))
+    end = int(math.floor(min(bottom + _ON_EDGE, height - 1.0))) + 1
+    along = plane[0] * view[ACROSS] * (2.0 / width)
+    for row in range(begin, end):
+        y, left, right = float(row), FAR, -FAR
+        for i in range(n):
+            j = i + 1 if i + 1 < n else 0
+            if outline[i, 4] > outline[j, 4]:
+                i, j = j, i  # the same numbers for the face on the other side
+            ya, yb = outline[i, 4], outline[j, 4]
+            if y < ya - _ON_EDGE or y > yb + _ON_EDGE:
+                continue
+            xa, xb = outline[i, 3], outline[j, 3]
+            if yb - ya < _ON_EDGE:
+                left, right = min(left, xa, xb), max(right, xa, xb)
+            else:
+                x = xa + (y - ya) * ((xb - xa) / (yb - ya))
+                left, right = min(left, x), max(right, x)
+        first = int(math.ceil(max(left - _ON_EDGE, 0.0)))
+        last = int(math.floor(min(right + _ON_EDGE, width - 1.0)))
+        upward = (1.0 - 2.0 * (row + 1) / height) * view[UPWARDS]
+        start = plane[1] * upward + plane[2] - plane[0] * view[ACROSS]
+        for column in range(first, last + 1):
+            value = start + along * column
+            if value > inverse[row, column]:
+                inverse[row, column], classes[row, column] = value, label
+
+
+@compiled
+def _pixels_around(view, surface, pose, seen, height, width):
+    """Rows and columns that a ball or cylinder may cover: first row, end, first column, end."""
+    left = top = FAR
+    right = bottom = -FAR
+    half = surface[SIZE : SIZE + 3]
+    for i in range(8):
+        x = half[0] if i & 1 else -half[0]
+        y = half[1] if i & 2 else -half[1]
+        z = half[2] if i & 4 else -half[2]
+        for j in range(3):
+            seen[i, j] = pose[9 + j] + pose[3 * j] * x + pose[3 * j + 1] * y + pose[3 * j + 2] * z
+        if seen[i, 2] < view[NEAREST]:
+            return 0, height, 0, width
+        _project(view, height, width, seen[i])
+        left, right = min(left, seen[i, 3]), max(right, seen[i, 3])
+        top, bottom = min(top, seen[i, 4]), max(bottom, seen[i, 4])
+    return (
+        int(math.ceil(min(max(top, 0.0), float(height)))),
+        int(math.floor(min(max(bottom, -1.0), height - 1.0))) + 1,
+        int(math.ceil(min(max(left, 0.0), float(width)))),
+        int(math.floor(min(max(right, -1.0), width - 1.0))) + 1,
+    )
+
+
+@compiled
+def _draw_ball(view, radius, pose, area, label, inverse, classes):
+    height, width = inverse.shape
+    x, y, z = pose[9], pose[10], pose[11]
+    beyond = x * x + y * y + z * z - radius * radius
+    for row in range(area[0], area[1]):
+        v = (1.0 - 2.0 * (row + 1) / height) * view[UPWARDS]
+        for column in range(area[2], area[3]):
+            u = (2.0 * column / width - 1.0) * view[ACROSS]
+            square, along = u * u + v * v + 1.0, u * x + v * y + z
+            under = along * along - square * beyond
+            if under < 0.0:
+                continue
+            depth = (along - math.sqrt(under)) / square
+            if depth >= view[NEAREST] and depth * inverse[row, column] < 1.0:
+                inverse[row, column], classes[row, column] = 1.0 / depth, label
+
+
+@compiled
+def _draw_cylinder(view, surface, pose, area, label, inverse, classes):
+    height, width = inverse.shape
+    radius, half = surface[SIZE], surface[SIZE + 2]
+    # The eye in the cylinder's own axes.
+    ox = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
+    oy = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
+    oz = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
+    beyond = ox * ox + oy * oy - radius * radius
+    for row in range(area[0], area[1]):
+        v = (1.0 - 2.0 * (row + 1) / height) * view[UPWARDS]
+        for column in range(area[2], area[3]):
+            u = (2.0 * column / width - 1.0) * view[ACROSS]
+            dx = pose[0] * u + pose[3] * v + pose[6]
+            dy = pose[1] * u + pose[4] * v + pose[7]
+            dz = pose[2] * u + pose[5] * v + pose[8]
+            enter, leave = -FAR, FAR
+            square, along = dx * dx + dy * dy, ox * dx + oy * dy
+            under = along * along - square * beyond
+            if under < 0.0 or (square == 0.0 and beyond > 0.0):
+                continue
+            if square > 0.0:
+                root = math.sqrt(under)
+                enter, leave = (-along - root) / square, (root - along) / square
+            if dz != 0.0:
+                one, other = (-half - oz) / dz, (half - oz) / dz
+                enter, leave = max(enter, min(one, other)), min(leave, max(one, other))
+            elif abs(oz) > half:
+                continue
+            if view[NEAREST] <= enter <= leave and enter * inverse[row, column] < 1.0:
+                inverse[row, column], classes[row, column] = 1.0 / enter, label
+
+
+@compiled
+def points_of_pixels(view, depth, classes, only, nothing, points, labels):
+    """Write the points (m) and classes of pixels that hit something, row by row from upper left.
+
+    Args:
+        view: float64 (`VIEW`,).
+        depth: float32 (height, width), m.
+        classes: uint8 (height, width).
+        only: the class of which points are written; negative: all but `nothing`.
+        nothing: the class of pixels without a hit.
+        points, labels: float32 (n, 3) and uint8 (n,), to write to.
+
+    Returns the number of points.
+    """
+    height, width = depth.shape
+    n = 0
+    for row in range(height):
+        upward = (1 - 2 * (row + 1) / height) * view[UPWARDS]
+        for column in range(width):
+            label = classes[row, column]
+            if label != only if only >= 0 else label == nothing:
+                continue
+            across = (2 * column / width - 1) * view[ACROSS]
+            for i in range(3):
+                ray = across * view[AXES + i] + upward * view[AXES + 3 + i] + view[AXES + 6 + i]
+                points[n, i] = view[EYE + i] + depth[row, column] * ray
+            labels[n] = label
+            n += 1
+    return n
+
+
+@compiled
+def edge_pixels(depth, classes, nothing, edge):
+    """Of pixels at edges, the least and the largest depth of the pixel and its four neighbours.
+
+    At an edge they are more than `edge` (m) apart; neighbours of the class `nothing` do not count.
+
+    Returns two arrays, float32 (height, width), m; zeros where there is no edge.
+    """
+    height, width = depth.shape
+    front, back = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    for row in range(height):
+        for column in range(width):
+            if classes[row, column] == nothing:
+                continue
+            least = most = depth[row, column]
+            for i in range(4):
+                r, c = row + (i == 0) - (i == 1), column + (i == 2) - (i == 3)
+                if 0 <= r < height and 0 <= c < width and classes[r, c] != nothing:
+                    least, most = min(least, depth[r, c]), max(most, depth[r, c])
+            if most - least > edge:
+                front[row, column], back[row, column] = least, most
+    return front, back

@@ -9,7 +9,11 @@ task has queries from elsewhere, each with
   uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
   scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`; where there are
   convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another; where there
-  are obstacles with `may_touch`, that of all k obstacles: uint8 (b,), a list as JSON.
+  are obstacles with `may_touch`, that of all k obstacles: uint8 (b,), a list as JSON; where
+  obstacles move, `motion_count`: uint32 (k,), how many numbers each one's motion has, and
+  `motions`: float64 (m,), the numbers (`envs.scenes.motions.motion_to_numbers`);
+- of tasks with moving obstacles, instead of these, `scene_seed`: uint32 (n,), from which each
+  query's scene is drawn (`AnimatedScenes`).
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
@@ -41,6 +45,7 @@ import h5py
 import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.motions import motion_from_numbers
 from roboarm_nmp.envs.scenes.primitives import (
     MAX_LENGTH,
     ROW,
@@ -48,11 +53,14 @@ from roboarm_nmp.envs.scenes.primitives import (
     check_obstacle,
     from_array,
     hull_vertices,
+    motion_numbers,
     scene_from_json,
     scene_to_json,
+    split_list,
     to_array,
     vertex_counts,
     with_may_touch,
+    with_motion,
 )
 from roboarm_nmp.envs.tasks import (
     TASKS,
@@ -79,9 +87,13 @@ SCENE_ARRAYS = {
     "obstacle_count": ("<u4", None, "obstacle_count"),
     "obstacles": ("<f8", ROW, "obstacles"),
 }
-# Where there are convex hulls, and where there are obstacles with `may_touch`.
-HULL_ARRAYS = {"hull_vertices": ("<f8", 3, "hull_vertices")}
-TOUCH_ARRAYS = {"may_touch": ("<u1", None, "may_touch")}
+SEED_ARRAYS = {"scene_seed": ("<u4", None, "start")}  # where obstacles move
+HULL_ARRAYS = {"hull_vertices": ("<f8", 3, "hull_vertices")}  # where there are convex hulls
+TOUCH_ARRAYS = {"may_touch": ("<u1", None, "may_touch")}  # where obstacles have it
+MOTION_ARRAYS = {  # where obstacles move
+    "motion_count": ("<u4", None, "obstacles"),
+    "motions": ("<f8", None, "motions"),
+}
 QUERY_ARRAYS = {
     "start": ("<f4", JOINTS, "start"),
     "goal": ("<f4", JOINTS, "start"),
@@ -108,6 +120,10 @@ def array_formats(schema, names):
                 arrays |= HULL_ARRAYS
             if f"{prefix}may_touch" in names:
                 arrays |= TOUCH_ARRAYS
+            if f"{prefix}motion_count" in names:
+                arrays |= MOTION_ARRAYS
+        if f"{prefix}scene_seed" in names:
+            arrays = {**arrays, **SEED_ARRAYS}
         return {
             prefix + name: (dtype, width, prefix + sibling)
             for name, (dtype, width, sibling) in arrays.items()
@@ -152,11 +168,17 @@ class QueryScenes:
         rows: float64 (k, 11), as of `envs.scenes.primitives.to_array`.
         vertices: float64 (v, 3), as of `envs.scenes.primitives.hull_vertices`.
         may_touch: a list, `may_touch` of each of the k obstacles; None if it is () for all.
+        motions: None, or the two arrays of `envs.scenes.primitives.motion_numbers`.
     """
 
-    def __init__(self, base, index=None, offsets=None, rows=None, vertices=(), may_touch=None):
+    def __init__(
+        self, base, index=None, offsets=None, rows=None, vertices=(), may_touch=None, motions=None
+    ):
         self.base, self.index, self.offsets, self.rows = base, index, offsets, rows
-        self.vertices, self.may_touch = vertices, may_touch
+        self.vertices, self.may_touch, self.motions = vertices, may_touch, motions
+        if motions is not None:  # the numbers of row j begin at number `_motion_offsets[j]`
+            counts = motions[1].astype(np.int64)
+            self._motion_offsets = np.concatenate([[0], np.cumsum(counts)])
         if rows is not None:  # the vertices of row j begin at number `_vertex_offsets[j]`
             self._vertex_offsets = np.concatenate([[0], np.cumsum(vertex_counts(rows))])
 
@@ -168,12 +190,54 @@ class QueryScenes:
         obstacles = from_array(self.rows[first:last], self.vertices[begin:end])
         if self.may_touch is not None:
             obstacles = with_may_touch(obstacles, self.may_touch[first:last])
+        if self.motions is not None:
+            ends = self._motion_offsets[first : last + 1]
+            numbers = [self.motions[0][i:j] for i, j in itertools.pairwise(ends)]
+            obstacles = map(with_motion, obstacles, numbers)
         return replace(self.base, obstacles=obstacles)
 
     def take(self, which):
         """The scenes of fewer queries, by slice or index array."""
         index = None if self.index is None else self.index[which]
-        return QueryScenes(self.base, index, self.offsets, self.rows, self.vertices, self.may_touch)
+        rest = self.offsets, self.rows, self.vertices, self.may_touch, self.motions
+        return QueryScenes(self.base, index, *rest)
+
+
+class AnimatedScenes:
+    """The scenes of n queries with moving obstacles: drawn from a seed each, on access.
+
+    Attributes:
+        distribution: an `envs.scenes.moving_boxes.MovingScenes`, whose robot has j joints.
+        seeds: uint32 (n,).
+        start, goal: float32 (n, j), rad, of the queries.
+    """
+
+    def __init__(self, distribution, seeds, start, goal):
+        self.distribution, self.base = distribution, distribution.base
+        self.seeds, self.start, self.goal = seeds, start, goal
+
+    def __getitem__(self, i):
+        rest, motions = map(np.random.default_rng, scene_seeds(self.seeds[i]))
+        scene = self.distribution.sample(rest)
+        return self.distribution.animate(scene, self.start[i], self.goal[i], motions)
+
+    def take(self, which):
+        """As `QueryScenes.take`."""
+        given = self.seeds[which], self.start[which], self.goal[which]
+        return AnimatedScenes(self.distribution, *given)
+
+    def summary(self):
+        """Numbers (JSON-ready) that tell scenes of another version of the distribution from these.
+
+        The sums of all numbers of the first query's obstacles, at several times.
+        """
+        times, scene = (0.0, 1.0, 3.0, 6.0), self[0]
+        return [float(to_array(scene.at(t).obstacles).sum()) for t in times]
+
+
+def scene_seeds(seed):
+    """The seeds of a scene at rest, and of its motions, from a seed of `AnimatedScenes`."""
+    return (int(seed), 0), (int(seed), 1)
 
 
 def task_file(task, folder, suffix):
@@ -241,6 +305,8 @@ def scene_arrays(path, scenes_of, base, prefix=""):
     """Arrays for a sequence of `Scene`s, equal ones stored once; none for None."""
     if scenes_of is None:
         return {}
+    if isinstance(scenes_of, AnimatedScenes):
+        return {f"{prefix}scene_seed": scenes_of.seeds}
     numbers = {}  # scene -> its number, in the order of their first use
     index = [numbers.setdefault(scene, len(numbers)) for scene in scenes_of]
     for scene in numbers:
@@ -254,12 +320,14 @@ def scene_arrays(path, scenes_of, base, prefix=""):
         f"{prefix}obstacle_count": np.array([len(s.obstacles) for s in numbers], np.uint32),
         f"{prefix}obstacles": to_array(obstacles),
     }
-    vertices = hull_vertices(obstacles)
-    if len(vertices):
+    if len(vertices := hull_vertices(obstacles)):
         arrays[f"{prefix}hull_vertices"] = vertices
     if any(obstacle.may_touch for obstacle in obstacles):
         text = json.dumps([obstacle.may_touch for obstacle in obstacles])
         arrays[f"{prefix}may_touch"] = np.frombuffer(text.encode(), np.uint8)
+    numbers, counts = motion_numbers(obstacles)
+    if len(numbers):
+        arrays |= {f"{prefix}motion_count": counts, f"{prefix}motions": numbers}
     return arrays
 
 
@@ -289,7 +357,19 @@ def read_scenes(path, base, arrays, prefix=""):
         raise DatasetError(
             f"{path}: {prefix}obstacles has sizes that are not positive, or too large"
         )
-    return QueryScenes(base, index.astype(np.int64), offsets, rows, vertices, may_touch)
+    motions = None
+    if f"{prefix}motion_count" in arrays:
+        motions = arrays[f"{prefix}motions"], arrays[f"{prefix}motion_count"]
+        if motions[1].sum(dtype=np.int64) != len(motions[0]):
+            raise DatasetError(f"{path}: {prefix}motion_count does not fit {prefix}motions")
+        ends = np.concatenate([[0], np.cumsum(motions[1].astype(np.int64))])
+        try:
+            for first, last in itertools.pairwise(ends.tolist()):
+                motion_from_numbers(motions[0][first:last])
+        except ValueError as error:
+            raise DatasetError(f"{path}: {prefix}motions: {error}") from error
+    rest = offsets, rows, vertices, may_touch, motions
+    return QueryScenes(base, index.astype(np.int64), *rest)
 
 
 def read_base_scene(path, text, robot):
@@ -330,26 +410,28 @@ def _same_scene(one, other):
             if here is not there:
                 return False
             continue
-        if field == "obstacles":  # rows may have different lengths, those of convex hulls
+        if field == "table":
+            here, there = _flat(here), _flat(there)
+        if field == "obstacles":  # rows may have different lengths, of convex hulls and motions
+            here, there = ([_flat(row) for row in rows] for rows in (here, there))
             if [len(row) for row in here] != [len(row) for row in there]:
                 return False
             here, there = (list(itertools.chain(*rows)) for rows in (here, there))
-        if field in ("obstacles", "table"):
-            here, there = ([x for x in row if not _is_touch(x)] for row in (here, there))
         a, b = np.array(here, dtype=float), np.array(there, dtype=float)
         if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SCENE_TOLERANCE):
             return False
     return True
 
 
-def _is_touch(entry):
-    """Whether an entry of a row of `to_lists` is its `may_touch`."""
-    return isinstance(entry, (bool, list))
-
-
 def _names_in(scene):
     """`may_touch` of a scene's obstacles and table (JSON)."""
-    return [[x for x in row if _is_touch(x)] for row in (*scene["obstacles"], scene["table"] or ())]
+    return [split_list(row)[2] for row in (*scene["obstacles"], scene["table"] or ())]
+
+
+def _flat(row):
+    """The numbers of a row of `envs.scenes.primitives.to_lists`, and of its motion."""
+    numbers, motion, _ = split_list(row)
+    return [*numbers, *motion]
 
 
 def _checksum(attributes, arrays):

@@ -78,6 +78,8 @@ def shard_bytes(task, seed, first, sensors, scenes, configurations, observations
         observations: list of n dicts, those of `observe`.
         made_by: the command line that makes the shards.
     """
+    if not all(scene.is_static for scene in scenes):
+        raise DatasetError("observations are of static scenes: obstacles of this task move")
     obstacles = [o for scene in scenes for o in scene.obstacles]
     if any(obstacle.may_touch for obstacle in obstacles):
         raise DatasetError("files of observations cannot have random obstacles with may_touch")

@@ -7,7 +7,7 @@ The format of the files: `envs.datasets.format`.
 
 import contextlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,9 @@ from roboarm_nmp.envs.datasets.format import (
     QUERY_ARRAYS,
     QUERY_SCHEMA,
     SPLITS,
+    AnimatedScenes,
     DatasetError,
+    OutOfDateError,
     QueryScenes,
     check_configurations,
     check_format,
@@ -61,7 +63,7 @@ class Queries:
         start: float32 (n, j), rad, of the j joints of the robot, `scenes.base.robot`.
         goal: float32 (n, j), rad.
         goal_position: float32 (n, 3), end-effector position at the goal, m.
-        scenes: `QueryScenes`; `scenes[i]` is that of query i.
+        scenes: `QueryScenes` or `AnimatedScenes`; `scenes[i]` is that of query i.
     """
 
     task: str
@@ -70,7 +72,7 @@ class Queries:
     start: np.ndarray
     goal: np.ndarray
     goal_position: np.ndarray
-    scenes: QueryScenes
+    scenes: QueryScenes | AnimatedScenes
 
     def __len__(self):
         return len(self.start)
@@ -128,7 +130,7 @@ def write_queries(path, task, seed, splits, made_by, parameters):
         seed: the seed the queries were made with, an int.
         splits: `{"test": (start, goal, scenes), "validation": (start, goal, scenes)}`, and
             `original` where there are some; start and goal float32 (n, j), rad; scenes a sequence
-            of n `Scene`s, left out where all of them are the task's.
+            of n `Scene`s, left out where all of them are the task's, or `AnimatedScenes`.
         made_by: the command line that makes this file.
         parameters: JSON-ready dict of everything else that determined the queries.
 
@@ -151,6 +153,8 @@ def write_queries(path, task, seed, splits, made_by, parameters):
             arrays[f"{split}/goal_position"] = position
     check_format(path, QUERY_SCHEMA, arrays, base.robot)
     _check_queries(path, arrays, base.robot)
+    if len(scenes := splits["test"][2:]) and isinstance(scenes[0], AnimatedScenes):
+        parameters = {**parameters, "first_scene": scenes[0].summary()}
     write_file(path, QUERY_SCHEMA, task, seed, arrays, made_by, parameters)
 
 
@@ -182,9 +186,30 @@ def _read_queries(path, task):
         if f"{split}/start" not in arrays:
             continue
         columns = {name: arrays[f"{split}/{name}"] for name in QUERY_ARRAYS}
-        columns["scenes"] = read_scenes(path, base, arrays, f"{split}/")
+        if f"{split}/scene_seed" in arrays:
+            seeds = arrays[f"{split}/scene_seed"]
+            columns["scenes"] = _animated(path, task or attributes["task"], seeds, columns)
+        else:
+            columns["scenes"] = read_scenes(path, base, arrays, f"{split}/")
         queries[split] = Queries(attributes["task"], split, attributes["seed"], **columns)
-    return queries, json.loads(attributes["parameters"])
+    parameters = json.loads(attributes["parameters"])
+    scenes = queries["test"].scenes
+    if isinstance(scenes, AnimatedScenes) and not np.allclose(
+        scenes.summary(), parameters.get("first_scene", np.nan), rtol=0.0, atol=1e-6
+    ):
+        raise OutOfDateError(
+            f"{path}: out of date: made for another version of the moving scenes of "
+            f"{attributes['task']!r}; make it again with: {attributes['made_by']} --overwrite"
+        )
+    return queries, parameters
+
+
+def _animated(path, task, seeds, columns):
+    """The `AnimatedScenes` of a split. Raises DatasetError: the task has none."""
+    distribution = get_task(task).scene
+    if not hasattr(distribution, "animate"):
+        raise DatasetError(f"{path}: has seeds of moving scenes, and the task {task!r} has none")
+    return AnimatedScenes(distribution, seeds, columns["start"], columns["goal"])
 
 
 def query_keys(start, goal):
@@ -226,8 +251,13 @@ def _simulate(path, queries, hold_steps, progress):
     ):
         for split in queries:
             for row, (start, goal, scene) in enumerate(queries[split]):
-                world.set_scene(scene)
-                for name, configuration in (("start", start), ("goal", goal)):
+                still = [obstacle for obstacle in scene.obstacles if obstacle.motion is None]
+                # Moving obstacles may be at the goal.
+                for name, configuration, around in (
+                    ("start", start, scene),
+                    ("goal", goal, replace(scene, obstacles=still)),
+                ):
+                    world.set_scene(around)
                     if not world.is_feasible(configuration, hold_steps):
                         raise DatasetError(f"{path}: {split}/{name}[{row}] is not feasible")
                 bar.update()

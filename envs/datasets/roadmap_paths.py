@@ -20,6 +20,7 @@ of a robot with j joints, and the attributes `schema`, `schema_version`, `task`,
 
 import io
 from dataclasses import dataclass
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -60,7 +61,7 @@ class RoadmapPaths:
 
     task: str
     seed: int
-    scenes: QueryScenes
+    scenes: QueryScenes | list
     path_offsets: np.ndarray
     points: np.ndarray
     offsets: np.ndarray
@@ -89,6 +90,8 @@ def shard_bytes(task, seed, first, scenes, paths, made_by):
     """
     flat = [path for of_scene in paths for path in of_scene]
     base = get_task(task).base_scene
+    if not all(scene.is_static for scene in scenes):
+        raise DatasetError("roadmap paths are of static scenes: obstacles of this task move")
     obstacles = [o for scene in scenes for o in scene.obstacles]
     if any(obstacle.may_touch for obstacle in obstacles):
         raise DatasetError("files of roadmap paths cannot have random obstacles with may_touch")
@@ -126,10 +129,15 @@ def open_shard(path):
 def load_roadmap_paths(folder, robot=PANDA):
     """All of a folder's `RoadmapPaths`, which must be those of `robot`.
 
+    Of several folders (a sequence), the scenes of one come after those of another, and `task` and
+    `seed` are those of the first.
+
     Raises:
         DatasetError: there are no shards, or one is missing, damaged, or not of the same collection
             as the others; or they were made for another robot.
     """
+    if not isinstance(folder, (str, Path)):
+        return _joined([load_roadmap_paths(one, robot) for one in folder])
     parts, vertices, first = {name: [] for name in _ARRAYS}, [], None
     for path in shard_paths(folder, "roadmap paths"):
         with open_shard(path) as file:
@@ -150,3 +158,16 @@ def load_roadmap_paths(folder, robot=PANDA):
     indices = np.arange(len(arrays["path_count"]))
     scenes = QueryScenes(base, indices, obstacles, arrays["obstacles"], np.concatenate(vertices))
     return RoadmapPaths(first["task"], first["seed"], scenes, paths, arrays["points"], offsets)
+
+
+def _joined(parts):
+    """One `RoadmapPaths` of several."""
+    if len(parts) == 1:
+        return parts[0]
+    scenes = [part.scenes[i] for part in parts for i in range(len(part))]
+    path_offsets, offsets = (
+        np.concatenate([[0], np.cumsum(np.concatenate([np.diff(one) for one in of_parts]))])
+        for of_parts in ([part.path_offsets for part in parts], [part.offsets for part in parts])
+    )
+    points = np.concatenate([part.points for part in parts])
+    return RoadmapPaths(parts[0].task, parts[0].seed, scenes, path_offsets, points, offsets)

@@ -38,13 +38,11 @@ import numpy as np
 import yaml
 
 from roboarm_nmp.envs.datasets.format import MAX_ARRAY_BYTES, DatasetError
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.envs.utils.files import write_atomically
-from roboarm_nmp.envs.world import SUBSTEPS, TIME_STEP
 
-STEP_SECONDS = SUBSTEPS * TIME_STEP
-"""s, of one environment step: 1/30."""
 ENDINGS = (".csv", ".npz", ".json", ".yaml")
 LIMIT_TOLERANCE = 0.1  # rad. The simulated arm may exceed its limits a little; degrees exceed them.
 MAX_DURATION = 100_000  # s: images of longer ones would need all of a machine's memory

@@ -223,6 +223,14 @@ class ExportedNetwork:
         except Exception as error:  # whatever a file with parts missing leads to
             raise NetworkError(f"{path}: damaged network: {error!r}") from error
 
+    def parameters(self):
+        """The parameters of the module that was saved, in its order, as `nn.Module.parameters`."""
+        return [
+            tensor
+            for name, tensor in zip(self._content["tensors"], self._tensors, strict=False)
+            if name.startswith("p_")  # torch.export's prefix
+        ]
+
     def to(self, device):
         """The same network on another device."""
         return ExportedNetwork(self._content, self._path, device)

@@ -18,8 +18,14 @@ import numpy as np
 
 from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
-from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, first_in_cells, label_points
-from roboarm_nmp.envs.perception.sensors import OBSTACLE, PointCloud, cardinal, observe_scene
+from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, farthest, first_in_cells, label_points
+from roboarm_nmp.envs.perception.sensors import (
+    OBSTACLE,
+    PointCloud,
+    SceneObservation,
+    cardinal,
+    world_of,
+)
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, ObservedScene, floor_box
 
@@ -49,7 +55,8 @@ def observed_points(scene):
     """Points of a `Scene`'s obstacles: float32 (n, 3), m, in the base's frame; not to be changed.
 
     One per cube of `CELL`; none, (0, 3), where no obstacle is visible. The last scenes are cached.
-    Those of an `ObservedScene` are its own.
+    Those of an `ObservedScene` are its own. A `SceneObservation` says where the arm is, and which
+    noise there is; with noise, outliers are removed as by `prepare_cloud`.
     """
     if isinstance(scene, ObservedScene):
         return scene.points
@@ -64,18 +71,37 @@ def remember_points(scene):
 
 def fine_observed_points(scene):
     """As `observed_points`, one per cube of `FINE_CELL`."""
-    return one_per_cell(_clouds(scene), scale_of(scene.robot) * FINE_CELL)
+    return _thin(scene, FINE_CELL)
 
 
 @functools.lru_cache(CACHED_SCENES)
 def _observe(scene):
-    return one_per_cell(_clouds(scene), scale_of(scene.robot) * CELL)
+    return _thin(scene, CELL)
+
+
+def _thin(scene, cell):
+    points, scale = _clouds(scene), scale_of(scene.robot)
+    if isinstance(scene, SceneObservation) and scene.noise.changes_images:
+        points = without_outliers(points, scale * CELL, MIN_POINTS)
+    return one_per_cell(points, scale * cell)
 
 
 @functools.lru_cache(1)  # 500 kB; the coarse and the fine points of a scene are needed together
 def _clouds(scene):
-    clouds = observe_scene(scene, cardinal(PointCloud, scene.robot)).values()
-    return np.concatenate([one["points"][one["labels"] == OBSTACLE] for one in clouds])
+    sensors = cardinal(PointCloud, scene.robot).values()
+    return obstacle_points(world_of(scene, len(sensors)), sensors)
+
+
+def obstacle_points(world, sensors):
+    """All points of obstacles that sensors observe: float32 (n, 3), m, in the base's frame.
+
+    Args:
+        world: an `envs.perception.sensors.SensorWorld`.
+        sensors: `PointCloud`s.
+    """
+    images = [(sensor, *world.cast(sensor, sensor.size)) for sensor in sensors]
+    points = [sensor.points_of_class(*image, OBSTACLE) for sensor, *image in images]
+    return np.concatenate([np.empty((0, 3), np.float32), *points])
 
 
 def one_per_cell(points, cell=CELL):
@@ -95,6 +121,15 @@ def without_known(points, obstacles, distance=KNOWN_DISTANCE):
     arm = arm_hulls(PANDA)
     label_points(points, *everywhere, shape_rows(obstacles), distance, no_arm, 0.0, arm, labels)
     return points[labels == OF_OBSTACLE]
+
+
+def without_outliers(points, cell, min_points):
+    """Those of float32 points (n, 3), m, that have enough points around them, themselves included.
+
+    Their cube with edges of `cell` (m) and the 26 around it have at least `min_points`.
+    """
+    _, cubes, around = first_in_cells(points, np.float32(cell))
+    return points[(around >= min_points)[cubes]]
 
 
 class PreparedCloud(NamedTuple):
@@ -177,8 +212,7 @@ def prepare_cloud(
     removed = dict(zip(STEPS, counts, strict=False))
     points = points[labels == OF_OBSTACLE]
     # Not the cubes of `cell`: of a fine one, most points of a surface would be alone.
-    _, cubes, around = first_in_cells(points, np.float32(scale_of(robot) * CELL))
-    dense = points[(around >= min_points)[cubes]]
+    dense = without_outliers(points, scale_of(robot) * CELL, min_points)
     thin = one_per_cell(dense, cell)
     removed["outliers"] = len(points) - len(dense)
     removed["thinned out"] = len(dense) - len(thin)
@@ -192,10 +226,5 @@ def farthest_points(points, number):
     no obstacle can be where the base is.
     """
     chosen = np.zeros((number, 3), np.float32)
-    distance = np.full(len(points), np.inf)
-    nearest = np.linalg.norm(points, axis=1)
-    for row in chosen[: len(points)]:
-        row[:] = points[nearest.argmax()]
-        distance = np.minimum(distance, np.linalg.norm(points - row, axis=1))
-        nearest = distance
+    farthest(np.require(points, np.float32, _AS_COMPILED), chosen)
     return chosen

@@ -1,25 +1,35 @@
 """Sensors: cameras and point clouds (paper, section 4).
 
 A sensor is plain data: its place, its viewing direction, its outputs. It observes a `SensorWorld`,
-a second simulation of the scene and the arm. So observing never changes an episode, and the goal's
-marker is invisible. `envs.wrappers.SensorWrapper` adds sensors to an environment.
+a scene with the arm at joint angles. So observing never changes an episode, and the goal's marker
+is invisible. `envs.wrappers.SensorWrapper` adds sensors to an environment.
+
+Depth, classes and points come from compiled ray casting (`envs.perception.ray_casting`), colours
+from PyBullet. Noise: `envs.perception.noise`.
 """
 
 import functools
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 import gymnasium as gym
 import numpy as np
 
+from roboarm_nmp.envs.collision.kernels import AXES, EYE, VIEW, points_of_pixels
+from roboarm_nmp.envs.perception.noise import NO_NOISE, NoiseOfEpisode, SensorNoise
+from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes of pixels)
+    NOTHING,
+    OBSTACLE,
+    ROBOT,
+    STATIC,
+    RayCaster,
+)
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
-from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, is_number
+from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, is_number
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
 
-# Classes (paper, appendix "Training and verifying the encoders").
-ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
 CLASSES = ("robot", "table and floor", "obstacle", "nothing")
 ROBOT_COLOUR = (0.90, 0.45, 0.15, 1)
 OUTPUTS = ("rgb", "depth", "segmentation")
@@ -89,9 +99,12 @@ class Camera:
 
     def observe(self, world):
         """Its observation of a `SensorWorld`: a dict of the outputs."""
-        rgb, depth, segmentation = world.render(self, self.size)
-        everything = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
-        return {name: everything[name] for name in self.outputs}
+        observed = {}
+        if "rgb" in self.outputs:
+            observed["rgb"] = world.render(self, self.size)
+        if "depth" in self.outputs or "segmentation" in self.outputs:
+            observed["depth"], observed["segmentation"] = world.cast(self, self.size)
+        return {name: observed[name] for name in self.outputs}
 
 
 @dataclass(frozen=True)
@@ -138,8 +151,7 @@ class PointCloud:
     @property
     def camera(self):
         """The camera whose pixels are the rays."""
-        edge = math.isqrt(self.num_samples)
-        fields = (self.eye, self.target, self.up, self.field_of_view, (edge, edge))
+        fields = self.eye, self.target, self.up, self.field_of_view, self.size
         return Camera(*fields, self.near, self.far, outputs=("depth", "segmentation"))
 
     def points(self, depth, segmentation):
@@ -150,16 +162,31 @@ class PointCloud:
         - `labels`: uint8 (num_samples,): the class of each hit, `ROBOT`, `STATIC` or `OBSTACLE`;
           then `NOTHING`.
         """
-        hit = segmentation != NOTHING
         points = np.zeros((self.num_samples, 3), np.float32)
         labels = np.full(self.num_samples, NOTHING, np.uint8)
-        points[: hit.sum()] = deproject(self, depth)[hit]
-        labels[: hit.sum()] = segmentation[hit]
+        depth = np.ascontiguousarray(depth, np.float32)
+        points_of_pixels(self._view, depth, segmentation, -1, NOTHING, points, labels)
         return {"points": points, "labels": labels}
+
+    def points_of_class(self, depth, segmentation, label):
+        """As `points`, those of one class alone, without zeros: float32 (n, 3), m."""
+        points = np.empty((self.num_samples, 3), np.float32)
+        labels = np.empty(self.num_samples, np.uint8)
+        given = self._view, depth, segmentation, label, NOTHING
+        return points[: points_of_pixels(*given, points, labels)]
+
+    @property
+    def size(self):
+        """(width, height) of the grid of rays."""
+        return (math.isqrt(self.num_samples),) * 2
+
+    @property
+    def _view(self):
+        return view_of(self, self.size)
 
     def observe(self, world):
         """Its observation of a `SensorWorld`: a dict of `points` and `labels`, see `points`."""
-        return self.points(**self.camera.observe(world))
+        return self.points(*world.cast(self, self.size))
 
 
 def cardinal(kind=Camera, robot=PANDA, **options):
@@ -182,8 +209,8 @@ def deproject(sensor, depth):
         sensor: a `Camera` or `PointCloud`.
         depth: (height, width), m along the viewing direction.
     """
-    right, up, forward = _axes(sensor)
     height, width = depth.shape
+    right, up, forward = view_of(sensor, (width, height))[AXES : AXES + 9].reshape(3, 3)
     half = math.tan(math.radians(sensor.field_of_view) / 2)
     # At distance 1. PyBullet's TinyRenderer looks through the lower left corners of the pixels.
     across = (2 * np.arange(width) / width - 1) * half * width / height
@@ -192,11 +219,11 @@ def deproject(sensor, depth):
     return np.array(sensor.eye) + depth[..., None] * rays
 
 
-def _axes(sensor):
-    """Unit vectors (right, up, forward) of a sensor's image."""
-    forward = np.subtract(sensor.target, sensor.eye).astype(np.float64)
+def _axes_of(eye, target, up):
+    """Unit vectors (right, up, forward) of an image."""
+    forward = np.subtract(target, eye).astype(np.float64)
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, sensor.up)
+    right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     return right, np.cross(right, forward), forward
 
@@ -223,70 +250,205 @@ def _check_view(sensor):
         )
 
 
-class SensorWorld(World):
+def view_of(sensor, size):
+    """A sensor's place and directions as `kernels.cast_rays` takes them: float64 (`VIEW`,).
+
+    `size`: (width, height) in pixels. Not to be changed.
+    """
+    place = (tuple(map(float, vector)) for vector in (sensor.eye, sensor.target, sensor.up))
+    return _view(*place, sensor.field_of_view, *size, sensor.near, sensor.far)
+
+
+@functools.lru_cache(maxsize=256)
+def _view(eye, target, up, field_of_view, width, height, near, far):
+    half = math.tan(math.radians(field_of_view) / 2)
+    view = np.empty(VIEW)
+    view[EYE:AXES], view[AXES : AXES + 9] = eye, np.ravel(_axes_of(eye, target, up))
+    view[AXES + 9 :] = half * width / height, half, near, far
+    return view
+
+
+class SensorWorld:
     """A scene with the arm in it, for sensors.
 
-    The arm is drawn as its collision meshes. Spheres and cylinders are drawn as polyhedra, up to a
-    tenth of their radius off the true surface.
+    Depth and classes need no PyBullet: `cast`. For colours, `render` opens a world of PyBullet's at
+    its first call, where the arm is drawn as its collision meshes, and spheres and cylinders as
+    polyhedra, up to a tenth of their radius off the true surface.
+
+    Args:
+        noise: an `envs.perception.noise.SensorNoise`, from the first `begin_episode` on.
+
+    Attributes:
+        scene: the `Scene`; None before `show`.
+        configuration: the arm's joint angles (n, rad).
+
+    Raises:
+        RuntimeError: of `cast` and `render`: it is closed.
     """
 
-    def _load_robot(self):
-        return self.robot.load_coarse(self.client, ROBOT_COLOUR)
+    def __init__(self, noise=NO_NOISE):
+        self.noise, self.scene, self.configuration = noise, None, None
+        self._caster = self._drawn = self._of_episode = None
+        self._number, self._is_closed = 0, False
 
-    def show(self, scene, configuration):
-        """Change to a `Scene` with the arm at joint angles (n, rad)."""
-        self.set_scene(scene)
-        self.robot.set_configuration(self.client, self.body, configuration)
+    @property
+    def robot(self):
+        """The scene's `Robot`."""
+        return self.scene.robot
 
-    def render(self, sensor, size):
-        """Images from a sensor's place, with `size` (width, height) in pixels.
+    @property
+    def client(self):
+        """PyBullet's number of a physics engine with the scene and the arm."""
+        return self._draw().client
+
+    def begin_episode(self, key, number):
+        """Draw the noise that stays the same for an episode.
+
+        Args:
+            key: int from 0 on: equal keys give equal noise.
+            number: of cameras, of which `SensorNoise.missing_cameras` are missing.
+        """
+        if self.noise.changes_images:
+            self._of_episode = NoiseOfEpisode(self.noise, key, number)
+
+    def _check_open(self):
+        if self._is_closed:
+            raise RuntimeError("this sensor world is closed")
+
+    def show(self, scene, configuration, number=0):
+        """Change to a `Scene` with the arm at joint angles (n, rad).
+
+        `number`: of the observation in its episode, for noise.
+        """
+        self.scene, self.configuration, self._number = scene, configuration, number
+        self._caster = None
+
+    def cast(self, sensor, size):
+        """What rays from a sensor's place hit, with `size` (width, height) in pixels.
 
         Returns:
-            `rgb`, `depth` and `segmentation`, as `Camera` describes them.
+            `depth` and `segmentation`, as `Camera` describes them.
         """
-        self.check_open()
-        width, height = size
-        _, _, rgb, depth, bodies = p.getCameraImage(
+        self._check_open()
+        if self._caster is None:
+            self._caster = RayCaster(self.scene, self.configuration)
+        view = view_of(sensor, size)
+        if self._of_episode is None:
+            return self._caster.image(view, size)
+        of_sensor = self._of_episode.of_sensor(view)
+        image = self._caster.image(of_sensor.true_view(view), size)
+        return of_sensor.apply(*image, sensor.far, self._number)
+
+    def render(self, sensor, size):
+        """The colour image from a sensor's place, with `size` (width, height) in pixels.
+
+        Returns:
+            `rgb`, as `Camera` describes it.
+        """
+        client, (width, height) = self.client, size
+        place = sensor.eye, sensor.target, sensor.up
+        if self._of_episode is not None:
+            view = view_of(sensor, size)
+            of_sensor = self._of_episode.of_sensor(view)
+            if of_sensor.is_missing:
+                return np.zeros((height, width, 3), np.uint8)
+            view = of_sensor.true_view(view).tolist()
+            eye, up, forward = (view[i : i + 3] for i in (EYE, AXES + 3, AXES + 6))
+            place = eye, np.add(eye, forward).tolist(), up
+        image = p.getCameraImage(
             width,
             height,
-            p.computeViewMatrix(sensor.eye, sensor.target, sensor.up),
+            p.computeViewMatrix(*place),
             p.computeProjectionMatrixFOV(
                 sensor.field_of_view, width / height, sensor.near, sensor.far
             ),
             shadow=0,
             renderer=p.ER_TINY_RENDERER,
-            physicsClientId=self.client,
+            physicsClientId=client,
         )
-        rgb = image_array(rgb, width, height)
-        # From OpenGL's depth in [0, 1] to m.
-        depth = np.reshape(depth, (height, width)).astype(np.float64)
-        depth = sensor.far * sensor.near / (sensor.far - (sensor.far - sensor.near) * depth)
-        bodies = np.reshape(bodies, (height, width))
-        num_static = (self.scene.floor is not None) + (self.scene.table is not None)
-        segmentation = np.full((height, width), OBSTACLE, np.uint8)
-        segmentation[bodies == self.body] = ROBOT
-        segmentation[np.isin(bodies, self._bodies[:num_static])] = STATIC
-        segmentation[bodies < 0], depth[bodies < 0] = NOTHING, sensor.far
-        return rgb, depth.astype(np.float32), segmentation
+        return image_array(image[2], width, height)
+
+    def _draw(self):
+        self._check_open()
+        if self._drawn is None:
+            self._drawn = _DrawnWorld(self.scene)
+        self._drawn.set_scene(self.scene)
+        self.robot.set_configuration(self._drawn.client, self._drawn.body, self.configuration)
+        return self._drawn
+
+    def close(self):
+        """Close it, and PyBullet's world, if there is one. Closing twice is allowed."""
+        self._is_closed = True
+        if self._drawn is not None:
+            self._drawn.close()
+            self._drawn = None
 
 
-@functools.cache
-def _shared_world():
-    return SensorWorld()
+class _DrawnWorld(World):
+    def _load_robot(self):
+        return self.robot.load_coarse(self.client, ROBOT_COLOUR)
+
+
+@dataclass(frozen=True)
+class SceneObservation(Scene):
+    """A `Scene` as sensors observe it at one time, with the arm where it is, and noise.
+
+    In a plain `Scene`, they observe the arm in its `observed_pose`, without noise. Whatever takes a
+    `Scene` also takes this: encoders, geometry sources, `observed_points`.
+
+    Attributes:
+        configuration: the arm's joint angles, n floats, rad.
+        noise: an `envs.perception.noise.SensorNoise`.
+        key: int from 0 on, of the episode: equal keys give equal noise.
+        number: of the observation in its episode, from 0 on.
+    """
+
+    configuration: tuple[float, ...] = ()
+    noise: SensorNoise = NO_NOISE
+    key: int = 0
+    number: int = 0
+
+    @classmethod
+    def of(cls, scene, configuration, noise=NO_NOISE, key=0, number=0):
+        """The observation of a static `Scene` with the arm at joint angles (n, rad)."""
+        given = {field.name: getattr(scene, field.name) for field in fields(Scene)}
+        return cls(
+            **given,
+            configuration=tuple(map(float, configuration)),
+            noise=noise,
+            key=key,
+            number=number,
+        )
+
+
+@functools.lru_cache(maxsize=8)
+def _shared_world(noise):
+    return SensorWorld(noise)
+
+
+def world_of(scene, number):
+    """A `SensorWorld` that shows a `Scene`, or a `SceneObservation`, for so many sensors."""
+    if not isinstance(scene, SceneObservation):
+        world = _shared_world(NO_NOISE)
+        world.show(scene, scene.robot.observed_pose)
+        return world
+    world = _shared_world(scene.noise)
+    world.begin_episode(scene.key, number)
+    world.show(scene, scene.configuration, scene.number)
+    return world
 
 
 def observe_scene(scene, sensors):
     """Observations of a `Scene` with the arm in its robot's `observed_pose`.
 
     Args:
-        scene: a `Scene`.
+        scene: a `Scene`, or a `SceneObservation`, which has a configuration and noise.
         sensors: dict of name -> sensor.
 
     Returns:
         Dict of name -> the sensor's observation, a dict.
     """
-    world = _shared_world()
-    world.show(scene, scene.robot.observed_pose)
+    world = world_of(scene, len(sensors))
     return {name: sensor.observe(world) for name, sensor in sensors.items()}
 
 

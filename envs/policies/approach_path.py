@@ -79,7 +79,8 @@ def _rows(robot, state, link_distances_at, clearance):
 def _project(move, rows, least):
     """The nearest move (n,) after which no row is below `least`, to first order."""
     moves, rows = move[None].copy(), np.ascontiguousarray(rows[None])
-    project(moves, rows, least[None].copy(), STEP, 1.0, np.inf, np.inf, PROJECTION_SWEEPS)
+    least, rates = least[None].copy(), np.zeros((1, len(least)))
+    project(moves, rows, least, rates, STEP, 1.0, np.inf, np.inf, PROJECTION_SWEEPS)
     return moves[0]
 
 

@@ -5,13 +5,19 @@
 - via-points: straight to the goal configuration if that motion is free of collisions; otherwise
   through the first of some random configurations for which the motion is free; without such a
   configuration, straight to the goal;
-- planner: follows a plan of OMPL's RRT-Connect, which may search for a limited time.
+- planner: follows a plan of OMPL's RRT-Connect, which may search for a limited time;
+- replanning: follows a plan, watches it, and plans again whenever it is blocked
+  (`envs.policies.replanning`);
+- space-time: follows a plan that knows how the obstacles will move, the reference in scenes with
+  moving obstacles (`demo_generation.space_time`).
 
 Of a goal pose, the goal configuration is one that inverse kinematics finds, the nearest one to the
 start; `via-points` and `planner` need one without collisions.
 
-`via-points` and `planner` check collisions with the obstacles of a geometry source
-(`envs.perception.geometry_source`); with the ground truth they are privileged.
+`via-points`, `planner` and `replanning` check collisions with the obstacles of a geometry source
+(`envs.perception.geometry_source`); with the ground truth they are privileged. Where obstacles
+move, the first two plan around obstacles as they are at the start, and `replanning` around those of
+the present step. `space-time` always has the ground truth, the future included.
 """
 
 import importlib
@@ -21,17 +27,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs.policies.pose_goals import goal_configuration
+from roboarm_nmp.envs.policies.pose_goals import goal_configuration, observed_at_start
 from roboarm_nmp.envs.subgoals import subgoals
 
-PLANNERS = ("via-points", "planner")
+SPACE_TIME = "space-time"
+OMPL_PLANNERS = ("planner", SPACE_TIME)
+"""Those of another package, with OMPL."""
+PLANNERS = ("via-points", *OMPL_PLANNERS)
 """The baselines that look for a motion before they move."""
-BASELINES = ("go-to-goal", "random", *PLANNERS)
+REPLANNING = "replanning"
+CHECKING = (*PLANNERS, REPLANNING)
+"""The baselines that need a geometry source."""
+BASELINES = ("go-to-goal", "random", *CHECKING)
 TRIES = 16  # of `via-points`, by default
 TIME_LIMIT = 5.0  # s, of `planner`, by default
 # The module of `planner`'s `Planner`. It is built on `envs` and needs OMPL, so it is imported by
 # name, only when this baseline is used.
 PLANNING_MODULE = "roboarm_nmp.demo_generation.planning"
+SPACE_TIME_MODULE = "roboarm_nmp.demo_generation.space_time"
 
 
 class EpisodePolicy(NamedTuple):
@@ -73,15 +86,21 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
     from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 
     source = find_geometry_source(geometry_source, robot)
+    if name == SPACE_TIME:
+        if geometry_source != "ground_truth":
+            raise ValueError(f"space-time plans with the ground truth, not {geometry_source}")
+        return _space_time(env, seed, time_limit)
     if name == "via-points":
         return _via_points(env, seed, tries, source)
+    if name == REPLANNING:
+        return _replanning(env, seed, source)
     return _planner(env, seed, time_limit, source)
 
 
-def import_planning():
-    """The module `PLANNING_MODULE`. Raises ValueError: OMPL is not installed."""
+def import_planning(module=PLANNING_MODULE):
+    """The module `PLANNING_MODULE`, or another one. Raises ValueError: OMPL is not installed."""
     try:
-        return importlib.import_module(PLANNING_MODULE)
+        return importlib.import_module(module)
     except ImportError as error:
         raise ValueError(f"the policy planner needs OMPL: {error}") from error
 
@@ -120,7 +139,7 @@ def _via_points(env, seed, tries, geometry_source):
     # Without a margin, which would reject more than it saves: with 3 mm, collision-free success was
     # 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
     def begin(number, query):
-        checker = geometry_source(query.scene)
+        checker = geometry_source(observed_at_start(env, query))
         configuration = _goal(env, query, checker)
         if configuration is None:
             return EpisodePolicy(None, plan_found=False)
@@ -139,11 +158,39 @@ def _via_points(env, seed, tries, geometry_source):
     return begin
 
 
+def _replanning(env, seed, geometry_source):
+    from roboarm_nmp.envs.policies.replanning import Replanning
+    from roboarm_nmp.envs.wrappers import observed_scene
+
+    # Compile here what is compiled at its first call: an action's time is for planning.
+    state = np.zeros(env.robot.num_joints)
+    checker = geometry_source(env.unwrapped.current_scene)
+    checker.find_path(state, state, np.random.default_rng(0), max_checks=1)
+
+    def current_checker():
+        return geometry_source(observed_scene(env))
+
+    def begin(number, query):
+        goal = _goal(env, query, geometry_source(observed_at_start(env, query)))
+        if goal is None:
+            return EpisodePolicy(None)
+        rng = np.random.default_rng([seed, number])
+        return EpisodePolicy(Replanning(env.robot, goal, current_checker, rng))
+
+    return begin
+
+
 def _planner(env, seed, time_limit, geometry_source):
     planning = import_planning()
+    scene = None  # that of the query, as it is observed
     planner = planning.Planner(env, geometry_source=geometry_source)
 
     def begin(number, query):
+        nonlocal planner, scene
+        if (observed := observed_at_start(env, query)) is not query.scene:
+            # A planner has one checker per scene, but this one is of a single episode.
+            scene = observed
+            planner = planning.Planner(env, geometry_source=lambda _: geometry_source(scene))
         options, given = {"seed": [seed, number], "time_limit": time_limit}, query
         if env.goal_type == "pose":
             options["goal_pose"] = env.robot.end_effector_pose(query.goal)
@@ -151,6 +198,20 @@ def _planner(env, seed, time_limit, geometry_source):
         try:
             path = planner.plan(*given, **options)
         except planning.PlanningError:
+            return EpisodePolicy(None, plan_found=False)
+        return EpisodePolicy(_follow(path, env.robot), plan_found=True)
+
+    return begin
+
+
+def _space_time(env, seed, time_limit):
+    module = import_planning(SPACE_TIME_MODULE)
+    planner = module.SpaceTimePlanner(env.unwrapped)
+
+    def begin(number, query):
+        try:
+            path = planner.plan(*query, seed=[seed, number], time_limit=time_limit)
+        except module.PlanningError:
             return EpisodePolicy(None, plan_found=False)
         return EpisodePolicy(_follow(path, env.robot), plan_found=True)
 

@@ -37,6 +37,15 @@ def goal_configuration(robot, pose, start, checker=None):
     return found[0].astype(np.float32)
 
 
+def observed_at_start(env, query):
+    """The scene of a `Query` as it is observed at the start of an episode in an environment."""
+    try:
+        observe = env.get_wrapper_attr("observed_at_start")
+    except AttributeError:  # no `envs.wrappers.ObservedSceneWrapper`
+        return query.scene.at(0.0)
+    return observe(query.scene, query.start)
+
+
 class ConfigurationGoals:
     """Observations in an environment of goal poses, as a policy for configurations expects them.
 
@@ -55,19 +64,19 @@ class ConfigurationGoals:
 
         Returns whether there is one.
         """
-        checker = None
+        checker, scene = None, observed_at_start(self.env, query)
         if self._has_distances:
-            checker = self.env.get_wrapper_attr("geometry_source")(query.scene)
+            checker = self.env.get_wrapper_attr("geometry_source")(scene)
         pose = self.robot.end_effector_pose(query.goal)
         goal = goal_configuration(self.robot, pose, query.start, checker)
         if goal is not None:
-            self._set(self.robot.normalise(goal), pose[:3], query.scene)
+            self._set(self.robot.normalise(goal), pose[:3], scene)
         return goal is not None
 
     def begin_anywhere(self):
         """Choose any goal, to see what the policy would observe."""
         goal = np.zeros(self.robot.num_joints)
-        self._set(goal, np.zeros(3), self.env.unwrapped.scene)
+        self._set(goal, np.zeros(3), self.env.unwrapped.current_scene)
 
     def _set(self, state, position, scene):
         self._more = {"desired_goal": goal_of(self.goal_type, state, position).astype(np.float32)}

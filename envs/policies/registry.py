@@ -10,12 +10,15 @@ A safety filter may be put around any policy (`envs.policies.safety_filter`); a 
 include one. Baselines: `envs.policies.baselines`. Whole episodes: `envs.policies.rollout`.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from roboarm_nmp.envs.policies.baselines import (
     BASELINES,
+    OMPL_PLANNERS,
+    REPLANNING,
     TIME_LIMIT,
     TRIES,
     EpisodePolicy,
@@ -72,9 +75,10 @@ def find_policy(name):
         name: one of `BASELINES`, which have no arguments, or a name or path as for `policy_file`.
 
     Raises:
-        PolicyError: there is no such policy, its file is not one, or `planner` lacks OMPL.
+        PolicyError: there is no such policy, its file is not one, or OMPL is missing, which
+            `planner` and `space-time` need.
     """
-    if name == "planner":
+    if name in OMPL_PLANNERS:
         try:
             import_planning()
         except ValueError as error:
@@ -91,6 +95,13 @@ def own_safety_filter(policy):
     `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
     """
     return None if callable(policy) or policy in BASELINES else _load(policy)[2]
+
+
+def filter_around(policy, safety_filter):
+    """A safety filter as it acts around a policy: `replanning` waits, and needs no escapes."""
+    if safety_filter and not callable(policy) and policy == REPLANNING:
+        return replace(safety_filter, escape=False)
+    return safety_filter
 
 
 def own_task(policy):
@@ -150,8 +161,8 @@ def make_policy(
         seed: of random numbers, >= 0; each query has its own generator.
         tries: random configurations that `via-points` tries per query.
         time_limit: seconds that `planner` may search per query.
-        geometry_source: where `via-points` and `planner` take the obstacles from: `ground_truth`,
-            `point_cloud` or an encoder's name (`envs.perception.geometry_source`).
+        geometry_source: where `via-points`, `planner` and `replanning` take the obstacles from:
+            `ground_truth`, `point_cloud` or an encoder's name (`envs.perception.geometry_source`).
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
             one that a trained policy includes, if any; False for none. The environment must have
             `link_distances`, whose geometry source is the filter's.
@@ -172,7 +183,7 @@ def make_policy(
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
     if safety_filter:
-        begin = _filtered(begin, env, seed, safety_filter)
+        begin = _filtered(begin, env, seed, filter_around(policy, safety_filter))
     return begin if as_observed is None else _translated(begin, as_observed)
 
 

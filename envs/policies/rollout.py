@@ -8,13 +8,18 @@
 actions of several episodes at once. Metrics and images are derived from trajectories.
 """
 
+import math
 import time
 from dataclasses import dataclass
 
 import numpy as np
 
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
+
+REAL_TIME = "real_time"
+"""A delay: as many steps as an action takes to compute, of wall-clock time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +30,7 @@ class Trajectory:
         states: float32 (T + 1, n), normalised configurations, from the start on.
         actions: float64 (T, n), as the environment received them.
         contacts: bool (T,), whether the arm was in contact during each step.
-        times: float64 (T,), s, from each observation to its action.
+        times: float64 (T,), s, from each observation to its action; with a delay, to the next step.
         success: whether the goal was reached.
         robot: the `Robot`.
     """
@@ -78,6 +83,11 @@ class Episode:
     def _state(self):
         return self.observation["observation"][: self._robot.num_joints]
 
+    def hold(self):
+        """The action that keeps the arm where it is."""
+        state = self._state()
+        return state if self.env.unwrapped.action_mode == "subgoal" else np.zeros_like(state)
+
     def step(self, action):
         """One step of the environment. Raises ValueError: it refuses the action."""
         seconds = time.perf_counter() - self._observed
@@ -101,20 +111,41 @@ class Episode:
         )
 
 
-def rollout(env, query, policy):
+def rollout(env, query, policy, delay=0, planning_seconds=0.0):
     """The `Trajectory` of a policy on a query.
+
+    With a delay, an action takes effect some steps after its observation, and the policy observes
+    nothing until then. Meanwhile the command before it applies: the arm makes that step, and then
+    holds its configuration. Before the first action the arm holds its start.
 
     Args:
         env: a `RoboArmEnv`, possibly wrapped.
         query: an `envs.datasets.queries.Query`.
         policy: a function from an observation to an action (n,); None: no step is made.
+        delay: of each action, in steps; 0: the simulation waits for the policy. `REAL_TIME`: the
+            steps of 1/30 s that pass while the policy computes, at least 1. The trajectory then
+            depends on the machine and its load.
+        planning_seconds: s, with `REAL_TIME`: what the policy has computed before the episode.
 
     Raises:
         ValueError: the environment refuses the query or an action.
     """
-    episode = Episode(env, query)
+    episode, command = Episode(env, query), None
     while policy is not None and not episode.ended:
-        episode.step(policy(episode.observation))
+        began = time.perf_counter()
+        action = policy(episode.observation)
+        steps = delay
+        if delay == REAL_TIME:
+            seconds = time.perf_counter() - began + planning_seconds
+            steps, planning_seconds = max(1, math.ceil(seconds / STEP_SECONDS)), 0.0
+        if steps == 0:
+            episode.step(action)
+            continue
+        for _ in range(steps):
+            if not episode.ended:
+                episode.step(episode.hold() if command is None else command)
+                command = None
+        command = action
     return episode.trajectory()
 
 

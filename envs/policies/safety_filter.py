@@ -22,6 +22,18 @@ The nearest point of a link may change during the step. So the distances at q + 
 and add a second half-space per link. Distances come from the observation's geometry source, table
 and floor; those between links need no observation.
 
+Where obstacles move, a distance also changes while the arm stands still, by r(q) per step, and the
+constraint is
+
+    d(q + a) + r(q) - d_min >= (1 - gamma) (d(q) - d_min):
+
+an arm in the way of an obstacle retreats. r is estimated without tracking anything, from two
+observations of the scene: the difference of the distances that the arm, as it stands now, has in
+both, per step between them. So it is a velocity along the direction of the nearest point of each
+link; what comes from behind a nearer obstacle is not noticed. Only approaching obstacles count. An
+obstacle that appears counts as one that approaches at `MAX_APPROACH`. In a scene where nothing has
+moved, r is zero, and actions are the same, bit for bit.
+
 Such a filter stands still in local minima. Where the arm has hardly moved for some steps, a random
 walk escapes (Barraquand and Latombe, 1991), and a virtual obstacle then keeps the arm from there.
 """
@@ -34,6 +46,7 @@ import numpy as np
 from roboarm_nmp.envs.collision.checker import self_distances
 from roboarm_nmp.envs.collision.kernels import project
 from roboarm_nmp.envs.policies.approach_path import ApproachPaths
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 
@@ -41,6 +54,7 @@ from roboarm_nmp.envs.subgoals import MAX_STEP
 # arrivals counted as local minima, and the gain was the same near a goal as elsewhere.
 VERSION = 3
 
+LOOKAHEAD, MAX_LOOKAHEAD = 0.0, 1.0  # s, by default and at most
 # The numbers below were chosen on validation and fresh queries: docs/lab_notebook.md.
 ACTIVATION_DISTANCE = 0.15  # m. Links with larger distances are not constrained.
 CBF_GAIN = 0.2  # gamma: share of the remaining clearance that one step may use
@@ -50,6 +64,12 @@ MAX_RECOVERY = 0.002  # m per step, by which a link nearer than the margin has t
 # distance there, and this much (m) more per unit of normalised distance from the goal.
 MARGIN_GROWTH = 0.03
 PROJECTION_SWEEPS = 12  # of cyclic projection
+# Of moving obstacles. A rate is that between observations RATE_STEPS apart, or more, where scenes
+# are observed less often: the points of a cloud are a few millimetres off from step to step.
+RATE_STEPS = 3
+MAX_APPROACH = 0.05  # m per step, 1.5 m/s
+# m. A goal with smaller link distances is occupied: around it, margins do not shrink.
+OCCUPIED = -0.005
 
 # A local minimum is a configuration where PATIENCE steps moved the arm by less than PROGRESS (L2,
 # normalised). Close to the goal, they also have to be less than this share of the remaining
@@ -75,16 +95,25 @@ class SafetyFilter:
         escape: whether to escape from local minima.
         approach: whether to follow approach paths, which need no margin, out of a start and into a
             goal in a tight place (`envs.policies.approach_path`).
+        lookahead: s, from 0 to `MAX_LOOKAHEAD`: distances count as they will be after this time if
+            obstacles continue to approach as they do now; None: as if no obstacle moved.
 
     Raises:
-        ValueError: `margin` is not in [0, `ACTIVATION_DISTANCE`), or another one is not a bool.
+        ValueError: `margin` is not in [0, `ACTIVATION_DISTANCE`), `lookahead` is out of its range,
+            or another one is not a bool.
     """
 
     margin: float = 0.01
     escape: bool = True
     approach: bool = False
+    lookahead: float | None = LOOKAHEAD
 
     def __post_init__(self):
+        lookahead = 0.0 if self.lookahead is None else self.lookahead
+        if not (is_number(lookahead) and 0 <= lookahead <= MAX_LOOKAHEAD):
+            raise ValueError(
+                f"lookahead must be None or in [0, {MAX_LOOKAHEAD}] s, got {self.lookahead!r}"
+            )
         if not (is_number(self.margin) and 0 <= self.margin < ACTIVATION_DISTANCE):
             raise ValueError(f"margin must be in [0, {ACTIVATION_DISTANCE}) m, got {self.margin!r}")
         for name in ("escape", "approach"):
@@ -95,7 +124,8 @@ class SafetyFilter:
     def from_metadata(cls, metadata):
         """The `SafetyFilter` of a policy, from its file's metadata; None if it has none.
 
-        Its options are in `safety_filter`, a dict with `margin`, `escape` and possibly `approach`.
+        Its options are in `safety_filter`, a dict with `margin`, `escape` and possibly `approach`
+        and `lookahead`.
         Raises ValueError if they are invalid.
         """
         options = metadata.get("safety_filter")
@@ -103,17 +133,30 @@ class SafetyFilter:
             return None
         try:
             flags = bool(options["escape"]), bool(options.get("approach", False))
-            return cls(float(options["margin"]), *flags)
+            lookahead = options.get("lookahead", LOOKAHEAD)
+            lookahead = None if lookahead is None else float(lookahead)
+            return cls(float(options["margin"]), *flags, lookahead)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"invalid safety_filter in its metadata: {options!r}") from error
 
     def to_metadata(self):
         """The options as `from_metadata` reads them."""
-        return {"margin": self.margin, "escape": self.escape} | (
-            {"approach": True} if self.approach else {}
-        )
+        options = {"margin": self.margin, "escape": self.escape}
+        if self.approach:
+            options["approach"] = True
+        if self.lookahead != LOOKAHEAD:
+            options["lookahead"] = self.lookahead
+        return options
 
-    def __call__(self, actions, link_distances, margins=None, max_step=MAX_STEP, cbf_gain=CBF_GAIN):
+    def __call__(
+        self,
+        actions,
+        link_distances,
+        margins=None,
+        max_step=MAX_STEP,
+        cbf_gain=CBF_GAIN,
+        rates=None,
+    ):
         """Actions (..., n), float32, that satisfy the constraints of all rows, to first order.
 
         They are close to the given actions, but not always the closest. Where the constraints
@@ -126,16 +169,19 @@ class SafetyFilter:
             margins: m, (..., rows), instead of the filter's `margin`.
             max_step: longest action (L2, normalised).
             cbf_gain: gamma.
+            rates: m per step, (..., rows): how distances change by themselves; None for zeros.
         """
         actions = np.array(actions, np.float64)
         link_distances = np.asarray(link_distances, np.float64)
         rows = link_distances.shape[-2]
         margins = self.margin if margins is None else margins
         margins = np.broadcast_to(margins, link_distances.shape[:-1]).astype(np.float64)
+        rates = np.zeros(margins.shape) if rates is None else np.array(rates, np.float64)
         project(
             actions.reshape(-1, actions.shape[-1]),
             link_distances.reshape(-1, rows, link_distances.shape[-1]),
             margins.reshape(-1, rows),
+            rates.reshape(-1, rows),
             max_step,
             cbf_gain,
             ACTIVATION_DISTANCE,
@@ -163,18 +209,37 @@ class SafetyFilter:
         link_distances_at, max_step = env.get_wrapper_attr("link_distances_at"), env.max_step
         joints = env.robot.num_joints
         local_minima, goal_distances = _LocalMinima(rng, max_step, joints), None
+        approach_rates = None
+        if self.lookahead is not None:
+            approach_rates = ApproachRates(env.get_wrapper_attr("current_checker"))
+            steps_ahead = self.lookahead / STEP_SECONDS
+
+        def predict(state, rows):
+            """Rates of rows of link distances; the rows are changed to those after `lookahead`."""
+            rates = np.zeros(len(rows))
+            if approach_rates is not None and approach_rates.any_motion:
+                scene = rows[: env.robot.link_distances_shape[0]]
+                rates[: len(scene)] = approach_rates(state, scene[:, 0])
+                rows[:, 0] += steps_ahead * rates
+            return rates
 
         def act_safely(observation):
             nonlocal goal_distances
             robot = env.robot  # an episode's scene may have another gripper opening, or objects
             state, goal = observation["observation"][:joints], None
             here = np.concatenate([observation["link_distances"], _self_distances(robot, state)])
+            if approach_rates is not None:
+                approach_rates.observe()
+            rates_here = predict(state, here)
             margins, cbf_gain = np.broadcast_to(self.margin, len(here)), CBF_GAIN
             if "goal_link_distances" in observation:
                 goal = observation["desired_goal"][:joints]
-                if goal_distances is None:
+                moves = approach_rates is not None and approach_rates.any_motion
+                if goal_distances is None or moves:
                     rows = observation["goal_link_distances"], _self_distances(robot, goal)
                     goal_distances = np.concatenate(rows)[:, 0]
+                    if moves and goal_distances.min() < OCCUPIED:
+                        goal_distances = np.full(len(goal_distances), np.inf)
                 remaining = np.linalg.norm(state - goal)
                 margins = self.margins_near_goal(goal_distances, remaining)
                 cbf_gain = max(CBF_GAIN, 1.0 - (1.0 - CBF_GAIN) * remaining / ARRIVAL_DISTANCE)
@@ -185,14 +250,16 @@ class SafetyFilter:
             virtual = local_minima.virtual_obstacles(state)
             here = np.concatenate([virtual, here])
             margins_here = np.concatenate([np.zeros(len(virtual)), margins])
-            move = self(action, here, margins_here, max_step, cbf_gain)
+            rates_here = np.concatenate([np.zeros(len(virtual)), rates_here])
+            move = self(action, here, margins_here, max_step, cbf_gain, rates_here)
             # Distances at the end of the step, extrapolated back to its start.
             end = state + move
             there = np.concatenate([link_distances_at(end), _self_distances(robot, end)])
+            rates = np.concatenate([rates_here, predict(end, there)])
             there[:, 0] -= there[:, 1:] @ move
             rows = np.concatenate([here, there])
             margins = np.concatenate([margins_here, margins])
-            local_minima.last_action = self(action, rows, margins, max_step, cbf_gain)
+            local_minima.last_action = self(action, rows, margins, max_step, cbf_gain, rates)
             return local_minima.last_action
 
         return act_safely
@@ -205,6 +272,50 @@ class SafetyFilter:
             remaining: distance from the goal, L2, normalised.
         """
         return np.minimum(self.margin, goal_distances + MARGIN_GROWTH * remaining)
+
+
+class ApproachRates:
+    """How fast obstacles approach links, from successive observations of one episode.
+
+    Call `observe` in each step.
+
+    Args:
+        current_checker: a function without arguments that returns the `CollisionChecker` of the
+            last observation, the same object as long as there is no new one.
+    """
+
+    def __init__(self, current_checker):
+        self._current_checker = current_checker
+        self._observed, self._step = deque(), 0  # pairs of a step and a checker
+
+    def observe(self):
+        """Take the present observation into account."""
+        checker, observed = self._current_checker(), self._observed
+        self._step += 1
+        if not observed or checker is not observed[-1][1]:
+            observed.append((self._step, checker))
+            while len(observed) > 2 and self._step - observed[1][0] >= RATE_STEPS:
+                observed.popleft()
+        # Everything stands still when there is nothing new for longer than usual.
+        elif self._step - observed[-1][0] > max(RATE_STEPS, observed[-1][0] - observed[0][0]):
+            while len(observed) > 1:
+                observed.popleft()
+
+    @property
+    def any_motion(self):
+        """Whether the last observations differ."""
+        return len(self._observed) > 1
+
+    def __call__(self, state, distances):
+        """Changes of link distances, m per step, (l,), from -`MAX_APPROACH` to 0.
+
+        Args:
+            state: normalised configuration (n,).
+            distances: m, (l,), from the obstacles of the last observation.
+        """
+        (then, before), (now, _) = self._observed[0], self._observed[-1]
+        change = distances - before.link_distances(state)[:, 0]
+        return np.clip(change / (now - then), -MAX_APPROACH, 0.0)
 
 
 class _LocalMinima:

@@ -10,6 +10,8 @@ from roboarm_nmp.envs.utils.bullet import pybullet as p
 # controller; docs/guide/environment.md has the measured tracking error.
 TIME_STEP = 1.0 / 120.0
 SUBSTEPS = 4
+STEP_SECONDS = SUBSTEPS * TIME_STEP
+"""The MDP's clock: an environment step is 1/30 s."""
 # Gains that `calibrate` tries, the Panda's among them.
 GAINS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 NUM_POSES, NUM_STEPS, STEP = 16, 12, 0.03  # of a calibration; length of a step (normalised)

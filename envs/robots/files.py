@@ -12,6 +12,10 @@ packages: {iiwa_description: ../iiwa_description}
 base_position: [0, 0, 0]
 base_orientation: [0, 0, 0, 1]
 gain: 0.6
+velocity: 2.0                    # of trajectories, rad/s; or joint by joint, as with jerk
+acceleration: 10                 # rad/s^2
+jerk: {joint_1: 1000, …}         # rad/s^3
+datasheet_limits: {joint_1: [-2.9, 2.9]}  # narrower position limits, for --limits datasheet
 """
 
 import functools
@@ -26,6 +30,7 @@ from roboarm_nmp.envs.robots.urdf import RobotError, robot_from_urdf
 
 ROBOT_FILES = (".urdf", ".yaml", ".yml")
 MAX_FILE = 100_000  # bytes
+NUMBER = (float, int)
 KEYS = {
     "urdf": str,
     "name": str,
@@ -38,7 +43,11 @@ KEYS = {
     "packages": dict,
     "base_position": list,
     "base_orientation": list,
-    "gain": float,
+    "gain": NUMBER,
+    "velocity": (*NUMBER, dict),
+    "acceleration": (*NUMBER, dict),
+    "jerk": (*NUMBER, dict),
+    "datasheet_limits": dict,
 }
 
 
@@ -91,9 +100,10 @@ def _read(path):
     for key, value in options.items():
         if key not in KEYS:
             raise RobotError(f"{path}: unknown key {key!r}: known are {', '.join(KEYS)}")
-        kind = KEYS[key]
-        if not (isinstance(value, kind) or kind is float and isinstance(value, int)):
-            raise RobotError(f"{path}: {key} must be a {kind.__name__}, got {value!r}")
+        if not isinstance(value, KEYS[key]) or isinstance(value, bool):
+            kinds = KEYS[key] if isinstance(KEYS[key], tuple) else (KEYS[key],)
+            names = " or ".join(kind.__name__ for kind in kinds if kind is not int)
+            raise RobotError(f"{path}: {key} must be a {names}, got {value!r}")
     return options
 
 

@@ -90,6 +90,7 @@ class Robot:
         xml: the URDF's text, with absolute paths of meshes; empty if PyBullet can read the file.
         datasheet_lower, datasheet_upper: position limits (n,) of the manufacturer's datasheet, rad
             or m, where they are others than the URDF's; None otherwise.
+        urdf_velocity: limits of the velocity (n,) in the URDF, None if it has none, or for `PANDA`.
         gains: of the position controllers (n,).
         contact_free: a configuration without contacts (n,).
         observed_pose: the configuration (n,) in which sensors observe a scene: always the same, so
@@ -135,6 +136,7 @@ class Robot:
     datasheet_upper: np.ndarray | None = None
     attached: tuple = ()
     carriers: tuple = ()
+    urdf_velocity: list | None = None
 
     def __post_init__(self):
         names = ("lower", "upper", "velocity", "acceleration", "jerk", "effort")
@@ -160,6 +162,9 @@ class Robot:
         Numbers are rounded to 1e-9: the last bits of sines and cosines differ between machines.
         """
         content = {f.name: getattr(self, f.name) for f in fields(self)}
+        velocity = content.pop("urdf_velocity")
+        if self.xml:  # limits of a robot's file concern trajectories alone: files stay valid
+            content |= {"velocity": velocity, "acceleration": None, "jerk": None}
         for name in ("urdf", "source", "xml", "described", "datasheet_lower", "datasheet_upper"):
             content.pop(name)
         content["attached"] = [one.described() for one in self.attached]
@@ -193,6 +198,12 @@ class Robot:
             base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
             gain: of the position controllers; by default from a calibration
                 (`envs.robots.control`).
+            velocity, acceleration, jerk: limits of trajectories, rad/s, rad/s^2, rad/s^3 (or m): a
+                number, or a dict from names of joints. By default the velocities are the URDF's, if
+                it has some, and the others are unknown.
+            datasheet_limits: dict from names of joints to (lower, upper), rad or m, inside the
+                position limits: those of the manufacturer's datasheet (`position_limits`). Joints
+                without have their position limits.
 
         Raises:
             RobotError: the file cannot be used; a ValueError that names it and the reason.

@@ -10,7 +10,7 @@ from xml.parsers import expat
 
 from roboarm_nmp.envs.robots.robot import temporary_file
 
-MAX_FILE, MAX_DEPTH = 5_000_000, 30  # bytes, nested elements
+MAX_FILE, MAX_DEPTH, MAX_ELEMENTS = 5_000_000, 30, 50_000  # bytes, nested elements, all elements
 MAX_HULL = 100_000  # vertices of the convex hulls of all collision meshes
 # PyBullet may crash while it loads a hostile file, so another process tries it first.
 MAX_SECONDS, MAX_MEMORY = 4, 1_000_000_000  # of its processor time; bytes
@@ -63,11 +63,13 @@ def read_xml(path):
     if "xmlns:xacro" in text and "xacro:macro" in text:
         raise RobotError(f"{path}: has xacro macros: run `xacro` on it first")
     # Some URDFs have extensions of other programs, with prefixes that they do not declare.
-    parser, builder, depth = expat.ParserCreate(), ElementTree.TreeBuilder(), 0
+    parser, builder, depth, number = expat.ParserCreate(), ElementTree.TreeBuilder(), 0, 0
 
     def start(tag, attributes):
-        nonlocal depth
-        depth += 1
+        nonlocal depth, number
+        depth, number = depth + 1, number + 1
+        if number > MAX_ELEMENTS:
+            raise RobotError(f"{path}: more than {MAX_ELEMENTS:,} elements")
         if depth > MAX_DEPTH:
             raise RobotError(f"{path}: elements are nested more than {MAX_DEPTH} deep")
         own = {n: value for n, value in attributes.items() if ":" not in n and n != "xmlns"}

@@ -5,22 +5,26 @@ import functools
 import hashlib
 import math
 import re
+import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
-from roboarm_nmp.envs.robots.control import calibrate
+from roboarm_nmp.envs.robots.cache import cached
+from roboarm_nmp.envs.robots.control import GAINS, calibrate
 from roboarm_nmp.envs.robots.robot import Frame, Link, Robot, resolve
-from roboarm_nmp.envs.robots.self_collisions import disabled_pairs, sample_pairs
+from roboarm_nmp.envs.robots.self_collisions import SAMPLES, disabled_pairs, sample_pairs
 from roboarm_nmp.envs.robots.untrusted import RobotError, bullet_indices, read_xml
 
 MAX_LINKS = 200
+MAX_JOINTS, MAX_MOVABLE = 32, 100  # actuated ones, and all: PyBullet has states of 128
 MAX_NAME = 200  # letters
 # Bytes of all meshes, and shapes for collisions.
-MAX_MESHES = {"collision": 50_000_000, "visual": 200_000_000}
+MAX_MESHES = {"collision": 50_000_000, "visual": 100_000_000}
 MAX_SHAPES = 500
-MAX_MESH = {"collision": 20_000_000, "visual": 50_000_000}  # bytes of one
+MAX_MESH = {"collision": 20_000_000, "visual": 30_000_000}  # bytes of one
+BLOCK = 4_000_000  # bytes of a mesh that are read at once
 MESH_ENDINGS = (".obj", ".stl", ".dae")
 MOVABLE = ("revolute", "continuous", "prismatic")
 DEFAULT_EFFORT = 1_000.0  # N m or N, where a URDF has none
@@ -45,13 +49,18 @@ def robot_from_urdf(
     base_position=(0.0, 0.0, 0.0),
     base_orientation=(0.0, 0.0, 0.0, 1.0),
     gain=None,
+    velocity=None,
+    acceleration=None,
+    jerk=None,
+    datasheet_limits=None,
 ):
     """See `Robot.from_urdf`."""
     _check_options(
         path,
         joints=joints or (),
         fixed=fixed or {},
-        limits=limits or {},
+        pairs={"limits": limits or {}, "datasheet_limits": datasheet_limits or {}},
+        positive={"velocity": velocity, "acceleration": acceleration, "jerk": jerk},
         end_effector_position=end_effector_position,
         base_position=base_position,
         base_orientation=base_orientation,
@@ -61,6 +70,8 @@ def robot_from_urdf(
     movable = [joint for joint in tree.joints if tree.is_movable(joint)]
     if not movable:
         raise RobotError(f"{path}: no joint can move")
+    if len(movable) > MAX_MOVABLE:
+        raise RobotError(f"{path}: {len(movable)} movable joints, at most {MAX_MOVABLE}")
     end_effector = end_effector or tree.likely_end_effector()
     if end_effector not in tree.links:
         raise RobotError(f"{path}: no link {end_effector!r}, but {', '.join(tree.links)}")
@@ -74,11 +85,16 @@ def robot_from_urdf(
                 f"{path}: {joint!r} is no movable joint between the base and {end_effector!r}; "
                 f"those are {', '.join(on_chain)}"
             )
+    if len(joints) > MAX_JOINTS:
+        raise RobotError(f"{path}: {len(joints)} actuated joints, at most {MAX_JOINTS}")
     joints = sorted(joints, key=on_chain.index)
     others = [joint for joint in movable if joint not in joints]
     for joint in fixed or {}:
         if joint not in others:
             raise RobotError(f"{path}: fixed: {joint!r} is none of the other joints {others}")
+    for joint in datasheet_limits or {}:
+        if joint not in joints:
+            raise RobotError(f"{path}: datasheet_limits: {joint!r} is none of the joints {joints}")
     bounds = np.array([tree.limits(joint, limits) for joint in joints])
     held = {joint: tree.held_at(joint, fixed) for joint in others}
     positions, mimics = dict(held), {}
@@ -113,6 +129,10 @@ def robot_from_urdf(
     links.sort(key=lambda link: (link.frame >= 0, link.index))
     still = [joint for joint in positions if joint in tree.joints]
     frame, rotation, position = placements[end_effector]
+    urdf_velocity = tree.limit_values("velocity", joints)
+    datasheet = np.array(
+        [tree.datasheet_limits(joint, datasheet_limits, limits) for joint in joints]
+    )
     robot = Robot(
         name=name or tree.root.get("name") or Path(path).stem,
         urdf=str(path),
@@ -122,9 +142,10 @@ def robot_from_urdf(
         joint_indices=tuple(index[joint] for joint in joints),
         lower=bounds[:, 0],
         upper=bounds[:, 1],
-        velocity=tree.limit_values("velocity", joints),
-        acceleration=None,
-        jerk=None,
+        velocity=_motion_limits(path, "velocity", velocity, joints, urdf_velocity),
+        acceleration=_motion_limits(path, "acceleration", acceleration, joints),
+        jerk=_motion_limits(path, "jerk", jerk, joints),
+        urdf_velocity=urdf_velocity,
         effort=[tree.effort(joint) for joint in joints],
         held_indices=tuple(index[joint] for joint in still),
         held_positions=tuple(positions[joint] for joint in still),
@@ -145,30 +166,51 @@ def robot_from_urdf(
         observed_pose=tuple(bounds.mean(1)),
         base_position=tuple(map(float, base_position)),
         base_orientation=tuple((base_orientation / np.linalg.norm(base_orientation)).tolist()),
+        datasheet_lower=datasheet[:, 0] if datasheet_limits else None,
+        datasheet_upper=datasheet[:, 1] if datasheet_limits else None,
     )
     adjacent = {
         tuple(sorted((link_index[a], link_index[b]))) for a, b in tree.neighbours(robot, link_index)
     }
     disabled = adjacent | (disabled_pairs(srdf, link_index) if srdf else set())
-    pairs, contact_free = sample_pairs(robot, disabled)
+    pairs, contact_free = cached(
+        "pairs", robot, [SAMPLES, sorted(disabled)], lambda: sample_pairs(robot, disabled)
+    )
     robot = dataclasses.replace(
         robot,
-        self_collision_pairs=pairs,
-        contact_free=contact_free,
-        observed_pose=contact_free,
+        self_collision_pairs=tuple(map(tuple, pairs)),
+        contact_free=tuple(contact_free),
+        observed_pose=tuple(contact_free),
     )
     if gain is None:
-        gain = calibrate(robot)[0]
+        gain = cached("gain", robot, [GAINS], lambda: calibrate(robot)[0])
         robot = dataclasses.replace(robot, gains=(gain,) * len(joints))
     return robot
 
 
-def _check_options(path, joints, fixed, limits, gain, **vectors):
+def _motion_limits(path, name, given, joints, own=None):
+    """Limits (n,) of velocity, acceleration or jerk, or None: `given`, or the URDF's own."""
+    if given is None:
+        return own
+    if not isinstance(given, dict):
+        return [given] * len(joints)
+    if unknown := [joint for joint in given if joint not in joints]:
+        raise RobotError(f"{path}: {name}: {unknown[0]!r} is none of the joints {joints}")
+    given = dict(zip(joints, own or (), strict=False)) | given
+    if missing := [joint for joint in joints if joint not in given]:
+        raise RobotError(f"{path}: {name}: no limit of {', '.join(missing)}")
+    return [given[joint] for joint in joints]
+
+
+def _check_options(path, joints, fixed, pairs, positive, gain, **vectors):
     """Raise RobotError for an option of another type, or one that is not finite."""
 
     def are_numbers(values, count):
         return len(values) == count and all(
-            isinstance(x, (int, float, np.number)) and abs(x) <= MAX_NUMBER for x in values
+            isinstance(x, (int, float, np.number))
+            and not isinstance(x, bool)
+            and abs(x) <= MAX_NUMBER
+            for x in values
         )
 
     sizes = {"end_effector_position": 3, "base_position": 3, "base_orientation": 4}
@@ -176,10 +218,18 @@ def _check_options(path, joints, fixed, limits, gain, **vectors):
     wrong += [f"joints {name!r}" for name in joints if not isinstance(name, str)]
     wrong += [f"fixed {name}: {x}" for name, x in fixed.items() if not are_numbers([x], 1)]
     wrong += [
-        f"limits {name}: {pair}"
-        for name, pair in limits.items()
+        f"{option} {name}: {pair}"
+        for option, given in pairs.items()
+        for name, pair in given.items()
         if not (isinstance(pair, (list, tuple, np.ndarray)) and are_numbers(pair, 2))
     ]
+    for option, given in positive.items():
+        values = given if isinstance(given, dict) else {"of all joints": given}
+        wrong += [
+            f"{option} {name}: {value}, which must be positive"
+            for name, value in values.items()
+            if given is not None and not (are_numbers([value], 1) and value > 0)
+        ]
     if gain is not None and not (are_numbers([gain], 1) and 0 < gain <= 1):
         wrong.append(f"gain {gain}, which must be in (0, 1]")
     if not wrong and abs(np.linalg.norm(vectors["base_orientation"]) - 1) > MAX_NORM_ERROR:
@@ -413,6 +463,17 @@ class _Tree:
             raise RobotError(f"{self.path}: joint {joint!r}: limits from {lower} to {upper}")
         return lower, upper
 
+    def datasheet_limits(self, joint, given, limits):
+        """Limits (lower, upper) of a joint's datasheet, from `given`, or those of `limits`."""
+        widest = self.limits(joint, limits)
+        lower, upper = map(float, (given or {}).get(joint, widest))
+        if not widest[0] <= lower < upper <= widest[1]:
+            raise RobotError(
+                f"{self.path}: joint {joint!r}: datasheet_limits from {lower} to {upper} are not "
+                f"inside the limits from {widest[0]} to {widest[1]}"
+            )
+        return lower, upper
+
     def held_at(self, joint, fixed):
         """The position of another joint: from `fixed`, or 0 within its limits."""
         if joint in (fixed or {}):
@@ -570,14 +631,28 @@ def _read(path):
 
 def _has_its_vertices(obj):
     """Whether an OBJ file's faces have vertices of the file; PyBullet would read beyond them."""
-    count = len(re.findall(rb"^[ \t]*v[ \t]", obj, re.MULTILINE))
-    faces = re.findall(rb"^[ \t]*f[ \t]([^#\r\n]*)", obj, re.MULTILINE)
-    corners = re.sub(rb"/[^ \t]*", b"", b" ".join(faces)).split()  # textures and normals
-    try:
-        numbers = np.array(corners, dtype="S20").astype(np.int64)
-    except ValueError:
-        return False
-    return bool(((numbers != 0) & (np.abs(numbers) <= count)).all())
+    count = sum(len(re.findall(rb"^[ \t]*v[ \t]", part, re.MULTILINE)) for part in _blocks(obj))
+    for part in _blocks(obj):
+        faces = re.findall(rb"^[ \t]*f[ \t]([^#\r\n]*)", part, re.MULTILINE)
+        corners = re.sub(rb"/[^ \t]*", b"", b" ".join(faces)).strip()  # textures and normals
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # of what are no numbers
+                numbers = np.fromstring(corners, dtype=np.int64, sep=" ")
+        except (DeprecationWarning, ValueError):
+            return False
+        if ((numbers == 0) | (numbers < -count) | (numbers > count)).any():
+            return False
+    return True
+
+
+def _blocks(text):
+    """Yield a text of bytes in parts of whole lines, so that lists of its words stay short."""
+    start = 0
+    while start < len(text):
+        end = text.find(b"\n", start + BLOCK) + 1 or len(text)
+        yield text[start:end]
+        start = end
 
 
 def _rotation_x(angle):

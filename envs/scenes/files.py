@@ -30,6 +30,20 @@ panda_hand, position: [0, 0, 0.1], size: [0.05, 0.05, 0.2], touch_links: []}`. `
 with the end effector if left out. `touch_links` are links that the object may touch, besides those
 that move with it.
 
+Obstacles may move, appear and disappear (`envs.scenes.motions`); times in s, from the start of an
+episode, angles in rad:
+
+      - box: {position: [0.5, 0, 0.3], size: [0.1, 0.1, 0.1], motion: {oscillation: {amplitude:
+              [0, 0.2, 0], period: 4, phase: 0, axis: [0, 0, 1], angle: 0}}}  # all but the period
+                                                                              # may be left out
+      - sphere: {position: [0.5, 0, 0.5], radius: 0.1, motion: {waypoints: {times: [1, 2],
+                 displacements: [[0, 0, 0], [0, 0.3, 0]], rotations: [[0, 0, 0, 1], [0, 0, 0, 1]],
+                 repeat: back_and_forth}}}  # or once, as if left out, or cyclic
+      - box: {position: [0.5, 0, 0.3], size: [0.1, 0.1, 0.1], motion: {present: [[0, 2], [5]]}}
+
+`rotations` may be left out. `present` are intervals of time, of which the last one may have no end;
+it may stand beside `oscillation` or `waypoints`. A mesh and the table cannot move.
+
 All but a sphere may have `yaw` or `orientation`, not both. A quaternion whose norm differs from
 1 by up to 1 % is normalised. A number is any finite number that Python's `float` reads, without
 quotes; also `1e-2`, which YAML 1.1 treats as text. YAML's anchors and aliases (`&a`, `*a`) work;
@@ -48,6 +62,16 @@ from roboarm_nmp.envs.robots.attached import MAX_ATTACHED
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
+from roboarm_nmp.envs.scenes.motions import (
+    MAX_INTERVALS,
+    MAX_TIME,
+    MAX_WAYPOINTS,
+    ONCE,
+    REPEATS,
+    Oscillation,
+    Presence,
+    Waypoints,
+)
 from roboarm_nmp.envs.scenes.primitives import (
     FLOOR,
     FRICTION,
@@ -68,7 +92,7 @@ from roboarm_nmp.envs.scenes.primitives import (
 )
 from roboarm_nmp.envs.utils.files import write_atomically
 
-_MAX_DEPTH = 10  # a scene needs 6
+_MAX_DEPTH = 12  # a scene needs 10
 _HEADER = """\
 # A scene for RoboArm-NMP. Lengths in metres, in the frame of the robot's base: x forward, y left,
 # z up. The format is described in envs/scenes/files.py.
@@ -157,7 +181,10 @@ def _format_fields(obstacle, more=()):
     """The dataclass's fields, and texts of more fields, as a YAML mapping on one line."""
     fields = []
     for name, value in vars(obstacle).items():
-        if name in ("position", "size", "orientation"):
+        if name == "motion":
+            if value is not None:
+                fields.append(f"motion: {_format_motion(value)}")
+        elif name in ("position", "size", "orientation"):
             if name == "orientation" and tuple(value) == IDENTITY:
                 continue
             fields.append(f"{name}: {_format_numbers(value)}")
@@ -168,6 +195,27 @@ def _format_fields(obstacle, more=()):
         else:
             fields.append(f"{name}: {float(value)!r}")
     return "{" + ", ".join([*fields, *more]) + "}"
+
+
+def _format_motion(motion):
+    present = ""
+    if isinstance(motion, Presence):
+        intervals = [_format_numbers(n for n in one if n < math.inf) for one in motion.intervals]
+        present, motion = f"present: [{', '.join(intervals)}]", motion.motion
+    if motion is None:
+        return f"{{{present}}}"
+    if isinstance(motion, Oscillation):
+        kind, vectors = "oscillation", ("amplitude", "axis")
+        fields = [f"{name}: {_format_numbers(getattr(motion, name))}" for name in vectors]
+        fields += [f"{name}: {getattr(motion, name)!r}" for name in ("period", "phase", "angle")]
+    else:
+        kind, fields = "waypoints", [f"times: {_format_numbers(motion.times)}"]
+        for name in ("displacements", "rotations"):
+            if rows := getattr(motion, name):
+                fields.append(f"{name}: [{', '.join(map(_format_numbers, rows))}]")
+        fields.append(f"repeat: {motion.repeat}")
+    present = f", {present}" if present else ""
+    return f"{{{kind}: {{{', '.join(fields)}}}{present}}}"
 
 
 def _format_numbers(numbers):
@@ -332,13 +380,15 @@ def _table(node):
     if not isinstance(node, yaml.MappingNode):
         expected = "true, false or {position: [x, y, z], size: [x, y, z]}"
         raise _mistake(node, f"table must be {expected}, got {_describe(node)}")
-    table = _box(node, "table", ("may_touch",))
+    table = _box(node, "table", ("may_touch", "motion"))
+    if table.motion is not None:
+        raise _mistake(node, "the table cannot move: leave it out, and add a box that does")
     return replace(table, may_touch=_may_touch(_some(node, ("may_touch",))))
 
 
 def _obstacle(node, folder):
     """A tuple of obstacles: a mesh may be several."""
-    shapes, more = _shapes(node, folder, ("may_touch",))
+    shapes, more = _shapes(node, folder, ("may_touch", "motion"))
     return [replace(shape, may_touch=_may_touch(more)) for shape in shapes]
 
 
@@ -365,6 +415,7 @@ def _shapes(node, folder, more):
         raise _mistake(node, f"an obstacle must have exactly one key, its kind ({kinds}): {keys}")
     [(key, fields)] = node.value
     if isinstance(key, yaml.ScalarNode) and key.value == "mesh":
+        more = [name for name in more if name != "motion"]
         return _mesh(fields, key.value, folder, more), _some(fields, more)
     if not isinstance(key, yaml.ScalarNode) or key.value not in _KINDS:
         raise _mistake(key, f"unknown kind of obstacle {_describe(key)}: one of {kinds}")
@@ -382,6 +433,7 @@ def _box(node, what, more=()):
         _vector(fields["position"], f"position of {what}", 3),
         _vector(fields["size"], f"size of {what}", 3, positive=True),
         _orientation(fields, what),
+        _motion(fields, what),
     )
 
 
@@ -392,6 +444,7 @@ def _cylinder(node, what, more):
         _number(fields["radius"], f"radius of {what}", positive=True),
         _number(fields["length"], f"length of {what}", positive=True),
         _orientation(fields, what),
+        _motion(fields, what),
     )
 
 
@@ -400,6 +453,7 @@ def _sphere(node, what, more):
     return Sphere(
         _vector(fields["position"], f"position of {what}", 3),
         _number(fields["radius"], f"radius of {what}", positive=True),
+        _motion(fields, what),
     )
 
 
@@ -414,6 +468,7 @@ def _convex_hull(node, what, more):
         _vector(fields["position"], f"position of {what}", 3),
         tuple(_vector(vertex, f"a vertex of {what}", 3) for vertex in vertices.value),
         _orientation(fields, what),
+        _motion(fields, what),
     )
     try:
         check_obstacle(hull)
@@ -463,6 +518,84 @@ def _orientation(fields, what):
         raise _mistake(node, f"orientation of {what}: {error}") from error
 
 
+def _motion(fields, what):
+    """The motion of an obstacle; None without one."""
+    node = fields.get("motion")
+    if node is None:
+        return None
+    if hasattr(node, "motion"):  # an alias: a small file may have many of a long motion
+        return node.motion
+    kinds = {"oscillation": _oscillation, "waypoints": _waypoints}
+    parts = _mapping(node, f"motion of {what}", optional=(*kinds, "present"))
+    chosen = [kind for kind in kinds if kind in parts]
+    if len(chosen) > 1 or not parts:
+        raise _mistake(node, f"motion of {what} must be one of {', '.join(kinds)}, or present")
+    try:
+        motion = kinds[chosen[0]](parts[chosen[0]], chosen[0]) if chosen else None
+        if "present" in parts:
+            motion = Presence(_intervals(parts["present"]), motion)
+    except ValueError as error:
+        raise _mistake(node, f"motion of {what}: {error}") from error
+    node.motion = motion
+    return motion
+
+
+def _oscillation(node, what):
+    vectors, numbers = ("amplitude", "axis"), ("period", "phase", "angle")
+    fields = _mapping(node, what, ("period",), ("amplitude", "axis", "phase", "angle"))
+    given = {
+        name: _vector(fields[name], f"{name} of {what}", 3)
+        for name in sorted(fields.keys() & set(vectors))
+    }
+    for name in sorted(fields.keys() & set(numbers)):
+        given[name] = _number(fields[name], f"{name} of {what}", most=MAX_TIME)
+    return Oscillation(**given)
+
+
+def _waypoints(node, what):
+    fields = _mapping(node, what, ("times", "displacements"), ("rotations", "repeat"))
+    times = _list(fields["times"], f"times of {what}", MAX_WAYPOINTS)
+    rows = {
+        name: tuple(
+            _vector(row, f"{name} of {what}", width)
+            for row in _list(fields[name], f"{name} of {what}", MAX_WAYPOINTS)
+        )
+        for name, width in (("displacements", 3), ("rotations", 4))
+        if name in fields
+    }
+    repeat = ONCE
+    if "repeat" in fields:
+        repeat = fields["repeat"].value
+        if repeat not in REPEATS:
+            found = _describe(fields["repeat"])
+            kinds = ", ".join(REPEATS)
+            raise _mistake(fields["repeat"], f"repeat must be one of {kinds}, got {found}")
+    return Waypoints(
+        tuple(_number(time, f"times of {what}", most=MAX_TIME) for time in times),
+        repeat=repeat,
+        **rows,
+    )
+
+
+def _intervals(node):
+    """Intervals of `Presence`; one of a single time has no end."""
+    intervals = []
+    for row in _list(node, "present", MAX_INTERVALS):
+        ends = _list(row, "an interval of present", 2)
+        times = [_number(end, "an interval of present", most=MAX_TIME) for end in ends]
+        intervals.append(tuple(times) if len(times) == 2 else (*times, math.inf))
+    return tuple(intervals)
+
+
+def _list(node, what, most):
+    """The nodes of a list that is not longer than `most`."""
+    if not isinstance(node, yaml.SequenceNode):
+        raise _mistake(node, f"{what} must be a list, got {_describe(node)}")
+    if len(node.value) > most:
+        raise _mistake(node, f"{what} has {len(node.value):,} entries, at most {most:,}")
+    return node.value
+
+
 def _mapping(node, what, required=(), optional=()):
     """The values (nodes) of a mapping by key, with all required keys and no unknown key."""
     known = ", ".join((*required, *optional))
@@ -489,15 +622,15 @@ def _vector(node, what, length, positive=False):
     return tuple(_number(number, what, positive) for number in node.value)
 
 
-def _number(node, what, positive=False):
+def _number(node, what, positive=False, most=MAX_LENGTH):
     try:
         number = float(node.value) if _is_plain(node) else math.nan
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
         raise _mistake(node, f"{what} must be a finite number, got {_describe(node)}")
-    if abs(number) > MAX_LENGTH:
-        limit = f"{MAX_LENGTH:.0f}"
+    if abs(number) > most:
+        limit = f"{most:.0f}"
         raise _mistake(node, f"{what} must be at most {limit}, got {_describe(node)}")
     if positive and number <= 0:
         raise _mistake(node, f"{what} must be positive, got {_describe(node)}")

@@ -8,49 +8,30 @@ import hashlib
 import json
 import math
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 
 import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.motions import (
+    Motion,
+    motion_from_numbers,
+    motion_to_numbers,
+    moved,
+)
+from roboarm_nmp.envs.scenes.numbers import (
+    IDENTITY,
+    MAX_LENGTH,
+    MAX_SCENE_OBSTACLES,
+    is_number,
+    unit_quaternion,
+)
 
-IDENTITY = (0.0, 0.0, 0.0, 1.0)
-MAX_LENGTH, MAX_SCENE_OBSTACLES = 1000.0, 10_000
-"""Limits of sizes and coordinates (m), and of a scene's obstacles: more is a mistake."""
 MAX_HULL_VERTICES = 256
 """Of a `ConvexHull`."""
 MAX_TOUCHING = 200
 """Names of links that one obstacle may touch."""
-# Quaternions: of up to the first deviation of the norm from 1, they stay as they are, bit for bit;
-# up to the second, such as (0, 0, 0.7071, 0.7071), they are normalised.
-_EXACT_NORM, _ROUNDED_NORM = 1e-6, 0.01
-
-
-def is_number(value):
-    """Whether a value is a finite real number of Python or NumPy: no text, date or tensor."""
-    try:
-        kinds = (int, float, np.integer, np.floating)
-        return isinstance(value, kinds) and math.isfinite(value)
-    except (OverflowError, TypeError):  # 10**400; a time span, an integer according to NumPy
-        return False
-
-
-def unit_quaternion(orientation):
-    """A quaternion (x, y, z, w) as a tuple of norm 1.
-
-    Raises ValueError: it is not four finite numbers, or its norm differs from 1 by more than 1 %.
-    """
-    orientation = tuple(orientation)
-    if len(orientation) != 4 or not all(map(is_number, orientation)):
-        raise ValueError(f"a quaternion x, y, z, w is four finite numbers, got {orientation}")
-    norm = math.hypot(*orientation)
-    if not abs(norm - 1) <= _ROUNDED_NORM:
-        raise ValueError(
-            f"a quaternion x, y, z, w must have norm 1 (within 1 %), got norm {norm:.9g}"
-        )
-    if abs(norm - 1) <= _EXACT_NORM:
-        return orientation
-    return tuple(float(number) / norm for number in orientation)
 
 
 def _normalise(body):
@@ -61,6 +42,10 @@ def _normalise(body):
             object.__setattr__(body, name, tuple(value))
     if hasattr(body, "orientation"):
         object.__setattr__(body, "orientation", unit_quaternion(body.orientation))
+    if not isinstance(body.motion, Motion | None):
+        raise TypeError(
+            f"motion must be Oscillation, Waypoints, Presence or None, got {body.motion!r}"
+        )
     if body.may_touch is not True and (type(body.may_touch) is not tuple or body.may_touch):
         object.__setattr__(body, "may_touch", _link_names(body.may_touch, "may_touch"))
 
@@ -79,6 +64,8 @@ def _link_names(names, what):
 class Box:
     """A box: centre, full edges, and orientation as a quaternion (x, y, z, w).
 
+    `motion`: how it moves away from this pose (`envs.scenes.motions`); None: it does not move.
+
     `may_touch`: names of the arm's links whose contacts with this obstacle are no collisions, with
     the objects attached to them; True: `Robot.hand_links`. Other obstacles have it, too.
 
@@ -89,6 +76,7 @@ class Box:
     position: tuple[float, float, float]
     size: tuple[float, float, float]
     orientation: tuple[float, float, float, float] = IDENTITY
+    motion: Motion | None = None
     may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
@@ -96,12 +84,16 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A cylinder around its local z axis. `position` is its centre, `orientation` as of a `Box`."""
+    """A cylinder around its local z axis.
+
+    `position` is its centre, `orientation` and `motion` are as of a `Box`.
+    """
 
     position: tuple[float, float, float]
     radius: float
     length: float
     orientation: tuple[float, float, float, float] = IDENTITY
+    motion: Motion | None = None
     may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
@@ -109,10 +101,11 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere; `position` is its centre."""
+    """A sphere; `position` is its centre, `motion` as of a `Box`."""
 
     position: tuple[float, float, float]
     radius: float
+    motion: Motion | None = None
     may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
@@ -125,12 +118,13 @@ class ConvexHull:
     `convex_hull` makes one of any number of points; `envs.scenes.meshes` of a mesh's file.
 
     `vertices` are (x, y, z), m, in the hull's own frame, which has its origin at `position`, and
-    `orientation` as of a `Box`.
+    `orientation` and `motion` as of a `Box`.
     """
 
     position: tuple[float, float, float]
     vertices: tuple[tuple[float, float, float], ...]
     orientation: tuple[float, float, float, float] = IDENTITY
+    motion: Motion | None = None
     may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     def __post_init__(self):
@@ -155,7 +149,7 @@ class Attached:
 
     Raises:
         TypeError: another type.
-        ValueError: as of a `Scene`'s obstacles; or the shape has `may_touch`.
+        ValueError: as of a `Scene`'s obstacles; or the shape has `may_touch` or a motion.
     """
 
     shape: Obstacle
@@ -170,6 +164,8 @@ class Attached:
         check_obstacle(self.shape)
         if self.shape.may_touch:
             raise ValueError("an attached shape has no may_touch: give the object touch_links")
+        if self.shape.motion is not None:
+            raise ValueError("an attached shape has no motion: it moves with its link")
         if self.link is not None and not isinstance(self.link, str):
             raise TypeError(f"link must be the name of a link, or None, got {self.link!r}")
         object.__setattr__(self, "touch_links", _link_names(self.touch_links, "touch_links"))
@@ -201,7 +197,8 @@ class Scene:
 
     `robot` is the arm. `floor` is the height of the floor's surface. `friction` is the obstacles'
     coefficient; PyBullet multiplies it by the arm's, 0.5. Scenes are values: they can be compared
-    and hashed.
+    and hashed. Obstacles may have motions (`envs.scenes.motions`): then `at` is the static scene of
+    each time.
 
     Raises:
         TypeError: an obstacle or the table is of another type.
@@ -230,6 +227,8 @@ class Scene:
                 raise TypeError(f"table must be a Box or None, got {self.table!r}")
             check_obstacle(self.table)
             self._check_links(self.table)
+            if self.table.motion is not None:
+                raise ValueError("the table cannot move: leave it out, and add a box that does")
         if self.floor is not None and not _is_length(self.floor):
             raise ValueError(f"floor must be a height in m or None, got {self.floor!r}")
         if not (is_number(self.friction) and self.friction >= 0):
@@ -241,6 +240,45 @@ class Scene:
         """Raise ValueError if an obstacle may touch a link that the robot does not have."""
         if obstacle.may_touch and isinstance(self.robot, Robot):
             self.robot.links_called(obstacle.may_touch)
+
+    @property
+    def is_static(self):
+        """Whether no obstacle moves, appears or disappears."""
+        return all(obstacle.motion is None for obstacle in self.obstacles)
+
+    def at(self, t):
+        """The static `Scene` at a time t, s: the obstacles that are present, where they are then.
+
+        A static scene is itself at all times. Raises ValueError: the time is not finite.
+        """
+        if self.is_static:
+            return self
+        if not is_number(t):
+            raise ValueError(f"a time is a finite number of seconds, got {t!r}")
+        return replace(
+            self, obstacles=[o for o in map(obstacle_at, self.obstacles, repeat(t)) if o]
+        )
+
+
+def pose_at(obstacle, t):
+    """Position (3), m, and orientation (4) of an obstacle at a time (s); None: it is absent."""
+    orientation = IDENTITY if isinstance(obstacle, Sphere) else obstacle.orientation
+    if obstacle.motion is None:
+        return obstacle.position, orientation
+    if not obstacle.motion.is_present(t):
+        return None
+    return moved(obstacle.position, orientation, *obstacle.motion.pose(t))
+
+
+def obstacle_at(obstacle, t):
+    """An obstacle as it is at a time (s), without its motion; None: it is absent."""
+    if obstacle.motion is None:
+        return obstacle
+    if (pose := pose_at(obstacle, t)) is None:
+        return None
+    position, orientation = pose
+    turned = {} if isinstance(obstacle, Sphere) else {"orientation": orientation}
+    return replace(obstacle, position=position, motion=None, **turned)
 
 
 POINT_RADIUS = 0.01
@@ -388,7 +426,7 @@ def to_array(obstacles):
 
     Kinds: 0 box, 1 cylinder, 2 sphere, 3 convex hull. Sizes: a box's three edges; (radius, radius,
     length) of a cylinder; three times the radius of a sphere; three times the number of a hull's
-    vertices, which are in `hull_vertices`.
+    vertices, which are in `hull_vertices`. A motion has no place in a row (`motion_numbers`).
     """
     rows = np.zeros((len(obstacles), ROW))
     for row, obstacle in zip(rows, obstacles, strict=True):
@@ -412,6 +450,22 @@ def hull_vertices(obstacles):
     return np.array([vertex for vertices in hulls for vertex in vertices]).reshape(-1, 3)
 
 
+def motion_numbers(obstacles):
+    """The motions of obstacles as numbers, one after another, and how many numbers each has.
+
+    Returns: float64 (m,) and uint32 (n,); see `envs.scenes.motions.motion_to_numbers`.
+    """
+    numbers = [motion_to_numbers(obstacle.motion) for obstacle in obstacles]
+    flat = [number for of_one in numbers for number in of_one]
+    return np.array(flat, np.float64), np.array([len(of_one) for of_one in numbers], np.uint32)
+
+
+def with_motion(obstacle, numbers):
+    """An obstacle with the motion that numbers describe. Raises ValueError: there is none."""
+    motion = motion_from_numbers(numbers)
+    return obstacle if motion is None else replace(obstacle, motion=motion)
+
+
 def vertex_counts(rows):
     """How many of `hull_vertices` each row of `to_array` has: int64 (n,). Raises ValueError."""
     counts = np.where(rows[:, 0] == HULL, rows[:, 8], 0)
@@ -423,8 +477,10 @@ def vertex_counts(rows):
 def padded_rows(obstacles, number):
     """Obstacles -> float32 array (number, 12): 1 and a row of `to_array`, then rows of zeros.
 
-    Raises ValueError: a `ConvexHull`, whose vertices a row cannot have.
+    Raises ValueError: a `ConvexHull`, whose vertices a row cannot have, or a motion.
     """
+    if any(obstacle.motion is not None for obstacle in obstacles):
+        raise ValueError("obstacles of this scene move: describe scene.at(t), at a time t")
     if any(isinstance(obstacle, ConvexHull) for obstacle in obstacles):
         raise ValueError("convex hulls cannot be described by rows of 12 numbers: use a sensor")
     rows = np.zeros((number, 1 + ROW), np.float32)
@@ -470,12 +526,15 @@ def from_array(rows, vertices=()):
 def to_lists(obstacles):
     """Obstacles as JSON's lists: rows of `to_array`, a hull's followed by its vertices' numbers.
 
-    `may_touch`, where there is any, is the last entry: True or a list of names.
+    Two more entries follow, where there are any: the numbers of its motion, a list; `may_touch`,
+    true or a list of names.
     """
     rows = to_array(obstacles).tolist()
     for row, obstacle in zip(rows, obstacles, strict=True):
         if isinstance(obstacle, ConvexHull):
             row += [float(number) for vertex in obstacle.vertices for number in vertex]
+        if obstacle.motion is not None:
+            row.append(motion_to_numbers(obstacle.motion))
         if obstacle.may_touch:
             row.append(obstacle.may_touch if obstacle.may_touch is True else [*obstacle.may_touch])
     return rows
@@ -483,11 +542,24 @@ def to_lists(obstacles):
 
 def from_lists(rows):
     """The inverse of `to_lists`. Raises ValueError, TypeError: as `from_array`."""
-    touching = [row[-1] if row and isinstance(row[-1], (bool, list)) else () for row in rows]
-    rows = [row[:-1] if may else row for row, may in zip(rows, touching, strict=True)]
+    rows, motions, touching = zip(*map(split_list, rows), strict=True) if rows else ((), (), ())
     vertices = np.array([number for row in rows for number in row[ROW:]]).reshape(-1, 3)
     obstacles = from_array(np.array([row[:ROW] for row in rows]).reshape(-1, ROW), vertices)
-    return with_may_touch(obstacles, touching)
+    return with_may_touch(map(with_motion, obstacles, motions), touching)
+
+
+def split_list(row):
+    """The numbers, the motion's numbers and `may_touch` of a row of `to_lists`."""
+    row, motion, may_touch = list(row), [], ()
+    if row and (isinstance(row[-1], bool) or _is_list_of(str, row[-1])):
+        may_touch = row.pop()
+    if row and isinstance(row[-1], list):
+        motion = row.pop()
+    return row, motion, may_touch
+
+
+def _is_list_of(kind, value):
+    return isinstance(value, list) and len(value) > 0 and isinstance(value[0], kind)
 
 
 def scene_to_json(scene):

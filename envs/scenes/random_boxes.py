@@ -51,7 +51,7 @@ class RandomBoxes:
             # Each box has a sector of its own, so that they stand all around the robot.
             azimuth = first + sector * (len(boxes) + rng.uniform(-0.5, 0.5))
             box = _sample_box(rng, azimuth, scale)
-            if _distance_to_robot(box, scale) >= KEEP_CLEAR * scale:
+            if distance_to_robot(box, scale) >= KEEP_CLEAR * scale:
                 boxes.append(box)
         return replace(self.base, obstacles=tuple(boxes))
 
@@ -87,7 +87,7 @@ def rounded(*lengths):
     return tuple(round(length / GRID) * GRID for length in lengths)
 
 
-def _distance_to_robot(box, scale):
+def distance_to_robot(box, scale):
     """Distance (m) of an upright box from the part of the robot's axis below its shoulder's top."""
     sin, cos = 2 * box.orientation[2] * box.orientation[3], 1 - 2 * box.orientation[2] ** 2
     x, y, z = box.position

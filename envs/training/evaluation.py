@@ -29,22 +29,33 @@ from roboarm_nmp.envs.datasets.queries import Query, load_queries, validate
 from roboarm_nmp.envs.metrics import motion_metrics, path_length, smoothness
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
+from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
-from roboarm_nmp.envs.policies.baselines import PLANNERS, TIME_LIMIT, TRIES
+from roboarm_nmp.envs.policies.baselines import (
+    CHECKING,
+    OMPL_PLANNERS,
+    PLANNERS,
+    TIME_LIMIT,
+    TRIES,
+)
+from roboarm_nmp.envs.policies.pose_goals import goal_configuration
 from roboarm_nmp.envs.policies.registry import (
     FOR_POSES,
+    filter_around,
     find_policy,
     make_policy,
     own_safety_filter,
     own_task,
 )
-from roboarm_nmp.envs.policies.rollout import render_strip, rollout
+from roboarm_nmp.envs.policies.rollout import REAL_TIME, render_strip, rollout
 from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.envs.utils import workers
 from roboarm_nmp.envs.utils.progress import progress_bar, write_line
 
+LEAST_CLEARANCE = 0.001  # m, of a goal among several; the checks may differ from PyBullet's by less
 CHUNK = 10  # queries a worker takes at a time
 
 
@@ -65,18 +76,27 @@ class EvaluationOptions:
             `envs.datasets.queries.Queries`. Without `scenes` they are in the task's scene, which
             must then not be random.
         problems: path of a file or folder of problems instead of queries
-            (`envs.datasets.problems`), in their own scenes. The goal is the first one of each.
+            (`envs.datasets.problems`), in their own scenes. Of several goals, the goal is the one
+            nearest to the start that is free; of a pose, a free configuration that has it.
         split: `test`, `validation` or `original`; which queries of the file.
         num_queries: only the first so many of them; None for all.
         stop_on_collision: end an episode at the first contact.
         seed: of random numbers, >= 0; each query has its own generator.
         tries: random configurations that `via-points` tries per query, >= 1.
-        time_limit: seconds that `planner` may search per query, > 0.
+        time_limit: seconds that `planner` and `space-time` may search per query,
+            > 0.
         geometry_source: where `planner`, `via-points`, the safety filter and the policy's
             observations take the obstacles from (`envs.perception.geometry_source`); None for the
             policy's own, otherwise `ground_truth`.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
             one that the policy includes, if any; False for none.
+        observe_every: steps from one observation of the scene to the next; None: static scenes are
+            observed once (`envs.wrappers.ObservedSceneWrapper`).
+        sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
+        action_delay: steps after which an action takes effect; 0: the simulation waits for the
+            policy (`envs.policies.rollout.rollout`).
+        real_time: instead of `action_delay`, as many steps as an action, or a plan, takes to
+            compute, at least 1. Results then depend on the machine and its load.
         clearance: also measure each episode's smallest distance from the ground-truth obstacles.
         workers: processes, >= 1. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
@@ -98,6 +118,10 @@ class EvaluationOptions:
     time_limit: float = TIME_LIMIT
     geometry_source: str | None = None
     safety_filter: SafetyFilter | bool | None = None
+    observe_every: int | None = None
+    sensor_noise: SensorNoise | None = None
+    action_delay: int = 0
+    real_time: bool = False
     clearance: bool = False
     workers: int = 1
     env: dict | None = None
@@ -106,6 +130,10 @@ class EvaluationOptions:
         for name in ("workers", "tries"):
             if getattr(self, name) < 1:
                 raise EvaluationError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.action_delay < 0:
+            raise EvaluationError(f"action_delay must not be negative, got {self.action_delay}")
+        if self.action_delay and self.real_time:
+            raise EvaluationError("action_delay and real_time: give one of them")
         if not 0 < self.time_limit < math.inf:
             raise EvaluationError(
                 f"time_limit must be a positive number of seconds, got {self.time_limit}"
@@ -116,10 +144,10 @@ def evaluate(policy, task=None, *, progress=False, **options):
     """Run a policy on a task's queries.
 
     Args:
-        policy: `go-to-goal`, `random`, `via-points`, `planner`, the path of a policy network or of
-            a folder with a `policy.pt`, the name of a pretrained policy, or a function from an
-            observation (dict of `RoboArmEnv`) to an action (n,); with several workers, one that can
-            be pickled.
+        policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, `space-time`, the
+            path of a policy network or of a folder with a `policy.pt`, the name of a pretrained
+            policy, or a function from an observation (dict of `RoboArmEnv`) to an action (n,); with
+            several workers, one that can be pickled.
         task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
             for the task that the policy was trained on, and for none with `problems`.
         progress: show a progress bar, with the success rate so far.
@@ -141,9 +169,10 @@ def evaluate(policy, task=None, *, progress=False, **options):
         - `policy`, `task`, `robot` (its name), `goal_type`, `split`, `queries` (the file, if it is
           not the task's own), `problems` (their file and its SHA-256), `num_queries`, `env`,
           `deviations` (from the standard rules), `safety_filter`, `seed`, `tries`, `time_limit`,
-          `versions`;
+          `action_delay` (steps, or `real_time`), `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
-          whether policy, filter or observations received the ground-truth obstacles.
+          whether policy, filter or observations received the ground-truth obstacles;
+        - `observe_every`, `sensor_noise` (a dict), where they were given.
 
     Raises:
         EvaluationError: the policy, the task or the queries cannot be used.
@@ -160,7 +189,7 @@ def first_episode_image(policy, task=None, frames=8, **options):
     job = _prepare(policy, task, EvaluationOptions(**options))
     env, begin = job.make(render_mode="rgb_array")
     query = job.query(0)
-    actions = rollout(env, query, begin(0, query).act).actions
+    actions = rollout(env, query, begin(0, query).act, job.delay).actions
     steps = np.linspace(0, len(actions), frames).round().astype(int)
     image = render_strip(env, query, actions, sorted(set(steps.tolist())))
     env.close()
@@ -212,10 +241,17 @@ class _Job:
 
     def make(self, **kwargs):
         """The environment, and the policy in it as `make_policy` returns it."""
-        env, o = envs.make(self.task, **self.options.env, **kwargs), self.options
+        o = self.options
+        kwargs |= {"observe_every": o.observe_every, "sensor_noise": o.sensor_noise}
+        env = envs.make(self.task, **o.env, **kwargs)
         source, safety_filter = o.geometry_source or GROUND_TRUTH, o.safety_filter or False
         options = o.seed, o.tries, o.time_limit, source, safety_filter
         return env, make_policy(self.policy, env, *options)
+
+    @property
+    def delay(self):
+        """As of `rollout`."""
+        return REAL_TIME if self.options.real_time else self.options.action_delay
 
     def query(self, index):
         return Query(self.start[index], self.goal[index], self.scenes[index])
@@ -267,8 +303,33 @@ def _with_problems(task, options):
             f"{len(problems.rejected)} problems cannot be used: {problems.rejected[0].reason}; "
             f"`roboarm import` writes a file of the others"
         )
+    problems = replace(problems, all=tuple(_with_one_goal(one) for one in problems.all))
     said = {"file": Path(options.problems).name, "sha256": problems.digest}
     return replace(options, queries=problems), said
+
+
+def _with_one_goal(problem):
+    """A problem with a single goal configuration; one of several, or of its goal pose.
+
+    Ground-truth obstacles decide which are free, as they decide where episodes may begin.
+    """
+    if len(problem.goals) == 1:
+        return problem
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
+
+    robot, checker = problem.scene.robot, ground_truth_checker(problem.scene)
+    if len(problem.goals) == 0:
+        goal = goal_configuration(robot, problem.goal_pose, problem.start, checker)
+        if goal is None:
+            raise EvaluationError(f"problem {problem.name}: its goal pose cannot be reached freely")
+        return problem._replace(goals=goal[None].astype(np.float64))
+    states = robot.normalise(problem.goals)
+    free = np.flatnonzero(checker.is_free(np.clip(states, -1.0, 1.0), margin=LEAST_CLEARANCE))
+    if not len(free):
+        raise EvaluationError(f"problem {problem.name}: all of its goals are in collision")
+    distances = np.linalg.norm(states[free] - robot.normalise(problem.start), axis=1)
+    return problem._replace(goals=problem.goals[free[distances.argmin()]][None])
 
 
 def _in_use(policy, options):
@@ -278,6 +339,7 @@ def _in_use(policy, options):
     env["stop_on_collision"] = options.stop_on_collision
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
+    safety_filter = filter_around(policy, safety_filter)
     if safety_filter:
         env["link_distances"] = True
     source = options.geometry_source or env.get("geometry_source")
@@ -285,12 +347,19 @@ def _in_use(policy, options):
         source = env["geometry_source"] = source or GROUND_TRUTH
     elif env.get("encoder") == POINT_CLOUD and source != GROUND_TRUTH:
         source = env["geometry_source"] = source or POINT_CLOUD
-    elif policy in PLANNERS:
+    elif policy in CHECKING:
         source = source or GROUND_TRUTH
     elif options.geometry_source is not None:
         raise EvaluationError(
-            "geometry_source is for via-points, planner, a safety filter, and policies that "
-            "observe points or link distances"
+            "geometry_source is for via-points, planner, a safety filter, replanning, and policies "
+            "that observe points or link distances"
+        )
+    noise = options.sensor_noise
+    unseen = (None, GROUND_TRUTH), (None, ORACLE)
+    if noise and noise.changes_images and source in unseen[0] and env.get("encoder") in unseen[1]:
+        raise EvaluationError(
+            "sensor_noise: nothing is observed by sensors; choose the geometry source point_cloud, "
+            "or a policy that receives an encoded scene"
         )
     return replace(options, env=env, geometry_source=source, safety_filter=safety_filter)
 
@@ -366,11 +435,11 @@ class _Worker:
         began = time.perf_counter()
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
-        trajectory = rollout(self.env, query, act)
+        trajectory = rollout(self.env, query, act, self.job.delay, planning_seconds)
         lengths = [np.nan, np.nan, (np.nan,) * len(MOTION_METRICS)]
         if trajectory.success:
             configurations = trajectory.configurations
-            motion = motion_metrics(trajectory, self._checker(query.scene))
+            motion = motion_metrics(trajectory, self._checker(query.scene, len(trajectory)))
             lengths = [path_length(configurations), smoothness(configurations)]
             lengths.append(tuple(motion[name] for name in MOTION_METRICS))
         return _Outcome(
@@ -383,14 +452,16 @@ class _Worker:
             plan_found,
         )
 
-    def _checker(self, scene):
-        """For the clearance in a scene; None where it is not measured."""
+    def _checker(self, scene, steps):
+        """For the clearance in an episode; None where it is not measured."""
         if not self.job.options.clearance:
             return None
         # Here, because Numba takes a while to import.
         from roboarm_nmp.envs.collision.checker import CollisionChecker
 
-        return CollisionChecker(scene)
+        if scene.is_static:
+            return CollisionChecker(scene)
+        return [CollisionChecker(scene.at(step * STEP_SECONDS)) for step in range(steps + 1)]
 
 
 def _run(job, progress):
@@ -450,8 +521,8 @@ def _summary(job, outcomes):
         planning["planning_seconds_solved"] = mean(columns.planning_seconds, found)
         if job.policy == "via-points":
             planning["free_motion_rate"] = float(found.mean())
-    random = plans or job.policy == "random" or safety_filter
-    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy == "planner")
+    random = job.policy in (*CHECKING, "random") or safety_filter
+    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy in OMPL_PLANNERS)
     return {
         "policy": getattr(job.policy, "__name__", str(job.policy)),
         "task": None if job.problems else job.task,
@@ -473,14 +544,17 @@ def _summary(job, outcomes):
         "env": options.env,
         "deviations": deviations(options.env),
         "geometry_source": options.geometry_source,
+        **({"observe_every": options.observe_every} if options.observe_every else {}),
+        **({"sensor_noise": options.sensor_noise.to_metadata()} if options.sensor_noise else {}),
         "privileged": is_privileged(options.env)
-        or (plans and options.geometry_source == GROUND_TRUTH),
+        or (job.policy in CHECKING and options.geometry_source == GROUND_TRUTH),
         "safety_filter": safety_filter.to_metadata() | {"version": VERSION}
         if safety_filter
         else None,
         "seed": options.seed if random else None,
         "tries": options.tries if job.policy == "via-points" else None,
-        "time_limit": options.time_limit if job.policy == "planner" else None,
+        "time_limit": options.time_limit if job.policy in OMPL_PLANNERS else None,
+        "action_delay": job.delay,
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in packages},

@@ -45,7 +45,7 @@ GROUPS = {
         *("clearance",),
     ),
     "run": (
-        *("exp_name", "seed", "runs_dir", "resume", "device", "bf16", "track", "workers"),
+        *("seed", "runs_dir", "resume", "device", "bf16", "compile", "track", "workers"),
         *("ray_address",),
     ),
     "output": ("output", "overwrite", "repair", "shard_size", "json", "image"),
@@ -73,9 +73,11 @@ PositiveInt = _number(int, 1, 10**12, "at least 1", ">= 1")
 NonNegativeInt = _number(int, 0, 10**12, "at least 0", ">= 0")
 Seed = _number(int, 0, 2**32 - 1, "in [0, 2^32)", "IN [0, 2^32)")
 Workers = _number(int, 1, 256, "in [1, 256]", "IN [1, 256]")
+Helpers = _number(int, 0, 256, "in [0, 256]", "IN [0, 256]")  # processes beside this one
 Layers = _number(int, 1, 100, "in [1, 100]", "IN [1, 100]")
 Width = _number(int, 1, 2**16, "in [1, 65536]", "IN [1, 65536]")
 Pixels = _number(int, 1, 4096, "in [1, 4096]", "IN [1, 4096]")  # larger images are very slow
+Horizon = _number(int, 1, 10**6, "in [1, 1000000]", "IN [1, 1000000]")  # fits replay buffers
 Environments = _number(int, 1, 1000, "in [1, 1000]", "IN [1, 1000]")  # PyBullet has room for 1,024
 Share = _number(float, 0.0, 1.0, "in [0, 1]", "IN [0, 1]")
 PositiveShare = _number(float, sys.float_info.min, 1.0, "above 0, and at most 1", "IN (0, 1]")

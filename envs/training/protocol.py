@@ -26,12 +26,20 @@ from roboarm_nmp.envs.networks.exported_networks import (
     robot_metadata,
     save_network,
 )
-from roboarm_nmp.envs.policies.registry import recurrent_size
+from roboarm_nmp.envs.policies.registry import policy_file, recurrent_size
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name, task_with_robot
-from roboarm_nmp.envs.training.flags import NonNegativeInt, PositiveFloat, PositiveInt
-from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite
+from roboarm_nmp.envs.training.collection import TrainingEnvs
+from roboarm_nmp.envs.training.cuda_graphs import to_device
+from roboarm_nmp.envs.training.flags import (
+    CORES,
+    Horizon,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+)
+from roboarm_nmp.envs.training.runs import Run, RunFlags, check_finite, script_name
 from roboarm_nmp.envs.utils.progress import progress_bar
 
 NUM_ENVS = 8  # at most, that an evaluation runs together; the first of them renders
@@ -68,7 +76,7 @@ class EnvFlags:
     """action: a displacement of the normalised configuration, or the next one itself"""
     max_step: PositiveFloat = MAX_STEP
     """longest displacement per step (L2, normalised configuration)"""
-    horizon: PositiveInt = HORIZON
+    horizon: Horizon = HORIZON
     """steps after which an episode is truncated"""
     stop_on_collision: bool = False
     """end an episode at the first contact"""
@@ -79,18 +87,18 @@ class EnvFlags:
     `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/guide/perception.md),
     `point_cloud` for observed points, or `oracle` for the ground-truth obstacles; by default
     nothing"""
-    geometry_source: str | None = None
-    """where link distances take the obstacles from: `ground_truth`, `point_cloud`, or an encoder
-    with a decoder (`field`, or a path), which then also gives the points of `point_cloud`"""
-    link_distances: bool = False
+    link_distances: str | None = None
     """append the signed distance of each link from the nearest obstacle and its gradient to the
-    observation; needs --geometry-source"""
+    observation; the obstacles are those of a geometry source: `ground_truth`, `point_cloud`, or an
+    encoder with a decoder (`field`, or a path), which also gives the points of `point_cloud`"""
 
 
 def env_arguments_of(args):
     """The `EnvFlags` in a trainer's flags as a dict, for `envs.make`."""
     arguments = {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
-    return arguments | {"append_link_distances": args.link_distances}
+    has_distances = args.link_distances is not None
+    arguments |= {"geometry_source": args.link_distances, "link_distances": has_distances}
+    return arguments | {"append_link_distances": has_distances}
 
 
 def load_task(args):
@@ -113,6 +121,22 @@ def load_task(args):
         sys.exit(f"--task: {error}")
 
 
+def copy_weights(policy, module):
+    """Give a module the weights of a policy of the same sizes, a name or path: `--initial-policy`.
+
+    Ends the program with a message where that cannot be.
+    """
+    try:
+        given, own = load_network(policy_file(policy)).parameters(), list(module.parameters())
+        if [weights.shape for weights in given] != [weights.shape for weights in own]:
+            raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
+    except ValueError as error:
+        sys.exit(f"--initial-policy: {error}")
+    with torch.no_grad():
+        for weights, initial in zip(own, given, strict=True):
+            weights.copy_(initial)
+
+
 def _first(queries, flag, number):
     if number > len(queries):
         print(f"{flag} {number}: there are {len(queries)}, all of them are used", file=sys.stderr)
@@ -128,8 +152,9 @@ def make_envs(task, number, **kwargs):
     try:
         return [envs.make(task, **kwargs) for _ in range(number)]
     except ValueError as error:
-        given = [name for name in ("encoder", "geometry_source") if kwargs.get(name) is not None]
-        flags = " or ".join(f"--{name.replace('_', '-')}" for name in given)
+        names = {"encoder": "--encoder", "geometry_source": "--link-distances"}
+        given = [flag for name, flag in names.items() if kwargs.get(name) is not None]
+        flags = " or ".join(given)
         sys.exit(f"{flags}: {error}" if given else str(error))
 
 
@@ -150,44 +175,30 @@ def make_training_envs(args, demo_prob=None, demos=None):
         demo_prob: value of the flag --demo-prob, if the trainer has it.
         demos: value of the flag --demos, a file; by default the task's own.
 
+    Returns:
+        The `envs.training.collection.TrainingEnvs`.
+
     Raises:
         SystemExit: an argument is rejected, or the demonstrations do not fit.
     """
     if demo_prob is None and demos is not None:
         sys.exit("--demos goes with --demo-prob")
     made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
+    # A GPU waits for its environments; on a CPU they take less time than the updates.
+    processes = min(args.num_envs, CORES) if torch.device(args.device).type == "cuda" else 0
     if demo_prob is None:
-        return made
+        return TrainingEnvs(made, processes=processes)
     try:
         demos = load_demos_for(made[0], demos or args.task, args.task)
     except ValueError as error:
         sys.exit(f"--demo-prob: {error}")
-    return [DemoQueriesWrapper(env, demos) for env in made]
-
-
-def encode_demos(envs):
-    """Encode the scenes of training environments' demonstrations, if they have both.
-
-    It may take minutes, once; without it, scenes are encoded at their resets.
-    """
-    if isinstance(envs[0], DemoQueriesWrapper) and hasattr(envs[0].env, "encoder"):
-        envs[0].env.encoder.encode_demos(envs[0].demos)
-
-
-def begin_episodes(envs, seed, step):
-    """First observations of new episodes, whose random numbers depend on seed and step only.
-
-    A trainer that begins new episodes at every checkpoint continues exactly without saving the
-    simulator's state.
-    """
-    seeds = np.random.SeedSequence([seed, step]).generate_state(len(envs)).tolist()
-    return [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
+    return TrainingEnvs([DemoQueriesWrapper(env, demos) for env in made], demo_prob, processes)
 
 
 def stack(observations, device):
     """List of observation dicts -> dict of float32 tensors (N, ...)."""
     return {
-        name: torch.as_tensor(np.stack([o[name] for o in observations]), device=device)
+        name: to_device(np.stack([o[name] for o in observations]), device)
         for name in observations[0]
     }
 
@@ -307,7 +318,7 @@ class PolicyRun(Run):
     """A run that trains a policy, and validates, saves and tests it under the benchmark's protocol.
 
     Args:
-        args: the flags, `task`, `goal_type`, `exp_name` and `seed` among them.
+        args: the flags, `task`, `goal_type` and `seed` among them.
         state: dict from names to the parts of the run, as for `runs.Run`.
         device: of the run.
         env_arguments: dict of `envs.make`'s arguments, which `policy.pt` is evaluated with.
@@ -325,17 +336,15 @@ class PolicyRun(Run):
         self.validation, self.safety_filter = validation, safety_filter
         self._recent = collections.deque(maxlen=100)  # outcomes of training episodes
 
-    def log_episode(self, step, episode_return, info):
-        """Log a training episode.
-
-        Args:
-            step: of the training, at which the episode ended.
-            episode_return: sum of its rewards.
-            info: of its last step.
-        """
-        self._recent.append(info["is_success"])
-        values = {"episodic_return": episode_return, "episodic_length": info["elapsed_steps"]}
+    def log_episode(self, episode, demos_injected):
+        """Log a `FinishedEpisode`, and with --demo-prob how many demonstrations were added."""
+        self._recent.append(episode.info["is_success"])
+        values = {"episodic_return": episode.episode_return}
+        values |= {"episodic_length": episode.info["elapsed_steps"]}
+        if self.args.demo_prob is not None:
+            values["demos_injected"] = demos_injected
         values["success"] = np.mean(self._recent)
+        step = self.step + episode.number + 1  # every environment's step counts
         self.log({f"charts/{name}": value for name, value in values.items()}, step)
 
     def validate(self, policy):
@@ -383,7 +392,7 @@ class PolicyRun(Run):
         metadata |= robot_metadata(self.eval_envs[0].unwrapped.robot)
         if self.safety_filter is not None:
             metadata["safety_filter"] = self.safety_filter.to_metadata()
-        metadata |= {"script": args.exp_name, "seed": args.seed, "step": self.step}
+        metadata |= {"script": script_name(), "seed": args.seed, "step": self.step}
         example = stack([env.reset(seed=0)[0] for env in self.eval_envs[:2]], self.device)
         if size := recurrent_size(policy):
             metadata["recurrent_size"] = size

@@ -19,7 +19,7 @@
             run.checkpoint()                # an interrupted run ends here
     run.close()
 
-Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`, `exp_name` at least.
+Every trainer uses these. Its `Args` is a dataclass that adds to `RunFlags`.
 A trainer of a policy uses `envs.training.protocol.PolicyRun`. These functions are for scripts:
 on a mistake of the user, they end the program with a message.
 """
@@ -103,8 +103,6 @@ def parse_args(Args, may_change=()):
             check_folder(args.runs_dir)
     except ValueError as error:
         sys.exit(f"--runs-dir {error}")
-    if Path(args.exp_name).name != args.exp_name:
-        sys.exit(f"--exp-name must be part of a folder's name, got {args.exp_name!r}")
     try:
         device = torch.device(args.device)
     except RuntimeError:
@@ -173,6 +171,20 @@ def write_json(path, content):
     write_atomically(path, _to_json(content).encode())
 
 
+@contextlib.contextmanager
+def errors_of(flag):
+    """Inside, a ValueError ends the program with a line that names the flag, e.g. "--paths"."""
+    try:
+        yield
+    except ValueError as error:
+        sys.exit(f"{flag}: {error}")
+
+
+def script_name():
+    """The name of the trainer's file without its ending: a part of the name of a run's folder."""
+    return Path(sys.argv[0]).stem
+
+
 def run_folder(args, task):
     """The run's folder: that of --resume, otherwise a new one, with the flags in `args.json`.
 
@@ -184,7 +196,7 @@ def run_folder(args, task):
         clear_leftovers(args.resume)
         sys.excepthook = functools.partial(_say_plainly, args.resume)
         return args.resume
-    name = f"{task}__{args.exp_name}__{args.seed}__{int(time.time())}"
+    name = f"{task}__{script_name()}__{args.seed}__{int(time.time())}"
     for again in itertools.count(1):  # another run may have begun in the same second
         run = args.runs_dir / (name if again == 1 else f"{name}_{again}")
         with contextlib.suppress(FileExistsError):
@@ -313,6 +325,9 @@ def _restore(part, state):
         part.update(state)
     else:
         part.load_state_dict(state)
+        for group in getattr(part, "param_groups", ()):
+            if isinstance(group["lr"], torch.Tensor):  # of `envs.training.cuda_graphs.adam`
+                group["lr"] = group["lr"].to(group["params"][0].device)
 
 
 def summary_writer(run, args, step):
@@ -464,8 +479,9 @@ class Run:
             exit_interrupted(self._interrupt, f"{where}; --resume {self.folder} continues there")
 
     def write_result(self, result):
-        """Write `result.json`: a dict, and the flags."""
-        write_json(self.folder / "result.json", result | {"args": asdict(self.args)})
+        """Write `result.json`: a dict, the trainer's name (`script`), and the flags."""
+        result = result | {"script": script_name(), "args": asdict(self.args)}
+        write_json(self.folder / "result.json", result)
 
     def close(self):
         """Close progress bar and writer. From here on, a signal ends the program at once."""

@@ -21,3 +21,4 @@ class Stream(enum.IntEnum):
     ROADMAPS = 5
     DAGGER_EXAMPLES = 6
     DAGGER_ROUNDS = 7
+    SENSOR_NOISE = 8

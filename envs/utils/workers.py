@@ -8,6 +8,7 @@ import collections
 import concurrent.futures
 import contextlib
 import importlib.util
+import itertools
 import multiprocessing
 import os
 import re
@@ -31,7 +32,7 @@ def run(make_worker, arguments, jobs, workers, warn=print):
     """
     waiting, deaths = collections.deque(jobs), 0
     while waiting:
-        with _starting_processes():
+        with starting_processes():
             executor = concurrent.futures.ProcessPoolExecutor(
                 workers, multiprocessing.get_context("spawn"), _start, (make_worker, arguments)
             )
@@ -39,7 +40,7 @@ def run(make_worker, arguments, jobs, workers, warn=print):
         try:
             while waiting or running:
                 while waiting and len(running) < 2 * workers:
-                    with _starting_processes():  # at the first job
+                    with starting_processes():  # at the first job
                         running[executor.submit(_work, waiting[0])] = waiting[0]
                     waiting.popleft()
                 done, _ = concurrent.futures.wait(
@@ -65,8 +66,41 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             executor.shutdown(cancel_futures=True)
 
 
+def in_order(work, jobs, workers):
+    """Yield `work(job)` of every job, in their order; `workers` processes work ahead.
+
+    Args:
+        work: a picklable function.
+        jobs: an iterable, which may be endless: closing this generator ends the processes.
+        workers: >= 0; without a process, a job is done when its result is asked for.
+
+    Raises:
+        BrokenProcessPool: a process died.
+        Exception: the exception of a job.
+    """
+    if workers == 0:
+        yield from map(work, jobs)
+        return
+    context, jobs, running = multiprocessing.get_context("spawn"), iter(jobs), collections.deque()
+    executor = concurrent.futures.ProcessPoolExecutor(workers, context, _start, (_same, (work,)))
+    try:
+        while True:
+            for job in itertools.islice(jobs, 2 * workers - len(running)):
+                with starting_processes():
+                    running.append(executor.submit(_work, job))
+            if not running:
+                return
+            yield running.popleft().result()
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _same(work):
+    return work
+
+
 @contextlib.contextmanager
-def _starting_processes():
+def starting_processes():
     """A context for starting processes: SIGINT and SIGTERM, also of a terminal, wait for its end.
 
     Neither this process is interrupted between two of its steps, nor a new one killed while this
@@ -88,11 +122,16 @@ def _starting_processes():
             signal.raise_signal(number)
 
 
-def _start(make_worker, arguments):
-    global _worker
+def begin_worker():
+    """What a process of `starting_processes` does first. It ends when its parent was killed."""
     # SIGINT stays blocked: a terminal sends Ctrl-C to this process, too, but the parent handles it.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+def _start(make_worker, arguments):
+    global _worker
+    begin_worker()
     _worker = make_worker(*arguments)
 
 

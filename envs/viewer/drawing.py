@@ -8,8 +8,9 @@ import numpy as np
 
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, find_geometry_source
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
+from roboarm_nmp.envs.perception.sensors import SceneObservation
 from roboarm_nmp.envs.robots.panda import scale_of
-from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, Cylinder, hull_faces
+from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, Cylinder, hull_faces, obstacle_at
 from roboarm_nmp.envs.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, arm_joints, link_meshes
 
 # m, for the Panda; for other arms in proportion to their reach.
@@ -177,7 +178,7 @@ class Drawing:
                 self._places.append(_Place(self._scene, simulation.robot, index, self._cell))
                 self._add_floor()
             place = self._places[index]
-            self._draw_scene(place, simulation.query.scene)
+            self._draw_scene(place, simulation.query.scene, arm.time)
             self._draw_arm(place, arm)
             self._draw_overlays(place, arm)
 
@@ -199,12 +200,13 @@ class Drawing:
 
     # --- The scene
 
-    def _draw_scene(self, place, scene):
-        shown = scene, self.selected
-        if place.scene is not None and place.scene[0] is scene and place.scene[1] == self.selected:
+    def _draw_scene(self, place, scene, time):
+        shown = scene, self.selected, 0.0 if scene.is_static else time
+        if place.scene is not None and place.scene[0] is scene and place.scene[1:] == shown[1:]:
             return
+        # None for an obstacle that is absent, so that the others keep their numbers.
         bodies = [
-            (body, TOUCHABLE_COLOUR if body.may_touch else OBSTACLE_COLOUR)
+            (obstacle_at(body, time), TOUCHABLE_COLOUR if body.may_touch else OBSTACLE_COLOUR)
             for body in scene.obstacles
         ]
         if self.selected is not None and self.selected < len(bodies):
@@ -282,15 +284,21 @@ class Drawing:
 
     def _draw_overlays(self, place, arm):
         robot = self.simulation.robot
-        self._points(place, "observed", OBSERVED_COLOUR, arm, _observed)
+        observed = _observed if self.simulation.query.scene.is_static else self._observed_now
+        self._points(place, "observed", OBSERVED_COLOUR, arm, observed)
         self._points(place, "decoded", DECODED_COLOUR, arm, _decoded)
         self._lines(place, "distances", 0.004, lambda: _distance_lines(arm, self.simulation))
         self._lines(place, "correction", 0.012, lambda: _arrows(arm, robot), arrows=True)
         self._lines(place, "trace", 0.006, lambda: _trace(arm, robot))
         self._contacts(place, arm)
 
+    def _observed_now(self, scene, arm):
+        """Of moving obstacles, with the arm where it is."""
+        configuration = self.simulation.robot.denormalise(arm.state)
+        return observed_points(SceneObservation.of(scene, configuration))
+
     def _points(self, place, name, colour, arm, find):
-        scene = self.simulation.query.scene
+        scene = self.simulation.query.scene.at(arm.time)
         drawn, handle = place.shapes.get(name, (None, None))
         if name not in self.show:
             if handle is not None:
@@ -375,7 +383,8 @@ def _decoded(scene, arm):
 
 def _distance_lines(arm, simulation):
     """Lines (n, 2, 3), m, from each link to the nearest geometry, and their colours (n, 2, 3)."""
-    checker = find_geometry_source(arm.geometry_source or GROUND_TRUTH)(simulation.query.scene)
+    scene = simulation.query.scene.at(arm.time)
+    checker = find_geometry_source(arm.geometry_source or GROUND_TRUTH)(scene)
     found = checker.signed_distances(np.clip(arm.state, -1.0, 1.0), False, within=FAR)
     near = np.isfinite(found.distance)
     distance, witness = found.distance[near], found.witness[near]

@@ -26,9 +26,10 @@ from roboarm_nmp.envs.datasets.format import ORIGINAL, SPLITS, DatasetError
 from roboarm_nmp.envs.datasets.queries import Query, load_queries, query_path
 from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.datasets.trajectories import load_trajectory
-from roboarm_nmp.envs.policies.baselines import PLANNERS
+from roboarm_nmp.envs.policies.baselines import CHECKING, PLANNERS
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
 from roboarm_nmp.envs.policies.rollout import Episode
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
@@ -159,9 +160,9 @@ class KinematicWorld(World):
 
     def simulate(self):
         """Put the arm at its target. Returns whether it is in contact there."""
-        return self.in_collision(self._target)
+        return self.in_collision(self._target, self.time + STEP_SECONDS)
 
-    def check_free(self, **configurations):
+    def check_free(self, ignoring_motions=(), **configurations):
         """Allows contacts: obstacles may be moved into the arm."""
 
 
@@ -223,6 +224,11 @@ class _Arm:
         self.contacts, self.success, self.ended = NO_CONTACTS, False, False
         self.kinematic, self.problem, self.ms_per_action = False, None, None
         self.wanted, self.action, self.correction, self.escaping = None, None, None, False
+
+    @property
+    def time(self):
+        """Seconds of simulated time since the start, or the last edit."""
+        return self.steps * STEP_SECONDS
 
     @property
     def in_contact(self):
@@ -288,7 +294,7 @@ class RecordedArm(_Arm):
         self.steps += 1
         self.state = self._states[self.steps]
         self.trace.append(self.state)
-        self._world.in_collision(self._world.robot.denormalise(self.state))
+        self._world.in_collision(self._world.robot.denormalise(self.state), self.time)
         self.contacts = contacts_in(self._world)
         self.contact_steps += self.in_contact
         self.ended = self.success = self.steps == len(self._states) - 1
@@ -340,7 +346,7 @@ class PolicyArm(_Arm):
             source = arguments["geometry_source"] = source or GROUND_TRUTH
         elif arguments.get("encoder") == "point_cloud" and source != GROUND_TRUTH:
             source = arguments["geometry_source"] = source or "point_cloud"
-        elif path in PLANNERS:
+        elif path in CHECKING:
             source = source or GROUND_TRUTH
         else:
             source = None
@@ -380,7 +386,7 @@ class PolicyArm(_Arm):
             self._kinematics = KinematicWorld(query.scene, drawn=False)
         self.env.unwrapped.world = self._kinematics
         self._kinematics.set_scene(query.scene)
-        collides = self._kinematics.in_collision(query.goal)
+        collides = self._kinematics.in_collision(query.goal, moving=False)
         self._start(query._replace(start=self.env.unwrapped.robot.denormalise(self.state)))
         self.kinematic = True
         if collides:

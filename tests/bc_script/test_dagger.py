@@ -67,7 +67,9 @@ def setting(request, folder, tmp_path_factory):
     actor = dagger.Actor(args, env)
     torch.nn.init.normal_(actor.head.weight)  # (the initial one ignores the scene)
     latents = torch.as_tensor(env.encoder.encode_demos(paths))
-    yield actor, env, dagger.with_scene(batch, latents, actor.token_size)
+    latents = dagger.without_padding(latents, actor.token_size)
+    scenes = latents[batch["scene"]]
+    yield actor, env, batch | {"observation": torch.cat([batch["observation"], scenes], dim=1)}
     env.close()
 
 
@@ -83,7 +85,7 @@ def test_update(setting):
     actor, _, batch = setting
     old, actor = copy.deepcopy(actor), copy.deepcopy(actor)
     optimizer = torch.optim.Adam(actor.parameters(), lr=1e-3)
-    losses = dagger.update(actor, optimizer, batch, 0.1)
+    losses = list(dagger.update(actor, optimizer, batch, 0.1).values())
     with torch.no_grad():
         direction, length = (x.double().numpy() for x in old.outputs(**inputs_of(batch)))
     label = batch["direction"].double().numpy()
@@ -93,7 +95,7 @@ def test_update(setting):
     assert losses[0].item() == pytest.approx(1.0 - cosine.mean(), abs=1e-5)
     assert losses[1].item() == pytest.approx(smooth.mean(), rel=1e-4)
     for _ in range(30):
-        last = dagger.update(actor, optimizer, batch, 0.1)
+        last = list(dagger.update(actor, optimizer, batch, 0.1).values())
     assert last[0] < losses[0] - 0.02 and last[1] < losses[1]
 
 
@@ -255,6 +257,29 @@ def test_interrupted_run_continues_bit_for_bit(tmp_path, folder, monkeypatch, sh
     for name in ("actor", "actor_average", "visited"):
         assert one[name].keys() == other[name].keys() and one[name]
         assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
+
+
+def test_run_begins_with_the_weights_of_another_policy(tmp_path, folder, short_episodes):
+    flags = ["--paths", str(folder), str(folder), "--encoder", "oracle", "--round-every", "0"]
+    flags += ["--eval-every", "40", "--eval-queries", "1", "--test-queries", "0"]
+    first = run_script("dagger", tmp_path / "first", *flags)
+    flags += ["--initial-policy", str(first), "--learning-rate", "1e-9", "--total-updates", "1"]
+    second = run_script("dagger", tmp_path / "second", *flags)
+    one, other = (load_network(run / "policy.pt").parameters() for run in (first, second))
+    assert len(one) > 10 and one[-2].abs().max() > 0.001  # the head, which begins with zeros
+    for weights, same in zip(one, other, strict=True):
+        torch.testing.assert_close(weights, same, atol=1e-6, rtol=0.0)
+
+
+@pytest.mark.parametrize(
+    "policy, message",
+    [(f"dagger-combined-point_cloud-{HARD}-s1", "{}: the sizes"), ("nobody", "no such")],
+)
+def test_initial_policy_that_does_not_fit_is_rejected(tmp_path, folder, policy, message, capsys):
+    flags = ["--paths", str(folder), "--initial-policy", policy]
+    assert "--initial-policy: " + message.format(policy) in refusal(
+        "dagger", capsys, tmp_path, *flags
+    )
 
 
 def test_goal_poses_are_imitated_saved_and_evaluated(tmp_path, folder, short_episodes):

@@ -293,7 +293,7 @@ def test_run_folder_is_printed_before_demonstrations_are_encoded(
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
         (["--resume", "nowhere"], "nowhere is no run's folder"),
         (["--goal-type", "poses"], "goal-type"),
-        (["--buffer-size", "49"], "--buffer-size 49: an episode has 50 transitions"),
+        (["--horizon", "1000001"], "--horizon must be in [1, 1000000], got 1000001"),
         (["--demo-prob", "1.5"], "--demo-prob must be in [0, 1], got 1.5"),
         (["--demo-prob", "1", "--velocities"], "demonstrations have no velocities"),
         (["--demo-prob", "1", "--max-step", "0.02"], "steps up to 0.03"),

@@ -24,11 +24,11 @@ EXAMPLE = ROOT / "examples" / "robots" / "xarm6.yaml"
 PANDAS = "sac-ee-wall-p1-s1"  # a pretrained policy
 SHORT = {
     "sac_her_mp": ["--total-timesteps", "400", "--goal-type", "combined", "--velocities"],
-    "td3_her_mp": ["--total-timesteps", "400", "--link-distances"],
+    "td3_her_mp": ["--total-timesteps", "400", "--link-distances", "ground_truth"],
     "bc": ["--total-updates", "300", "--eval-every", "300", "--num-modes", "2"],
     "dagger": ["--task", "no_obstacles"],
 }
-SHORT["td3_her_mp"] += ["--geometry-source", "ground_truth", "--demo-prob", "1"]
+SHORT["td3_her_mp"] += ["--demo-prob", "1"]
 
 
 @pytest.fixture(scope="module")

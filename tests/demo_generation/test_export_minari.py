@@ -1,6 +1,7 @@
 """The Minari export: its episodes are those of the environment, and replay in it."""
 
 import dataclasses
+import shutil
 import subprocess
 import sys
 
@@ -14,8 +15,9 @@ import minari  # noqa: E402
 
 from roboarm_nmp import envs  # noqa: E402
 from roboarm_nmp.demo_generation import collect, export_minari  # noqa: E402
-from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos  # noqa: E402
+from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos, write_demos  # noqa: E402
 from roboarm_nmp.envs.datasets.format import QueryScenes  # noqa: E402
+from roboarm_nmp.envs.robots.files import load_robot  # noqa: E402
 from roboarm_nmp.envs.robots.panda import PANDA  # noqa: E402
 from roboarm_nmp.envs.scenes.files import save_scene  # noqa: E402
 from roboarm_nmp.envs.scenes.primitives import to_array  # noqa: E402
@@ -177,17 +179,31 @@ def test_scenes_that_vary_are_rejected(demos, storage):
     assert list(storage.iterdir()) == []
 
 
-def test_scene_file_is_rejected(demos, storage, tmp_path_factory):
+def test_scene_file_is_exported_with_its_path(demos, storage, tmp_path_factory):
     folder = tmp_path_factory.mktemp("own")
     save_scene(envs.TASKS["wall"].scene, folder / "mine.yaml")
     columns = {name: getattr(demos, name) for name in ("plan_seed", "digest", "collided")}
     plans, states = zip(*((demo.plan, demo.states) for demo in demos), strict=True)
     file = folder / "mine_demos.h5"
     write_demos(file, str(folder / "mine.yaml"), 5, plans, states, columns, "a test", {})
-    for source in ({"file": file}, {"task": str(folder / "mine.yaml")}):
-        with pytest.raises(SystemExit, match="^error: .* task 'mine' is not in envs.TASKS"):
-            export_minari.main(export_minari.Args(**source))
+    with pytest.raises(SystemExit, match="^error: .* task 'mine' is not in envs.TASKS: .* --task"):
+        export_minari.main(export_minari.Args(file=file))
     assert list(storage.iterdir()) == []
+    export_minari.main(export_minari.Args(task=str(folder / "mine.yaml")))
+    dataset = minari.load_dataset("roboarm-nmp/mine/ee-v0")
+    assert dataset.recover_environment().unwrapped.scene == envs.TASKS["wall"].scene
+
+
+def test_another_arm_is_exported_with_its_file(storage, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("arm")
+    robot = shutil.copy(ROOT / "examples" / "robots" / "xarm6.yaml", folder)
+    task = f"no_obstacles@{robot}"
+    collect.collect(demo_path(task), 2, OPTIONS | {"task": task}, progress=False)
+    export_minari.main(export_minari.Args(task="no_obstacles", robot=robot))
+    dataset = minari.load_dataset("roboarm-nmp/no_obstacles-xarm6/ee-v0")
+    env = dataset.recover_environment()
+    assert env.unwrapped.robot == load_robot(robot) and env.action_space == dataset.action_space
+    assert dataset[0].actions.shape[1] == 6
 
 
 def test_existing_dataset_is_replaced_only_on_demand_and_as_a_whole(demos, storage, monkeypatch):
@@ -233,7 +249,8 @@ def test_main_names_the_error(path, monkeypatch):
             export_minari.main(export_minari.Args(**flags))
         return caught.value.code
 
-    assert error() == "error: give --task or --file, one of them"
+    assert error() == "error: give --task, or the --file of a named task of the Panda"
+    assert error(file=path, robot=path) == error()
     assert "no such file" in error(file=path.with_name("none.h5"))
     for bad in ("no version-v0", "name", "../up-v0"):
         assert f"bad dataset id {bad!r}" in error(file=path, dataset_id=bad)

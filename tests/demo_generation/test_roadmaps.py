@@ -13,6 +13,7 @@ import pytest
 from paths import ROOT
 
 from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.place_configurations import place_configurations
 from roboarm_nmp.demo_generation.roadmaps import Args, Roadmap, collect
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.format import DatasetError
@@ -204,6 +205,39 @@ def test_margin_below_that_of_the_nodes_is_rejected():
         Roadmap(Scene(), np.random.default_rng(0), margin=0.001)
 
 
+# --- Places
+
+
+def test_place_configurations_are_near_surfaces_with_the_hand_in_a_place():
+    task, inside = envs.get_task("containers").scene, 0
+    for seed in range(3):
+        scene, places = task.sample_with_places(np.random.default_rng([1, seed]))
+        given = scene, places, np.random.default_rng(seed), 6
+        ends, on_ways = place_configurations(*given)
+        assert 3 <= len(ends) <= min(6, len(on_ways))  # not all places are within reach
+        given = scene, places, np.random.default_rng(seed), 6
+        np.testing.assert_array_equal(place_configurations(*given)[0], ends)
+        assert distances(scene, ends).min() > 0.003 - 1e-4
+        for state in ends:
+            at = PANDA.forward_kinematics(PANDA.denormalise(state))
+            for place in places:
+                x, y, z = at - place.centre
+                cos, sin = np.cos(place.yaw), np.sin(place.yaw)
+                local = np.array([cos * x + sin * y, cos * y - sin * x, z])
+                inside += (np.abs(local) <= place.size / 2 + 2e-4).all()
+    assert inside >= 5  # the others have retreated
+
+
+def test_paths_lead_out_of_places_and_into_them(tmp_path):
+    options = SMALL | {"task": "containers", "scenes": 1, "paths_per_scene": 12}
+    found = collect(Args(tmp_path, **options), progress=False).of_scene(0)
+    goals = np.unique([path[-1] for path in found], axis=0)
+    starts = np.array([path[0] for path in found])
+    assert len(found) == 12 and len(goals) <= 3  # one in five is anywhere
+    assert (starts[:, None] == goals).all(2).any()
+    assert all(np.linalg.norm(np.diff(path, axis=0), axis=1).all() for path in found)
+
+
 # --- Collections
 
 
@@ -276,6 +310,18 @@ def test_interrupted_command_continues_to_the_same_files(collected, tmp_path, nu
     collect(Args(tmp_path, **SMALL), progress=False)
     assert shard_path(tmp_path, 0).stat().st_mtime_ns == written
     assert files(tmp_path) == files(collected)
+
+
+def test_joined_collections_have_the_paths_of_both(collected, tmp_path):
+    collect(Args(tmp_path, **SMALL | {"task": "containers", "scenes": 1}), progress=False)
+    parts = [load_roadmap_paths(tmp_path), load_roadmap_paths(collected)]
+    joined = load_roadmap_paths([tmp_path, collected])
+    assert len(joined) == 6 and joined.task == "containers"
+    whole = [(part.scenes[i], part.of_scene(i)) for part in parts for i in range(len(part))]
+    for i, (scene, paths) in enumerate(whole):
+        assert joined.scenes[i] == scene
+        assert all(map(np.array_equal, joined.of_scene(i), paths)) and len(paths) == 6
+    assert joined.scenes[0].table is None and joined.scenes[1].table is not None
 
 
 def test_more_scenes_extend_a_collection(collected, tmp_path):

@@ -22,7 +22,7 @@ from paths import ROOT
 from roboarm_nmp import TASKS, __main__
 from roboarm_nmp.envs.policies.registry import find_policy
 
-OTHER_TASKS = {"mixed_scenes", "roadmaps"}  # to train on; a folder, for the viewer
+OTHER_TASKS = {"mixed_scenes", "containers", "roadmaps"}  # to train on; a folder, for the viewer
 OPTIONAL = {"panda_gym", "optuna", "ray", "viser"}  # imported before arguments are parsed
 SHELL = ("", "bash", "sh", "shell", "console", "text")
 

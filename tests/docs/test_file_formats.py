@@ -9,6 +9,7 @@ import roboarm_nmp
 from roboarm_nmp.envs.datasets.format import (
     DEMO_ARRAYS,
     HULL_ARRAYS,
+    MOTION_ARRAYS,
     QUERY_ARRAYS,
     SCENE_ARRAYS,
     TOUCH_ARRAYS,
@@ -31,7 +32,7 @@ def code(title, language):
 
 def test_arrays_are_listed_with_their_dtypes():
     for title, arrays in (
-        ("Queries", QUERY_ARRAYS | SCENE_ARRAYS | HULL_ARRAYS | TOUCH_ARRAYS),
+        ("Queries", QUERY_ARRAYS | SCENE_ARRAYS | HULL_ARRAYS | TOUCH_ARRAYS | MOTION_ARRAYS),
         ("Demonstrations", DEMO_ARRAYS),
         ("Problems", PROBLEM_ARRAYS),
     ):

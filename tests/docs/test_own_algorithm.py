@@ -16,12 +16,11 @@ PAGE = (ROOT / "docs/customise/algorithm.md").read_text()
 
 
 def test_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
-    name, before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:3]
+    before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:2]
     source = PATHS["sac_her_mp"].read_text()
     assert source.count(before) == 1
     script = tmp_path / "sac_final_mp.py"
-    source = source.replace('    exp_name: str = "sac_her_mp"\n', name).replace(before, after)
-    script.write_text(source)
+    script.write_text(source.replace(before, after))
 
     run_here(script, "--runs-dir", tmp_path / "runs", *TINY.split(), "--task", "wall")
     (run,) = (tmp_path / "runs").glob("wall__sac_final_mp__1__*")
@@ -36,7 +35,7 @@ def test_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
 
 
 def test_example_relabels_with_the_ends_of_episodes(tmp_path, monkeypatch):
-    _, before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:3]
+    before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:2]
     script = tmp_path / "sac_final_mp.py"
     script.write_text(PATHS["sac_her_mp"].read_text().replace(before, after))
     monkeypatch.setitem(PATHS, "sac_final_mp", script)

@@ -9,7 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,7 @@ COMMANDS = [
     for line in text.splitlines()
     if kind == "" and line.startswith(("python ", "roboarm "))
 ]
+OF_MY_SCENE = [command for command in COMMANDS if "moving.yaml" not in command]
 YAML = next(text for kind, text in BLOCKS if kind == "yaml")
 POSTS = [text for kind, text in BLOCKS if kind == "python"][-1]
 
@@ -116,8 +117,10 @@ def page(tmp_path_factory):
         patch.setattr(show, "MAX_FRAMES", 4)
         for kind, text in BLOCKS:
             if kind == "yaml":
-                Path("from_python.yaml").write_bytes(Path("my_scene.yaml").read_bytes())
-                Path("my_scene.yaml").write_text(text)
+                name = Path(text.split()[1])  # its first line: "# NAME"
+                if name.exists():
+                    Path("from_python.yaml").write_bytes(name.read_bytes())
+                name.write_text(text)
             elif kind == "python":
                 exec(text, names)
             for line in text.splitlines():
@@ -146,7 +149,7 @@ def result_of(page, part):
 
 
 def test_the_commands_work(page):
-    assert len(page[1]) == len(COMMANDS) == 14
+    assert len(page[1]) == len(COMMANDS) == 15
     for command, result in page[1].items():
         window = "show" in command and "--output" not in command
         assert result.code == (2 if window else 0), (command, result.error)
@@ -156,6 +159,8 @@ def test_the_commands_work(page):
     assert sorted(path.name for path in page[0].iterdir()) == [
         "episode.gif",
         "from_python.yaml",
+        "moving.gif",
+        "moving.yaml",
         "my_scene.yaml",
         "my_scene_demos.h5",
         "my_scene_queries.h5",
@@ -176,6 +181,17 @@ def test_the_scene_is_what_the_page_says(page):
     assert turned.orientation == pytest.approx(
         (0, 0, math.sin(math.pi / 12), math.cos(math.pi / 12))
     )
+
+
+def test_obstacles_of_the_page_move(page):
+    scene = load_scene(page[0] / "moving.yaml")
+    swinging, sphere, turning, cylinder = scene.obstacles
+    assert scene.at(0.0).obstacles[0] == replace(swinging, motion=None)
+    assert [round(scene.at(t).obstacles[0].position[1], 9) for t in (1, 3)] == [0.2, -0.2]
+    assert scene.at(5.0).obstacles[1].position == pytest.approx((0.4, -0.5, 0.7))
+    assert [len(scene.at(t).obstacles) for t in (0, 1, 4, 6, 100)] == [3, 4, 3, 4, 4]
+    with Image.open(page[0] / "moving.gif") as animation:
+        assert animation.n_frames > 1
 
 
 def test_queries_and_demonstrations_are_beside_the_scene(page):
@@ -212,7 +228,7 @@ def test_training_and_evaluating(page):
 # --- What is refused
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", OF_MY_SCENE)
 def test_malformed_scene_file_is_rejected_with_its_line(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my_scene.yaml").write_text(YAML.replace("length:", "height:"))
@@ -229,7 +245,7 @@ def test_files_of_a_changed_scene_are_out_of_date(inside):
     for load, expected in ((load_queries, queries), (load_demos, demos)):
         with pytest.raises(DatasetError, match=f"^{expected}roboarm (queries|collect)"):
             load("my_scene.yaml")
-    for command in COMMANDS:
+    for command in OF_MY_SCENE:
         if "roboarm queries" in command or "show" in command and "--output" not in command:
             continue
         if "RUN" in command:

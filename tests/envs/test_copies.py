@@ -216,7 +216,9 @@ def test_sensor_wrapper_and_its_copy_observe_the_same(make_copy, every_step):
         "camera": Camera((1.6, 0.0, 0.8), size=(16, 16)),
         "cloud": PointCloud((0.0, 1.6, 0.8), num_samples=64),
     }
-    env = SensorWrapper(envs.make("random_boxes_hard", horizon=20), sensors, every_step)
+    env = SensorWrapper(
+        envs.make("random_boxes_hard", horizon=20), sensors, 1 if every_step else None
+    )
     env.reset(seed=0)
     play(env, 10, 0)
     twin = make_copy(env)

@@ -18,8 +18,10 @@ import roboarm_nmp
 from roboarm_nmp.clean_rl_scripts import evaluate as evaluate_script
 from roboarm_nmp.envs import import_problems as command
 from roboarm_nmp.envs import show
-from roboarm_nmp.envs.datasets.problems import load_problems
+from roboarm_nmp.envs.datasets.problems import Problem, load_problems, write_problems
 from roboarm_nmp.envs.import_problems import import_problems, summary
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.training.evaluation import EvaluationError
 
 IN_THE_CAN = MOVEIT_SCENE.replace("position: [0.6, 0.5, 0.07]", "position: [0.3, 0.0, 0.5]")
@@ -142,6 +144,37 @@ def test_trained_policy_is_evaluated_on_problems(folder, tmp_path):
     run(folder, "--output", tmp_path / "a.h5")
     found = roboarm_nmp.evaluate("bc-config-wall-s1", problems=tmp_path / "a.h5", num_queries=1)
     assert found["goal_type"] == "config" and found["problems"]["file"] == "a.h5"
+
+
+def test_evaluation_takes_the_nearest_free_goal_or_one_with_the_pose(tmp_path):
+    box = Scene((Box((0.4, 0.3, 0.3), (0.1, 0.1, 0.6)),))
+    start, near = np.array([0.0, 0.0, 0.0, -1.5, 0.0, 1.5, 0.8]), np.zeros(7)
+    near[0] = 0.2
+    far, blocked = 3.0 * near, np.array([0.64, 0.3, 0.0, -1.9, 0.0, 2.2, 0.8])
+    goals, pose = (
+        np.array([start + far, blocked, start - near]),
+        PANDA.end_effector_pose(start - far),
+    )
+    problems = [
+        Problem("several", start, goals, None, box),
+        Problem("a pose", start, np.empty((0, 7)), pose, box),
+    ]
+    write_problems(tmp_path / "a.h5", problems)
+    given = {"problems": tmp_path / "a.h5", "goal_type": "config"}
+    found = roboarm_nmp.evaluate("go-to-goal", **given)
+    assert found["success_rate"] == found["collision_free_success_rate"] == 1.0
+    # Straight to the one at -0.2 rad; the others are farther away, or in the box.
+    found = roboarm_nmp.evaluate("go-to-goal", **given, num_queries=1)
+    assert 0.1 < found["path_length"] < 0.25
+    blocked_only = problems[0]._replace(goals=np.array([blocked, blocked]))
+    beyond = problems[1]._replace(goal_pose=np.array([2.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0]))
+    for problem, message in (
+        (blocked_only, "all of its goals are in"),
+        (beyond, "cannot be reach"),
+    ):
+        write_problems(tmp_path / "a.h5", [problem])
+        with pytest.raises(EvaluationError, match=f"problem {problem.name}: .*{message}"):
+            roboarm_nmp.evaluate("go-to-goal", **given)
 
 
 def test_evaluation_of_unusable_problems_says_what_to_do(folder, tmp_path):

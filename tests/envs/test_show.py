@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.motions import Presence
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import TASKS, Task
 from roboarm_nmp.envs.utils.bullet import pybullet as p
@@ -243,6 +245,19 @@ def test_animation_has_as_many_frames_as_steps_or_as_allowed(tmp_path, capsys, m
     assert "test query 2, go-to-goal: reached the goal in " in capsys.readouterr().out
     few, _ = frames_of(tmp_path / "b.gif")
     assert 4 <= len(few) <= 5
+
+
+def test_obstacles_move_in_an_animation():
+    """A box that disappears after 1 s is not in the image of that time."""
+    env = env_of("no_obstacles")
+    box = Box((0.6, -0.3, 0.2), (0.2, 0.2, 0.2), motion=Presence(((0.0, 1.0),)))
+    query = Query(BENT, BENT, Scene((box,)))
+    options = {"times": (0.0, 1.0), "size": SMALL}
+    there, gone = show.render_configurations(env, query, [BENT, BENT], **options)
+    still = Query(BENT, BENT, Scene((replace(box, motion=None),)))
+    same, without = show.render_configurations(env, still, [BENT, BENT], size=SMALL)
+    assert np.array_equal(there, same) and not np.array_equal(gone, without)
+    env.close()
 
 
 def test_random_actions_depend_on_the_seed(tmp_path, monkeypatch):

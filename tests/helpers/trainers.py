@@ -29,7 +29,7 @@ TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --ev
 TINY_BC += " --test-queries 4 --total-updates 1200"
 TINY_DAGGER = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --pool-size 100"
 TINY_DAGGER += " --examples-per-update 10 --total-updates 40 --round-every 15 --round-queries 1"
-TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1"
+TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1 --workers 0"
 # For tests of what training leaves in the checkpoint: one evaluation, on one query.
 ONE_EVALUATION = ["--eval-every", "1200", "--eval-queries", "1", "--test-queries", "0"]
 

@@ -650,7 +650,8 @@ def test_queries_of_the_project_are_feasible_and_have_their_positions(task):
         chosen = np.random.default_rng(0).choice(len(queries), 20, replace=False)
         for start, goal, scene in queries[chosen]:
             env.set_scene(scene)
-            assert env.is_feasible(start) and env.is_feasible(goal)
+            assert env.is_feasible(start)
+            assert not scene.is_static or env.is_feasible(goal)
         for goal, position in zip(queries.goal[chosen], queries.goal_position[chosen], strict=True):
             for joint, angle in enumerate(goal):
                 p.resetJointState(robot, joint, angle, physicsClientId=client)

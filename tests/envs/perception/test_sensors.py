@@ -191,7 +191,7 @@ def test_sensor_wrapper_is_a_gymnasium_environment():
 
 def test_sensors_observe_once_per_episode_or_in_every_step():
     for every_step in (False, True):
-        env = SensorWrapper(envs.make("random_boxes_hard"), MIX, every_step)
+        env = SensorWrapper(envs.make("random_boxes_hard"), MIX, 1 if every_step else None)
         first, _ = env.reset(seed=4)
         assert env.observation_space.contains(first)
         for _ in range(20):
@@ -223,7 +223,7 @@ def test_code_of_perception_page_runs():
 def test_observing_changes_no_episode():
     plain = envs.make("random_boxes_hard", render_mode="rgb_array")  # with a goal's marker
     wrapped = SensorWrapper(
-        envs.make("random_boxes_hard", render_mode="rgb_array"), MIX, every_step=True
+        envs.make("random_boxes_hard", render_mode="rgb_array"), MIX, observe_every=1
     )
     marked = wrapped.reset(seed=3)[0]["sensors"]
     unmarked = SensorWrapper(envs.make("random_boxes_hard"), MIX)

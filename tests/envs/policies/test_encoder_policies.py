@@ -105,7 +105,7 @@ def test_appended_link_distances_in_observations_buffer_and_demonstrations():
 def flags(trainer, demos):
     more = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
     more += ["--goal-type", "combined", "--demos", demos, "--eval-queries", "1"]
-    distances = ["--link-distances", "--geometry-source", "ground_truth"]
+    distances = ["--link-distances", "ground_truth"]
     return more if trainer == "bc" else [*more, "--demo-prob", "1", *distances]
 
 

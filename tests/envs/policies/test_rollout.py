@@ -5,6 +5,7 @@ import pytest
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.datasets.queries import Query, load_queries
+from roboarm_nmp.envs.policies import rollout as rollouts
 from roboarm_nmp.envs.policies.registry import make_policy
 from roboarm_nmp.envs.policies.rollout import Episode, render_strip, rollout
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -109,3 +110,56 @@ def test_replay_renders_what_the_rollout_went_through():
     assert np.array_equal(strip, np.concatenate([images[step] for step in steps], axis=1))
     assert not np.array_equal(images[0], images[-1])
     env.close()
+
+
+def test_delayed_action_takes_effect_some_steps_later():
+    """Meanwhile the arm makes the step before it, then holds; the policy observes nothing."""
+    env, query = envs.RoboArmEnv(), Query(BENT, AT_THE_SIDE, Scene())
+    observed = []
+
+    def act(observation):
+        observed.append(observation["observation"][:7])
+        return np.full(7, len(observed), np.float32) / 1000
+
+    trajectory = rollout(env, query, act, delay=3)
+    commands = (trajectory.actions[:, 0] * 1000).round().astype(int)
+    assert commands[:12].tolist() == [0, 0, 0, 1, 0, 0, 2, 0, 0, 3, 0, 0]
+    assert np.array_equal(observed[:4], trajectory.states[:12:3])
+    assert len(trajectory) == env.horizon
+    assert len(rollout(env, query, act, delay=1).actions) == env.horizon
+
+
+def test_delay_of_one_step_is_the_action_before():
+    env, query = envs.RoboArmEnv(), Query(BENT, AT_THE_SIDE, Scene())
+    trajectory = rollout(env, query, straight(query), delay=1)
+    act, observation = straight(query), env.reset_specific(*query)[0]
+    previous = np.zeros(7)
+    for state, command in zip(trajectory.states[1:], trajectory.actions, strict=True):
+        assert np.array_equal(command, previous)
+        previous = act(observation)
+        observation, *_ = env.step(command)
+        assert np.array_equal(observation["observation"][:7], state)
+
+
+def test_held_arm_stays_where_it_is_in_mode_subgoal():
+    env, query = envs.RoboArmEnv(action_mode="subgoal"), Query(BENT, AT_THE_SIDE, Scene())
+    goal = PANDA.normalise(AT_THE_SIDE)
+    trajectory = rollout(env, query, lambda observation: goal, delay=10)
+    moved = np.linalg.norm(np.diff(trajectory.states, axis=0), axis=1)
+    moving = (moved > 5e-3).nonzero()[0]  # a step after each observation, and the lag of one
+    assert set(moving % 10) == {0, 1}
+
+
+def test_real_time_delays_by_the_time_that_an_action_takes(monkeypatch):
+    env, query, clock = envs.RoboArmEnv(), Query(BENT, AT_THE_SIDE, Scene()), [0.0]
+    monkeypatch.setattr(rollouts.time, "perf_counter", lambda: clock[0])
+
+    def act(observation):
+        clock[0] += 0.070  # s, which are three steps of 1/30 s
+        return np.full(7, 0.001, np.float32)
+
+    plain = rollout(env, query, act, "real_time")
+    assert (plain.actions[:9, 0] > 0).tolist() == [False] * 3 + [True, False, False] * 2
+    late = rollout(env, query, act, "real_time", planning_seconds=0.1)
+    assert (late.actions[:9, 0] > 0).tolist() == [False] * 6 + [True, False, False]
+    assert plain.times.sum() == pytest.approx(0.070 * np.ceil(env.horizon / 3))

@@ -34,9 +34,8 @@ ESCAPE_JOINTS = PANDA.num_joints - TURNING_JOINTS
 
 def fake_env(max_step, link_distances_at):
     """What `filter_policy` needs of an environment of the Panda."""
-    return SimpleNamespace(
-        robot=PANDA, max_step=max_step, get_wrapper_attr=lambda name: link_distances_at
-    )
+    attributes = {"link_distances_at": link_distances_at, "current_checker": lambda: None}
+    return SimpleNamespace(robot=PANDA, max_step=max_step, get_wrapper_attr=attributes.get)
 
 
 # --- Link distances

@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+import roboarm_nmp.envs.robots.urdf
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.hulls import arm_hulls
 from roboarm_nmp.envs.robots.files import load_robot
@@ -18,6 +19,7 @@ from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.urdf import RobotError
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.time_parameterisation import time_parameterise
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
 
@@ -43,6 +45,12 @@ def joint(name, parent, child, kind="revolute", axis="0 0 1", xyz="0 0 0.3", mor
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
         f'<origin xyz="{xyz}" rpy="0.2 0.1 -0.4"/><axis xyz="{axis}"/>{limit}</joint>'
     )
+
+
+def chain(number):
+    """Links one after another, with joints between them."""
+    joints = (joint(f"j{i}", f"l{i - 1}", f"l{i}") for i in range(1, number))
+    return "".join([*(link(f"l{i}", BAR) for i in range(number)), *joints])
 
 
 BAR = "0 0 0.15", "0.1 0 0", '<box size="0.05 0.06 0.2"/>'
@@ -240,6 +248,9 @@ MESH = "0 0 0", "0 0 0", '<mesh filename="{}"/>'
         (link("a", *[BAR] * 600), "601 collision shapes|600 collision shapes"),
         ("<link name='a'>" * 40 + "</link>" * 40, "nested more than"),
         ("<link name='a'>" * 300_000, "nested more than"),
+        ("<x/>" * 60_000, "more than 50,000 elements"),
+        (chain(34), "33 actuated joints, at most 32"),
+        (chain(110), "109 movable joints, at most 100"),  # PyBullet has no states of more
     ],
 )
 def test_unusable_urdf_is_rejected_with_its_reason(urdf, elements, reason):
@@ -288,7 +299,9 @@ def test_mesh_without_triangles_is_rejected(urdf, contents, ending):
 
 
 @pytest.mark.parametrize("kind", ["collision", "visual"])
-@pytest.mark.parametrize("face", ["1 2 9", "1 2 0", "1/1/1 2/2/2 9/3/3", "-1 -2 -9", "1 2 x"])
+@pytest.mark.parametrize(
+    "face", ["1 2 9", "1 2 0", "1/1/1 2/2/2 9/3/3", "-1 -2 -9", "1 2 x", f"1 2 {-(2**63)}"]
+)
 def test_face_with_a_missing_vertex_is_rejected(urdf, face, kind):
     path = urdf(TWO + joint("1", "a", "b") + link("c", (*MESH[:2], MESH[2].format("x.obj"))))
     text = path.read_text().replace("</robot>", joint("2", "b", "c") + "</robot>")
@@ -362,6 +375,11 @@ def test_frame_without_inertial_is_light(urdf):
         {"limits": {"turn": 5}},
         {"limits": {"turn": (float("nan"), 1)}},
         {"joints": [5]},
+        {"acceleration": 0},
+        {"acceleration": True},
+        {"jerk": {"turn": float("nan")}},
+        {"velocity": {"turn": "fast"}},
+        {"datasheet_limits": {"turn": 1}},
     ],
 )
 def test_options_of_other_types_are_rejected(urdf, options):
@@ -391,6 +409,16 @@ def test_options_that_do_not_fit_are_rejected(urdf):
         Robot.from_urdf(path, end_effector="tool", joints=["turn", "grip"])
     with pytest.raises(RobotError, match="fixed: 'turn' is none of the other joints"):
         Robot.from_urdf(path, end_effector="tool", fixed={"turn": 0.0})
+    with pytest.raises(RobotError, match="acceleration: no limit of slide, roll"):
+        Robot.from_urdf(path, end_effector="tool", acceleration={"turn": 5})
+    with pytest.raises(RobotError, match="velocity: 'grip' is none of the joints"):
+        Robot.from_urdf(path, end_effector="tool", velocity={"grip": 1})
+    with pytest.raises(RobotError, match="datasheet_limits: 'grip' is none of the joints"):
+        Robot.from_urdf(path, end_effector="tool", datasheet_limits={"grip": (0, 1)})
+    with pytest.raises(
+        RobotError, match="'roll': datasheet_limits from -2.0 to 1.0 are not inside"
+    ):
+        Robot.from_urdf(path, end_effector="tool", datasheet_limits={"roll": (-2, 1)})
 
 
 def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
@@ -406,6 +434,39 @@ def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
     assert load_robot(file) == robot
 
 
+def test_robot_file_adds_limits_of_trajectories_and_the_datasheet(urdf, tmp_path):
+    path = urdf(ARM)
+    plain, file = Robot.from_urdf(path, end_effector="tool", gain=0.5), tmp_path / "arm.yaml"
+    file.write_text(
+        f"urdf: {path}\nname: arm\nend_effector: tool\ngain: 0.5\nvelocity: {{slide: 0.4}}\n"
+        "acceleration: 3\njerk: {turn: 30, slide: 10, roll: 50}\n"
+        "datasheet_limits: {roll: [-1, 1.2]}\n"
+    )
+    robot = load_robot(file)
+    assert robot.velocity.tolist() == [2.0, 0.4, 2.0]  # the others are the URDF's
+    assert robot.acceleration.tolist() == [3.0] * 3
+    assert robot.jerk.tolist() == [30.0, 10.0, 50.0]
+    lower, upper = robot.position_limits("datasheet")
+    assert lower.tolist() == [-1.5, -1.5, -1.0] and upper.tolist() == [1.5, 1.5, 1.2]
+    assert robot.upper.tolist() == [1.5, 1.5, 1.5]
+    # Demonstrations and policies of the arm stay valid.
+    assert robot == plain and plain.acceleration is None and plain.datasheet_lower is None
+
+    pytest.importorskip("toppra")
+    motion = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    trajectory = time_parameterise(motion, robot)
+    assert np.abs(trajectory.velocities).max(0)[1] <= 0.4 + 1e-9
+    assert np.abs(trajectory.accelerations).max() <= 3 + 1e-9
+    assert (
+        np.diff(np.abs(trajectory.accelerations), axis=0) <= np.array([0.3, 0.1, 0.5]) + 1e-9
+    ).all()
+    assert trajectory.duration > 1.2 * time_parameterise(motion, plain).duration
+    with pytest.raises(
+        ValueError, match="waypoint 1 .* the datasheet position limits: roll is 1.5"
+    ):
+        time_parameterise([[0, 0, 0], [1, 1, 1.5]], robot, limits="datasheet")
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -417,6 +478,8 @@ def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
         ("a: &a [1]\nb: *a", "anchors"),
         ("urdf: package:no_such_package/x.urdf", "not installed"),
         ("{", "no YAML"),
+        ("urdf: x.urdf\njerk: [5]", "jerk must be a float or dict"),
+        ("urdf: x.urdf\ngain: true", "gain must be a float"),
     ],
 )
 def test_malformed_robot_file_is_rejected_with_its_reason(tmp_path, text, reason):
@@ -424,6 +487,27 @@ def test_malformed_robot_file_is_rejected_with_its_reason(tmp_path, text, reason
     file.write_text(text)
     with pytest.raises(RobotError, match=reason):
         load_robot(file)
+
+
+def test_pairs_and_gain_are_cached_and_a_damaged_cache_is_made_again(urdf, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path))
+    arm = {"path": urdf(ARM), "end_effector": "tool"}
+    first = Robot.from_urdf(**arm)
+    files = list((tmp_path / "robots").iterdir())
+    assert len(files) == 2  # of the pairs and of the gain
+    with monkeypatch.context() as patch:
+        patch.setattr(roboarm_nmp.envs.robots.urdf, "sample_pairs", None)
+        patch.setattr(roboarm_nmp.envs.robots.urdf, "calibrate", None)
+        again = Robot.from_urdf(**arm)
+        # A box that has another size may collide elsewhere.
+        wider = urdf(ARM.replace("0.05 0.06 0.2", "0.05 0.07 0.2"))
+        with pytest.raises(TypeError):
+            Robot.from_urdf(wider, end_effector="tool")
+    assert again == first and again.self_collision_pairs == first.self_collision_pairs
+    assert again.gains == first.gains and again.contact_free == first.contact_free
+    for file in files:
+        file.write_bytes(b"[[1, ")
+    assert Robot.from_urdf(**arm) == first
 
 
 def test_pybullet_is_left_without_connections(urdf):

@@ -189,12 +189,41 @@ def test_mixed_scenes_are_of_three_kinds_and_clear_of_the_robot():
     assert 70 < walls < 130 and 70 < racks < 130 and 40 < objects < racks
 
 
-def test_mixed_scenes_have_no_queries():
-    with pytest.raises(
-        DatasetError, match="mixed_scenes are scenes for training: there are no queries"
-    ):
-        load_queries("mixed_scenes")
-    env = envs.make("mixed_scenes")
+def test_containers_have_places_between_their_parts_and_are_clear_of_the_robot():
+    containers = envs.get_task("containers").scene
+    drawn = [containers.sample_with_places(np.random.default_rng([0, i])) for i in range(150)]
+    assert containers.sample(np.random.default_rng([0, 7])) == drawn[7][0]
+    assert len({scene for scene, _ in drawn}) == 150
+    kinds, apart = set(), []
+    for scene, places in drawn:
+        assert scene == replace(containers.base, obstacles=scene.obstacles) and places
+        assert len(scene.obstacles) <= MAX_OBSTACLES
+        boxes = [obstacle for obstacle in scene.obstacles if isinstance(obstacle, Box)]
+        upright = [box for box in boxes if box.orientation[:2] == (0.0, 0.0)]
+        assert min(map(distance_to_robot, upright)) > KEEP_CLEAR - 0.02
+        # Boards do not cross the places between them. (Objects may stand there; a tilted lid is
+        # above its box; those of other furniture may.)
+        boards = [box for box in upright if max(box.size) > 0.4]
+        for place in places:
+            kinds.add(tuple(np.round(place.approach[2:], 1)))
+            assert np.linalg.norm(place.approach) == pytest.approx(1.0) and min(place.size) > 0.0
+            corners = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), -1).reshape(-1, 3) * place.size
+            turn = p.getQuaternionFromEuler((0.0, 0.0, place.yaw))
+            points = [p.multiplyTransforms(place.centre, turn, x, (0, 0, 0, 1))[0] for x in corners]
+            for board in boards:
+                to_board = p.invertTransform(board.position, board.orientation)
+                local = [p.multiplyTransforms(*to_board, x, (0, 0, 0, 1))[0] for x in points]
+                local = np.array(local)
+                face = np.array(board.size) / 2 - 2 * GRID  # rounded; all are beyond one face
+                apart.append(((local > face).all(0) | (local < -face).all(0)).any())
+    assert kinds == {(-1.0,), (0.0,), (-0.6,)} and np.mean(apart) > 0.97
+
+
+@pytest.mark.parametrize("name", ["mixed_scenes", "containers"])
+def test_training_scenes_have_no_queries(name):
+    with pytest.raises(DatasetError, match=f"{name} are scenes for training: there are no queries"):
+        load_queries(name)
+    env = envs.make(name)
     env.reset(seed=0)
     first = env.world.scene
     env.reset()

@@ -20,12 +20,14 @@ from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import evaluate as command
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
+from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.policies.registry import make_policy
 from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import save_scene
+from roboarm_nmp.envs.scenes.motions import Waypoints
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.tasks import Task
 from roboarm_nmp.envs.training import evaluation
@@ -668,3 +670,33 @@ def test_options_out_of_range_and_unknown_options_are_refused():
 
 def test_evaluate_is_available_at_the_top_level(queries):
     assert roboarm_nmp.evaluate is evaluate
+
+
+def test_moving_obstacles_are_evaluated_and_a_delay_is_noted(tmp_path, capsys):
+    """A box that comes to the arm's place after 1 s: who waits for 60 steps is hit by it."""
+    here = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], np.float32)
+    there = here + np.float32([1.5, 0, 0, 0, 0, 0, 0])
+    coming = Waypoints((1.0, 2.0), ((0.0, 0.0, 0.0), (0.0, 0.4, 0.0)))
+    scene = Scene((Box((0.307, -0.4, 0.5), (0.1, 0.1, 0.1), motion=coming),))
+    queries = SimpleNamespace(start=here[None], goal=there[None], scenes=[scene])
+    options = {"queries": queries, "goal_type": "config", "clearance": True}
+    found = evaluate("go-to-goal", "no_obstacles", **options)
+    assert found["collision_free_success_rate"] == 1 and found["action_delay"] == 0
+    checkers = [CollisionChecker(scene.at(t)) for t in (0.0, found["mean_steps"] / 30)]
+    states = PANDA.normalise([here, there])
+    ends = [
+        c.signed_distances(q, False).distance.min() for c, q in zip(checkers, states, strict=True)
+    ]
+    assert 0 < found["min_clearance"] <= min(ends) + 1e-6
+    late = evaluate("go-to-goal", "no_obstacles", action_delay=60, **options)
+    assert late["collision_rate"] == 1 and late["action_delay"] == 60
+    real = evaluate("go-to-goal", "no_obstacles", real_time=True, **options)
+    assert real["action_delay"] == "real_time"
+    for result, words in ((late, "60 steps"), (real, "real time"), (found, None)):
+        text = command._table(result)
+        assert (f"action delay            {words}" in text) == (words is not None)
+    assert "action delay" not in command._table(found)
+    with pytest.raises(EvaluationError, match="give one of them"):
+        evaluate("go-to-goal", "wall", action_delay=1, real_time=True)
+    with pytest.raises(EvaluationError, match="must not be negative"):
+        evaluate("go-to-goal", "wall", action_delay=-1)

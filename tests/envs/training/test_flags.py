@@ -23,7 +23,6 @@ POLICIES = (*REINFORCEMENT, "bc", "dagger")
 OF_ALL = (
     *(("--seed", bad) for bad in ("-1", "4294967296")),
     *(("--device", bad) for bad in ("foo", "cuda:99", "")),
-    *(("--exp-name", bad) for bad in ("../../x", "a/b")),
     ("--batch-size", "0"),
     ("--eval-every", "0"),
     ("--runs-dir", "/dev/null/runs"),

@@ -26,7 +26,6 @@ DISTANCES = {"link_distances": True, "geometry_source": "ground_truth"}
 @dataclass
 class Flags(protocol.PolicyFlags):
     goal_type: str = "config"
-    exp_name: str = "x"
 
 
 @pytest.fixture(autouse=True)
@@ -325,9 +324,11 @@ def test_training_environments_need_neither_replay_buffer_nor_demonstrations():
     class Args(protocol.EnvFlags):
         task: str = "wall"
         num_envs: int = 2
+        device: str = "cpu"
 
     made = protocol.make_training_envs(Args(goal_type="config", velocities=True))
-    assert len(made) == 2
-    for observation in protocol.begin_episodes(made, seed=1, step=0):
+    assert made.begin_episodes(seed=1, step=0) == []
+    assert len(made.observations) == 2
+    for observation in made.observations:
         assert observation["observation"].shape == (17,)
         assert observation["desired_goal"].shape == (7,)

@@ -25,7 +25,6 @@ from roboarm_nmp.envs.utils.files import new_contents
 
 @dataclass
 class Args(runs.RunFlags):
-    exp_name: str = "test"
     data: Path | None = None
     files: tuple[Path, ...] = ()
     radii: tuple[float, float] = (0.1, 0.2)
@@ -57,7 +56,7 @@ def test_flags_are_restored_by_resume(parse, tmp_path):
     flags = ["--runs-dir", tmp_path, "--data", "a.h5", "--files", "b.h5", "c.h5", "--name", "x"]
     args = parse(*flags, "--radii", "0.3", "0.5")
     run = runs.run_folder(args, "wall")
-    assert run.parent == tmp_path and run.name.startswith("wall__test__1__")
+    assert run.parent == tmp_path and run.name.startswith("wall__trainer__1__")
     again = parse("--resume", run)
     assert again.resume == run == runs.run_folder(again, "wall")
     args.resume = run
@@ -73,7 +72,7 @@ def test_flags_are_restored_by_resume(parse, tmp_path):
         (["--radii", "0.3", "0.4"], r"--radii is \[0.3, 0.4\] now, the run had \[0.1, 0.2\]"),
         (["--files", "e.h5"], r"--files is \['e.h5'\] now, the run had \[\]"),
         (["--name", "y"], "--name is 'y' now, the run had None"),
-        (["--seed", "2", "--exp-name", "z"], "--seed is 2 now, .*; --exp-name is 'z'"),
+        (["--seed", "2", "--name", "z"], "--seed is 2 now, .*; --name is 'z'"),
     ],
 )
 def test_resuming_with_another_flag_is_rejected(parse, tmp_path, flags, message):
@@ -237,7 +236,7 @@ from roboarm_nmp.envs.training import runs
 
 @dataclass
 class Args(runs.RunFlags):
-    exp_name: str = "test"
+    pass
 
 args = runs.parse_args(Args)
 run = runs.run_folder(args, "wall")

@@ -15,8 +15,9 @@ from roboarm_nmp.envs.policies.registry import find_policy, make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.files import load_scene
-from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
+from roboarm_nmp.envs.scenes.files import load_scene, save_scene
+from roboarm_nmp.envs.scenes.motions import Oscillation, Presence
+from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere, obstacle_at
 from roboarm_nmp.envs.viewer.simulation import (
     PolicyArm,
     RecordedArm,
@@ -38,12 +39,12 @@ def simulation():
     """A function that makes a `Simulation` of a task with policies; all are closed afterwards."""
     made = []
 
-    def make(task, *policies, number=0, **options):
+    def make(task, *policies, number=0, split="test", **options):
         simulation = Simulation(task_episodes(task))
         made.append(simulation)
         for policy in policies:
             simulation.add(PolicyArm(task, policy, **options))
-        simulation.select("test", number)
+        simulation.select(split, number)
         return simulation
 
     yield make
@@ -307,3 +308,38 @@ def test_file_of_a_trajectory_is_played_in_the_scene_of_each_query(tmp_path):
     middle = PANDA.denormalise(arm.trace[15])
     np.testing.assert_allclose(middle[0], 0.15, atol=1e-5)  # the cubic's, between rest and rest
     simulation.close()
+
+
+def test_obstacles_move_as_in_an_evaluation_and_are_drawn_where_they_are(simulation, tmp_path):
+    viser = pytest.importorskip("viser")
+    from roboarm_nmp.envs.viewer.drawing import Drawing
+
+    swinging = Box((0.5, 0.0, 0.3), (0.1, 0.1, 0.4), motion=Oscillation((0.0, 0.3, 0.0), 3.0))
+    late = Sphere((0.4, 0.6, 0.5), 0.1, Presence(((0.1, 1.0),)))
+    scene = Scene((swinging, late, FAR))
+    save_scene(scene, tmp_path / "moving.yaml")
+    shown = simulation(str(tmp_path / "moving.yaml"), "go-to-goal", split="random")
+    arm, server = shown.arms[0], viser.ViserServer(port=0, verbose=False)
+    try:
+        drawing = Drawing(server, shown)
+        places = []
+        for _ in range(6):
+            drawing.update()
+            here = [body for (body, _), _ in drawing._places[0].bodies[:3]]
+            assert here == [obstacle_at(obstacle, arm.time) for obstacle in scene.obstacles]
+            assert arm.time == arm.env.unwrapped.time
+            places.append(here[0])
+            shown.step()
+        assert len(set(places)) == 6 and here[1] is not None
+    finally:
+        server.stop()
+    expected = rollout(arm.env, shown.query, make_policy("go-to-goal", arm.env)(0, shown.query).act)
+    shown.restart()
+    run(shown)
+    np.testing.assert_array_equal(arm.trajectory().states, expected.states)
+    shown.restart()
+    shown.step()
+    shown.replace_obstacle(2, FAR)  # an edit: goes on without forces, from time 0
+    for _ in range(5):
+        shown.step()
+    assert arm.kinematic and arm.time == arm.env.unwrapped.time

@@ -64,7 +64,7 @@ def make_files(folder):
     paths["checkpoint"] = folder / "checkpoint.pt"
     runs.save_checkpoint(folder, parts_of_a_run(), "cpu")
     paths["args"] = folder / "args.json"
-    runs.write_json(paths["args"], {"seed": 3, "runs_dir": "runs", "exp_name": "x", "rates": [1.0]})
+    runs.write_json(paths["args"], {"seed": 3, "runs_dir": "runs", "rates": [1.0]})
     return paths
 
 

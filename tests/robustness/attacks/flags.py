@@ -37,7 +37,7 @@ LONG += (
 
 RUN = "--eval-queries 1 --test-queries 1 --runs-dir runs"
 RL = f"--task wall --num-envs 1 --hidden-size 8 --batch-size 4 --learning-starts 20 {RUN}"
-RL += " --total-timesteps 60 --eval-every 60 --horizon 20 --buffer-size 100"
+RL += " --total-timesteps 60 --eval-every 60 --horizon 20"
 OUTSIDE = ("benchmarks.paper_tables",)  # of the package
 TINY = {
     "clean_rl_scripts.sac_her_mp": RL,

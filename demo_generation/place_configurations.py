@@ -1,0 +1,68 @@
+"""Configurations with the hand in a scene's places, such as between two boards or in a box.
+
+scene, places = Containers().sample_with_places(rng)
+ends, on_ways = place_configurations(scene, places, rng, 20)
+"""
+
+import numpy as np
+
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.policies.approach_path import approach_path
+from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
+
+MARGIN, NEAR = 0.003, 0.015  # m: of all configurations, and of most of them at most
+FAR_SHARE = 0.25  # of those farther than NEAR, so many are kept
+RETREATED = 0.5  # share of the configurations from which the arm has retreated
+TILT = 0.35  # standard deviation of the hand's direction from the place's approach, each axis
+POSES, NUM_SEEDS, MAX_ROUNDS = 32, 8, 10  # of inverse kinematics: poses a round, states a pose
+EVERY = 10  # steps of an approach path between configurations on the way
+
+
+def place_configurations(scene, places, rng, number):
+    """Free configurations with the end effector in one of the `Place`s of a scene.
+
+    Half of them are at the end of an approach path, with as much room as there is nearby.
+
+    Returns:
+        float64 (k, n), normalised, k <= `number`, and (m, n): more on the ways out of places.
+    """
+    robot, checker, ends, on_ways = scene.robot, CollisionChecker(scene), [], []
+    for _ in range(MAX_ROUNDS):
+        found = inverse_kinematics(
+            robot, _poses(places, rng), int(rng.integers(2**32)), NUM_SEEDS, checker, MARGIN
+        )
+        states = [robot.normalise(one[rng.integers(len(one))]) for one in found if len(one)]
+        for state in states:
+            near = not checker.is_free(state[None], NEAR)[0]
+            if len(ends) == number or not (near or rng.random() < FAR_SHARE):
+                continue
+            path = approach_path(robot, state, checker.link_distances)
+            ends.append(path[-1] if rng.random() < RETREATED else path[0])
+            on_ways += list(path[::EVERY])
+        if len(ends) == number:
+            break
+    joints = robot.num_joints
+    return np.reshape(ends, (-1, joints)), np.reshape(on_ways, (-1, joints))
+
+
+def _poses(places, rng):
+    """Random end-effector poses (POSES, 7) in places."""
+    poses = np.empty((POSES, 7))
+    for pose in poses:
+        place = places[rng.integers(len(places))]
+        x, y, z = rng.uniform(-0.5, 0.5, 3) * place.size
+        cos, sin = np.cos(place.yaw), np.sin(place.yaw)
+        pose[:3] = place.centre + [cos * x - sin * y, sin * x + cos * y, z]
+        axis = place.approach + TILT * rng.standard_normal(3)
+        pose[3:] = _hand_along(axis / np.linalg.norm(axis), rng.uniform(-np.pi, np.pi))
+    return poses
+
+
+def _hand_along(axis, roll):
+    """The quaternion (xyzw) that turns z to a unit vector, after a turn about z."""
+    x, y, z = axis
+    # From z to the axis by the shortest turn; from -z by half a turn about x.
+    turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -1.0 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
+    a, b, _, w = turn / np.linalg.norm(turn)
+    sin, cos = np.sin(roll / 2), np.cos(roll / 2)
+    return np.array([a * cos + b * sin, b * cos - a * sin, w * sin, w * cos])

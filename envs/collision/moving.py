@@ -1,0 +1,142 @@
+"""Moving obstacles as arrays: where they are at any time, and how fast they move. Compiled.
+
+    from roboarm_nmp.envs.collision.moving import MovingObstacles
+
+    moving = MovingObstacles(env.unwrapped.scene)
+    now = moving.at(env.unwrapped.time)               # `ObstacleStates`, a row per obstacle
+    soon = moving.at(env.unwrapped.time + np.arange(30) / 30)   # of 30 times, (30, n, ...)
+
+Row i is `scene.obstacles[i]`, present or not. The obstacles of `scene.at(t)` are the present ones:
+number j there is row `np.flatnonzero(now.present)[j]`.
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from roboarm_nmp.envs.collision.hulls import (
+    group_points,
+    shape_centres,
+    shape_rows,
+    world_shapes,
+)
+from roboarm_nmp.envs.collision.kernels import (
+    AMPLITUDE,
+    ANGLE,
+    AXIS,
+    FREQUENCY,
+    INTERVALS,
+    OWN_COLUMNS,
+    PHASE,
+    REPEAT,
+    WAYPOINTS,
+    free_batch,
+    moved_rows,
+    obstacle_states,
+)
+from roboarm_nmp.envs.scenes.motions import REPEATS, Oscillation, Presence, Waypoints
+from roboarm_nmp.envs.scenes.numbers import IDENTITY
+from roboarm_nmp.envs.scenes.primitives import to_array
+
+
+class ObstacleStates(NamedTuple):
+    """The n obstacles of a scene at times of shape (...).
+
+    Attributes:
+        present: bool (..., n).
+        position: m, (..., n, 3).
+        orientation: quaternions (..., n, 4), x, y, z, w.
+        velocity: m/s, (..., n, 3), of the position. A point at an offset r from it moves at
+            `velocity + np.cross(angular_velocity, r)`.
+        angular_velocity: rad/s, (..., n, 3), in the base's frame.
+    """
+
+    present: np.ndarray
+    position: np.ndarray
+    orientation: np.ndarray
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+
+
+class MovingObstacles:
+    """The obstacles of a `Scene` over time; those without a motion stand still.
+
+    Attributes:
+        motions, centres, shapes: the arrays that `kernels.moved_rows` takes, for checks in a loop
+            over time. (`hulls.world_shapes` has convex hulls' bodies, and who may touch what.)
+    """
+
+    def __init__(self, scene):
+        self.motions = motion_arrays(scene.obstacles)
+        self.centres, self.shapes = shape_centres(scene.obstacles), shape_rows(scene.obstacles)
+
+    def at(self, times):
+        """`ObstacleStates` at times (s), a number or an array. Raises ValueError: not finite."""
+        times = np.asarray(times, dtype=np.float64)
+        if not np.isfinite(times).all():
+            raise ValueError("times must be finite numbers of seconds")
+        shape = *times.shape, len(self.motions[0])
+        present, flat = np.empty(shape, np.bool_), np.ascontiguousarray(times.reshape(-1))
+        poses, velocities = np.empty((*shape, 7)), np.empty((*shape, 6))
+        obstacle_states(
+            self.motions,
+            flat,
+            present.reshape(len(flat), -1),
+            poses.reshape(len(flat), -1, 7),
+            velocities.reshape(len(flat), -1, 6),
+        )
+        return ObstacleStates(
+            present, poses[..., :3], poses[..., 3:], velocities[..., :3], velocities[..., 3:]
+        )
+
+
+def motion_arrays(obstacles):
+    """The motions of n obstacles as the compiled functions take them (`kernels`).
+
+    Returns: float64 (n, `OWN_COLUMNS`), waypoints (w, 8), intervals (i, 2).
+    """
+    own, waypoints, intervals = np.zeros((len(obstacles), OWN_COLUMNS)), [], []
+    for row, numbers, obstacle in zip(own, to_array(obstacles), obstacles, strict=True):
+        row[:AMPLITUDE] = numbers[1:8]
+        motion = obstacle.motion
+        row[INTERVALS] = len(intervals)
+        if isinstance(motion, Presence):
+            intervals += motion.intervals
+            motion = motion.motion
+        row[INTERVALS + 1] = len(intervals)
+        row[WAYPOINTS] = len(waypoints)
+        if isinstance(motion, Oscillation):
+            row[AMPLITUDE:FREQUENCY], row[FREQUENCY] = motion.amplitude, 2 * math.pi / motion.period
+            row[PHASE], row[AXIS:ANGLE], row[ANGLE] = motion.phase, motion.axis, motion.angle
+        elif isinstance(motion, Waypoints):
+            rotations = motion.rotations or (IDENTITY,) * len(motion.times)
+            ways = zip(motion.times, motion.displacements, rotations, strict=True)
+            waypoints += [(time, *displacement, *turn) for time, displacement, turn in ways]
+            row[REPEAT] = REPEATS.index(motion.repeat)
+        row[WAYPOINTS + 1] = len(waypoints)
+    return own, np.reshape(waypoints, (-1, 8)), np.reshape(intervals, (-1, 2))
+
+
+def free_over_time(scene, states, times):
+    """Whether configurations are free of a scene's moving obstacles.
+
+    Args:
+        scene: a `Scene`. Its table, its floor and obstacles without a motion do not count.
+        states: normalised configurations (m, n).
+        times: s, (t,).
+
+    Returns:
+        bool (m, t).
+    """
+    moving = replace(scene, obstacles=[o for o in scene.obstacles if o.motion is not None])
+    rows, arm = world_shapes(moving.obstacles, scene.robot)
+    own, shapes = MovingObstacles(moving), rows.copy()
+    world = rows, *group_points((), 0.0)
+    rule = np.zeros(4), np.empty((1, 0, scene.robot.num_joints + 1))
+    states, free = np.ascontiguousarray(states, float), np.empty((len(times), len(states)), bool)
+    for t, answers in zip(times, free, strict=True):
+        moved_rows(own.motions, own.centres, shapes, t, rows)
+        free_batch(states, *rule, arm, world, answers)
+    return free.T

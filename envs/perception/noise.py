@@ -1,0 +1,192 @@
+"""Noise of sensors: what a real depth camera adds to the ideal one.
+
+    noise = SensorNoise(gaussian=0.002, dropout=0.1, missing_cameras=1, latency=2)
+    env = roboarm_nmp.make(
+        "random_boxes_hard", link_distances=True, geometry_source="point_cloud", sensor_noise=noise
+    )
+
+Noise acts on depth images, before points are computed. A `SensorNoise` has a seed; the same seed
+and query give the same noise, in any order of the episodes.
+"""
+
+import math
+from dataclasses import asdict, dataclass, fields
+
+import numpy as np
+
+from roboarm_nmp.envs.collision.kernels import AXES, EYE, edge_pixels
+from roboarm_nmp.envs.perception.ray_casting import NOTHING
+from roboarm_nmp.envs.scenes.primitives import is_number
+from roboarm_nmp.envs.utils.names import suggest
+from roboarm_nmp.envs.utils.random_streams import Stream
+
+EDGE = 0.05
+"""m. Neighbouring pixels whose depths differ by more are at an edge, where pixels may fly."""
+MAX_LATENCY = 1000  # steps
+_WHOLE = ("missing_cameras", "latency", "seed")
+_SHARES = ("dropout", "flying_pixels")
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """What depth cameras get wrong. All of it is off by default.
+
+    Attributes:
+        gaussian: m, standard deviation of each depth.
+        per_metre: m per m of depth: standard deviation that grows with the depth, in addition.
+        quantisation: m: depths are rounded to multiples of this.
+        dropout: share of the pixels, chosen at random in each image, that have no depth.
+        flying_pixels: share of the pixels at edges (depths more than `EDGE` apart) that get a depth
+            between that of the front and that of the back.
+        missing_cameras: how many cameras observe nothing in an episode; which, is drawn.
+        calibration_mm, calibration_degrees: standard deviation of the error of each camera's
+            assumed position along each axis (mm), and orientation about each axis (degrees), drawn
+            once an episode.
+        latency: steps from an observation to the step in which it is received.
+        seed: of all random numbers.
+
+    Raises:
+        ValueError: an attribute is out of its range.
+    """
+
+    gaussian: float = 0.0
+    per_metre: float = 0.0
+    quantisation: float = 0.0
+    dropout: float = 0.0
+    flying_pixels: float = 0.0
+    missing_cameras: int = 0
+    calibration_mm: float = 0.0
+    calibration_degrees: float = 0.0
+    latency: int = 0
+    seed: int = 0
+
+    def __post_init__(self):
+        for field in fields(self):
+            name, value = field.name, getattr(self, field.name)
+            if name in _WHOLE:
+                most = MAX_LATENCY if name == "latency" else 2**32 - 1
+                whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+                if not (whole and 0 <= value <= most):
+                    raise ValueError(f"{name} must be a whole number from 0 on, got {value!r}")
+            elif not (is_number(value) and 0 <= value <= (1 if name in _SHARES else 1000)):
+                wanted = "a share in [0, 1]" if name in _SHARES else "a number from 0 on"
+                raise ValueError(f"{name} must be {wanted}, got {value!r}")
+
+    @classmethod
+    def parse(cls, settings):
+        """The noise of settings such as `("gaussian=0.005", "missing_cameras=1")`.
+
+        Raises ValueError: an unknown name, or no number.
+        """
+        values, names = {}, [field.name for field in fields(cls)]
+        for setting in settings:
+            name, equals, text = setting.partition("=")
+            if name not in names or not equals:
+                raise ValueError(
+                    f"sensor noise is NAME=VALUE, got {setting!r}: {suggest(name, names)}"
+                )
+            try:
+                values[name] = int(text) if name in _WHOLE else float(text)
+            except ValueError as error:
+                raise ValueError(f"sensor noise: {name} needs a number, got {text!r}") from error
+        return cls(**values)
+
+    def to_metadata(self):
+        """The attributes that are not the defaults, as a dict."""
+        return {name: value for name, value in asdict(self).items() if value}
+
+    @property
+    def changes_images(self):
+        """Whether there is more than latency."""
+        return any(value for name, value in asdict(self).items() if name not in ("latency", "seed"))
+
+
+NO_NOISE = SensorNoise()
+
+
+class NoiseOfEpisode:
+    """The noise of all cameras in an episode.
+
+    Args:
+        noise: a `SensorNoise`.
+        key: int from 0 on, of the episode.
+        number: of cameras.
+    """
+
+    def __init__(self, noise, key, number):
+        self._noise, self._key = noise, key
+        order = _rng(noise, key).permutation(number)
+        self._missing, self._sensors = set(order[: noise.missing_cameras].tolist()), {}
+
+    def of_sensor(self, view):
+        """The noise of the camera with a view: in the order in which they observe first."""
+        place = view[: AXES + 9].tobytes()
+        if place not in self._sensors:
+            number = len(self._sensors)
+            missing = number in self._missing
+            self._sensors[place] = NoiseOfSensor(self._noise, (self._key, 1 + number), missing)
+        return self._sensors[place]
+
+
+class NoiseOfSensor:
+    """The noise of one camera in an episode.
+
+    Attributes:
+        is_missing: whether it observes nothing.
+    """
+
+    def __init__(self, noise, key, is_missing):
+        self._noise, self._key, self.is_missing = noise, key, is_missing
+        rng = _rng(noise, *key)
+        self._shift = 1e-3 * noise.calibration_mm * rng.standard_normal(3)
+        self._turn = _rotation(math.radians(noise.calibration_degrees) * rng.standard_normal(3))
+
+    def true_view(self, view):
+        """Where the camera really is (`kernels.VIEW`): its assumed view with the errors."""
+        noise = self._noise
+        if not (noise.calibration_mm or noise.calibration_degrees):
+            return view
+        view = view.copy()
+        view[EYE:AXES] += self._shift
+        view[AXES : AXES + 9] = (view[AXES : AXES + 9].reshape(3, 3) @ self._turn.T).ravel()
+        return view
+
+    def apply(self, depth, classes, far, number):
+        """A depth image (m) and its classes with noise.
+
+        `number`: of the observation in its episode, from 0 on.
+        """
+        noise, rng = self._noise, _rng(self._noise, *self._key, 1 + number)
+        if self.is_missing:
+            return np.full_like(depth, far), np.full_like(classes, NOTHING)
+        hit = classes != NOTHING
+        if noise.flying_pixels:
+            front, back = edge_pixels(depth, classes, NOTHING, EDGE)
+            flies = (back > 0) & (rng.random(depth.shape, np.float32) < noise.flying_pixels)
+            share = rng.random(depth.shape, np.float32)
+            depth = np.where(flies, front + share * (back - front), depth)
+        if noise.gaussian or noise.per_metre:
+            spread = np.float32(noise.gaussian), np.float32(noise.per_metre)
+            depth = depth + spread[0] * rng.standard_normal(depth.shape, np.float32)
+            depth = depth + spread[1] * depth * rng.standard_normal(depth.shape, np.float32)
+        if noise.quantisation:
+            step = np.float32(noise.quantisation)
+            depth = np.round(depth / step) * step
+        if noise.dropout:
+            hit &= rng.random(depth.shape, np.float32) >= noise.dropout
+        hit &= (depth > 0) & (depth < far)
+        return np.where(hit, depth, np.float32(far)), np.where(hit, classes, np.uint8(NOTHING))
+
+
+def _rng(noise, *key):
+    return np.random.default_rng([noise.seed, Stream.SENSOR_NOISE, *key])
+
+
+def _rotation(vector):
+    """The rotation matrix (3, 3) about a vector (3,), by its norm in rad (Rodrigues' formula)."""
+    angle = np.linalg.norm(vector)
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross

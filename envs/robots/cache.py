@@ -1,0 +1,37 @@
+"""A cache on disk of what takes seconds to find out about an arm from a URDF.
+
+It is in the user's cache folder (`envs.utils.files.cache_folder`). A damaged file is written anew.
+"""
+
+import contextlib
+import hashlib
+import importlib.metadata
+import json
+import re
+
+from roboarm_nmp.envs.utils.files import cache_folder, write_atomically
+
+
+def cached(name, robot, settings, compute):
+    """The result of `compute()`, from the cache where it has it.
+
+    Args:
+        name: of what is computed.
+        robot: the `Robot` that it is computed from.
+        settings: whatever else it depends on, for JSON.
+        compute: a function without arguments; its result is lists and numbers. What it raises is
+            not cached.
+    """
+    # Contents of meshes are in the robot's fingerprint; their paths do not matter.
+    xml = re.sub(r'filename="[^"]*"', "", robot.xml)
+    version = importlib.metadata.version("pybullet")
+    key = json.dumps([name, robot.fingerprint, xml, settings, version])
+    name = f"{hashlib.sha256(key.encode()).hexdigest()}.json"
+    with contextlib.suppress(OSError, ValueError):
+        (result,) = json.loads((cache_folder() / "robots" / name).read_bytes())
+        return result
+    result = compute()
+    with contextlib.suppress(OSError):  # without a folder to write to, it is computed each time
+        (cache_folder() / "robots").mkdir(parents=True, exist_ok=True)
+        write_atomically(cache_folder() / "robots" / name, json.dumps([result]).encode())
+    return result
