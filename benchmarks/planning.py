@@ -81,9 +81,10 @@ class PyBulletPlanner(Planner):
     def plan(self, start, goal, scene=None, *, seed, time_limit=5.0):
         rng, deadline = np.random.default_rng(seed), time.monotonic() + time_limit
         self.env.reset_specific(start, goal, scene)
+        goals = np.array([goal], dtype=np.float32)
         for share, self.margin_scale in ((0.5, 1.0), (0.5, 0.5), (1.0, 0.25)):
             until = time.monotonic() + share * (deadline - time.monotonic())
-            path = self._search(start, goal, int(rng.integers(1, 2**32)), until)
+            path = self._search(start, goals, int(rng.integers(1, 2**32)), until)
             if path is not None:
                 return path
         raise PlanningError(f"no path in {time_limit} s")
@@ -91,15 +92,15 @@ class PyBulletPlanner(Planner):
     def _turns(self):
         return ((self.planner, math.inf),)
 
-    def _validity(self, start, goal, deadline):
-        world = self.env
+    def _validity(self, start, goals, deadline):
+        world, goal = self.env, goals[0]
         self.inflated.set_scene(inflate(self.env.scene, self.margin_scale * self.clearance))
         if not any(self.inflated.in_collision(end) for end in (start, goal)):
             world = self.inflated
         return PyBulletValidity(world, self.margin_scale * MARGIN, (start, goal), deadline)
 
     def _space(self, is_valid):
-        information = ob.SpaceInformation(planning.normalised_space())
+        information = ob.SpaceInformation(planning.normalised_space(PANDA.num_joints))
         information.setStateValidityChecker(is_valid)
         longest = information.getStateSpace().getMaximumExtent()
         information.setStateValidityCheckingResolution(RESOLUTION / longest)

@@ -25,6 +25,7 @@ from ompl import util as ou
 
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.robots.inverse_kinematics import NUM_SEEDS, inverse_kinematics
+from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.envs.utils.names import suggest
 
@@ -45,6 +46,7 @@ PLANNERS = tuple(
 
 # A configuration this close (m) to a collision counts as one, which absorbs most of the
 # controller's lag: without the margin, two of three plans on `double_walls` collide when followed.
+# This is the Panda's; for another arm, margin and clearance scale with its reach, as the lag does.
 MARGIN = 0.003
 # The distance (m) by which the checks and PyBullet may disagree.
 EXACTNESS = 0.001
@@ -109,7 +111,9 @@ class Validity:
         Both are tuples of n floats.
         """
         checks = self._check(start, end)
-        self._count(abs(checks))
+        self.checks += checks if checks > 0 else -checks  # quicker than `abs`: planners ask often
+        if self.checks >= self._next:
+            self._next_rule()
         return checks > 0
 
     def free(self, states):
@@ -190,7 +194,8 @@ class Planner:
             `RRTConnect` alternates with `OTHER_PLANNER` where it takes long.
         clearance: metres that a path keeps from the scene, in addition to `MARGIN`. A query that
             starts or ends nearer is planned without it. `MARGIN_SCHEDULE` scales both in a long
-            search.
+            search. For an arm other than the Panda, both are multiplied by the ratio of their
+            reaches.
         planner_range: longest motion (L2, normalised) that the planner tries at once, if it has
             such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with RRTConnect,
             docs/benchmark/performance.md.)
@@ -232,7 +237,9 @@ class Planner:
         bounds = env.robot.position_limits(limits)
         if limits != "urdf":
             self._bounds = tuple(np.clip(env.robot.normalise(bounds), -1.0, 1.0))
-        self.env, self.planner, self.clearance = env, planner, clearance
+        scale = scale_of(env.robot)
+        self.env, self.planner = env, planner
+        self.clearance, self.margin = scale * clearance, scale * MARGIN
         self.planner_range, self.simplify = planner_range, simplify
         self.max_checks, self._geometry_source = max_checks, geometry_source
         self._scene, self._checker = env.scene, geometry_source(env.scene.at(0.0))
@@ -356,7 +363,7 @@ class Planner:
         else:
             raise PlanningError("no collision-free configuration has the goal pose")
         states = np.clip(robot.normalise(goals), -1.0, 1.0)
-        for clearance in (MARGIN + self.clearance, MARGIN, EXACTNESS):
+        for clearance in (self.margin + self.clearance, self.margin, EXACTNESS):
             wide = checker.is_free(states, margin=EXACTNESS, clearance=clearance - EXACTNESS)
             if wide.any():
                 goals = goals[wide]
@@ -413,7 +420,7 @@ class Planner:
             # Less a hair, because the ends are checked again after normalising, which rounds.
             distances = np.minimum(near, from_scene - margin_scale * clearance) - 1e-5
             rule = {
-                "margin": margin_scale * MARGIN,
+                "margin": margin_scale * self.margin,
                 "clearance": margin_scale * clearance,
                 "endpoint_margins": (ends, distances, MARGIN_GROWTH),
             }

@@ -9,15 +9,22 @@ from xml.etree import ElementTree
 import numpy as np
 
 from roboarm_nmp.envs.collision.kernels import (
+    BEGIN,
     BODY_COLUMNS,
     BULLET_MARGIN,
     CELLS,
+    CENTRE,
+    FRAME,
     FRAME_COLUMNS,
     LINK,
     LINK_ROW,
+    PARENT,
     POSITION,
+    PRISMATIC,
+    RADIUS,
     ROTATION,
     ROW,
+    SPAN,
     SPHERE,
 )
 from roboarm_nmp.envs.robots.robot import matrix, temporary_file
@@ -39,10 +46,10 @@ def arm_hulls(robot):
 
     - `chain`: float64 (f, `FRAME_COLUMNS`): a frame's parent, its joint, whether that is prismatic,
       the joint's value at -1 and its range, position 3 and rotation 9 in the parent;
-    - `bodies`: float64 (b, `BODY_COLUMNS`): the frame in which a body moves, the centre of its
+    - `bodies`: float64 (b, `BODY_COLUMNS` + f): the frame in which a body moves, the centre of its
       bounding box there 3, the radius of the sphere around that centre, half edges 3, rounding (m),
       and the link's row of link distances (`Robot.link_rows`), -1 for those that do not move, which
-      come first;
+      come first; then `_levers`;
     - `pairs`: int64 (p, 2), the bodies that may collide;
     - `vertices`: float64 (v, 3), m, relative to their body's centre;
     - `cells`: see `_cells`.
@@ -81,7 +88,29 @@ def arm_hulls(robot):
     ]
     pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     bodies = np.reshape(bodies, (-1, BODY_COLUMNS))
+    bodies = np.concatenate([bodies, _levers(chain, bodies)], axis=1)
     return chain, bodies, pairs, np.concatenate(meshes), _cells(meshes)
+
+
+def _levers(chain, bodies):
+    """How far a body's points move at most, per unit that a frame's joint turns or slides: (b, f).
+
+    m per rad: the largest distance of its points from the joint's axis, in any configuration; 1
+    for a prismatic joint; 0 for a frame that does not move the body.
+    """
+    levers = np.zeros((len(bodies), len(chain)))
+    for body, row in zip(bodies, levers, strict=True):
+        frame, position, beyond = int(body[FRAME]), body[CENTRE:RADIUS], body[RADIUS]
+        while frame > 0:
+            given = chain[frame]
+            if given[PRISMATIC]:
+                row[frame] = 1.0
+                beyond += max(abs(given[BEGIN]), abs(given[BEGIN] + given[SPAN]))
+            else:
+                row[frame] = math.hypot(*position[:2]) + beyond
+            beyond += np.linalg.norm(position)
+            frame, position = int(given[PARENT]), given[POSITION:ROTATION]
+    return levers
 
 
 def link_shapes(robot):

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from roboarm_nmp.envs.utils.numba_cache import compiled
+from roboarm_nmp.envs.utils.numba_cache import compiled, uncounted
 
 BULLET_MARGIN = 0.001
 """m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
@@ -29,6 +29,8 @@ ROW = 18
 CELLS = 8
 # GJK stops at this precision (m), after 3 to 10 iterations in nearly all cases; EPA at its own.
 _TOLERANCE, _MAX_ITERATIONS = 1e-8, 64
+# m: more than rounding can change a distance by.
+_ROUNDING = 1e-9
 _EPA_TOLERANCE, _EPA_VERTICES, _EPA_FACES = 1e-7, 128, 768
 
 # Columns of `arm`'s first two arrays, see `hulls.arm_hulls`.
@@ -48,39 +50,58 @@ def _memory(chain, bodies):
     )
 
 
-@compiled
+@uncounted
 def _place(q, chain, bodies, frames, centres):
     """Write the frames and the bodies' centres of a normalised configuration."""
+    # Numbers are read one by one, here and in `_is_free`: Numba counts references to each row of an
+    # array that has a name, which takes as long as the arithmetic.
     for i in range(9):
         frames[0, i] = chain[0, ROTATION + i]
     for i in range(3):
         frames[0, 9 + i] = chain[0, POSITION + i]
     for frame in range(1, chain.shape[0]):
-        given = chain[frame]
-        here, there = frames[int(given[PARENT])], frames[frame]
-        value = given[BEGIN] + (q[int(given[JOINT])] + 1.0) * 0.5 * given[SPAN]
+        parent = int(chain[frame, PARENT])
+        value = chain[frame, BEGIN] + (q[int(chain[frame, JOINT])] + 1.0) * 0.5 * chain[frame, SPAN]
         c, s, slide = 1.0, 0.0, value
-        if given[PRISMATIC] == 0.0:
+        if chain[frame, PRISMATIC] == 0.0:
             c, s, slide = math.cos(value), math.sin(value), 0.0
-        x, y, z = given[POSITION], given[POSITION + 1], given[POSITION + 2]
+        x, y, z = chain[frame, POSITION], chain[frame, POSITION + 1], chain[frame, POSITION + 2]
+        xx, xy, xz = chain[frame, ROTATION], chain[frame, ROTATION + 1], chain[frame, ROTATION + 2]
+        yx, yy, yz = (
+            chain[frame, ROTATION + 3],
+            chain[frame, ROTATION + 4],
+            chain[frame, ROTATION + 5],
+        )
+        zx, zy, zz = (
+            chain[frame, ROTATION + 6],
+            chain[frame, ROTATION + 7],
+            chain[frame, ROTATION + 8],
+        )
         for i in range(0, 9, 3):
-            rx, ry, rz = here[i], here[i + 1], here[i + 2]
+            rx, ry, rz = frames[parent, i], frames[parent, i + 1], frames[parent, i + 2]
             # Rotated into the frame, then by the joint about its z.
-            tx = rx * given[ROTATION] + ry * given[ROTATION + 3] + rz * given[ROTATION + 6]
-            ty = rx * given[ROTATION + 1] + ry * given[ROTATION + 4] + rz * given[ROTATION + 7]
-            tz = rx * given[ROTATION + 2] + ry * given[ROTATION + 5] + rz * given[ROTATION + 8]
-            there[9 + i // 3] = here[9 + i // 3] + rx * x + ry * y + rz * z + slide * tz
-            there[i] = c * tx + s * ty
-            there[i + 1] = c * ty - s * tx
-            there[i + 2] = tz
+            tx = rx * xx + ry * yx + rz * zx
+            ty = rx * xy + ry * yy + rz * zy
+            tz = rx * xz + ry * yz + rz * zz
+            frames[frame, 9 + i // 3] = (
+                frames[parent, 9 + i // 3] + rx * x + ry * y + rz * z + slide * tz
+            )
+            frames[frame, i] = c * tx + s * ty
+            frames[frame, i + 1] = c * ty - s * tx
+            frames[frame, i + 2] = tz
     for body in range(bodies.shape[0]):
-        f = frames[int(bodies[body, FRAME])]
+        f = int(bodies[body, FRAME])
         x, y, z = bodies[body, CENTRE], bodies[body, CENTRE + 1], bodies[body, CENTRE + 2]
         for i in range(3):
-            centres[body, i] = f[9 + i] + f[3 * i] * x + f[3 * i + 1] * y + f[3 * i + 2] * z
+            centres[body, i] = (
+                frames[f, 9 + i]
+                + frames[f, 3 * i] * x
+                + frames[f, 3 * i + 1] * y
+                + frames[f, 3 * i + 2] * z
+            )
 
 
-@compiled
+@uncounted
 def _sphere_gap(rows, j, centres, k):
     """Squared distance (m^2) of a body's centre from the box around a shape's core."""
     x, y, z = centres[k, 0] - rows[j, 1], centres[k, 1] - rows[j, 2], centres[k, 2] - rows[j, 3]
@@ -90,7 +111,7 @@ def _sphere_gap(rows, j, centres, k):
     return u * u + v * v + w * w
 
 
-@compiled
+@uncounted
 def _box_gap(bodies, k, frames, centres, points, j, pose):
     """Distance (m) of a point from the box around a body. Writes its position to `pose`."""
     f = frames[int(bodies[k, FRAME])]
@@ -123,7 +144,7 @@ def _box_gaps(bodies, k, frames, centres, points, begin, end, gaps):
         gaps[j] = math.sqrt(u * u + v * v + w * w)
 
 
-@compiled
+@uncounted
 def _relative(rows, j, frames, f, centres, k, pose):
     """Write the pose of a shape in a body's frame: rotation (row-major) and position."""
     x, y, z = rows[j, 1] - centres[k, 0], rows[j, 2] - centres[k, 1], rows[j, 3] - centres[k, 2]
@@ -134,7 +155,7 @@ def _relative(rows, j, frames, f, centres, k, pose):
             pose[3 * i + n] = a * rows[j, 4 + n] + b * rows[j, 7 + n] + c * rows[j, 10 + n]
 
 
-@compiled
+@uncounted
 def _boxes_apart(bodies, k, rows, j, pose, gap):
     """Whether a face of the body's box, or of the box around the core, separates them by `gap`."""
     for i in range(3):
@@ -153,7 +174,7 @@ def _boxes_apart(bodies, k, rows, j, pose, gap):
     return False
 
 
-@compiled
+@uncounted
 def _begin(rows, j, pose, s):
     """Write a vector from a core towards a body to s[28:31], where `_gjk` begins."""
     # From the nearest point of the box around the core to the body's centre, in the core's axes.
@@ -172,7 +193,7 @@ def _begin(rows, j, pose, s):
         s[28] = 1.0
 
 
-@compiled
+@uncounted
 def _farthest(vertices, cells, k, x, y, z):
     """Index of the vertex of a body that is farthest along (x, y, z)."""
     u, v, w = abs(x), abs(y), abs(z)
@@ -196,7 +217,7 @@ def _farthest(vertices, cells, k, x, y, z):
     return found
 
 
-@compiled
+@uncounted
 def _support(vertices, cells, k, rows, j, pose, x, y, z):
     """The point of body minus core that is farthest along (x, y, z), and the body's vertex."""
     i = _farthest(vertices, cells, k, x, y, z)
@@ -226,7 +247,7 @@ def _support(vertices, cells, k, rows, j, pose, x, y, z):
     )
 
 
-@compiled
+@uncounted
 def _triangle(s, a, b, c):
     """The triangle of the points at s[a], s[b], s[c]: its point nearest to the origin.
 
@@ -268,7 +289,7 @@ def _triangle(s, a, b, c):
     return squared, u, v, w
 
 
-@compiled
+@uncounted
 def _reduce(s, n):
     """Reduce a simplex of `n` points to those that span its point nearest to the origin.
 
@@ -324,7 +345,7 @@ def _reduce(s, n):
     return left
 
 
-@compiled
+@uncounted
 def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
     """Distance (m) of a body's hull from a shape's core; 0 where they overlap.
 
@@ -364,17 +385,7 @@ def _gjk(vertices, cells, k, rows, j, pose, s, near, far):
     return bound, n
 
 
-@compiled
-def _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
-    """Whether a body's hull is at least `gap` (m) away from a shape's core."""
-    _relative(rows, j, frames, int(bodies[k, FRAME]), centres, k, pose)
-    if _boxes_apart(bodies, k, rows, j, pose, gap):
-        return True
-    _begin(rows, j, pose, s)
-    return _gjk(vertices, cells, k, rows, j, pose, s, gap, gap)[0] >= gap
-
-
-@compiled
+@uncounted
 def _as_row(bodies, k, frames, centres, row):
     """Write a body as a shape to `row` (1, `ROW`)."""
     row[0, 0], row[0, 16], row[0, 17] = LINK, bodies[k, ROUNDING], k
@@ -384,13 +395,60 @@ def _as_row(bodies, k, frames, centres, row):
         row[0, 4 + i] = frames[int(bodies[k, FRAME]), i]
 
 
-@compiled
-def _is_free(q, rule, endpoint_margins, arm, world, memory):
-    """`CollisionChecker.is_free` of one state."""
+@uncounted
+def _apart_by(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap, axes, n):
+    """`_is_apart`, with a lower bound (m) of the distance, at least `gap`; -`FAR` if it is nearer.
+
+    Row n of `axes` (m, 3) is the axis from the core to the body, in the base's frame, along which
+    the two were apart before; zeros at first. It is tried first, and written here. No axis is tried
+    where `axes` is empty.
+    """
+    f = int(bodies[k, FRAME])
+    _relative(rows, j, frames, f, centres, k, pose)
+    if axes.shape[0] > 0 and (axes[n, 0] != 0.0 or axes[n, 1] != 0.0 or axes[n, 2] != 0.0):
+        x = frames[f, 0] * axes[n, 0] + frames[f, 3] * axes[n, 1] + frames[f, 6] * axes[n, 2]
+        y = frames[f, 1] * axes[n, 0] + frames[f, 4] * axes[n, 1] + frames[f, 7] * axes[n, 2]
+        z = frames[f, 2] * axes[n, 0] + frames[f, 5] * axes[n, 1] + frames[f, 8] * axes[n, 2]
+        px, py, pz, _, _, _ = _support(vertices, cells, k, rows, j, pose, -x, -y, -z)
+        lower = (px * x + py * y + pz * z) / math.sqrt(x * x + y * y + z * z)
+        if lower >= gap + _ROUNDING:
+            return lower
+    if _boxes_apart(bodies, k, rows, j, pose, gap):
+        return gap
+    _begin(rows, j, pose, s)
+    if _gjk(vertices, cells, k, rows, j, pose, s, gap, gap)[0] < gap:
+        return -FAR
+    if axes.shape[0] > 0:
+        for i in range(3):
+            x, y, z = frames[f, 3 * i], frames[f, 3 * i + 1], frames[f, 3 * i + 2]
+            axes[n, i] = x * s[28] + y * s[29] + z * s[30]
+    return max(s[31], gap)
+
+
+@uncounted
+def _is_free(
+    q, rule, endpoint_margins, arm, world, memory, axes, sweeps, share, known, still, place
+):
+    """`CollisionChecker.is_free` of one state, and what is near in the motion that it is part of.
+
+    A pair is (k, j), body k and shape j, or (-1, i), the links of `pairs[i]`.
+
+    Args:
+        axes: for `_apart_by`: a row per body and shape, then per pair of links; or empty.
+        sweeps: of the motion, see `_sweeps`.
+        share: of the motion, that is still to be checked on each side of this state; or 0.
+        known: lists of pairs (m, l, 2), the list of those that may touch here, and its length; a
+            length of -1 for all pairs.
+        still, place: list `place` of `still` receives the pairs that may touch in that share.
+
+    Returns the length of that list; -1 if the state is not free.
+    """
     chain, bodies, pairs, vertices, cells = arm
     rows, points, groups, ball = world
     frames, centres, pose, s, other = memory
-    joints, touching = endpoint_margins.shape[1] - 1, rows.shape[1] > ROW
+    lists, above, given = known
+    joints, count, shapes = endpoint_margins.shape[1] - 1, 0, rows.shape[0]
+    touching = rows.shape[1] > ROW
     margin, clearance, growth = rule[0], rule[1], rule[2]
     for i in range(endpoint_margins.shape[0]):
         squared = 0.0
@@ -398,18 +456,67 @@ def _is_free(q, rule, endpoint_margins, arm, world, memory):
             squared += (q[j] - endpoint_margins[i, j]) ** 2
         margin = min(margin, endpoint_margins[i, joints] + growth * math.sqrt(squared))
     _place(q, chain, bodies, frames, centres)
-    for k in range(bodies.shape[0] - 1, -1, -1):  # the hand first: it moves most
-        if bodies[k, LINK_ROW] < 0.0:  # the base stands where it stands
+    k, j = bodies.shape[0] - 1, -1  # the hand first: it moves most
+    i = -1
+    while True:
+        i += 1
+        if given >= 0:
+            if i == given:
+                break
+            k, j = lists[above, i, 0], lists[above, i, 1]
+        elif k >= 0:
+            j += 1
+            if j >= shapes:
+                k, j = k - 1, 0
+            if shapes == 0 or k < 0 or bodies[k, LINK_ROW] < 0.0:  # the base stands where it stands
+                k, j = -1, 0
+        else:
+            j += 1
+        if k < 0 and j >= pairs.shape[0]:
             break
-        for j in range(rows.shape[0]):
+        if k >= 0:
             if touching and rows[j, ROW + k] != 0.0:
                 continue
             gap = margin + clearance + rows[j, 16] + bodies[k, ROUNDING]
             reach = bodies[k, RADIUS] + gap
-            if reach > 0.0 and _sphere_gap(rows, j, centres, k) >= reach * reach:
+            squared = _sphere_gap(rows, j, centres, k)
+        else:
+            a, b = pairs[j, 0], pairs[j, 1]
+            gap = margin + (bodies[a, ROUNDING] + bodies[b, ROUNDING])
+            reach = bodies[a, RADIUS] + bodies[b, RADIUS] + gap
+            x, y = centres[a, 0] - centres[b, 0], centres[a, 1] - centres[b, 1]
+            z = centres[a, 2] - centres[b, 2]
+            squared = x * x + y * y + z * z
+        swept = 0.0
+        if share > 0.0:
+            # With the full margin, because that of other states may be larger.
+            sweep = sweeps[k if k >= 0 else bodies.shape[0] + j]
+            swept = rule[0] - margin + share * sweep + _ROUNDING
+            far = reach + swept
+            if squared >= far * far and reach > 0.0:
                 continue
-            if not _is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
-                return False
+        if reach <= 0.0 or squared < reach * reach:
+            if k >= 0:
+                lower = _apart_by(
+                    bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap, axes,
+                    k * shapes + j,
+                )  # fmt: skip
+            else:
+                _as_row(bodies, b, frames, centres, other)
+                lower = _apart_by(
+                    bodies, vertices, cells, a, other, 0, frames, centres, pose, s, gap, axes,
+                    bodies.shape[0] * shapes + j,
+                )  # fmt: skip
+            if lower == -FAR:
+                return -1
+            if share > 0.0 and lower >= gap + swept:
+                continue
+        if share > 0.0:
+            still[place, count, 0], still[place, count, 1] = k, j
+            count += 1
+    for k in range(bodies.shape[0] - 1 if groups.shape[0] > 0 else -1, -1, -1):
+        if bodies[k, LINK_ROW] < 0.0:
+            break
         for g in range(groups.shape[0]):
             gap = margin + clearance + ball[0, 16] + bodies[k, ROUNDING]
             if _box_gap(bodies, k, frames, centres, groups, g, pose) >= groups[g, 3] + gap:
@@ -419,39 +526,60 @@ def _is_free(q, rule, endpoint_margins, arm, world, memory):
                     continue
                 _begin(ball, 0, pose, s)
                 if _gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
-                    return False
-    for i in range(pairs.shape[0]):
-        a, b = pairs[i, 0], pairs[i, 1]
-        gap = margin + (bodies[a, ROUNDING] + bodies[b, ROUNDING])
-        reach = bodies[a, RADIUS] + bodies[b, RADIUS] + gap
-        x, y = centres[a, 0] - centres[b, 0], centres[a, 1] - centres[b, 1]
-        z = centres[a, 2] - centres[b, 2]
-        if reach > 0.0 and x * x + y * y + z * z >= reach * reach:
-            continue
-        _as_row(bodies, b, frames, centres, other)
-        if not _is_apart(bodies, vertices, cells, a, other, 0, frames, centres, pose, s, gap):
-            return False
-    return True
+                    return -1
+    return count
+
+
+@compiled
+def _sweeps(start, end, chain, bodies, pairs):
+    """How far (m) points move at most in a straight motion, (b + p,).
+
+    Those of each body in the base's frame, and those of each pair of links towards each other.
+    """
+    sweeps = np.zeros(bodies.shape[0] + pairs.shape[0])
+    for frame in range(1, chain.shape[0]):
+        joint = int(chain[frame, JOINT])
+        turn = abs((end[joint] - start[joint]) * 0.5 * chain[frame, SPAN])
+        for k in range(bodies.shape[0]):
+            sweeps[k] += turn * bodies[k, BODY_COLUMNS + frame]
+        for i in range(pairs.shape[0]):
+            one = bodies[pairs[i, 0], BODY_COLUMNS + frame]
+            two = bodies[pairs[i, 1], BODY_COLUMNS + frame]
+            if one == 0.0 or two == 0.0:  # a frame that moves both changes nothing
+                sweeps[bodies.shape[0] + i] += turn * (one + two)
+    return sweeps
 
 
 @compiled
 def free_batch(states, rule, endpoint_margins, arm, world, free):
     """Write `CollisionChecker.is_free` of states (m, n) to `free` (m,)."""
-    memory = _memory(arm[0], arm[1])
+    memory, sweeps = _memory(arm[0], arm[1]), np.empty(0)
+    axes, lists = np.empty((0, 3)), np.empty((0, 0, 2), np.int64)
     for i in range(states.shape[0]):
-        near = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
-        free[i] = _is_free(states[i], rule, near, arm, world, memory)
+        margins = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
+        known = lists, 0, -1
+        near = _is_free(
+            states[i], rule, margins, arm, world, memory, axes, sweeps, 0.0, known, lists, 0
+        )
+        free[i] = near >= 0
+
+
+# Of the states of a motion, the first ones list what is near. The others use those lists.
+_LISTS = 32
 
 
 @compiled
 def motion(rule, endpoint_margins, arm, world, end_known, start, end):
     """Number of states of a motion that were checked, without its start; negative: not free."""
+    chain, bodies, pairs, _, _ = arm
     joints = len(start)
-    memory, q = _memory(arm[0], arm[1]), np.empty(joints)
+    memory, q = _memory(chain, bodies), np.empty(joints)
     squared = 0.0
     for j in range(joints):
         squared += (end[j] - start[j]) ** 2
     pieces = int(math.ceil(math.sqrt(squared) / rule[3]))
+    axes, sweeps = np.empty((0, 3)), np.empty(0)
+    lists, counts = np.empty((0, 0, 2), np.int64), np.empty(0, np.int64)
     checks, parts, part = 0, 1, 1
     if end_known:
         parts = 2
@@ -466,8 +594,28 @@ def motion(rule, endpoint_margins, arm, world, end_known, start, end):
             for j in range(joints):
                 q[j] = start[j] + (end[j] - start[j]) * share
             checks += 1
-            if not _is_free(q, rule, endpoint_margins, arm, world, memory):
+            if parts == 2:  # the end is free, so it is worth while to remember what is near
+                size = bodies.shape[0] * world[0].shape[0] + pairs.shape[0]
+                axes, sweeps = np.zeros((size, 3)), _sweeps(start, end, chain, bodies, pairs)
+                lists = np.empty((min(_LISTS, pieces), size, 2), np.int64)
+                counts = np.empty(lists.shape[0], np.int64)
+            # The states are a binary tree: below a state are those between it and its neighbours,
+            # and below place n are 2 n and 2 n + 1.
+            place = parts // 2 + part // 2
+            above = place // 2
+            while above >= max(lists.shape[0], 1):
+                above //= 2
+            around = max(i - before, after - i)
+            share = around / pieces if 0 < place < lists.shape[0] and around > 1 else 0.0
+            known = lists, above, counts[above] if above > 0 else -1
+            near = _is_free(
+                q, rule, endpoint_margins, arm, world, memory, axes, sweeps, share, known, lists,
+                place,
+            )  # fmt: skip
+            if near < 0:
                 return -checks
+            if share > 0.0:
+                counts[place] = near
         part += 2
         if part > parts:
             if parts >= pieces:
@@ -478,17 +626,17 @@ def motion(rule, endpoint_margins, arm, world, end_known, start, end):
 @compiled
 def motion_batch(starts, stops, rule, endpoint_margins, arm, world, ends_known, checks):
     """Write `CollisionChecker.motion_checks` of motions (m, n), (m, n) to `checks` (m,)."""
-    memory = _memory(arm[0], arm[1])
+    begins = np.ones(starts.shape[0], np.bool_)
+    if not ends_known:
+        free_batch(starts, rule, endpoint_margins, arm, world, begins)
     for i in range(starts.shape[0]):
-        near = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
-        if ends_known:
-            checks[i] = motion(rule, near, arm, world, True, starts[i], stops[i])
-            continue
-        if not _is_free(starts[i], rule, near, arm, world, memory):
+        if not begins[i]:
             checks[i] = -1
             continue
-        more = motion(rule, near, arm, world, False, starts[i], stops[i])
-        checks[i] = more + 1 if more > 0 else more - 1
+        margins = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
+        checks[i] = motion(rule, margins, arm, world, ends_known, starts[i], stops[i])
+        if not ends_known:
+            checks[i] += 1 if checks[i] > 0 else -1
 
 
 # --- Signed distances

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from paths import ROOT
 
+from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
+from roboarm_nmp.demo_generation.planning import Planner, PlanningError
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.demo_generation.verify import verify
 from roboarm_nmp.envs.collision.checker import CollisionChecker
@@ -53,6 +55,28 @@ def test_queries_and_demonstrations_of_another_arm_are_made_and_verified(file):
     assert "4 good, 0 changed, 0 missed, 0 collided, 0 refused" in verified.stdout
     by_path = roboarm("verify", demo_path(task), "--workers", 1)
     assert by_path.returncode == 1 and "name the robot's file, as TASK@" in by_path.stderr
+
+
+def test_plans_of_a_larger_arm_keep_a_larger_distance():
+    env = envs.make(f"random_boxes_hard@{ROBOTS / 'iiwa.yaml'}")
+    rng, planner, kept = np.random.default_rng(2), Planner(env, simplify=0), []
+    while len(kept) < 4:
+        env.sample_scene(rng)
+        start, goal = env.sample_query(rng)
+        checker = CollisionChecker(env.scene)
+        ends = np.clip(env.robot.normalise([start, goal]), -1.0, 1.0)
+        if not checker.is_free(ends, 0.02, 0.02).all():
+            continue
+        try:  # with the full margins, which shrink after 4,000 checks
+            path = planner.plan(start, goal, seed=1, time_limit=60)
+        except PlanningError:
+            continue
+        if planner.checks < 4_000:
+            states = np.clip(env.robot.normalise(path), -1.0, 1.0)
+            near = checker.signed_distances(states, self_collisions=False).distance.min()
+            kept.append(near)
+    assert min(kept) > 0.011  # 8 mm for the Panda, whose reach is 1.5 times shorter
+    env.close()
 
 
 def test_interrupted_collection_of_another_arm_continues_to_the_same_bytes(tmp_path, monkeypatch):

@@ -20,6 +20,7 @@ from roboarm_nmp.envs.collision.checker import (
     ARM,
     FLOOR,
     NOTHING,
+    RESOLUTION,
     TABLE,
     CollisionChecker,
 )
@@ -448,6 +449,30 @@ def test_every_point_of_a_motion_is_checked():
     pairs = zip(map(tuple, starts), map(tuple, ends), strict=True)
     free = [one(*pair) > 0 and checker.is_free(pair[0]) for pair in pairs]
     np.testing.assert_array_equal(free, expected)
+
+
+@pytest.mark.parametrize("robot", ["panda", "iiwa"])
+def test_motion_is_free_where_all_its_states_are(robot):
+    """What is remembered along a motion does not change an answer, of any length of motion."""
+    file = "" if robot == "panda" else f"@{ROOT / 'examples' / 'robots' / 'iiwa.yaml'}"
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        scene = envs.get_task(f"random_boxes_hard{file}").scene.sample(rng)
+        points = rng.uniform(0.3, 0.9, (20, 3)) * rng.choice([-1.0, 1.0], (20, 3)) * [1, 1, 0.5]
+        checker = CollisionChecker(scene, points, 0.01)
+        starts = rng.uniform(-1.0, 1.0, (2000, 7))
+        starts = starts[checker.is_free(starts, 0.003, 0.005)][:60]
+        lengths = rng.choice([0.05, 0.3, 1.5], (len(starts), 1))
+        moves = lengths * rng.standard_normal(starts.shape) / math.sqrt(7)
+        ends = np.clip(starts + moves, -1.0, 1.0)
+        near = ends[:2], np.array([0.001, -0.002]), 0.03
+        options = {"margin": 0.003, "clearance": 0.005, "endpoint_margins": near}
+        free = checker.is_motion_free(starts, ends, **options)
+        assert 0.1 < free.mean() < 0.95
+        for start, end, is_free in zip(starts, ends, free, strict=True):
+            pieces = max(math.ceil(np.linalg.norm(end - start) / RESOLUTION), 1)
+            states = start + np.arange(pieces + 1)[:, None] / pieces * (end - start)
+            assert checker.is_free(states.clip(-1.0, 1.0), **options).all() == is_free
 
 
 def test_one_start_is_broadcast_to_many_ends():
