@@ -1533,15 +1533,21 @@ def rows_in_time(motions, centres, shapes, times, rows):
 def free_in_time(states, steps, rule, endpoint_margins, arm, rows, cloud, free):
     """Write whether states (m, n) are free at `steps` (m,) and one step later to `free` (m,).
 
-    `rows`: (t, r, `ROW`), of each step. `cloud`: points, groups and ball of `world`.
+    `rows`: (t, r, `ROW` or more), of each step. `cloud`: points, groups and ball of `world`.
     """
     memory, last = _memory(arm[0], arm[1]), rows.shape[0] - 1
     points, groups, ball = cloud
+    axes, sweeps, lists = np.empty((0, 3)), np.empty(0), np.empty((0, 0, 2), np.int64)
+    known = lists, 0, -1
     for i in range(states.shape[0]):
         free[i] = True
         for step in range(steps[i], steps[i] + 2):
             world = rows[min(step, last)], points, groups, ball
-            if not _is_free(states[i], rule, endpoint_margins, arm, world, memory):
+            near = _is_free(
+                states[i], rule, endpoint_margins, arm, world, memory, axes, sweeps, 0.0, known,
+                lists, 0,
+            )  # fmt: skip
+            if near < 0:
                 free[i] = False
                 break
 
