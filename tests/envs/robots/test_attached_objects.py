@@ -16,10 +16,13 @@ from roboarm_nmp.envs.datasets.problem_formats import Problem
 from roboarm_nmp.envs.datasets.problems import load_problems, write_problems
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.networks.exported_networks import check_robot
-from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
+from roboarm_nmp.envs.perception.point_clouds import obstacle_points, prepare_cloud
+from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
 from roboarm_nmp.envs.policies.rollout import Episode
+from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.motions import Oscillation
 from roboarm_nmp.envs.scenes.primitives import (
     Attached,
     Box,
@@ -135,6 +138,48 @@ def test_points_on_an_object_are_the_arms_own():
     assert not len(prepare_cloud(points, robot, START, min_points=0)[0])
 
 
+def test_sensors_see_an_object_as_the_arm_and_no_points_of_it():
+    position, rotation = PANDA.frame_poses(START)[6]
+    place = position + 0.5 * rotation[:, 2]  # behind the fingertips
+    camera = Camera(tuple(place + [0.0, 0.5, 0.1]), tuple(place), size=(64, 64))
+    wall = Box((0.4, -0.5, 0.4), (1.0, 0.1, 0.8))  # behind the object
+    seen, world = [], SensorWorld()
+    for robot in (PANDA, PANDA.with_attached([Attached(Box((0, 0, 0.3), (0.05, 0.05, 0.2)))])):
+        world.show(Scene((wall,), robot=robot), START)
+        depth, classes = world.cast(camera, camera.size)
+        seen.append((classes[32, 32], depth[32, 32] < 0.5))
+        points = obstacle_points(world, [PointCloud(camera.eye, camera.target)])
+        assert len(points) > 1000 and points[:, 1].max() < -0.449
+    assert seen == [(OBSTACLE, False), (ROBOT, True)]
+    world.close()
+
+
+def test_safety_filter_keeps_an_object_from_the_table():
+    low = START.copy()
+    low[1], low[5] = 0.4, 2.5  # the fingertips are 0.16 m above the table
+    rod = PANDA.with_attached([Attached(Box((0, 0, 0.2), (0.03, 0.03, 0.3)))])
+    env = envs.make("no_obstacles", link_distances=True, geometry_source="ground_truth")
+    table = Box((0, 0, -0.02), (3, 3, 0.04))
+
+    def lowered(robot, filtered):
+        observation, _ = env.reset_specific(START, START, Scene((), table, robot=robot))
+        act = lambda seen: 0.04 * (PANDA.normalise(low) - seen["observation"][:7])  # noqa: E731
+        contact, safe = False, SafetyFilter(escape=False)
+        if filtered:
+            act = safe.filter_policy(act, env, np.random.default_rng(0))
+        for _ in range(120):
+            observation, *_, info = env.step(act(observation))
+            contact |= info["collision"]
+        return contact, np.abs(PANDA.denormalise(observation["observation"][:7]) - low).max()
+
+    assert lowered(rod, filtered=False)[0]
+    contact, away = lowered(rod, filtered=True)
+    assert not contact and away > 0.1
+    contact, away = lowered(PANDA, filtered=True)
+    assert not contact and away < 0.05
+    env.close()
+
+
 def test_body_and_its_coarse_copy_have_the_object():
     client = p.connect(p.DIRECT)
     for robot, links in ((PANDA, 12), (PANDA.with_attached([BOARD, ROCK]), 14)):
@@ -228,5 +273,7 @@ def test_objects_that_cannot_be_are_rejected():
         Attached("box")
     with pytest.raises(ValueError, match="positive sizes"):
         Attached(Sphere((0, 0, 0), -1.0))
+    with pytest.raises(ValueError, match="an attached shape has no motion"):
+        Attached(Sphere((0, 0, 0), 0.1, Oscillation((0.1, 0, 0))))
     with pytest.raises(ValueError, match="the arm collides with itself in each of"):
         PANDA.with_attached([Attached(Sphere((0, 0, 0), 3.0))])

@@ -9,10 +9,13 @@ from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.collision.moving import free_over_time
+from roboarm_nmp.envs.collision.timed_checker import TimedChecker
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.motions import Oscillation, Presence
 from roboarm_nmp.envs.scenes.primitives import (
     Attached,
     Box,
@@ -89,10 +92,44 @@ def test_link_distances_leave_the_object_out_for_the_hand_alone(source):
         assert checker.is_free(state) == margin_free
 
 
+def test_moving_obstacles_keep_the_links():
+    rng, names = np.random.default_rng(0), ("panda_link5", "panda_link6")
+    robot = PANDA.with_attached([Attached(Box((0, 0, 0.1), (0.05, 0.05, 0.3)))])
+    boxes, choices = RandomBoxes(8, 8).sample(rng).obstacles, [True, names, (), True]
+    obstacles = [
+        replace(one, may_touch=choices[i % 4], motion=Oscillation((0.1, 0, 0.05), 3.0, i))
+        for i, one in enumerate(boxes)
+    ]
+    scene = Scene((*obstacles, replace(boxes[0], may_touch=True)), robot=robot)
+    assert [one.may_touch for one in scene.at(1.0).obstacles] == [*choices, *choices, True]
+    states, world, differ = rng.uniform(-1, 1, (60, 7)), World(scene, drawn=False), 0
+    timed = TimedChecker(scene, 40, 1 / 30)
+    for step in (0, 30):
+        t = step / 30
+        checkers = [CollisionChecker(scene.at((step + i) / 30)) for i in range(2)]
+        free = [one.is_free(states) for one in checkers]
+        angles = [robot.denormalise(state).tolist() for state in states]
+        assert [not world.in_collision(q, t) for q in angles] == free[0].tolist()
+        np.testing.assert_array_equal(timed.is_free(states, np.full(60, step)), free[0] & free[1])
+        moving = Scene(scene.at(t).obstacles[:8], None, None, robot=robot)
+        itself = CollisionChecker(Scene((), None, None, robot=robot)).is_free(states)
+        found = free_over_time(scene, states, [t])[:, 0]
+        np.testing.assert_array_equal(found & itself, CollisionChecker(moving).is_free(states))
+        solid = [replace(one, may_touch=()) for one in scene.at(t).obstacles]
+        differ += (
+            CollisionChecker(replace(scene, obstacles=solid)).is_free(states) != free[0]
+        ).sum()
+    world.close()
+    assert differ > 3
+
+
 def test_files_keep_the_links(tmp_path):
     hull = convex_hull(np.random.default_rng(0).uniform(-0.1, 0.1, (8, 3)), (0.5, 0, 0.2))
     names = ("panda_hand", "panda_link5")
+    motion = Presence(((1.0, 2.0),), Oscillation((0.1, 0, 0)))
     obstacles = (CAN, replace(hull, may_touch=names), Sphere((0, 0.6, 0.5), 0.1))
+    obstacles += replace(CAN, motion=motion), replace(obstacles[1], motion=motion)
+    obstacles += (replace(hull, motion=motion),)
     table = replace(Scene().table, may_touch=("panda_hand",))
     scene = Scene(obstacles, table)
     save_scene(scene, tmp_path / "a.yaml")
@@ -108,7 +145,9 @@ def test_query_file_of_varying_scenes_keeps_the_links(tmp_path):
     ends, base = np.array([START, GOAL], np.float32), get_task("random_boxes_easy").base_scene
     for touching in (True, False):
         path = tmp_path / f"{touching}.h5"
-        found = [replace(base, obstacles=(replace(CAN, may_touch=touching),)), base]
+        can = replace(CAN, may_touch=touching)
+        moving = replace(can, motion=Oscillation((0, 0.3, 0)))
+        found = [replace(base, obstacles=(can, moving)), replace(base, obstacles=(can,))]
         splits = {"test": (ends, ends[::-1], found)}
         splits["validation"] = ends + np.float32(0.01), ends[::-1], found
         write_queries(path, "random_boxes_easy", 0, splits, "", {})
