@@ -207,7 +207,7 @@ class SafetyFilter:
     def _filter_actions(self, act, env, rng):
         """`filter_policy` without approach paths."""
         link_distances_at, max_step = env.get_wrapper_attr("link_distances_at"), env.max_step
-        robot, joints = env.robot, env.robot.num_joints
+        joints = env.robot.num_joints
         local_minima, goal_distances = _LocalMinima(rng, max_step, joints), None
         approach_rates = None
         if self.lookahead is not None:
@@ -218,13 +218,14 @@ class SafetyFilter:
             """Rates of rows of link distances; the rows are changed to those after `lookahead`."""
             rates = np.zeros(len(rows))
             if approach_rates is not None and approach_rates.any_motion:
-                scene = rows[: robot.link_distances_shape[0]]
+                scene = rows[: env.robot.link_distances_shape[0]]
                 rates[: len(scene)] = approach_rates(state, scene[:, 0])
                 rows[:, 0] += steps_ahead * rates
             return rates
 
         def act_safely(observation):
             nonlocal goal_distances
+            robot = env.robot  # an episode's scene may have another gripper opening, or objects
             state, goal = observation["observation"][:joints], None
             here = np.concatenate([observation["link_distances"], _self_distances(robot, state)])
             if approach_rates is not None:
