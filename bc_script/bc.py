@@ -58,8 +58,6 @@ class Args(protocol.PolicyFlags):
     """raw observations and goals as inputs"""
     bf16: bool = False
     """train with hidden layers in bfloat16"""
-    compile: bool = True
-    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
     encoder: str | None = None
     """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
     `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/guide/perception.md),
@@ -240,9 +238,9 @@ if __name__ == "__main__":
 
     while run.step < args.total_updates:
         # ALGO LOGIC: learn
-        if args.anneal:
-            remaining = 1.0 - run.step / args.total_updates
-            cuda_graphs.set_learning_rate(optimizer, args.learning_rate * remaining)
+        remaining = 1.0 - run.step / args.total_updates if args.anneal else 1.0
+        learning_rate = args.learning_rate * remaining
+        cuda_graphs.set_learning_rate(optimizer, learning_rate)
         rows = torch.randint(len(data[0]), (args.batch_size,), device=device)
         observation, goal, action, demo_index = (tensor[rows] for tensor in data)
         if latents is not None:
@@ -251,7 +249,6 @@ if __name__ == "__main__":
         polyak_update(actor_average, actor, args.policy_average)
         step = run.advance()
         if step % 1000 == 0:
-            learning_rate = optimizer.param_groups[0]["lr"]
             run.log({f"losses/{name}": value for name, value in losses.items()})
             run.log({"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
 

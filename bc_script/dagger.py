@@ -14,7 +14,6 @@ under `# ALGO LOGIC`. The part between `# SHARED` and `# END SHARED` is the same
 
 import functools
 import itertools
-import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,8 +92,6 @@ class Args(protocol.PolicyFlags):
     """number of residual blocks"""
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
-    compile: bool = True
-    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
 
     # The safety filter
     safety_margin: flags.NonNegativeFloat = 0.01
@@ -170,7 +167,7 @@ class Actor(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = env.observation_space["desired_goal"].shape[0]
         # Sines, cosines and link distances; here and, unless it is a pose, at the goal.
-        size = 2 * joints + math.prod(robot.link_distances_shape)
+        size = 2 * joints + int(np.prod(robot.link_distances_shape))
         size = self.arm_size + goal_size + (size + 6 if self.goal_is_pose else 2 * size)
         self.token_in = nn.Linear(self.token_size, args.token_width)
         self.arm_in = nn.Linear(size, args.token_width)
@@ -345,9 +342,9 @@ if __name__ == "__main__":
 
     while run.step < args.total_updates:
         # ALGO LOGIC: learn, while the next examples are drawn
-        if args.anneal:
-            remaining = 1.0 - run.step / args.total_updates
-            cuda_graphs.set_learning_rate(optimizer, args.learning_rate * remaining)
+        remaining = 1.0 - run.step / args.total_updates if args.anneal else 1.0
+        learning_rate = args.learning_rate * remaining
+        cuda_graphs.set_learning_rate(optimizer, learning_rate)
         batch = sample(pool, args.batch_size)
         if visited and len(visited["scene"]):
             weight = args.round_weight * len(visited["scene"])
@@ -363,7 +360,6 @@ if __name__ == "__main__":
             pool[name][oldest : oldest + len(tensor)] = tensor
         step = run.advance()
         if step % 100 == 0:
-            learning_rate = optimizer.param_groups[0]["lr"]
             run.log(losses | {"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
 
         # ALGO LOGIC: a round of DAgger

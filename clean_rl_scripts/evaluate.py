@@ -19,45 +19,19 @@ Baselines to compare a trained policy with:
 
 - go-to-goal: straight to the goal configuration, whatever is in the way;
 - random: a random action at every step;
-- via-points: straight to the goal configuration if that motion is free of collisions; otherwise
-  through the first of `--tries` random configurations for which the motion is free; without such a
-  configuration, straight to the goal;
-- planner: follows a plan of OMPL's RRT-Connect, which may search for `--time-limit` seconds per
-  query. The longer the search, the smaller the margin around obstacles. (Shortening a plan may take
-  a few more milliseconds.) Without a plan the episode is a failure of 0 steps. The limit is
-  wall-clock time, so the numbers may depend on the machine and its load;
-- replanning: follows a plan, checks it in each step against the obstacles as they are then, and
-  plans again whenever it is blocked. Each plan may take a few thousand checks. It waits near a goal
-  that is occupied;
+- via-points: straight, or through one of `--tries` random configurations if that motion is free;
+- planner: follows a plan of OMPL's RRT-Connect, found within `--time-limit` seconds;
+- replanning: checks its plan in each step, and plans again whenever it is blocked;
 - space-time: follows a plan that knows how obstacles will move, the reference where they do.
 
-The last four check collisions with the obstacles of a geometry source (`--geometry-source`):
-`ground_truth` by default, which a trained policy does not receive; `point_cloud` to plan from the
-observed point cloud; or an encoder with a decoder, e.g. `field`, to plan from its latent code.
+The last four check collisions with the obstacles of `--geometry-source`, by default the ground
+truth, which `space-time` always has. `--safety-margin` puts a safety filter around any policy. A
+result that used ground-truth obstacles is `privileged`.
 
-Around any policy, `--safety-margin` puts a safety filter (`envs.policies.safety_filter`): it
-enforces a minimum clearance (m) on every link as far as possible, retreats from approaching
-obstacles, and escapes local minima (but around `replanning`, which waits on purpose). Its
-link distances have a geometry source, too: the policy's own, otherwise `ground_truth`. Results that
-used the ground truth are `privileged`, in the header of the table and in the JSON.
-
-Metrics:
-
-- success: share of episodes that reached the goal, with a 95% Wilson interval;
-- collision-free success: share that reached it without any contact;
-- collision: share with a contact, whether the goal was reached or not;
-- steps, path length, smoothness: means over the successful episodes. With configurations
-  c_0 ... c_T in rad, the path length is the sum of |c_t+1 - c_t|, in rad, and the smoothness the
-  mean of |c_t+1 - 2 c_t + c_t-1|, in rad per step^2 (L2 norms; lower is smoother);
-- end effector's path, in m, duration of the motion, in s, and mean jerk, in rad/s^3: likewise. The
-  JSON has more (`envs.metrics`): rotation of the end effector, largest jerk, SPARC;
-- clearance, with `--clearance`: the episode's smallest distance from an obstacle, in m, likewise;
-- time per action: of the policy alone, without the simulator and without planning.
-
-Also of `via-points`, `planner` and `space-time`:
-
-- planning time, in s, before moving: mean over all queries, and over those with a motion found;
-- free motion (only `via-points`): share of queries with a motion found.
+The success rate counts contacts as no failure, the collision-free success rate does. Both, and the
+collision rate, have 95% Wilson intervals. Means over the successful episodes: steps, path length
+(rad), smoothness (rad/step^2, lower is smoother), end effector's path (m), duration (s), jerk
+(rad/s^3), clearance (m). docs/guide/evaluation.md describes baselines, filter and every number.
 
 From Python: `roboarm_nmp.evaluate(policy, task, ...)` returns the same numbers as a dict.
 """
@@ -71,11 +45,10 @@ from typing import Literal
 
 from PIL import Image
 
-from roboarm_nmp.envs.arm_env import STANDARD_RULES
 from roboarm_nmp.envs.policies.baselines import TIME_LIMIT, TRIES
-from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
+from roboarm_nmp.envs.training.evaluation_report import report
 from roboarm_nmp.envs.utils.files import check_writable, write_atomically
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
@@ -174,7 +147,7 @@ def main(arguments=None):
     except ValueError as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
-    print(_table(result | {"policy": args.policy}), flush=True)  # before JSON on /dev/stdout
+    print(report(result | {"policy": args.policy}), flush=True)  # before JSON on /dev/stdout
     try:
         if args.json is not None:
             write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())
@@ -213,91 +186,6 @@ def _safety_filter(args):
         lookahead = own.lookahead
     options = {"approach": own.approach or args.approach, "lookahead": lookahead}
     return replace(own, escape=own.escape and args.escape, **options)
-
-
-def _settings(result):
-    """What distinguishes this evaluation from others, in words; None where a policy lacks it."""
-    from roboarm_nmp.envs.perception.point_clouds import NUM_POINTS
-
-    env, safety_filter = result["env"], result["safety_filter"]
-    encoder, margin = env.get("encoder") or "none", "none"
-    if encoder == "point_cloud":
-        encoder += f", {env.get('num_points', NUM_POINTS)} points"
-    if safety_filter is not None:
-        escape = "escapes local minima" if safety_filter["escape"] else "no escape"
-        margin = f"margin {safety_filter['margin']:g} m, {escape}"
-        margin += ", approach paths" * ("approach" in safety_filter)
-        if "lookahead" in safety_filter:
-            ahead = safety_filter["lookahead"]
-            margin += ", no velocities" if ahead is None else f", {ahead:g} s ahead"
-    limit, noise = result["time_limit"], result.get("sensor_noise", {})
-    return {
-        "robot": None if result["robot"] == PANDA.name else result["robot"],
-        "queries": result["queries"],
-        "goal type": result["goal_type"],
-        "encoder": encoder,
-        "geometry source": result["geometry_source"] or "none",
-        "privileged": "yes" if result["privileged"] else None,
-        "safety filter": margin,
-        "replans": "when stuck" if result.get("replan") else None,
-        "observed every": f"{result['observe_every']} steps" if "observe_every" in result else None,
-        "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
-        "time limit": None if limit is None else f"{limit:g} s per query",
-        "tries": result["tries"],
-        "action delay": _delay(result["action_delay"]),
-        "seed": result["seed"],
-    }
-
-
-def _delay(steps):
-    """The delay in words; None for none."""
-    if steps == "real_time":
-        return "real time: the steps that each action takes to compute"
-    return f"{steps} steps" if steps else None
-
-
-def _table(result):
-    """The text that is printed of a result."""
-
-    def row(name, value, unit="", interval=None):
-        number = "-" if value is None else f"{value:.4g}" if unit else f"{value:.4f}"
-        between = f"[{interval[0]:.4f}, {interval[1]:.4f}]" if interval else unit
-        return f"  {name:<24}{number:>9}  {between}"
-
-    count, split = f"{result['num_queries']:,}", result["split"]
-    lines = [f"{result['policy']} on {result['task']}: {count} {split} queries"]
-    if problems := result.get("problems"):
-        lines = [f"{result['policy']} on {problems['file']}: {count} problems"]
-    settings = _settings(result)
-    lines += [f"  {name:<24}{value}" for name, value in settings.items() if value is not None]
-    lines += [
-        f"  not comparable: {name} is {value}, not {STANDARD_RULES[name]}"
-        for name, value in result["deviations"].items()
-    ]
-    for label, name in (
-        ("success", "success_rate"),
-        ("collision-free success", "collision_free_success_rate"),
-        ("collision", "collision_rate"),
-    ):
-        lines.append(row(label, result[name], interval=result[f"{name}_interval"]))
-    lines += [
-        row("mean steps", result["mean_steps"], "of successful episodes"),
-        row("path length", result["path_length"], "rad"),
-        row("smoothness", result["smoothness"], "rad/step^2"),
-        row("end effector's path", result["ee_path_length"], "m"),
-        row("duration", result["duration"], "s"),
-        row("mean jerk", result["mean_jerk"], "rad/s^3"),
-    ]
-    if result["min_clearance"] is not None:
-        lines.append(row("smallest clearance", result["min_clearance"], "m"))
-    lines.append(row("time per action", result["ms_per_action"], "ms"))
-    if result["planning_seconds"] is not None:
-        lines += [
-            row("planning time", result["planning_seconds"], "s"),
-            row("  ... if found", result["planning_seconds_solved"], "s"),
-        ]
-    lines += [row("free motion", result["free_motion_rate"])] * (result["tries"] is not None)
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -67,8 +67,6 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not twice `max_step`)"""
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
-    compile: bool = True
-    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
     eval_every: flags.PositiveInt = 25_000
     """environment steps between evaluations on validation queries; the best policy is saved"""
     stop_at_success: flags.Share | None = None

@@ -36,13 +36,16 @@ GROUPS = {
         *("problems", "num_queries", "query", "num"),
         *("action_mode", "max_step", "horizon", "stop_on_collision"),
     ),
-    "observation": (*("encoder", "num_points", "velocities", "geometry_source", "link_distances"),),
-    "safety_filter": ("safety_margin", "escape", "approach"),
+    "observation": (
+        *("encoder", "num_points", "velocities", "geometry_source", "link_distances"),
+        *("observe_every", "sensor_noise"),
+    ),
+    "safety_filter": ("safety_margin", "escape", "approach", "lookahead"),
     "data": ("demo_prob", "demos", "num_demos", "paths", "observations", "validation_share"),
     OTHERS: (),
     "evaluation": (
         *("eval_every", "eval_queries", "test_queries", "stop_at_success", "eval_scenes"),
-        *("clearance",),
+        *("clearance", "action_delay", "real_time"),
     ),
     "run": (
         *("seed", "runs_dir", "resume", "device", "bf16", "compile", "track", "workers"),

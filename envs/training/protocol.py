@@ -50,12 +50,14 @@ RULES = [name for name in STANDARD_RULES if name != "max_step"]
 
 @dataclass
 class PolicyFlags(RunFlags):
-    """The flags of every trainer of a policy: those of its run, the task and the evaluations."""
+    """The flags of every trainer of a policy: its run, task, updates and evaluations."""
 
     task: str = "no_obstacles"
     """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
     robot: Path | None = None
     """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
+    compile: bool = True
+    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
     eval_queries: PositiveInt = 200
     """validation queries per evaluation"""
     test_queries: NonNegativeInt = 1_000

@@ -32,6 +32,7 @@ from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.tasks import Task
 from roboarm_nmp.envs.training import evaluation
 from roboarm_nmp.envs.training.evaluation import EvaluationError, evaluate
+from roboarm_nmp.envs.training.evaluation_report import report
 
 SCRIPT = ROOT / "clean_rl_scripts" / "evaluate.py"
 HARD = "random_boxes_hard"
@@ -86,7 +87,7 @@ def _numbers(result):
 def header_of(result):
     """Rows of the command's header: dict of name -> text."""
     rows = itertools.takewhile(
-        lambda line: not line.startswith("  success"), command._table(result).splitlines()[1:]
+        lambda line: not line.startswith("  success"), report(result).splitlines()[1:]
     )
     return dict(re.split(" {2,}", row.strip(), maxsplit=1) for row in rows)
 
@@ -693,9 +694,9 @@ def test_moving_obstacles_are_evaluated_and_a_delay_is_noted(tmp_path, capsys):
     real = evaluate("go-to-goal", "no_obstacles", real_time=True, **options)
     assert real["action_delay"] == "real_time"
     for result, words in ((late, "60 steps"), (real, "real time"), (found, None)):
-        text = command._table(result)
+        text = report(result)
         assert (f"action delay            {words}" in text) == (words is not None)
-    assert "action delay" not in command._table(found)
+    assert "action delay" not in report(found)
     with pytest.raises(EvaluationError, match="give one of them"):
         evaluate("go-to-goal", "wall", action_delay=1, real_time=True)
     with pytest.raises(EvaluationError, match="must not be negative"):
