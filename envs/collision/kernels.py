@@ -1536,8 +1536,6 @@ def free_in_time(states, steps, rule, endpoint_margins, arm, rows, cloud, free):
     `rows`: (t, r, `ROW` or more), of each step. `cloud`: points, groups and ball of `world`.
     """
     memory, last = _memory(arm[0], arm[1]), rows.shape[0] - 1
-    axes, sweeps, lists = np.empty((0, 3)), np.empty(0), np.empty((0, 0, 2), np.int64)
-    known = lists, 0, -1
     points, groups, ball = cloud
     axes, sweeps, lists = np.empty((0, 3)), np.empty(0), np.empty((0, 0, 2), np.int64)
     known = lists, 0, -1
