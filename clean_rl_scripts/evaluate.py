@@ -22,7 +22,7 @@ Baselines to compare a trained policy with:
 - via-points: straight, or through one of `--tries` random configurations if that motion is free;
 - planner: follows a plan of OMPL's RRT-Connect, found within `--time-limit` seconds;
 - replanning: checks its plan in each step, and plans again whenever it is blocked;
-- space-time: follows a plan that knows how obstacles will move, the reference where they do.
+- space-time: follows a plan for the known future motions of obstacles, the reference with them.
 
 The last four check collisions with the obstacles of `--geometry-source`, by default the ground
 truth, which `space-time` always has. `--safety-margin` puts a safety filter around any policy. A
