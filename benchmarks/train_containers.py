@@ -228,9 +228,8 @@ def main(args):
         args.workers, multiprocessing.get_context("spawn"), begin, (args, weights)
     )
     pool, visited = Pool(args.pool_size, device), Pool(VISITED_SIZE, device)
-    drawing, visiting = collections.deque(), []
-    num_drawn = num_visits = step = 0
-    outcomes, start = collections.deque(maxlen=100), None
+    drawing, visiting, outcomes = collections.deque(), [], collections.deque(maxlen=100)
+    num_drawn, num_visits, step, start = 0, 0, 0, None
     bar = progress_bar(description="training", unit="update")
     while start is None or time.time() < start + args.seconds:
         # New examples.
