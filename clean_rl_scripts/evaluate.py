@@ -22,7 +22,7 @@ Baselines to compare a trained policy with:
 - via-points: straight, or through one of `--tries` random configurations if that motion is free;
 - planner: follows a plan of OMPL's RRT-Connect, found within `--time-limit` seconds;
 - replanning: checks its plan in each step, and plans again whenever it is blocked;
-- space-time: follows a plan that knows how obstacles will move, the reference where they do.
+- space-time: follows a plan for the known future motions of obstacles, the reference with them.
 
 The last four check collisions with the obstacles of `--geometry-source`, by default the ground
 truth, which `space-time` always has. `--safety-margin` puts a safety filter around any policy. A
@@ -88,6 +88,9 @@ class Args:
     default the filter that the policy includes, if any"""
     escape: bool = True
     """the safety filter escapes local minima, in a random direction"""
+    replan: bool = False
+    """whenever the policy is stuck, follow a plan for 90 steps, as `replanning` does, among the
+    obstacles of the geometry source; the safety filter then makes no escapes"""
     lookahead: flags.NonNegativeFloat = 0.0
     """s: the safety filter takes distances as they will be after this time, if obstacles continue
     to approach as they do now"""

@@ -133,12 +133,16 @@ class Sampler:
             ends, robot = np.array([start, goal]), self.env.robot
             if self.limits != "urdf" and not robot.is_within(ends, self.limits).all():
                 rejected["outside"] += 1
-            elif not all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal)):
+                continue
+            if not self.env.sample_motions(start, goal, motions):
+                rejected["blocked"] += 1
+                continue
+            if moving:
+                self.env.set_scene(self.env.scene_at_rest)
+            if not all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal)):
                 rejected["unheld"] += 1
             elif self.planner and not demonstrate(self.planner, start, goal, rng, SOLVE_ATTEMPTS):
                 rejected["unsolved"] += 1
-            elif not self.env.sample_motions(start, goal, motions):
-                rejected["blocked"] += 1
             else:
                 scene = {"obstacles": to_lists(self.env.scene.obstacles)}
                 if moving:

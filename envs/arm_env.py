@@ -178,7 +178,8 @@ class RoboArmEnv(gym.Env):
         if self.scene_distribution is not None:
             scene = self.scene_distribution.base
         self.is_animated = hasattr(self.scene_distribution, "animate")
-        self._scene_at_rest = scene
+        self.scene_at_rest = scene
+        """The scene that was drawn last, without motions; the task's, if it is fixed."""
         self.goal_type = goal_type
         self._tolerance = config_tolerance if goal_type == "config" else ee_tolerance
         self.ee_tolerance = ee_tolerance
@@ -326,8 +327,8 @@ class RoboArmEnv(gym.Env):
     def sample_scene(self, rng):
         """Change to a scene drawn from the task's distribution. A fixed scene stays."""
         if self.scene_distribution is not None:
-            self._scene_at_rest = self.scene_distribution.sample(rng)
-            self.set_scene(self._scene_at_rest)
+            self.scene_at_rest = self.scene_distribution.sample(rng)
+            self.set_scene(self.scene_at_rest)
 
     def sample_motions(self, start, goal, rng):
         """Draw motions for the obstacles of the sampled scene, where its distribution has some.
@@ -345,7 +346,7 @@ class RoboArmEnv(gym.Env):
         # Here, because Numba takes a while to import.
         from roboarm_nmp.envs.collision.moving import free_over_time
 
-        scene = distribution.animate(self._scene_at_rest, start, goal, rng)
+        scene = distribution.animate(self.scene_at_rest, start, goal, rng)
         states = self.robot.normalise(np.array([start, goal]))
         if not distribution.accepts(*free_over_time(scene, states, distribution.check_times)):
             return False
@@ -377,7 +378,7 @@ class RoboArmEnv(gym.Env):
         self._episodes_in_scene += 1
         while True:
             if self.is_animated:
-                self.set_scene(self._scene_at_rest)
+                self.set_scene(self.scene_at_rest)
             start, goal = self.sample_query(self.np_random)
             if self.sample_motions(start, goal, self.np_random):
                 return self._begin(start, goal)

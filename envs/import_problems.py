@@ -113,6 +113,12 @@ def summary(kept, rejected):
     poses = sum(not len(problem.goals) for problem in kept)
     if poses:
         lines.append(f"  {poses} with a goal pose only")
+    attached = sum(bool(problem.scene.robot.attached) for problem in kept)
+    if attached:
+        lines.append(f"  {attached} with attached objects")
+    touching = sum(any(one.may_touch for one in problem.scene.obstacles) for problem in kept)
+    if touching:
+        lines.append(f"  {touching} with obstacles that links may touch")
     kinds = Counter(re.sub(r"[\d.]+ rad", "... rad", _kind(one.reason)) for one in rejected)
     lines += [f"not imported: {count}: {kind}" for kind, count in kinds.most_common(LISTED)]
     lines += [f"  {one.name}: {one.reason}" for one in rejected[:LISTED]]

@@ -31,7 +31,7 @@ HOLD_STEPS = 5
 HOLD_DRIFT = 1e-3
 # Colour and friction.
 FLOOR_STYLE, TABLE_STYLE = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
-OBSTACLE_COLOUR = (0.36, 0.50, 0.65, 1)
+OBSTACLE_COLOUR, TOUCHABLE_COLOUR = (0.36, 0.50, 0.65, 1), (0.59, 0.47, 0.67, 1)
 MAX_SAMPLING_TRIES = 10_000
 MAX_EDGE = 4096  # pixels of an image: 20,000 by 20,000 would need all of a machine's memory
 # PyBullet keeps about 4 kB of each body that is removed, so the world is made anew after this many
@@ -224,13 +224,15 @@ class World:
             self._parts.append((floor_box(scene.floor), *FLOOR_STYLE))
         if scene.table is not None:
             self._parts.append((scene.table, *TABLE_STYLE))
-        style = (OBSTACLE_COLOUR, scene.friction)
-        self._parts += [(obstacle, *style) for obstacle in scene.obstacles]
+        for obstacle in scene.obstacles:
+            colour = TOUCHABLE_COLOUR if obstacle.may_touch else OBSTACLE_COLOUR
+            self._parts.append((obstacle, colour, scene.friction))
         # The first bodies stay as far as they are the same: floor and table, mostly.
         same = 0
         while same < min(len(before), len(self._parts)) and before[same] == self._parts[same]:
             same += 1
-        for body in self._bodies[same:]:
+        for (obstacle, *_), body in zip(before[same:], self._bodies[same:], strict=True):
+            self._let_touch(obstacle, body, may_collide=1)  # PyBullet will use its number again
             p.removeBody(body, physicsClientId=self.client)
         self._bodies = self._bodies[:same]
         for part in self._parts[same:]:
@@ -318,8 +320,16 @@ class World:
         for link in self.robot.links:  # the arm's base is bolted to the table
             if link.frame < 0 and (link.index >= 0 or obstacle is self.scene.table):
                 p.setCollisionFilterPair(self.body, body, link.index, -1, 0, physicsClientId=client)
+        self._let_touch(obstacle, body)
         self._bodies.append(body)
         self._bodies_made += 1
+
+    def _let_touch(self, obstacle, body, may_collide=0):
+        """Let the links that may touch an obstacle pass through its body, or not any more."""
+        for link in self.robot.links_called(obstacle.may_touch) & self.robot.link_rows.keys():
+            p.setCollisionFilterPair(
+                self.body, body, link, -1, may_collide, physicsClientId=self.client
+            )
 
     # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
 

@@ -12,8 +12,9 @@ The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`
 world. The shapes are: the convex hulls of the links' collision meshes, and of obstacles,
 `BULLET_MARGIN` thicker on all sides; boxes and cylinders, with edges rounded by as much; spheres;
 the table and the floor. Of links, the robot's `self_collision_pairs` are checked. As in PyBullet,
-the base collides only with the arm itself. How often the two disagree:
-docs/benchmark/performance.md.
+the base collides only with the arm itself. An obstacle is not there for links in its `may_touch`.
+Objects attached to the arm belong to the links that carry them, with self-collision pairs of their
+own. How often the two disagree: docs/benchmark/performance.md.
 
 Two shapes are compared in three stages, each only if the one before could not separate them: the
 link's bounding sphere against the box around the obstacle; the link's bounding box against that
@@ -32,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, group_points, world_shapes
+from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, group_points, world_shapes
 from roboarm_nmp.envs.collision.kernels import (
     free_batch,
     link_distances_batch,
@@ -118,7 +119,7 @@ class CollisionChecker:
             shapes.append(floor_box(scene.floor))
             geometries.append(FLOOR)
         self._geometries = np.array([*geometries, ARM, POINT, NOTHING])
-        rows, self._arm = world_shapes(shapes, arm_hulls(scene.robot))
+        rows, self._arm = world_shapes(shapes, scene.robot)
         self._world = rows, *group_points(points, point_radius)
 
     @classmethod
@@ -372,6 +373,6 @@ def self_distances(robot, states, within):
     return _arm_alone(robot).link_distances(states, self_collisions=True, within=within)
 
 
-@functools.cache
+@functools.lru_cache(64)
 def _arm_alone(robot):
     return CollisionChecker(Scene(table=None, floor=None, robot=robot))

@@ -17,6 +17,7 @@ from roboarm_nmp.envs.collision.kernels import (
     FRAME,
     FRAME_COLUMNS,
     LINK,
+    LINK_ROW,
     PARENT,
     POSITION,
     PRISMATIC,
@@ -36,7 +37,7 @@ MAX_MARGIN = 0.5
 _GROUP_SIZE = 0.16
 
 
-@functools.cache
+@functools.lru_cache(64)
 def arm_hulls(robot):
     """The links' shapes as PyBullet makes them: `(chain, bodies, pairs, vertices, cells)`.
 
@@ -47,8 +48,8 @@ def arm_hulls(robot):
       the joint's value at -1 and its range, position 3 and rotation 9 in the parent;
     - `bodies`: float64 (b, `BODY_COLUMNS` + f): the frame in which a body moves, the centre of its
       bounding box there 3, the radius of the sphere around that centre, half edges 3, rounding (m),
-      and the link's row of link distances, -1 for those that do not move, which come first; then
-      `_levers`;
+      and the link's row of link distances (`Robot.link_rows`), -1 for those that do not move, which
+      come first; then `_levers`;
     - `pairs`: int64 (p, 2), the bodies that may collide;
     - `vertices`: float64 (v, 3), m, relative to their body's centre;
     - `cells`: see `_cells`.
@@ -65,12 +66,18 @@ def arm_hulls(robot):
         )
         row[POSITION:] = *frame.position, *_exact(frame.rotation)
     bodies, meshes, of_link = [], [], {link.index: [] for link in robot.links}
-    rows = {link: row for row, link in enumerate(robot.collision_links)}
     for link, mesh, rounding, _ in link_shapes(robot):
         centre = (mesh.min(0) + mesh.max(0)) / 2
         mesh = mesh - centre
         radius = np.linalg.norm(mesh, axis=1).max()
-        body = 1 + link.frame, *centre, radius, *mesh.max(0), rounding, rows.get(link.index, -1)
+        body = (
+            1 + link.frame,
+            *centre,
+            radius,
+            *mesh.max(0),
+            rounding,
+            robot.link_rows.get(link.index, -1),
+        )
         of_link[link.index].append(len(bodies))
         bodies.append(body)
         meshes.append(mesh)
@@ -257,12 +264,19 @@ def _cells(meshes):
     return np.concatenate([np.array(ends) + len(ends), *candidates])
 
 
-def world_shapes(obstacles, arm):
-    """Obstacles as `shape_rows`, and `arm_hulls` with their convex hulls as well.
+def world_shapes(obstacles, robot):
+    """Obstacles as `shape_rows`, and a robot's `arm_hulls` with their convex hulls as well.
 
-    A convex hull is a row of the kind `LINK`, of a body that is not among the arm's `bodies`.
+    A convex hull is a row of the kind `LINK`, of a body that is not among the arm's `bodies`. If
+    links may touch some of the obstacles, rows have a column more for each body: 1 if it may.
     """
-    rows = shape_rows(obstacles)
+    rows, arm = shape_rows(obstacles), arm_hulls(robot)
+    if any(obstacle.may_touch for obstacle in obstacles):
+        links = [robot.links_called(obstacle.may_touch) for obstacle in obstacles]
+        of_rows = [[link in found for link in robot.collision_links] for found in links]
+        # (The base, whose row is -1, touches nothing anyway.)
+        touching = np.array(of_rows, dtype=np.float64)[:, arm[1][:, LINK_ROW].astype(int)]
+        rows = np.concatenate([rows, touching], axis=1)
     hulls = [obstacle for obstacle in obstacles if isinstance(obstacle, ConvexHull)]
     if not hulls:
         return rows, arm

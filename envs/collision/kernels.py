@@ -20,7 +20,8 @@ BULLET_MARGIN = 0.001
 FAR = 1e9  # m: farther than anything
 # A row describes a convex shape: kind, centre 3, rotation 9 (row-major), half edges of its core 3,
 # rounding, and the body's index if it is a link. The shape is the set of points within `rounding`
-# of its core: a box or a cylinder less its rounding, a sphere's centre, or a link's hull.
+# of its core: a box or a cylinder less its rounding, a sphere's centre, or a link's hull. Rows of
+# obstacles may have a column more for each body of the arm, which is 1 if that may touch the shape.
 # Kinds are those of `envs.scenes.primitives.to_array`, and `LINK`.
 CYLINDER, SPHERE, LINK = 1, 2, 3
 ROW = 18
@@ -447,6 +448,7 @@ def _is_free(
     frames, centres, pose, s, other = memory
     lists, above, given = known
     joints, count, shapes = endpoint_margins.shape[1] - 1, 0, rows.shape[0]
+    touching = rows.shape[1] > ROW
     margin, clearance, growth = rule[0], rule[1], rule[2]
     for i in range(endpoint_margins.shape[0]):
         squared = 0.0
@@ -473,6 +475,8 @@ def _is_free(
         if k < 0 and j >= pairs.shape[0]:
             break
         if k >= 0:
+            if touching and rows[j, ROW + k] != 0.0:
+                continue
             gap = margin + clearance + rows[j, 16] + bodies[k, ROUNDING]
             reach = bodies[k, RADIUS] + gap
             squared = _sphere_gap(rows, j, centres, k)
@@ -903,7 +907,7 @@ def signed_distances_batch(
         np.empty((_EPA_FACES, 2), np.int64),
     )
     gaps = np.empty(groups.shape[0]), np.empty(points.shape[0])
-    of_arm = rows.shape[0]
+    of_arm, touching = rows.shape[0], rows.shape[1] > ROW
     distance[:], normal[:], witness[:], geometry[:] = within, 0.0, 0.0, of_arm + 2
     for i in range(states.shape[0]):
         _place(states[i], chain, bodies, frames, centres)
@@ -924,7 +928,7 @@ def signed_distances_batch(
                 core = _signed_distance(
                     bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope
                 )
-                if core < far:
+                if core < far and not (touching and rows[j, ROW + k] != 0.0):
                     distance[i, link], geometry[i, link] = core - rounding, j
                     _to_base(frames, f, centres, k, s, 1.0, 0.0, normal[i, link], witness[i, link])
             rounding = ball[0, 16] + bodies[k, ROUNDING]
@@ -1251,8 +1255,8 @@ def obstacle_states(motions, times, present, poses, velocities):
 def moved_rows(motions, centres, shapes, t, rows):
     """Write `shape_rows` of n moving obstacles at a time (s) to `rows[:n]`.
 
-    `shapes`: (n, `ROW`), the rows at their own poses. `centres`: m, (n, 3), of the shapes in the
-    obstacles' own frames (zeros but for convex hulls). Absent obstacles are `ABSENT` away.
+    `shapes`: (n, `ROW` or more), the rows at their own poses. `centres`: m, (n, 3), of the shapes
+    in the obstacles' own frames (zeros but for convex hulls). Absent obstacles are `ABSENT` away.
     """
     pose, velocity = np.empty(7), np.empty(6)
     for i in range(shapes.shape[0]):
@@ -1515,7 +1519,7 @@ def shortcut(path, chords, rule, endpoint_margins, arm, world):
 
 @compiled
 def rows_in_time(motions, centres, shapes, times, rows):
-    """Write the rows of all shapes at times (t,), s, to `rows` (t, r, `ROW`).
+    """Write the rows of all shapes at times (t,), s, to `rows` (t, r, `ROW` or more).
 
     `shapes`: (r, `ROW`), of which the first ones have `motions` and `centres`, as of `moved_rows`.
     """
@@ -1529,15 +1533,21 @@ def rows_in_time(motions, centres, shapes, times, rows):
 def free_in_time(states, steps, rule, endpoint_margins, arm, rows, cloud, free):
     """Write whether states (m, n) are free at `steps` (m,) and one step later to `free` (m,).
 
-    `rows`: (t, r, `ROW`), of each step. `cloud`: points, groups and ball of `world`.
+    `rows`: (t, r, `ROW` or more), of each step. `cloud`: points, groups and ball of `world`.
     """
     memory, last = _memory(arm[0], arm[1]), rows.shape[0] - 1
     points, groups, ball = cloud
+    axes, sweeps, lists = np.empty((0, 3)), np.empty(0), np.empty((0, 0, 2), np.int64)
+    known = lists, 0, -1
     for i in range(states.shape[0]):
         free[i] = True
         for step in range(steps[i], steps[i] + 2):
             world = rows[min(step, last)], points, groups, ball
-            if not _is_free(states[i], rule, endpoint_margins, arm, world, memory):
+            near = _is_free(
+                states[i], rule, endpoint_margins, arm, world, memory, axes, sweeps, 0.0, known,
+                lists, 0,
+            )  # fmt: skip
+            if near < 0:
                 free[i] = False
                 break
 

@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 
 from roboarm_nmp.envs.collision.hulls import (
-    arm_hulls,
     group_points,
     shape_centres,
     shape_rows,
@@ -66,7 +65,7 @@ class MovingObstacles:
 
     Attributes:
         motions, centres, shapes: the arrays that `kernels.moved_rows` takes, for checks in a loop
-            over time. (Convex hulls need the bodies of `hulls.world_shapes`, too.)
+            over time. (`hulls.world_shapes` has convex hulls' bodies, and who may touch what.)
     """
 
     def __init__(self, scene):
@@ -132,7 +131,7 @@ def free_over_time(scene, states, times):
         bool (m, t).
     """
     moving = replace(scene, obstacles=[o for o in scene.obstacles if o.motion is not None])
-    rows, arm = world_shapes(moving.obstacles, arm_hulls(scene.robot))
+    rows, arm = world_shapes(moving.obstacles, scene.robot)
     own, shapes = MovingObstacles(moving), rows.copy()
     world = rows, *group_points((), 0.0)
     rule = np.zeros(4), np.empty((1, 0, scene.robot.num_joints + 1))

@@ -12,12 +12,11 @@ import numpy as np
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.hulls import (
-    arm_hulls,
     group_points,
     shape_centres,
     world_shapes,
 )
-from roboarm_nmp.envs.collision.kernels import ROW, first_departure, free_in_time, rows_in_time
+from roboarm_nmp.envs.collision.kernels import first_departure, free_in_time, rows_in_time
 from roboarm_nmp.envs.collision.moving import motion_arrays
 from roboarm_nmp.envs.scenes.primitives import floor_box
 
@@ -40,9 +39,9 @@ class TimedChecker:
         shapes = [*scene.obstacles]
         shapes += [scene.table] if scene.table is not None else []
         shapes += [floor_box(scene.floor)] if scene.floor is not None else []
-        rows, self._arm = world_shapes(shapes, arm_hulls(scene.robot))
+        rows, self._arm = world_shapes(shapes, scene.robot)
         times = step_seconds * np.arange(num_steps + 1)
-        self._rows = np.empty((len(times), len(rows), ROW))
+        self._rows = np.empty((len(times), *rows.shape))
         motions, centres = motion_arrays(scene.obstacles), shape_centres(scene.obstacles)
         rows_in_time(motions, centres, rows, times, self._rows)
         self._cloud = group_points((), 0.0)

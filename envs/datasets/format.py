@@ -8,16 +8,12 @@ task has queries from elsewhere, each with
 - where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
   uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
   scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`; where there are
-  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another; where
+  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another; where there
+  are obstacles with `may_touch`, that of all k obstacles: uint8 (b,), a list as JSON; where
   obstacles move, `motion_count`: uint32 (k,), how many numbers each one's motion has, and
   `motions`: float64 (m,), the numbers (`envs.scenes.motions.motion_to_numbers`);
-<<<<<<< HEAD
-- for tasks where obstacles move, instead, `scene_seed`: uint32 (n,), from which each query's scene
-  is drawn (`AnimatedScenes`).
-=======
 - of tasks with moving obstacles, instead of these, `scene_seed`: uint32 (n,), from which each
   query's scene is drawn (`AnimatedScenes`).
->>>>>>> main
 
 A demonstration file, `envs/demos/<task>.h5`, has the arrays
 
@@ -27,7 +23,7 @@ A demonstration file, `envs/demos/<task>.h5`, has the arrays
   `envs.datasets.demonstrations.write_demos`); `length`: uint32 (n,), configurations in each;
 - `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
 - `collided`: uint8 (n,), whether the execution has a contact;
-- where scenes vary, `scene`, `obstacle_count`, `obstacles`, `hull_vertices`, as above.
+- where scenes vary, `scene`, `obstacle_count`, `obstacles`, `hull_vertices`, `may_touch`, as above.
 
 j is the number of the robot's joints, 7 of the Panda.
 
@@ -60,8 +56,10 @@ from roboarm_nmp.envs.scenes.primitives import (
     motion_numbers,
     scene_from_json,
     scene_to_json,
+    split_list,
     to_array,
     vertex_counts,
+    with_may_touch,
     with_motion,
 )
 from roboarm_nmp.envs.tasks import (
@@ -91,6 +89,7 @@ SCENE_ARRAYS = {
 }
 SEED_ARRAYS = {"scene_seed": ("<u4", None, "start")}  # where obstacles move
 HULL_ARRAYS = {"hull_vertices": ("<f8", 3, "hull_vertices")}  # where there are convex hulls
+TOUCH_ARRAYS = {"may_touch": ("<u1", None, "may_touch")}  # where obstacles have it
 MOTION_ARRAYS = {  # where obstacles move
     "motion_count": ("<u4", None, "obstacles"),
     "motions": ("<f8", None, "motions"),
@@ -119,6 +118,8 @@ def array_formats(schema, names):
             arrays = {**arrays, **SCENE_ARRAYS, "scene": ("<u4", None, rows_of)}
             if f"{prefix}hull_vertices" in names:
                 arrays |= HULL_ARRAYS
+            if f"{prefix}may_touch" in names:
+                arrays |= TOUCH_ARRAYS
             if f"{prefix}motion_count" in names:
                 arrays |= MOTION_ARRAYS
         if f"{prefix}scene_seed" in names:
@@ -166,12 +167,15 @@ class QueryScenes:
         offsets: int64 (s + 1,): the obstacles of scene j are `rows[offsets[j] : offsets[j + 1]]`.
         rows: float64 (k, 11), as of `envs.scenes.primitives.to_array`.
         vertices: float64 (v, 3), as of `envs.scenes.primitives.hull_vertices`.
+        may_touch: a list, `may_touch` of each of the k obstacles; None if it is () for all.
         motions: None, or the two arrays of `envs.scenes.primitives.motion_numbers`.
     """
 
-    def __init__(self, base, index=None, offsets=None, rows=None, vertices=(), motions=None):
+    def __init__(
+        self, base, index=None, offsets=None, rows=None, vertices=(), may_touch=None, motions=None
+    ):
         self.base, self.index, self.offsets, self.rows = base, index, offsets, rows
-        self.vertices, self.motions = vertices, motions
+        self.vertices, self.may_touch, self.motions = vertices, may_touch, motions
         if motions is not None:  # the numbers of row j begin at number `_motion_offsets[j]`
             counts = motions[1].astype(np.int64)
             self._motion_offsets = np.concatenate([[0], np.cumsum(counts)])
@@ -184,6 +188,8 @@ class QueryScenes:
         first, last = self.offsets[self.index[i] :][:2]
         begin, end = self._vertex_offsets[[first, last]]
         obstacles = from_array(self.rows[first:last], self.vertices[begin:end])
+        if self.may_touch is not None:
+            obstacles = with_may_touch(obstacles, self.may_touch[first:last])
         if self.motions is not None:
             ends = self._motion_offsets[first : last + 1]
             numbers = [self.motions[0][i:j] for i, j in itertools.pairwise(ends)]
@@ -193,7 +199,8 @@ class QueryScenes:
     def take(self, which):
         """The scenes of fewer queries, by slice or index array."""
         index = None if self.index is None else self.index[which]
-        return QueryScenes(self.base, index, self.offsets, self.rows, self.vertices, self.motions)
+        rest = self.offsets, self.rows, self.vertices, self.may_touch, self.motions
+        return QueryScenes(self.base, index, *rest)
 
 
 class AnimatedScenes:
@@ -315,6 +322,9 @@ def scene_arrays(path, scenes_of, base, prefix=""):
     }
     if len(vertices := hull_vertices(obstacles)):
         arrays[f"{prefix}hull_vertices"] = vertices
+    if any(obstacle.may_touch for obstacle in obstacles):
+        text = json.dumps([obstacle.may_touch for obstacle in obstacles])
+        arrays[f"{prefix}may_touch"] = np.frombuffer(text.encode(), np.uint8)
     numbers, counts = motion_numbers(obstacles)
     if len(numbers):
         arrays |= {f"{prefix}motion_count": counts, f"{prefix}motions": numbers}
@@ -331,10 +341,15 @@ def read_scenes(path, base, arrays, prefix=""):
         raise DatasetError(f"{path}: {prefix}scene does not fit the number of scenes or obstacles")
     vertices = arrays.get(f"{prefix}hull_vertices", np.empty((0, 3)))
     try:
-        for obstacle in from_array(rows, vertices):
+        obstacles, may_touch = from_array(rows, vertices), None
+        if f"{prefix}may_touch" in arrays:
+            may_touch = json.loads(arrays[f"{prefix}may_touch"].tobytes())
+            obstacles = with_may_touch(obstacles, may_touch)
+        for obstacle in obstacles:
+            base.robot.links_called(obstacle.may_touch)
             if isinstance(obstacle, ConvexHull):
                 check_obstacle(obstacle)
-    except ValueError as error:
+    except (RecursionError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: {prefix}obstacles: {error}") from error
     if not np.isfinite(rows).all():
         raise DatasetError(f"{path}: {prefix}obstacles has numbers that are not finite")
@@ -353,7 +368,8 @@ def read_scenes(path, base, arrays, prefix=""):
                 motion_from_numbers(motions[0][first:last])
         except ValueError as error:
             raise DatasetError(f"{path}: {prefix}motions: {error}") from error
-    return QueryScenes(base, index.astype(np.int64), offsets, rows, vertices, motions)
+    rest = offsets, rows, vertices, may_touch, motions
+    return QueryScenes(base, index.astype(np.int64), *rest)
 
 
 def read_base_scene(path, text, robot):
@@ -384,7 +400,9 @@ def read_base_scene(path, text, robot):
 def _same_scene(one, other):
     """Whether two scenes (JSON) are equal up to rounding."""
     one, other = json.loads(one), json.loads(other)
-    if any(one.get(field) != other.get(field) for field in ("robot", "held")):
+    if any(one.get(field) != other.get(field) for field in ("robot", "held", "attached")):
+        return False
+    if _names_in(one) != _names_in(other):
         return False
     for field in ("obstacles", "table", "floor", "friction"):
         here, there = one.get(field), other.get(field)
@@ -392,6 +410,8 @@ def _same_scene(one, other):
             if here is not there:
                 return False
             continue
+        if field == "table":
+            here, there = _flat(here), _flat(there)
         if field == "obstacles":  # rows may have different lengths, of convex hulls and motions
             here, there = ([_flat(row) for row in rows] for rows in (here, there))
             if [len(row) for row in here] != [len(row) for row in there]:
@@ -403,9 +423,15 @@ def _same_scene(one, other):
     return True
 
 
+def _names_in(scene):
+    """`may_touch` of a scene's obstacles and table (JSON)."""
+    return [split_list(row)[2] for row in (*scene["obstacles"], scene["table"] or ())]
+
+
 def _flat(row):
-    """A row of `envs.scenes.primitives.to_lists` without the list of a motion in it."""
-    return [*row[:-1], *row[-1]] if isinstance(row[-1], list) else row
+    """The numbers of a row of `envs.scenes.primitives.to_lists`, and of its motion."""
+    numbers, motion, _ = split_list(row)
+    return [*numbers, *motion]
 
 
 def _checksum(attributes, arrays):

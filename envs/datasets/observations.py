@@ -81,6 +81,8 @@ def shard_bytes(task, seed, first, sensors, scenes, configurations, observations
     if not all(scene.is_static for scene in scenes):
         raise DatasetError("observations are of static scenes: obstacles of this task move")
     obstacles = [o for scene in scenes for o in scene.obstacles]
+    if any(obstacle.may_touch for obstacle in obstacles):
+        raise DatasetError("files of observations cannot have random obstacles with may_touch")
     arrays = {
         "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
         "obstacles": to_array(obstacles),

@@ -33,8 +33,8 @@ from roboarm_nmp.envs.scenes.formats import (
     curobo_obstacles,
     is_world,
     moveit_scene,
-    reject,
     vamp_obstacles,
+    with_attached_objects,
 )
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, unit_quaternion
 
@@ -155,8 +155,6 @@ def _request(root, robot):
             raise Mistake(fields[key], f"{key} are not supported")
     check_frames(fields, robot)
     state = mapping(get(root, "start_state", "a request"), "start_state")
-    if not is_nothing(state.get("attached_collision_objects")):
-        reject(state["attached_collision_objects"], "attached_collision_objects")
     joints = get(fields["start_state"], "joint_state", "start_state")
     names = sequence(get(joints, "name", "joint_state"), "name", 1000)
     values = sequence(get(joints, "position", "joint_state"), "position", 1000)
@@ -167,6 +165,7 @@ def _request(root, robot):
         joint = documents.text(name, "the name of a joint")
         positions[joint] = number(value, f"the position of {joint[:40]}", MAX_ANGLE)
     start, robot = _configuration(joints, positions, robot, "the start")
+    robot = with_attached_objects(state, robot)
     constraints = get(root, "goal_constraints", "a request")
     goals = []
     for one in sequence(constraints, "goal_constraints", MAX_GOALS):

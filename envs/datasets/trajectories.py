@@ -45,6 +45,7 @@ from roboarm_nmp.envs.utils.files import write_atomically
 
 ENDINGS = (".csv", ".npz", ".json", ".yaml")
 LIMIT_TOLERANCE = 0.1  # rad. The simulated arm may exceed its limits a little; degrees exceed them.
+MAX_DURATION = 100_000  # s: images of longer ones would need all of a machine's memory
 MAX_TEXT = {".csv": 100_000_000, ".json": 100_000_000, ".yaml": 10_000_000}  # bytes
 # What readers raise for a file that is damaged, or of another kind: NotImplementedError is
 # zipfile's for an unknown compression.
@@ -237,6 +238,8 @@ def load_trajectory(path, robot):
         raise DatasetError(f"{path}: it needs one finite time per configuration")
     if (np.diff(times) <= 0).any():
         raise DatasetError(f"{path}: its times do not increase")
+    if times[-1] - times[0] > MAX_DURATION:
+        raise DatasetError(f"{path}: it takes more than {MAX_DURATION:,} s")
     for name, values in zip(("velocities", "accelerations"), others, strict=True):
         if values is not None and (
             values.shape != configurations.shape or not np.isfinite(values).all()

@@ -7,7 +7,8 @@
 - `point_cloud`: points that four sensors observe of them, or those of an `ObservedScene`;
 - the name or path of an encoder with a decoder: points decoded from its latent code.
 
-Table and floor are known to all of them.
+Table and floor are known to all of them, and so are obstacles with `may_touch`: points within
+`KNOWN_DISTANCE` of them are left out.
 """
 
 import functools
@@ -19,6 +20,7 @@ from roboarm_nmp.envs.perception.point_clouds import (
     POINT_CLOUD,
     fine_observed_points,
     observed_points,
+    without_known,
 )
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene
@@ -71,7 +73,7 @@ def observed_checker(scene):
     if isinstance(scene, ObservedScene):
         return CollisionChecker(replace(scene, obstacles=()))
     radius = scale_of(scene.robot) * POINT_RADIUS
-    return CollisionChecker(replace(scene, obstacles=()), observed_points(scene), radius)
+    return _checker_of_points(scene, observed_points(scene), radius)
 
 
 @functools.lru_cache(CACHED_FINE_CHECKERS)
@@ -80,11 +82,17 @@ def fine_observed_checker(scene):
     if isinstance(scene, ObservedScene):
         return observed_checker(scene)
     radius = scale_of(scene.robot) * FINE_POINT_RADIUS
-    return CollisionChecker(replace(scene, obstacles=()), fine_observed_points(scene), radius)
+    return _checker_of_points(scene, fine_observed_points(scene), radius)
 
 
 @functools.lru_cache(CACHED_CHECKERS)
 def decoded_checker(scene, encoder):
     """A `CollisionChecker` of table, floor, and points decoded from z_E of a `NetworkEncoder`."""
-    points = encoder.decoded_points(scene)
-    return CollisionChecker(replace(scene, obstacles=()), points, DECODED_RADIUS)
+    return _checker_of_points(scene, encoder.decoded_points(scene), DECODED_RADIUS)
+
+
+def _checker_of_points(scene, points, radius):
+    """The checker of points in the place of a scene's obstacles, except those with `may_touch`."""
+    known = tuple(obstacle for obstacle in scene.obstacles if obstacle.may_touch)
+    points = without_known(points, known) if known else points
+    return CollisionChecker(replace(scene, obstacles=known), points, radius)

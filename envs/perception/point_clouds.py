@@ -114,6 +114,15 @@ def one_per_cell(points, cell=CELL):
     return points[first_in_cells(numbers, numbers.dtype.type(cell))[0]]
 
 
+def without_known(points, obstacles, distance=KNOWN_DISTANCE):
+    """The points (n, 3), m, that are not within a distance (m) of the boxes around obstacles."""
+    points, labels = np.require(points, np.float32, _AS_COMPILED), np.empty(len(points), np.uint8)
+    everywhere, no_arm = np.array([[-np.inf] * 3, [np.inf] * 3]), np.empty(0)
+    arm = arm_hulls(PANDA)
+    label_points(points, *everywhere, shape_rows(obstacles), distance, no_arm, 0.0, arm, labels)
+    return points[labels == OF_OBSTACLE]
+
+
 def without_outliers(points, cell, min_points):
     """Those of float32 points (n, 3), m, that have enough points around them, themselves included.
 

@@ -124,7 +124,7 @@ def _meshes(robot, hulls):
     return arm, (np.concatenate([mesh for mesh, _ in meshes]), vertex_ends, face_ends, corners)
 
 
-@functools.cache
+@functools.lru_cache(maxsize=64)
 def _arm_surfaces(robot):
     """The arm's surfaces, and their polyhedra, which follow the cube: `(vertices, faces)` each."""
     rows, meshes = [], []

@@ -95,7 +95,7 @@ class ApproachPaths:
     """
 
     def __init__(self, act, env):
-        self._act, self._env, self._robot = act, env, env.robot
+        self._act, self._env = act, env
         self._at = env.get_wrapper_attr("link_distances_at")
         self._fine_at = env.get_wrapper_attr("fine_link_distances_at")
         self._retreat = self._approach = None  # `_Following`, from the first observation on
@@ -103,9 +103,9 @@ class ApproachPaths:
         self._planned_for = None  # scene and goal: both may change during an episode
 
     def __call__(self, observation):
-        state = observation["observation"][: self._robot.num_joints].astype(np.float64)
+        state = observation["observation"][: self._env.robot.num_joints].astype(np.float64)
         if self._retreat is None:
-            path = approach_path(self._robot, state, self._fine_at, START_CLEARANCE)
+            path = approach_path(self._env.robot, state, self._fine_at, START_CLEARANCE)
             self._retreat = _Following(path)
         if "goal_link_distances" in observation:
             planned_for = self._env.scene, observation["desired_goal"].tobytes()
@@ -120,7 +120,7 @@ class ApproachPaths:
         return self._act(observation | self._free_end)
 
     def _plan_approach(self, goal):
-        robot, self._approach, self._free_end = self._robot, None, {}
+        robot, self._approach, self._free_end = self._env.robot, None, {}
         path = approach_path(robot, goal[: robot.num_joints], self._fine_at)[::-1]
         if len(path) == 1:
             return

@@ -93,7 +93,7 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
     if name == "via-points":
         return _via_points(env, seed, tries, source)
     if name == REPLANNING:
-        return _replanning(env, seed, source)
+        return make_replanning(env, seed, source)
     return _planner(env, seed, time_limit, source)
 
 
@@ -158,7 +158,8 @@ def _via_points(env, seed, tries, geometry_source):
     return begin
 
 
-def _replanning(env, seed, geometry_source):
+def make_replanning(env, seed, geometry_source):
+    """As `make_baseline` of `replanning`; `geometry_source`: a function from a scene."""
     from roboarm_nmp.envs.policies.replanning import Replanning
     from roboarm_nmp.envs.wrappers import observed_scene
 

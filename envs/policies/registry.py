@@ -24,6 +24,7 @@ from roboarm_nmp.envs.policies.baselines import (
     EpisodePolicy,
     import_planning,
     make_baseline,
+    make_replanning,
 )
 from roboarm_nmp.envs.policies.pose_goals import ConfigurationGoals
 from roboarm_nmp.envs.utils.names import suggest
@@ -97,9 +98,10 @@ def own_safety_filter(policy):
     return None if callable(policy) or policy in BASELINES else _load(policy)[2]
 
 
-def filter_around(policy, safety_filter):
-    """A safety filter as it acts around a policy: `replanning` waits, and needs no escapes."""
-    if safety_filter and not callable(policy) and policy == REPLANNING:
+def filter_around(policy, safety_filter, replan=False):
+    """A safety filter as it acts around a policy: a policy that replans needs no escapes."""
+    replan = replan or (not callable(policy) and policy == REPLANNING)
+    if safety_filter and replan:
         return replace(safety_filter, escape=False)
     return safety_filter
 
@@ -145,6 +147,7 @@ def make_policy(
     time_limit=TIME_LIMIT,
     geometry_source="ground_truth",
     safety_filter=None,
+    replan=False,
 ):
     """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
 
@@ -166,6 +169,8 @@ def make_policy(
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
             one that a trained policy includes, if any; False for none. The environment must have
             `link_distances`, whose geometry source is the filter's.
+        replan: whenever the policy is stuck, follow a plan for a while
+            (`envs.policies.replanning.ReplanWhenStuck`); a safety filter then makes no escapes.
 
     Raises:
         PolicyError: the policy cannot act in this environment.
@@ -182,8 +187,10 @@ def make_policy(
         begin, as_observed = _trained(policy, env)
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
+    if replan:
+        begin = _replanned(begin, env, seed, geometry_source)
     if safety_filter:
-        begin = _filtered(begin, env, seed, filter_around(policy, safety_filter))
+        begin = _filtered(begin, env, seed, filter_around(policy, safety_filter, replan))
     return begin if as_observed is None else _translated(begin, as_observed)
 
 
@@ -206,6 +213,28 @@ def _filtered(begin, env, seed, safety_filter):
         return EpisodePolicy(act and safety_filter.filter_policy(act, env, rng), plan_found)
 
     return begin_filtered
+
+
+def _replanned(begin, env, seed, geometry_source):
+    from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+    from roboarm_nmp.envs.policies.replanning import ReplanWhenStuck
+
+    if env.action_mode != "relative":
+        raise PolicyError(f"plans give displacements, not actions of mode {env.action_mode!r}")
+    if env.goal_type == "pose":
+        raise PolicyError("replan needs goals that are configurations, not poses")
+    try:
+        source = find_geometry_source(geometry_source, env.robot)
+    except ValueError as error:
+        raise PolicyError(str(error)) from error
+    begin_replanning = make_replanning(env, seed, source)
+
+    def begin_replanned(number, query):
+        act, plan_found = begin(number, query)
+        replanning, goal = begin_replanning(number, query).act, env.robot.normalise(query.goal)
+        return EpisodePolicy(act and ReplanWhenStuck(act, replanning, goal), plan_found)
+
+    return begin_replanned
 
 
 def _translated(begin, goals):

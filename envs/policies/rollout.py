@@ -73,8 +73,8 @@ class Episode:
     """
 
     def __init__(self, env, query):
-        self.env, self._robot = env, env.unwrapped.robot
         self.observation, self.info = env.reset_specific(*query)
+        self.env, self._robot = env, env.unwrapped.robot  # the query's, in its scene
         self.ended = self._success = self.info["is_success"]
         self._states, self._actions = [self._state()], []
         self._contacts, self._times = [], []

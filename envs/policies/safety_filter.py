@@ -69,7 +69,7 @@ PROJECTION_SWEEPS = 12  # of cyclic projection
 RATE_STEPS = 3
 MAX_APPROACH = 0.05  # m per step, 1.5 m/s
 # m. A goal with smaller link distances is occupied: around it, margins do not shrink.
-OCCUPIED = -0.005
+OCCUPIED = -0.012
 
 # A local minimum is a configuration where PATIENCE steps moved the arm by less than PROGRESS (L2,
 # normalised). Close to the goal, they also have to be less than this share of the remaining
@@ -207,7 +207,7 @@ class SafetyFilter:
     def _filter_actions(self, act, env, rng):
         """`filter_policy` without approach paths."""
         link_distances_at, max_step = env.get_wrapper_attr("link_distances_at"), env.max_step
-        robot, joints = env.robot, env.robot.num_joints
+        joints = env.robot.num_joints
         local_minima, goal_distances = _LocalMinima(rng, max_step, joints), None
         approach_rates = None
         if self.lookahead is not None:
@@ -218,13 +218,14 @@ class SafetyFilter:
             """Rates of rows of link distances; the rows are changed to those after `lookahead`."""
             rates = np.zeros(len(rows))
             if approach_rates is not None and approach_rates.any_motion:
-                scene = rows[: robot.link_distances_shape[0]]
+                scene = rows[: env.robot.link_distances_shape[0]]
                 rates[: len(scene)] = approach_rates(state, scene[:, 0])
                 rows[:, 0] += steps_ahead * rates
             return rates
 
         def act_safely(observation):
             nonlocal goal_distances
+            robot = env.robot  # an episode's scene may have another gripper opening, or objects
             state, goal = observation["observation"][:joints], None
             here = np.concatenate([observation["link_distances"], _self_distances(robot, state)])
             if approach_rates is not None:
@@ -306,14 +307,14 @@ class ApproachRates:
         return len(self._observed) > 1
 
     def __call__(self, state, distances):
-        """Changes of link distances, m per step, (l,), from -`MAX_APPROACH` to 0.
+        """Changes of link distances, m per step, (..., l), from -`MAX_APPROACH` to 0.
 
         Args:
-            state: normalised configuration (n,).
-            distances: m, (l,), from the obstacles of the last observation.
+            state: normalised configuration (n,), or several, (..., n).
+            distances: m, (..., l), there, from the obstacles of the last observation.
         """
         (then, before), (now, _) = self._observed[0], self._observed[-1]
-        change = distances - before.link_distances(state)[:, 0]
+        change = distances - before.link_distances(state)[..., 0]
         return np.clip(change / (now - then), -MAX_APPROACH, 0.0)
 
 

@@ -95,8 +95,11 @@ class Robot:
         contact_free: a configuration without contacts (n,).
         observed_pose: the configuration (n,) in which sensors observe a scene: always the same, so
             that an encoded scene depends on the scene alone.
-        described: of `with_held`: the arm with its held joints where its description has them;
-            None for that arm itself.
+        described: of `with_held` and `with_attached`: the arm with its held joints where its
+            description has them, and without objects; None for that arm itself.
+        attached: the `envs.scenes.primitives.Attached` objects, whose links are the last of
+            `links`.
+        carriers: PyBullet's index of the link whose row of link distances each of them shares.
     """
 
     name: str
@@ -131,6 +134,8 @@ class Robot:
     described: "Robot | None" = None
     datasheet_lower: np.ndarray | None = None
     datasheet_upper: np.ndarray | None = None
+    attached: tuple = ()
+    carriers: tuple = ()
     urdf_velocity: list | None = None
 
     def __post_init__(self):
@@ -162,6 +167,9 @@ class Robot:
             content |= {"velocity": velocity, "acceleration": None, "jerk": None}
         for name in ("urdf", "source", "xml", "described", "datasheet_lower", "datasheet_upper"):
             content.pop(name)
+        content["attached"] = [one.described() for one in self.attached]
+        if not self.attached:
+            del content["attached"], content["carriers"]
         text = json.dumps(_rounded(content), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -204,15 +212,15 @@ class Robot:
         urdf = importlib.import_module("roboarm_nmp.envs.robots.urdf")
         return urdf.robot_from_urdf(path, **options)
 
-    # --- Held joints
+    # --- Held joints and attached objects
 
     @property
     def arm(self):
-        """The arm with its held joints where its description has them: what files name."""
+        """The arm as its description has it, without objects: what files name."""
         return self.described or self
 
     def same_arm(self, other):
-        """Whether another `Robot` is this arm, wherever the held joints of the two are."""
+        """Whether another `Robot` is this arm, wherever held joints are, whatever is attached."""
         return self.arm == other.arm
 
     @property
@@ -243,7 +251,54 @@ class Robot:
                 raise ValueError(f"{self.name}: {name} cannot be held at {position!r}")
         held |= urdf.followers(arm, positions)
         held |= {name: float(position) for name, position in positions.items()}
-        return urdf.held_at(arm, tuple(held.values()))
+        return urdf.held_at(arm, tuple(held.values())).with_attached(self.attached)
+
+    def with_attached(self, objects):
+        """This arm with objects attached to its links, as parts of these; `()` detaches all.
+
+        The objects collide with the scene, and with those links that move against their own. Their
+        distances are in the rows of the links that carry them, so policies and encoders of the arm
+        accept it. In the simulator they weigh 1 g.
+
+        Args:
+            objects: `envs.scenes.primitives.Attached` objects, in the place of present ones.
+
+        Raises:
+            TypeError: objects of another type.
+            ValueError: no such link, one that does not move, too many objects, or one with which
+                the arm collides with itself everywhere.
+        """
+        # By name, because those modules are built on this one.
+        urdf = importlib.import_module("roboarm_nmp.envs.robots.urdf")
+        attached = importlib.import_module("roboarm_nmp.envs.robots.attached")
+        robot, objects = urdf.held_at(self.arm, self.held_positions), tuple(objects)
+        return attached.attach(robot, objects) if objects else robot
+
+    @functools.cached_property
+    def hand_links(self):
+        """Names of the hand's links: those that move with the end effector and may collide.
+
+        The link that the last joint moves is among them only if there are no others.
+        """
+        names, frame = self.bullet_names[1], self.end_effector_frame
+        found = [link.index for link in self._own_links if link.frame == frame >= 0]
+        last = self.joint_indices[self.frames[frame].joint]
+        return tuple(names[index] for index in [i for i in found if i != last] or found)
+
+    def links_called(self, names):
+        """PyBullet's indices of links by their names, and of the objects attached to them.
+
+        `names`: a sequence, or True for the `hand_links`. Raises ValueError: there is no such link.
+        """
+        if not names:
+            return frozenset()
+        index = {name: link for link, name in self.bullet_names[1].items()}
+        names = self.hand_links if names is True else names
+        if unknown := [name for name in names if name not in index]:
+            raise ValueError(f"{self.name} has no link {unknown[0]!r}")
+        found = {index[name] for name in names}
+        objects = zip(self.links[len(self._own_links) :], self.carriers, strict=True)
+        return frozenset(found | {link.index for link, carrier in objects if carrier in found})
 
     # --- Sizes and normalisation
 
@@ -274,7 +329,22 @@ class Robot:
     @property
     def collision_links(self):
         """PyBullet's indices of the moving links that may collide: the rows of link distances."""
-        return tuple(link.index for link in self.links if link.frame >= 0)
+        return tuple(link.index for link in self._own_links if link.frame >= 0)
+
+    @property
+    def _own_links(self):
+        """`links` without those of attached objects."""
+        return self.links[: len(self.links) - len(self.attached)]
+
+    @functools.cached_property
+    def link_rows(self):
+        """The row of link distances of each moving link that may collide: dict from its index.
+
+        An attached object has the row of the link that carries it.
+        """
+        rows = {link: row for row, link in enumerate(self.collision_links)}
+        objects = zip(self.links[len(self._own_links) :], self.carriers, strict=True)
+        return rows | {link.index: rows[carrier] for link, carrier in objects}
 
     @property
     def link_distances_shape(self):
@@ -448,7 +518,8 @@ class Robot:
         """Names of joints and of links by PyBullet's index, two dicts; -1 is the base link."""
         client = p.connect(p.DIRECT)
         try:
-            body = self.load(client, drawn=False)
+            with self._readable_urdf() as urdf:
+                body = self._load(client, urdf, p.URDF_IGNORE_VISUAL_SHAPES)
             number = p.getNumJoints(body, physicsClientId=client)
             infos = [p.getJointInfo(body, i, physicsClientId=client) for i in range(number)]
             base = p.getBodyInfo(body, physicsClientId=client)[0].decode()
@@ -458,10 +529,14 @@ class Robot:
         return joints, {-1: base} | {info[0]: info[12].decode() for info in infos}
 
     def parsed_urdf(self):
-        """The URDF's XML element, with absolute paths of meshes."""
+        """The URDF's XML element, with absolute paths of meshes, and with attached objects."""
         root = ElementTree.fromstring(self.xml or Path(self.urdf).read_text())
         for mesh in root.iter("mesh"):
             mesh.set("filename", resolve(mesh.get("filename"), self.urdf))
+        if self.attached:
+            # By name, because that module is built on this one.
+            attached = importlib.import_module("roboarm_nmp.envs.robots.attached")
+            root.extend(attached.elements(self.attached))
         return root
 
     def collision_elements(self, link):
@@ -471,7 +546,12 @@ class Robot:
 
     @contextlib.contextmanager
     def _readable_urdf(self):
-        if self.xml:
+        if self.attached:
+            with temporary_file(
+                ElementTree.tostring(self.parsed_urdf(), "unicode"), ".urdf"
+            ) as urdf:
+                yield urdf
+        elif self.xml:
             with temporary_file(self.xml, ".urdf") as urdf:
                 yield urdf
         else:

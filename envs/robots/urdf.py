@@ -121,7 +121,7 @@ def robot_from_urdf(
                 f"{path}: link {link!r}: PyBullet cannot use one of its collision shapes"
             )
     links = [
-        Link(link_index[link], placements[link][0], _steps(placements[link]))
+        Link(link_index[link], placements[link][0], steps(placements[link]))
         for link in tree.links
         if tree.elements[link].find("collision") is not None
     ]
@@ -551,7 +551,7 @@ def held_at(arm, positions):
     for i, link in enumerate(links):
         if changed & set(_held_above(names[link.index], by_child, held)):
             placement = link_placement(robot, names[link.index])
-            links[i] = link._replace(placements=_steps(placement))
+            links[i] = link._replace(placements=steps(placement))
     end = names[robot.end_effector_link]
     if changed & set(_held_above(end, by_child, held)):
         _, rotation, position = link_placement(robot, end)
@@ -720,8 +720,8 @@ def _frames(tree, joints, positions, mimics):
     return frames, placements
 
 
-def _steps(placement):
-    """`Link.placements` of one transform."""
+def steps(placement):
+    """`Link.placements` of one transform, as of `link_placement`."""
     _, rotation, position = placement
     if (rotation == np.eye(3)).all() and not position.any():
         return ()

@@ -23,6 +23,13 @@ An obstacle can be a mesh of a file in this file's folder, or below: `mesh: {fil
 0.001, decompose: true, position: [0.5, 0, 0.2]}`. `scale` is 1 and `decompose` false if left out:
 then a mesh's convex hull takes its place (`envs.scenes.meshes`).
 
+Obstacles may have `may_touch`: `true`, or names of links, such as `[panda_hand]`, whose contacts
+with it are no collisions; `true` means the hand and its fingers. Objects that the arm carries are
+listed like obstacles under the key `attached`, placed in the frame of a link: `- box: {link:
+panda_hand, position: [0, 0, 0.1], size: [0.05, 0.05, 0.2], touch_links: []}`. `link` is the one
+with the end effector if left out. `touch_links` are links that the object may touch, besides those
+that move with it.
+
 Obstacles may move, appear and disappear (`envs.scenes.motions`); times in s, from the start of an
 episode, angles in rad:
 
@@ -44,11 +51,14 @@ tags (`!a`) and merge keys (`<<`) are rejected. Positions are not checked here: 
 reports collisions with the arm.
 """
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
 
+from roboarm_nmp.envs.robots.attached import MAX_ATTACHED
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
@@ -70,6 +80,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     MAX_LENGTH,
     MAX_SCENE_OBSTACLES,
     TABLE,
+    Attached,
     Box,
     ConvexHull,
     Cylinder,
@@ -138,27 +149,36 @@ def save_scene(scene, path):
 
 def _format_scene(scene):
     table = "false" if scene.table is None else _format_fields(scene.table)
-    held = ""
-    if scene.robot.described:
-        held = ", ".join(f"{joint}: {value!r}" for joint, value in scene.robot.held.items())
+    robot, held = scene.robot, ""
+    if robot.held_positions != robot.arm.held_positions:
+        held = ", ".join(f"{joint}: {value!r}" for joint, value in robot.held.items())
     lines = [
-        *[f"robot: {scene.robot.source}"] * (scene.robot.arm != PANDA),
-        *[f"held: {{{held}}}"] * (scene.robot.described is not None),
+        *[f"robot: {robot.source}"] * (robot.arm != PANDA),
+        *[f"held: {{{held}}}"] * bool(held),
+        *["attached:"] * bool(robot.attached),
+        *[f"  - {_format_obstacle(one.shape, _format_link(one))}" for one in robot.attached],
         f"table: {'true' if scene.table == TABLE else table}",
         f"floor: {'false' if scene.floor is None else repr(float(scene.floor))}",
         *[f"friction: {float(scene.friction)!r}"] * (scene.friction != FRICTION),
         "obstacles:" if scene.obstacles else "obstacles: []",
     ]
-    for obstacle in scene.obstacles:
-        kind = (
-            "convex_hull" if isinstance(obstacle, ConvexHull) else type(obstacle).__name__.lower()
-        )
-        lines.append(f"  - {kind}: {_format_fields(obstacle)}")
+    lines += [f"  - {_format_obstacle(obstacle)}" for obstacle in scene.obstacles]
     return _HEADER + "\n".join(lines) + "\n"
 
 
-def _format_fields(obstacle):
-    """The dataclass's fields as a YAML mapping on one line."""
+def _format_obstacle(obstacle, more=()):
+    kind = "convex_hull" if isinstance(obstacle, ConvexHull) else type(obstacle).__name__.lower()
+    return f"{kind}: {_format_fields(obstacle, more)}"
+
+
+def _format_link(attached):
+    yield f"link: {json.dumps(attached.link)}"
+    if attached.touch_links:
+        yield f"touch_links: {json.dumps(attached.touch_links)}"
+
+
+def _format_fields(obstacle, more=()):
+    """The dataclass's fields, and texts of more fields, as a YAML mapping on one line."""
     fields = []
     for name, value in vars(obstacle).items():
         if name == "motion":
@@ -170,9 +190,11 @@ def _format_fields(obstacle):
             fields.append(f"{name}: {_format_numbers(value)}")
         elif name == "vertices":
             fields.append(f"{name}: [{', '.join(map(_format_numbers, value))}]")
+        elif name == "may_touch":
+            fields += [f"{name}: {json.dumps(value)}"] * bool(value)
         else:
             fields.append(f"{name}: {float(value)!r}")
-    return "{" + ", ".join(fields) + "}"
+    return "{" + ", ".join([*fields, *more]) + "}"
 
 
 def _format_motion(motion):
@@ -265,13 +287,15 @@ def _compose(text):
 
 
 def _scene(node, folder):
-    keys = ("robot", "held", "table", "floor", "friction", "obstacles")
+    keys = ("robot", "held", "attached", "table", "floor", "friction", "obstacles")
     fields = _mapping(node, "a scene", optional=keys)
     table, floor, friction, obstacles, robot = TABLE, FLOOR, FRICTION, (), PANDA
     if "robot" in fields:
         robot = _robot(fields["robot"], folder)
     if "held" in fields:
         robot = _held(fields["held"], robot)
+    if "attached" in fields:
+        robot = _attached(fields["attached"], robot, folder)
     if "table" in fields:
         table = _table(fields["table"])
     if "floor" in fields:
@@ -295,7 +319,10 @@ def _scene(node, folder):
             obstacles += _obstacle(entry, folder)
             if len(obstacles) > MAX_SCENE_OBSTACLES:  # a mesh may be several
                 raise _mistake(entry, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
-    return Scene(obstacles, table, floor, friction, robot)
+    try:
+        return Scene(obstacles, table, floor, friction, robot)
+    except ValueError as error:  # an obstacle may touch a link that the robot does not have
+        raise _mistake(node, str(error)) from error
 
 
 def _robot(node, folder):
@@ -315,6 +342,37 @@ def _held(node, robot):
         raise _mistake(node, str(error)) from error
 
 
+def _attached(node, robot, folder):
+    if not isinstance(node, yaml.SequenceNode):
+        raise _mistake(node, f"attached must be a list, got {_describe(node)}")
+    found = []
+    for entry in node.value:
+        shapes, more = _shapes(entry, folder, ("link", "touch_links"))
+        link = more.get("link")
+        if link is not None and not isinstance(link, yaml.ScalarNode):
+            raise _mistake(link, f"link must be a link's name, got {_describe(link)}")
+        touched = _names(more["touch_links"], "touch_links") if "touch_links" in more else ()
+        try:
+            found += [Attached(shape, link and link.value, touched) for shape in shapes]
+        except ValueError as error:
+            raise _mistake(entry, str(error)) from error
+        if len(found) > MAX_ATTACHED:
+            raise _mistake(entry, f"an arm has at most {MAX_ATTACHED} attached objects")
+    try:
+        return robot.with_attached(found)
+    except ValueError as error:
+        raise _mistake(node, str(error)) from error
+
+
+def _names(node, what):
+    """Names of links, a tuple."""
+    if not isinstance(node, yaml.SequenceNode):
+        raise _mistake(node, f"{what} must be a list of links' names, got {_describe(node)}")
+    if wrong := [one for one in node.value if not isinstance(one, yaml.ScalarNode)]:
+        raise _mistake(wrong[0], f"a link's name must be text, got {_describe(wrong[0])}")
+    return tuple(one.value for one in node.value)
+
+
 def _table(node):
     switch = _switch(node)
     if switch is not None:
@@ -322,14 +380,32 @@ def _table(node):
     if not isinstance(node, yaml.MappingNode):
         expected = "true, false or {position: [x, y, z], size: [x, y, z]}"
         raise _mistake(node, f"table must be {expected}, got {_describe(node)}")
-    table = _box(node, "table")
+    table = _box(node, "table", ("may_touch", "motion"))
     if table.motion is not None:
         raise _mistake(node, "the table cannot move: leave it out, and add a box that does")
-    return table
+    return replace(table, may_touch=_may_touch(_some(node, ("may_touch",))))
 
 
 def _obstacle(node, folder):
     """A tuple of obstacles: a mesh may be several."""
+    shapes, more = _shapes(node, folder, ("may_touch", "motion"))
+    return [replace(shape, may_touch=_may_touch(more)) for shape in shapes]
+
+
+def _may_touch(fields):
+    """`may_touch` of an obstacle, from the values of its further keys."""
+    if "may_touch" not in fields:
+        return ()
+    switch = _switch(fields["may_touch"])
+    try:
+        return _names(fields["may_touch"], "may_touch") if switch is None else switch
+    except _Mistake as mistake:
+        reason = f"{mistake.reason}, or true, or false"
+        raise _Mistake(mistake.line, reason) from None
+
+
+def _shapes(node, folder, more):
+    """An entry's shapes, a tuple, and the values (nodes) of its keys that are in `more`, a dict."""
     kinds = ", ".join((*_KINDS, "mesh"))
     if not isinstance(node, yaml.MappingNode):
         expected = f"a mapping of its kind ({kinds}) to its fields"
@@ -339,14 +415,20 @@ def _obstacle(node, folder):
         raise _mistake(node, f"an obstacle must have exactly one key, its kind ({kinds}): {keys}")
     [(key, fields)] = node.value
     if isinstance(key, yaml.ScalarNode) and key.value == "mesh":
-        return _mesh(fields, key.value, folder)
+        more = [name for name in more if name != "motion"]
+        return _mesh(fields, key.value, folder, more), _some(fields, more)
     if not isinstance(key, yaml.ScalarNode) or key.value not in _KINDS:
         raise _mistake(key, f"unknown kind of obstacle {_describe(key)}: one of {kinds}")
-    return (_KINDS[key.value](fields, key.value),)
+    return (_KINDS[key.value](fields, key.value, more),), _some(fields, more)
 
 
-def _box(node, what):
-    fields = _mapping(node, what, ("position", "size"), ("orientation", "yaw", "motion"))
+def _some(node, names):
+    """The values (nodes) of those keys of a mapping that are in `names`."""
+    return {key.value: value for key, value in node.value if key.value in names}
+
+
+def _box(node, what, more=()):
+    fields = _mapping(node, what, ("position", "size"), ("orientation", "yaw", *more))
     return Box(
         _vector(fields["position"], f"position of {what}", 3),
         _vector(fields["size"], f"size of {what}", 3, positive=True),
@@ -355,9 +437,8 @@ def _box(node, what):
     )
 
 
-def _cylinder(node, what):
-    optional = ("orientation", "yaw", "motion")
-    fields = _mapping(node, what, ("position", "radius", "length"), optional)
+def _cylinder(node, what, more):
+    fields = _mapping(node, what, ("position", "radius", "length"), ("orientation", "yaw", *more))
     return Cylinder(
         _vector(fields["position"], f"position of {what}", 3),
         _number(fields["radius"], f"radius of {what}", positive=True),
@@ -367,8 +448,8 @@ def _cylinder(node, what):
     )
 
 
-def _sphere(node, what):
-    fields = _mapping(node, what, ("position", "radius"), ("motion",))
+def _sphere(node, what, more):
+    fields = _mapping(node, what, ("position", "radius"), more)
     return Sphere(
         _vector(fields["position"], f"position of {what}", 3),
         _number(fields["radius"], f"radius of {what}", positive=True),
@@ -376,8 +457,8 @@ def _sphere(node, what):
     )
 
 
-def _convex_hull(node, what):
-    fields = _mapping(node, what, ("position", "vertices"), ("orientation", "yaw", "motion"))
+def _convex_hull(node, what, more):
+    fields = _mapping(node, what, ("position", "vertices"), ("orientation", "yaw", *more))
     vertices = fields["vertices"]
     if not isinstance(vertices, yaml.SequenceNode):
         raise _mistake(vertices, f"vertices must be a list of points, got {_describe(vertices)}")
@@ -396,8 +477,8 @@ def _convex_hull(node, what):
     return hull
 
 
-def _mesh(node, what, folder):
-    optional = ("scale", "decompose", "orientation", "yaw")
+def _mesh(node, what, folder, more):
+    optional = ("scale", "decompose", "orientation", "yaw", *more)
     fields = _mapping(node, what, ("file", "position"), optional)
     file, scale, decompose = fields["file"], 1.0, False
     if not isinstance(file, yaml.ScalarNode):

@@ -8,10 +8,12 @@ with its line: see `UNSUPPORTED`.
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from roboarm_nmp.envs.robots.attached import MAX_ATTACHED
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import matrix
 from roboarm_nmp.envs.scenes import documents, meshes
@@ -35,6 +37,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     IDENTITY,
     MAX_LENGTH,
     MAX_SCENE_OBSTACLES,
+    Attached,
     Box,
     Cylinder,
     Scene,
@@ -55,13 +58,13 @@ UNSUPPORTED = {
     "voxel": "voxel grids",
     "voxels": "voxel grids",
     "blox": "nvblox maps",
-    "attached_collision_objects": "attached objects",
 }
 """Contents that are rejected where they are not empty, by their names in files, and in words."""
 # MoveIt's numbers for a primitive's type, of messages that were printed.
 _MOVEIT_TYPES = {"1": "box", "2": "sphere", "3": "cylinder", "4": "cone", "5": "prism"}
 _MOVEIT_SCENE = ("world", "robot_model_name", "fixed_frame_transforms", "collision_objects")
 _CUROBO_KINDS = ("cuboid", "cylinder", "sphere", "capsule", "mesh", "voxel", "blox")
+MAX_NAMES = 1000  # of an allowed collision matrix
 WORLD_FILES = (".yaml", ".yml", ".scene")
 
 
@@ -118,15 +121,97 @@ def moveit_scene(root, robot):
     check_frames(fields, robot)
     world = mapping(fields["world"], "world") if "world" in fields else fields
     _reject_unless_empty(world, "octomap")
-    state = fields.get("robot_state")
-    if state is not None and not is_nothing(state):
-        _reject_unless_empty(mapping(state, "robot_state"), "attached_collision_objects")
+    allowed = _AllowedCollisions(fields.get("allowed_collision_matrix"))
     obstacles = []
     if "collision_objects" in world:
         for entry in sequence(world["collision_objects"], "collision_objects"):
-            obstacles += _collision_object(entry, robot)
+            found = _collision_object(entry, robot)
+            if touching := allowed.links(_id(entry), robot):
+                found = [replace(one, may_touch=touching) for one in found]
+            obstacles += found
             _check_number(entry, obstacles)
+    state = fields.get("robot_state")
+    if not is_nothing(state):
+        robot = with_attached_objects(mapping(state, "robot_state"), robot, allowed)
     return checked_scene(root, tuple(obstacles), robot)
+
+
+def _id(node):
+    name = mapping(node, "a collision object").get("id")
+    return "" if name is None else documents.text(name, "id")
+
+
+class _AllowedCollisions:
+    """MoveIt's allowed collision matrix, a `Node` or None. Raises Mistake."""
+
+    def __init__(self, node):
+        self._rows, self._defaults = {}, {}
+        if is_nothing(node):
+            return
+        fields, names = mapping(node, "allowed_collision_matrix"), {}
+        for what in ("entry_names", "entry_values", "default_entry_names", "default_entry_values"):
+            names[what] = sequence(fields.get(what, Node([], node.line)), what, MAX_NAMES)
+        columns = [documents.text(name, "entry_names") for name in names["entry_names"]]
+        rows = [self._row(row, columns) for row in names["entry_values"]]
+        if len(rows) != len(columns):
+            raise Mistake(node, f"{len(columns)} entry_names have {len(rows)} entry_values")
+        self._rows = dict(zip(columns, rows, strict=True))
+        named = [documents.text(name, "a name") for name in names["default_entry_names"]]
+        values = [_switch(value) for value in names["default_entry_values"]]
+        if len(named) != len(values):
+            raise Mistake(node, f"{len(named)} default_entry_names have {len(values)} values")
+        self._defaults = dict(zip(named, values, strict=True))
+
+    def _row(self, node, columns):
+        if isinstance(node.value, dict):
+            node = get(node, "enabled", "a row of entry_values")
+        values = [_switch(value) for value in sequence(node, "a row of entry_values")]
+        if len(values) != len(columns):
+            raise Mistake(node, f"{len(columns)} entry_names have a row of {len(values)} values")
+        return dict(zip(columns, values, strict=True))
+
+    def links(self, name, robot):
+        """Names of the robot's links that an object may touch, a tuple."""
+        row, default = self._rows.get(name, {}), self._defaults.get(name, False)
+        if not row and not default:
+            return ()
+        links = robot.arm.bullet_names[1].values()
+        return tuple(link for link in links if row.get(link, default))
+
+
+def _switch(node):
+    value = documents.text(node, "an entry of the allowed collision matrix").lower()
+    if value not in ("true", "false", "0", "1"):
+        raise Mistake(node, f"an entry must be true or false, got {describe(node)}")
+    return value in ("true", "1")
+
+
+def with_attached_objects(state, robot, allowed=None):
+    """A `Robot` with the attached objects of a RobotState, a dict of `Node`s. Raises Mistake."""
+    node = state.get("attached_collision_objects")
+    if is_nothing(node):
+        return robot
+    found = list(robot.attached)
+    for entry in sequence(node, "attached_collision_objects", MAX_ATTACHED):
+        link = documents.text(get(entry, "link_name", "an attached object"), "link_name")
+        shape = get(entry, "object", "an attached object")
+        touched = mapping(entry, "an attached object").get("touch_links")
+        touched = [] if touched is None else sequence(touched, "touch_links", MAX_NAMES)
+        touched = [documents.text(one, "touch_links") for one in touched]
+        if allowed is not None:
+            touched += allowed.links(_id(shape), robot)
+        shapes = _collision_object(shape, robot, link)
+        if not shapes:
+            raise Mistake(shape, "an attached object needs primitives or meshes of its own")
+        try:
+            objects = [Attached(one, link, touched) for one in shapes]
+            found += [one for one in objects if one not in found]  # of the start state, too
+        except ValueError as error:
+            raise Mistake(entry, str(error)) from error
+    try:
+        return robot.with_attached(found)
+    except ValueError as error:
+        raise Mistake(node, str(error)) from error
 
 
 def checked_scene(node, obstacles, robot=PANDA):
@@ -172,12 +257,16 @@ def check_frame(node, robot):
         raise Mistake(node, f"the frame {shorten(name)} is neither {base}, the base, nor world")
 
 
-def _collision_object(node, robot):
+def _collision_object(node, robot, link=None):
+    """The obstacles of a collision object; `link`: the frame of an attached one."""
     fields = mapping(node, "a collision object")
     if "header" in fields:
         header = mapping(fields["header"], "header")
-        if "frame_id" in header:
+        if "frame_id" in header and link is None:
             check_frame(header["frame_id"], robot)
+        elif "frame_id" in header and documents.text(header["frame_id"], "a frame") != link:
+            name = shorten(header["frame_id"].value)
+            raise Mistake(header["frame_id"], f"the frame {name} is not {link}, the object's link")
     _reject_unless_empty(fields, "planes")
     if "operation" in fields:
         operation = documents.text(fields["operation"], "operation")

@@ -30,6 +30,8 @@ from roboarm_nmp.envs.scenes.numbers import (
 
 MAX_HULL_VERTICES = 256
 """Of a `ConvexHull`."""
+MAX_TOUCHING = 200
+"""Names of links that one obstacle may touch."""
 
 
 def _normalise(body):
@@ -44,6 +46,18 @@ def _normalise(body):
         raise TypeError(
             f"motion must be Oscillation, Waypoints, Presence or None, got {body.motion!r}"
         )
+    if body.may_touch is not True and (type(body.may_touch) is not tuple or body.may_touch):
+        object.__setattr__(body, "may_touch", _link_names(body.may_touch, "may_touch"))
+
+
+def _link_names(names, what):
+    """Names of links as a sorted tuple; False is none. Raises ValueError."""
+    if names is False:
+        return ()
+    names = tuple(names) if isinstance(names, (tuple, list, set, frozenset)) else (None,)
+    if not all(isinstance(name, str) for name in names) or len(names) > MAX_TOUCHING:
+        raise ValueError(f"{what} must be names of up to {MAX_TOUCHING} links, got {names!r}")
+    return tuple(sorted(set(names)))
 
 
 @dataclass(frozen=True)
@@ -51,6 +65,9 @@ class Box:
     """A box: centre, full edges, and orientation as a quaternion (x, y, z, w).
 
     `motion`: how it moves away from this pose (`envs.scenes.motions`); None: it does not move.
+
+    `may_touch`: names of the arm's links whose contacts with this obstacle are no collisions, with
+    the objects attached to them; True: `Robot.hand_links`. Other obstacles have it, too.
 
     Raises ValueError: the norm of the quaternion differs from 1 by more than 1 %. It is normalised
     otherwise.
@@ -60,6 +77,7 @@ class Box:
     size: tuple[float, float, float]
     orientation: tuple[float, float, float, float] = IDENTITY
     motion: Motion | None = None
+    may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
 
@@ -76,6 +94,7 @@ class Cylinder:
     length: float
     orientation: tuple[float, float, float, float] = IDENTITY
     motion: Motion | None = None
+    may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
 
@@ -87,6 +106,7 @@ class Sphere:
     position: tuple[float, float, float]
     radius: float
     motion: Motion | None = None
+    may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     __post_init__ = _normalise
 
@@ -105,6 +125,7 @@ class ConvexHull:
     vertices: tuple[tuple[float, float, float], ...]
     orientation: tuple[float, float, float, float] = IDENTITY
     motion: Motion | None = None
+    may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     def __post_init__(self):
         _normalise(self)
@@ -114,6 +135,50 @@ class ConvexHull:
 
 
 Obstacle = Box | Cylinder | Sphere | ConvexHull
+
+
+@dataclass(frozen=True)
+class Attached:
+    """An object that the arm carries, as a part of one of its links; see `Robot.with_attached`.
+
+    Attributes:
+        shape: a `Box`, `Cylinder`, `Sphere` or `ConvexHull`, in the frame of the link in the URDF.
+        link: the link's name; None: the link with the end effector.
+        touch_links: names of links whose contacts with the object are no collisions. Those that
+            move with the object never collide with it.
+
+    Raises:
+        TypeError: another type.
+        ValueError: as of a `Scene`'s obstacles; or the shape has `may_touch` or a motion.
+    """
+
+    shape: Obstacle
+    link: str | None = None
+    touch_links: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if not isinstance(self.shape, Obstacle):
+            raise TypeError(
+                f"an attached shape must be Box, Cylinder, Sphere or ConvexHull, got {self.shape!r}"
+            )
+        check_obstacle(self.shape)
+        if self.shape.may_touch:
+            raise ValueError("an attached shape has no may_touch: give the object touch_links")
+        if self.shape.motion is not None:
+            raise ValueError("an attached shape has no motion: it moves with its link")
+        if self.link is not None and not isinstance(self.link, str):
+            raise TypeError(f"link must be the name of a link, or None, got {self.link!r}")
+        object.__setattr__(self, "touch_links", _link_names(self.touch_links, "touch_links"))
+
+    @property
+    def triangles(self):
+        """The triangles of a `ConvexHull`'s surface: `hull_faces`."""
+        return hull_faces(self.shape.vertices)
+
+    def described(self):
+        """All of it as lists, for files and fingerprints: row of `to_lists`, link, touch_links."""
+        return [to_lists([self.shape])[0], self.link, list(self.touch_links)]
+
 
 # The arm stands on the table's top (z = 0).
 TABLE = Box(position=(0.2, 0.0, -0.02), size=(1.0, 1.0, 0.04))
@@ -154,12 +219,14 @@ class Scene:
                     f"obstacles must be Box, Cylinder, Sphere or ConvexHull, got {obstacle!r}"
                 )
             check_obstacle(obstacle)
+            self._check_links(obstacle)
         if len(self.obstacles) > MAX_SCENE_OBSTACLES:
             raise ValueError(f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
         if self.table is not None:
             if not isinstance(self.table, Box):
                 raise TypeError(f"table must be a Box or None, got {self.table!r}")
             check_obstacle(self.table)
+            self._check_links(self.table)
             if self.table.motion is not None:
                 raise ValueError("the table cannot move: leave it out, and add a box that does")
         if self.floor is not None and not _is_length(self.floor):
@@ -168,6 +235,11 @@ class Scene:
             raise ValueError(f"friction must be a number from 0 on, got {self.friction!r}")
         if not isinstance(self.robot, Robot):
             raise TypeError(f"robot must be a Robot, got {self.robot!r}")
+
+    def _check_links(self, obstacle):
+        """Raise ValueError if an obstacle may touch a link that the robot does not have."""
+        if obstacle.may_touch and isinstance(self.robot, Robot):
+            self.robot.links_called(obstacle.may_touch)
 
     @property
     def is_static(self):
@@ -454,7 +526,8 @@ def from_array(rows, vertices=()):
 def to_lists(obstacles):
     """Obstacles as JSON's lists: rows of `to_array`, a hull's followed by its vertices' numbers.
 
-    The last entry of one that moves is a list, the numbers of its motion.
+    Two more entries follow, where there are any: the numbers of its motion, a list; `may_touch`,
+    true or a list of names.
     """
     rows = to_array(obstacles).tolist()
     for row, obstacle in zip(rows, obstacles, strict=True):
@@ -462,16 +535,31 @@ def to_lists(obstacles):
             row += [float(number) for vertex in obstacle.vertices for number in vertex]
         if obstacle.motion is not None:
             row.append(motion_to_numbers(obstacle.motion))
+        if obstacle.may_touch:
+            row.append(obstacle.may_touch if obstacle.may_touch is True else [*obstacle.may_touch])
     return rows
 
 
 def from_lists(rows):
     """The inverse of `to_lists`. Raises ValueError, TypeError: as `from_array`."""
-    motions = [row[-1] if row and isinstance(row[-1], list) else [] for row in rows]
-    rows = [row[:-1] if motion else row for row, motion in zip(rows, motions, strict=True)]
+    rows, motions, touching = zip(*map(split_list, rows), strict=True) if rows else ((), (), ())
     vertices = np.array([number for row in rows for number in row[ROW:]]).reshape(-1, 3)
     obstacles = from_array(np.array([row[:ROW] for row in rows]).reshape(-1, ROW), vertices)
-    return tuple(map(with_motion, obstacles, motions))
+    return with_may_touch(map(with_motion, obstacles, motions), touching)
+
+
+def split_list(row):
+    """The numbers, the motion's numbers and `may_touch` of a row of `to_lists`."""
+    row, motion, may_touch = list(row), [], ()
+    if row and (isinstance(row[-1], bool) or _is_list_of(str, row[-1])):
+        may_touch = row.pop()
+    if row and isinstance(row[-1], list):
+        motion = row.pop()
+    return row, motion, may_touch
+
+
+def _is_list_of(kind, value):
+    return isinstance(value, list) and len(value) > 0 and isinstance(value[0], kind)
 
 
 def scene_to_json(scene):
@@ -480,15 +568,17 @@ def scene_to_json(scene):
         raise ValueError("a scene with points cannot be written: save the points as .npy instead")
     fields = {
         "obstacles": to_lists(scene.obstacles),
-        "table": None if scene.table is None else to_array([scene.table])[0].tolist(),
+        "table": None if scene.table is None else to_lists([scene.table])[0],
         "floor": scene.floor,
     }
     if scene.friction != FRICTION:
         fields["friction"] = scene.friction
     if scene.robot.arm != PANDA:
         fields["robot"] = scene.robot.arm.name, scene.robot.arm.fingerprint
-    if scene.robot.described:
+    if scene.robot.held_positions != scene.robot.arm.held_positions:
         fields["held"] = scene.robot.held
+    if scene.robot.attached:
+        fields["attached"] = [one.described() for one in scene.robot.attached]
     return json.dumps(fields, sort_keys=True)
 
 
@@ -498,7 +588,20 @@ def scene_from_json(text, robot=PANDA):
     `robot` is the scene's arm: the text has only its fingerprint, and where joints are held.
     """
     fields = json.loads(text)
-    table = fields["table"] and from_array([fields["table"]])[0]
+    table = fields["table"] and from_lists([fields["table"]])[0]
     friction = fields.get("friction", FRICTION)
     robot = robot.arm.with_held(fields["held"]) if "held" in fields else robot.arm
+    robot = robot.with_attached(map(_attached, fields.get("attached", ())))
     return Scene(from_lists(fields["obstacles"]), table, fields["floor"], friction, robot)
+
+
+def _attached(fields):
+    """The inverse of `Attached.described`."""
+    row, link, touch_links = fields
+    return Attached(*from_lists([row]), link, touch_links)
+
+
+def with_may_touch(obstacles, touching):
+    """Obstacles, each with its `may_touch`, a tuple. Raises ValueError: of another number."""
+    pairs = zip(obstacles, touching, strict=True)
+    return tuple(replace(one, may_touch=may) if may else one for one, may in pairs)

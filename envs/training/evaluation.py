@@ -90,6 +90,8 @@ class EvaluationOptions:
             policy's own, otherwise `ground_truth`.
         safety_filter: an `envs.policies.safety_filter.SafetyFilter` around the policy; None for the
             one that the policy includes, if any; False for none.
+        replan: whenever the policy is stuck, follow a plan for a while
+            (`envs.policies.replanning.ReplanWhenStuck`), among the geometry source's obstacles.
         observe_every: steps from one observation of the scene to the next; None: static scenes are
             observed once (`envs.wrappers.ObservedSceneWrapper`).
         sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
@@ -118,6 +120,7 @@ class EvaluationOptions:
     time_limit: float = TIME_LIMIT
     geometry_source: str | None = None
     safety_filter: SafetyFilter | bool | None = None
+    replan: bool = False
     observe_every: int | None = None
     sensor_noise: SensorNoise | None = None
     action_delay: int = 0
@@ -246,7 +249,7 @@ class _Job:
         env = envs.make(self.task, **o.env, **kwargs)
         source, safety_filter = o.geometry_source or GROUND_TRUTH, o.safety_filter or False
         options = o.seed, o.tries, o.time_limit, source, safety_filter
-        return env, make_policy(self.policy, env, *options)
+        return env, make_policy(self.policy, env, *options, replan=o.replan)
 
     @property
     def delay(self):
@@ -339,7 +342,7 @@ def _in_use(policy, options):
     env["stop_on_collision"] = options.stop_on_collision
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
-    safety_filter = filter_around(policy, safety_filter)
+    safety_filter = filter_around(policy, safety_filter, options.replan)
     if safety_filter:
         env["link_distances"] = True
     source = options.geometry_source or env.get("geometry_source")
@@ -347,7 +350,7 @@ def _in_use(policy, options):
         source = env["geometry_source"] = source or GROUND_TRUTH
     elif env.get("encoder") == POINT_CLOUD and source != GROUND_TRUTH:
         source = env["geometry_source"] = source or POINT_CLOUD
-    elif policy in CHECKING:
+    elif policy in CHECKING or options.replan:
         source = source or GROUND_TRUTH
     elif options.geometry_source is not None:
         raise EvaluationError(
@@ -521,7 +524,8 @@ def _summary(job, outcomes):
         planning["planning_seconds_solved"] = mean(columns.planning_seconds, found)
         if job.policy == "via-points":
             planning["free_motion_rate"] = float(found.mean())
-    random = job.policy in (*CHECKING, "random") or safety_filter
+    checks = job.policy in CHECKING or options.replan
+    random = checks or job.policy == "random" or safety_filter
     packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy in OMPL_PLANNERS)
     return {
         "policy": getattr(job.policy, "__name__", str(job.policy)),
@@ -547,7 +551,8 @@ def _summary(job, outcomes):
         **({"observe_every": options.observe_every} if options.observe_every else {}),
         **({"sensor_noise": options.sensor_noise.to_metadata()} if options.sensor_noise else {}),
         "privileged": is_privileged(options.env)
-        or (job.policy in CHECKING and options.geometry_source == GROUND_TRUTH),
+        or (checks and options.geometry_source == GROUND_TRUTH),
+        **({"replan": True} if options.replan else {}),
         "safety_filter": safety_filter.to_metadata() | {"version": VERSION}
         if safety_filter
         else None,

@@ -66,6 +66,9 @@ def _settings(result):
         if "lookahead" in safety_filter:
             ahead = safety_filter["lookahead"]
             margin += ", no velocities" if ahead is None else f", {ahead:g} s ahead"
+        if "lookahead" in safety_filter:
+            ahead = safety_filter["lookahead"]
+            margin += ", no velocities" if ahead is None else f", {ahead:g} s ahead"
     limit, noise = result["time_limit"], result.get("sensor_noise", {})
     return {
         "robot": None if result["robot"] == PANDA.name else result["robot"],
@@ -75,6 +78,7 @@ def _settings(result):
         "geometry source": result["geometry_source"] or "none",
         "privileged": "yes" if result["privileged"] else None,
         "safety filter": margin,
+        "replans": "when stuck" if result.get("replan") else None,
         "observed every": f"{result['observe_every']} steps" if "observe_every" in result else None,
         "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",

@@ -22,6 +22,7 @@ DECODED_BY = "field"  # the encoder whose decoded points are shown where an arm 
 # Colours (red, green, blue).
 FLOOR_COLOUR, TABLE_COLOUR = (205, 205, 205), (196, 178, 150)
 OBSTACLE_COLOUR, SELECTED_COLOUR = (96, 132, 172), (240, 170, 60)
+TOUCHABLE_COLOUR = (150, 120, 170)
 START_COLOUR, GOAL_COLOUR, CONTACT_COLOUR = (150, 150, 165), (60, 190, 90), (230, 30, 30)
 OBSERVED_COLOUR, DECODED_COLOUR = (255, 140, 0), (150, 60, 200)
 WANTED_COLOUR, FILTERED_COLOUR = (130, 130, 130), (20, 110, 230)
@@ -204,7 +205,10 @@ class Drawing:
         if place.scene is not None and place.scene[0] is scene and place.scene[1:] == shown[1:]:
             return
         # None for an obstacle that is absent, so that the others keep their numbers.
-        bodies = [(obstacle_at(body, time), OBSTACLE_COLOUR) for body in scene.obstacles]
+        bodies = [
+            (obstacle_at(body, time), TOUCHABLE_COLOUR if body.may_touch else OBSTACLE_COLOUR)
+            for body in scene.obstacles
+        ]
         if self.selected is not None and self.selected < len(bodies):
             bodies[self.selected] = bodies[self.selected][0], SELECTED_COLOUR
         bodies.append((scene.table, TABLE_COLOUR))

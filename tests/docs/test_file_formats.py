@@ -12,6 +12,7 @@ from roboarm_nmp.envs.datasets.format import (
     MOTION_ARRAYS,
     QUERY_ARRAYS,
     SCENE_ARRAYS,
+    TOUCH_ARRAYS,
 )
 from roboarm_nmp.envs.datasets.problems import ARRAYS as PROBLEM_ARRAYS
 from roboarm_nmp.envs.networks import operations
@@ -31,7 +32,7 @@ def code(title, language):
 
 def test_arrays_are_listed_with_their_dtypes():
     for title, arrays in (
-        ("Queries", QUERY_ARRAYS | SCENE_ARRAYS | HULL_ARRAYS | MOTION_ARRAYS),
+        ("Queries", QUERY_ARRAYS | SCENE_ARRAYS | HULL_ARRAYS | TOUCH_ARRAYS | MOTION_ARRAYS),
         ("Demonstrations", DEMO_ARRAYS),
         ("Problems", PROBLEM_ARRAYS),
     ):

@@ -8,6 +8,7 @@ from problem_files import (
     GOALS,
     MOVEIT_REQUEST,
     MOVEIT_SCENE,
+    MOVEIT_TOUCHING,
     ROBOMETRICS,
     write_file,
     write_folder,
@@ -59,6 +60,26 @@ def test_summary_says_what_was_imported_and_why_others_were_not(folder, tmp_path
     assert problems.names == ("shelf/0001", "shelf/0002", "shelf/0003", "shelf/0")
     assert not problems.rejected
     assert list(problems[0].scene.robot.held.values()) == [0.065] * 2
+
+
+def test_summary_counts_objects_and_names_constraints_that_are_not_supported(tmp_path, capsys):
+    request = MOVEIT_REQUEST.replace(
+        "  joint_state:\n    name",
+        "  attached_collision_objects:\n  - {link_name: panda_hand, object: {primitives: "
+        "[{type: sphere, dimensions: [0.02]}], primitive_poses: [{}]}}\n"
+        "  joint_state:\n    name",
+    )
+    folder = write_folder(tmp_path / "shelf", scene=MOVEIT_TOUCHING, request=request)
+    upright = f"path_constraints: {{orientation_constraints: [{{weight: 1}}]}}\n{MOVEIT_REQUEST}"
+    write_folder(folder, "0002", request=upright)
+    run(folder, "--output", tmp_path / "problems.h5")
+    lines = capsys.readouterr().out.splitlines()
+    assert "  1 with attached objects" in lines
+    assert "  1 with obstacles that links may touch" in lines
+    assert "not imported: 1: path_constraints are not supported" in lines
+    [problem] = load_problems(tmp_path / "problems.h5")
+    shapes = [type(one.shape).__name__ for one in problem.scene.robot.attached]
+    assert shapes == ["Sphere", "Box"] and list(problem.scene.robot.held.values()) == [0.065] * 2
 
 
 def test_goals_that_cannot_be_reached_are_left_out(tmp_path):

@@ -54,6 +54,35 @@ start_state:
            panda_joint5, panda_joint6, panda_joint7, panda_finger_joint2]
     position: [0.065, 0, -0.785, 0, -2.356, 0, 1.571, 0.785, 0.065]
 """
+# The scene with a box in the hand, and with entries for the can and the box among the links.
+MOVEIT_TOUCHING = (
+    MOVEIT_SCENE.replace(
+        "  joint_state: {name",
+        """\
+  attached_collision_objects:
+    - link_name: panda_hand
+      touch_links: [panda_link6]
+      object:
+        header: {frame_id: panda_hand}
+        id: tool
+        pose: {position: [0, 0, 0.1], orientation: [0, 0, 0, 1]}
+        primitives: [{type: box, dimensions: [0.04, 0.05, 0.1]}]
+        primitive_poses: [{position: [0, 0, 0.05], orientation: [0, 0, 0, 1]}]
+        operation: 0
+  joint_state: {name""",
+    )
+    + """\
+allowed_collision_matrix:
+  entry_names: [can, panda_hand, panda_link5, tool]
+  entry_values:
+    - [false, true, false, true]
+    - {enabled: [true, false, true, false]}
+    - [false, true, false, true]
+    - [true, false, true, false]
+  default_entry_names: [shelf]
+  default_entry_values: [false]
+"""
+)
 # The hand's pose at GOALS[0], as the test of it computes with PyBullet.
 ROBOMETRICS = """\
 shelf:

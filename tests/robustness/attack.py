@@ -8,8 +8,9 @@ Attacks: `networks` (network files with one to three things changed at random, e
 its own), `files` (bits flipped and files cut off, of every kind that is written), `robots` (URDFs,
 their meshes and YAML files, changed likewise), `clouds` (point clouds of every format, changed
 likewise), `problems` (files of problems and scenes in other programs' formats, changed likewise),
-`flags` (of every command), `environments` (arguments of environments, scenes and sensors, and
-actions), `kills` (`kill -9` at random moments of training, collecting, drawing and sweeping).
+`trajectories` (trajectories and joint paths of every format, changed likewise), `flags` (of every
+command), `environments` (arguments of environments, scenes and sensors, and actions), `kills`
+(`kill -9` at random moments of training, collecting, drawing and sweeping).
 
 Each attempt depends on the seed and its number only. The last lines are a table: how many attempts
 were refused clearly, ran, or read what was there before; then, of whatever else came of attempts,
@@ -39,20 +40,30 @@ from attacks import (
     networks,
     problems,
     robots,
+    trajectories,
 )
 from tqdm import tqdm
 
 # How many attempts, and how many of them share a process.
 SIZES = {
     **{"networks": 10_000, "files": 20_000, "robots": 2_000, "clouds": 10_000},
-    **{"problems": 10_000, "flags": 2_000, "environments": 20_000, "kills": 50},
+    **{"problems": 10_000, "trajectories": 10_000, "flags": 2_000, "environments": 20_000},
+    **{"kills": 50},
 }
 Name = Literal[
-    "networks", "files", "robots", "clouds", "problems", "flags", "environments", "kills"
+    "networks",
+    "files",
+    "robots",
+    "clouds",
+    "problems",
+    "trajectories",
+    "flags",
+    "environments",
+    "kills",
 ]
 PER_CHILD = {
     **{"networks": 1, "files": 200, "robots": 1, "clouds": 100, "problems": 20, "flags": 1},
-    **{"environments": 100, "kills": 1},
+    **{"trajectories": 200, "environments": 100, "kills": 1},
 }
 MODULES = {
     "networks": networks,
@@ -60,6 +71,7 @@ MODULES = {
     "robots": robots,
     "clouds": clouds,
     "problems": problems,
+    "trajectories": trajectories,
     "flags": flags,
     "environments": environments,
     "kills": kills,
@@ -72,8 +84,8 @@ class Args:
     only: tuple[Name, ...] = tuple(SIZES)
     """these attacks"""
     number: int | None = None
-    """attempts of each; by default 10,000, 20,000, 2,000, 10,000, 10,000, 2,000, 20,000, 50 (of
-    four kills)"""
+    """attempts of each; by default 10,000, 20,000, 2,000, 10,000, 10,000, 10,000, 2,000, 20,000, 50
+    (of four kills)"""
     seed: int = 0
     """of everything random"""
     repeat: int | None = None

@@ -12,6 +12,7 @@ FEW = {
     "robots": 30,
     "clouds": 400,
     "problems": 60,
+    "trajectories": 200,
     "environments": 400,
     "flags": 17,
     "kills": 2,

@@ -284,7 +284,7 @@ def test_distance_grows_along_the_normal(env):
         near = CollisionChecker(scene).signed_distances(state, self_collisions=False)
         for link in (3, 7, 9):
             moved = tuple(obstacle.position - step * near.normal[link])
-            scene = Scene((type(obstacle)(moved, *list(vars(obstacle).values())[1:]),), None, None)
+            scene = Scene((replace(obstacle, position=moved),), None, None)
             there = CollisionChecker(scene).signed_distances(state, self_collisions=False)
             assert there.distance[link] - near.distance[link] == pytest.approx(step, rel=0.02)
             # The witness is on the link, at that distance from the obstacle.

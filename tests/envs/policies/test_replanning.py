@@ -208,6 +208,17 @@ def test_replanning_waits_near_an_occupied_goal_and_goes_there_when_it_is_free()
     assert 3.0 < len(trajectory) * STEP_SECONDS < 5.0
 
 
+def test_stuck_policy_follows_a_plan():
+    query = load_queries("random_boxes_hard", "validation")[4]
+    env, success = make_env(query.scene, horizon=250), {}
+    for replan in (False, True):
+        options = {"safety_filter": SafetyFilter(escape=False), "replan": replan}
+        trajectory = rollout(env, query, make_policy("go-to-goal", env, **options)(0, query).act)
+        success[replan] = trajectory.success and not trajectory.collides
+    env.close()
+    assert success == {False: False, True: True}
+
+
 # --- Space and time
 
 

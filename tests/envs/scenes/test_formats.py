@@ -2,11 +2,19 @@
 
 import numpy as np
 import pytest
-from problem_files import CUROBO, MOVEIT_SCENE, OLD_SCENE_TEXT, SCENE_TEXT, write_file
+from problem_files import (
+    CUROBO,
+    MOVEIT_SCENE,
+    MOVEIT_TOUCHING,
+    OLD_SCENE_TEXT,
+    SCENE_TEXT,
+    write_file,
+)
 
 from roboarm_nmp.envs import make
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.formats import load_world, multiply
-from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.scenes.primitives import Attached, Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import get_task
 
 HALF = 0.7071067811865476
@@ -52,6 +60,18 @@ def test_file_can_be_a_task(name, tmp_path):
     env.close()
 
 
+def test_attached_objects_and_allowed_collisions_are_those_of_the_file(tmp_path):
+    """The matrix allows the can and the hand, and what the hand carries and link 5."""
+    scene = load_world(write_file(tmp_path / "scene.yaml", MOVEIT_TOUCHING))
+    box = Box((0, 0, 0.15), (0.04, 0.05, 0.1))
+    tool = Attached(box, "panda_hand", ("panda_link5", "panda_link6"))
+    assert scene.robot == PANDA.with_attached([tool])
+    assert [one.may_touch for one in scene.obstacles] == [("panda_hand",), (), ()]
+    every = MOVEIT_TOUCHING.replace("default_entry_values: [false]", "default_entry_values: [true]")
+    shelf = load_world(write_file(tmp_path / "scene.yaml", every)).obstacles[1]
+    assert set(shelf.may_touch) == set(PANDA.bullet_names[1].values())
+
+
 def test_own_scene_files_are_worlds_too(tmp_path):
     path = write_file(tmp_path / "own.yaml", "floor: false\ntable: false\n")
     assert load_world(path) == Scene(table=None, floor=None)
@@ -70,6 +90,15 @@ def edited(text, old, new):
 
 
 MISTAKES = [
+    ("a.yaml", edited(MOVEIT_TOUCHING, "frame_id: panda_hand", "frame_id: world"), 11,
+     "the frame 'world' is not panda_hand, the object's link"),
+    ("a.yaml", edited(MOVEIT_TOUCHING, "link_name: panda_hand", "link_name: thumb"), 11,
+     "the frame 'panda_hand' is not thumb"),
+    ("a.yaml", edited(MOVEIT_TOUCHING, "[panda_link6]", "[thumb]"), 8, "panda has no link 'thumb'"),
+    ("a.yaml", edited(MOVEIT_TOUCHING, "- [false, true, false, true]", "- [false, true]"), 43,
+     "4 entry_names have a row of 2 values"),
+    ("a.yaml", edited(MOVEIT_TOUCHING, "[true, false, true, false]}", "[yes, false, true, false]}"),
+     44, "an entry must be true or false, got 'yes'"),
     ("a.yaml", edited(MOVEIT_SCENE, "type: cylinder", "type: cone"), 15,
      "cones are not supported"),
     ("a.yaml", edited(MOVEIT_SCENE, "  collision_objects:", "  octomap: {id: x}\n  collision_obj"
@@ -91,7 +120,7 @@ MISTAKES = [
     ("a.yaml", edited(MOVEIT_SCENE, "- id: can", "- id: can\n      header: {frame_id: camera}"), 14,
      "the frame 'camera' is neither panda_link0, the base, nor world"),
     ("a.yaml", edited(MOVEIT_SCENE, "  joint_state:", "  attached_collision_objects: [{x: 1}]\n  "
-     "joint_state:"), 7, "attached objects are not supported"),
+     "joint_state:"), 7, "an attached object lacks link_name"),
     ("b.yml", edited(CUROBO, "mesh: {}", "mesh: {cup: {file_path: cup.obj}}"), 7,
      "mesh cup lacks pose"),
     ("b.yml", edited(CUROBO, "-0.1, 1, 0, 0, 0]", "-0.1, 1, 0, 0]"), 4,

@@ -288,7 +288,8 @@ def sphere(position="[0, 0, 0]", radius="1"):
         (
             "floor: 0\nflor: 0",
             2,
-            "unknown key flor in a scene: known are robot, held, table, floor, friction, obstacles",
+            "unknown key flor in a scene: known are robot, held, attached, table, floor, friction, "
+            "obstacles",
         ),
         ("floor: 0\n<<: {table: true}", 2, "unknown key << in a scene"),
         ("floor: 0\n? [a]\n: 1", 2, "unknown key a list in a scene"),

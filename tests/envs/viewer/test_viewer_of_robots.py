@@ -8,7 +8,7 @@ from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.files import load_scene
-from roboarm_nmp.envs.scenes.primitives import Scene, Sphere
+from roboarm_nmp.envs.scenes.primitives import Attached, Box, Scene, Sphere, convex_hull
 from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.viewer import app
 from roboarm_nmp.envs.viewer.simulation import (
@@ -228,3 +228,16 @@ def test_robots_that_cannot_be_viewed_give_one_line(capfd, monkeypatch, argument
     assert app.main([*arguments, "--record", str(tmp_path / "a.html")]) == 2
     output, errors = capfd.readouterr()
     assert output == "" and len(errors.splitlines()) == 1 and words in errors
+
+
+def test_attached_objects_are_drawn_where_their_links_are():
+    hull = convex_hull(np.random.default_rng(0).uniform(-0.05, 0.05, (12, 3)), (0, 0, 0.1))
+    shapes = (Sphere((0, 0, 0.1), 0.05), Box((0, 0, 0.15), (0.05, 0.1, 0.2)), hull)
+    robot = PANDA.with_attached([Attached(shape, "panda_hand") for shape in shapes])
+    links = [link.index for link in robot.links[-3:]]
+    hand = {joint.link: joint.parent for joint in arm_joints(robot)}
+    assert {hand[link] for link in links} == {8}
+    drawn = link_meshes(robot, 1e-4)
+    extents = [np.ptp(drawn[link][0][1], axis=0) for link in links]
+    np.testing.assert_allclose(extents[1], (0.05, 0.1, 0.2), atol=1e-3)
+    np.testing.assert_allclose(extents[2], np.ptp(hull.vertices, axis=0), atol=1e-3)

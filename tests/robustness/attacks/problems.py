@@ -25,6 +25,7 @@ ODD = (
 NUMBERS = (b"0", b"-1", b"1", b"0.5", b"nan", b".inf", b"1e300", b"1e-300", b"1e3", b"-0.02", b"7")
 WORLDS = {
     "world.yaml": problem_files.MOVEIT_SCENE,
+    "touching.yaml": problem_files.MOVEIT_TOUCHING,
     "curobo.yaml": problem_files.CUROBO,
     "new.scene": problem_files.SCENE_TEXT,
     "old.scene": problem_files.OLD_SCENE_TEXT,

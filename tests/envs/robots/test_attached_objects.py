@@ -1,0 +1,279 @@
+"""Objects attached to the arm: body, checks, distances, planning and files have them as links."""
+
+import copy
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from roboarm_nmp import envs
+from roboarm_nmp.demo_generation.following import follow
+from roboarm_nmp.demo_generation.planning import Planner
+from roboarm_nmp.envs import RoboArmEnv
+from roboarm_nmp.envs.collision.checker import ARM, CollisionChecker
+from roboarm_nmp.envs.datasets.problem_formats import Problem
+from roboarm_nmp.envs.datasets.problems import load_problems, write_problems
+from roboarm_nmp.envs.datasets.queries import Query
+from roboarm_nmp.envs.networks.exported_networks import check_robot
+from roboarm_nmp.envs.perception.point_clouds import obstacle_points, prepare_cloud
+from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
+from roboarm_nmp.envs.policies.rollout import Episode
+from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.motions import Oscillation
+from roboarm_nmp.envs.scenes.primitives import (
+    Attached,
+    Box,
+    Cylinder,
+    Scene,
+    Sphere,
+    convex_hull,
+    scene_from_json,
+    scene_to_json,
+)
+from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
+from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.envs.world import World
+
+TURN = (0.3, -0.1, 0.4, np.sqrt(0.74))
+BOARD = Attached(Box((0.0, 0.0, 0.05), (0.06, 0.1, 0.2), TURN))
+POINTS = np.random.default_rng(1).uniform(-0.06, 0.06, (30, 3))
+ROCK = Attached(convex_hull(POINTS, (0.02, 0.01, 0.12), TURN), "panda_hand")
+# A box, a hull, a cylinder and a sphere, on links before and behind others in PyBullet's order.
+MANY = (
+    Attached(Box((0.1, 0.0, -0.1), (0.1, 0.1, 0.1), TURN), "panda_link5"),
+    Attached(Sphere((0.0, 0.0, 0.08), 0.05), "panda_leftfinger"),
+    Attached(Cylinder((0.0, 0.05, 0.1), 0.03, 0.3, TURN)),
+    ROCK,
+)
+START = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)
+GOAL = np.array([0.6, -0.3, 0.1, -1.8, 0.1, 1.5, 0.6], np.float32)
+
+
+def test_arm_without_objects_is_the_same_object_and_keeps_its_fingerprint():
+    carrying = PANDA.with_attached([BOARD])
+    assert PANDA.with_attached([]) is PANDA and carrying.with_attached(()) is PANDA
+    assert PANDA.fingerprint.startswith("026faa3f2a77")
+    assert carrying != PANDA and carrying.same_arm(PANDA) and carrying.arm is PANDA
+    assert carrying == PANDA.with_attached([BOARD]) == pickle.loads(pickle.dumps(carrying))
+    assert carrying != PANDA.with_attached([ROCK])
+    assert carrying.collision_links == PANDA.collision_links
+    check_robot("policy.pt", {}, carrying)
+
+
+def test_objects_stay_when_the_gripper_is_held_elsewhere():
+    robot = PANDA.with_attached([BOARD]).with_held({"panda_finger_joint1": 0.01})
+    assert robot.attached == PANDA.with_attached([BOARD]).attached
+    assert list(robot.held.values()) == [0.01] * 2
+    assert robot == PANDA.with_held({"panda_finger_joint1": 0.01}).with_attached([BOARD])
+
+
+@pytest.mark.parametrize("objects", [[BOARD], MANY], ids=["board", "many"])
+def test_compiled_checks_agree_with_pybullet(objects):
+    robot, rng, free = PANDA.with_attached(objects), np.random.default_rng(0), 0
+    for i in range(3):
+        scene = replace(RandomBoxes(2, 4).sample(rng), robot=robot)
+        if i == 0:
+            world = World(scene, drawn=False)
+        world.set_scene(scene)
+        states = rng.uniform(-1, 1, (100, 7))
+        expected = [not world.in_collision(robot.denormalise(s).tolist()) for s in states]
+        checker = CollisionChecker(scene)
+        np.testing.assert_array_equal(checker.is_free(states), expected)
+        distance = checker.signed_distances(states).distance.min(-1)
+        np.testing.assert_array_equal(distance > 0, expected)
+        free += sum(expected)
+    world.close()
+    assert 30 < free < 270
+
+
+def test_distances_of_an_object_are_in_the_row_of_the_link_that_carries_it():
+    position, rotation = PANDA.frame_poses(START)[6]
+    below = position + 0.5 * rotation[:, 2]  # the fingertips are 0.21 m beyond joint 7
+    ball = Sphere(tuple(below.tolist()), 0.02)
+    rod = PANDA.with_attached([Attached(Cylinder((0, 0, 0.1), 0.01, 0.2), "panda_hand")])
+    state = PANDA.normalise(START.astype(np.float64))
+    plain, carrying = (
+        CollisionChecker(Scene((ball,), None, None, robot=robot)) for robot in (PANDA, rod)
+    )
+    before, after = (one.signed_distances(state, False) for one in (plain, carrying))
+    hand = PANDA.collision_links.index(8)
+    # The rod ends 0.107 + 0.2 m beyond joint 7, and is rounded by 1 mm.
+    assert after.distance[hand] == pytest.approx(0.5 - 0.307 - 0.02 - 0.001, abs=2e-3)
+    assert after.distance[hand] < before.distance[hand] - 0.05
+    others = np.arange(10) != hand
+    np.testing.assert_array_equal(after.distance[others], before.distance[others])
+    for joint in range(7):
+        step = np.eye(7)[joint] * 1e-5
+        there, back = (
+            carrying.signed_distances(state + s, False).distance[hand] for s in (step, -step)
+        )
+        assert after.gradient[hand, joint] == pytest.approx((there - back) / 2e-5, abs=1e-4)
+
+
+def test_object_collides_with_links_that_move_against_it_except_touch_links():
+    long = Box((0.0, 0.0, 0.2), (0.05, 0.05, 0.6))
+    states = np.random.default_rng(0).uniform(-1, 1, (500, 7))
+
+    def collisions(robot):
+        return ~CollisionChecker(Scene(table=None, floor=None, robot=robot)).is_free(states)
+
+    alone, names = collisions(PANDA), PANDA.bullet_names[1].values()
+    carrying = collisions(PANDA.with_attached([Attached(long)]))
+    assert carrying[alone].all() and carrying.sum() > alone.sum() + 3
+    touching = PANDA.with_attached([Attached(long, touch_links=tuple(names))])
+    np.testing.assert_array_equal(collisions(touching), alone)
+    checker = CollisionChecker(Scene((), None, None, robot=PANDA.with_attached([Attached(long)])))
+    assert ARM in checker.signed_distances(states[carrying & ~alone][0]).geometry
+
+
+def test_points_on_an_object_are_the_arms_own():
+    robot = PANDA.with_attached([Attached(Box((0, 0, 0.2), (0.05, 0.05, 0.3)))])
+    position, rotation = robot.frame_poses(START)[6]
+    away = np.linspace(0.35, 0.5, 40)[:, None]  # behind the fingertips
+    points = position + away * rotation[:, 2]
+    assert len(prepare_cloud(points, PANDA, START, min_points=0)[0]) > 3
+    assert not len(prepare_cloud(points, robot, START, min_points=0)[0])
+
+
+def test_sensors_see_an_object_as_the_arm_and_no_points_of_it():
+    position, rotation = PANDA.frame_poses(START)[6]
+    place = position + 0.5 * rotation[:, 2]  # behind the fingertips
+    camera = Camera(tuple(place + [0.0, 0.5, 0.1]), tuple(place), size=(64, 64))
+    wall = Box((0.4, -0.5, 0.4), (1.0, 0.1, 0.8))  # behind the object
+    seen, world = [], SensorWorld()
+    for robot in (PANDA, PANDA.with_attached([Attached(Box((0, 0, 0.3), (0.05, 0.05, 0.2)))])):
+        world.show(Scene((wall,), robot=robot), START)
+        depth, classes = world.cast(camera, camera.size)
+        seen.append((classes[32, 32], depth[32, 32] < 0.5))
+        points = obstacle_points(world, [PointCloud(camera.eye, camera.target)])
+        assert len(points) > 1000 and points[:, 1].max() < -0.449
+    assert seen == [(OBSTACLE, False), (ROBOT, True)]
+    world.close()
+
+
+def test_safety_filter_keeps_an_object_from_the_table():
+    low = START.copy()
+    low[1], low[5] = 0.4, 2.5  # the fingertips are 0.16 m above the table
+    rod = PANDA.with_attached([Attached(Box((0, 0, 0.2), (0.03, 0.03, 0.3)))])
+    env = envs.make("no_obstacles", link_distances=True, geometry_source="ground_truth")
+    table = Box((0, 0, -0.02), (3, 3, 0.04))
+
+    def lowered(robot, filtered):
+        observation, _ = env.reset_specific(START, START, Scene((), table, robot=robot))
+        act = lambda seen: 0.04 * (PANDA.normalise(low) - seen["observation"][:7])  # noqa: E731
+        contact, safe = False, SafetyFilter(escape=False)
+        if filtered:
+            act = safe.filter_policy(act, env, np.random.default_rng(0))
+        for _ in range(120):
+            observation, *_, info = env.step(act(observation))
+            contact |= info["collision"]
+        return contact, np.abs(PANDA.denormalise(observation["observation"][:7]) - low).max()
+
+    assert lowered(rod, filtered=False)[0]
+    contact, away = lowered(rod, filtered=True)
+    assert not contact and away > 0.1
+    contact, away = lowered(PANDA, filtered=True)
+    assert not contact and away < 0.05
+    env.close()
+
+
+def test_body_and_its_coarse_copy_have_the_object():
+    client = p.connect(p.DIRECT)
+    for robot, links in ((PANDA, 12), (PANDA.with_attached([BOARD, ROCK]), 14)):
+        for body in (robot.load(client), robot.load_coarse(client, (1, 0, 0, 1))):
+            assert p.getNumJoints(body, physicsClientId=client) == links
+            drawn = {shape[1] for shape in p.getVisualShapeData(body, physicsClientId=client)}
+            assert set(range(12, links)) <= drawn
+    p.disconnect(client)
+
+
+def test_plan_with_an_object_is_followed_without_contact():
+    env = envs.make("wall")
+    robot = PANDA.with_attached([Attached(Box((0.0, 0.0, 0.15), (0.03, 0.2, 0.3)))])
+    scene = replace(env.unwrapped.scene, robot=robot)
+    start = np.array([1.2, -0.5, 0.0, -1.8, 0.0, 1.5, 0.0], np.float32)
+    goal = np.array([-1.2, -0.3, 0.0, -1.8, 0.0, 1.7, 0.0], np.float32)
+    path = Planner(env.unwrapped).plan(start, goal, scene, seed=0)
+    run = follow(env.unwrapped, path, scene)
+    assert run.reached and not run.collided and env.unwrapped.robot == robot
+    env.close()
+
+
+def test_episode_with_an_object_is_that_of_its_copy_and_of_a_new_environment():
+    scene = Scene(robot=PANDA.with_attached(MANY))
+
+    def episode(env):
+        observation, _ = env.reset_specific(START, GOAL, scene)
+        states = [observation["observation"]]
+        for _ in range(15):
+            states.append(env.step(PANDA.normalise(GOAL) - states[-1][:7])[0]["observation"])
+        return np.array(states)
+
+    env, fresh = RoboArmEnv(), RoboArmEnv(scene)
+    expected = episode(fresh)
+    np.testing.assert_array_equal(episode(env), expected)
+    other = copy.deepcopy(env)
+    one, two = (e.step(np.full(7, 0.01))[0]["observation"] for e in (env, other))
+    np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(expected[0], expected[-1])
+
+
+def test_episode_has_the_arm_of_its_scene():
+    env = RoboArmEnv()
+    scene = Scene(robot=PANDA.with_attached([BOARD]))
+    assert Episode(env, Query(START, GOAL, scene)).trajectory().robot == scene.robot
+    env.close()
+
+
+def test_files_keep_objects(tmp_path):
+    held = PANDA.with_held({"panda_finger_joint1": 0.02})
+    for robot in (PANDA.with_attached(MANY), held.with_attached([BOARD])):
+        scene = Scene((Box((0.5, 0, 0.3), (0.1, 0.1, 0.1)),), robot=robot)
+        save_scene(scene, tmp_path / "a.yaml")
+        assert load_scene(tmp_path / "a.yaml") == scene
+        assert scene_from_json(scene_to_json(scene)) == scene
+        problem = Problem("a", START.astype(float), GOAL[None].astype(float), None, scene)
+        write_problems(tmp_path / "problems.h5", [problem])
+        assert load_problems(tmp_path / "problems.h5")[0].scene == scene
+    assert "attached" not in scene_to_json(Scene()) and "held" in scene_to_json(scene)
+    text = "attached:\n- box: {position: [0, 0, 0.1], size: [0.1, 0.1, 0.1], link: panda_hand}\n"
+    (tmp_path / "b.yaml").write_text(text)
+    expected = Attached(Box((0, 0, 0.1), (0.1, 0.1, 0.1)), "panda_hand")
+    assert load_scene(tmp_path / "b.yaml").robot == PANDA.with_attached([expected])
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ("link: thumb", "2: panda has no link 'thumb'"),
+        ("link: panda_link0", "2: panda: 'panda_link0' does not move"),
+        ("touch_links: [thumb]", "2: panda has no link 'thumb'"),
+        ("touch_links: 1", "2: touch_links must be a list of links' names, got 1"),
+        ("may_touch: true", "2: unknown key may_touch in sphere"),
+    ],
+)
+def test_mistake_in_a_file_is_rejected_with_its_line(fields, reason, tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(f"attached:\n- sphere: {{position: [0, 0, 0], radius: 0.1, {fields}}}\n")
+    with pytest.raises(SceneFileError) as error:
+        load_scene(path)
+    line, _, rest = reason.partition(": ")
+    assert str(error.value).startswith(f"{path}:{line}: {rest}")
+
+
+def test_objects_that_cannot_be_are_rejected():
+    with pytest.raises(ValueError, match="at most 100 attached objects"):
+        PANDA.with_attached([BOARD] * 101)
+    with pytest.raises(TypeError, match="must be of the type Attached"):
+        PANDA.with_attached([BOARD.shape])
+    with pytest.raises(TypeError, match="an attached shape must be Box"):
+        Attached("box")
+    with pytest.raises(ValueError, match="positive sizes"):
+        Attached(Sphere((0, 0, 0), -1.0))
+    with pytest.raises(ValueError, match="an attached shape has no motion"):
+        Attached(Sphere((0, 0, 0), 0.1, Oscillation((0.1, 0, 0))))
+    with pytest.raises(ValueError, match="the arm collides with itself in each of"):
+        PANDA.with_attached([Attached(Sphere((0, 0, 0), 3.0))])
