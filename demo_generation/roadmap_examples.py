@@ -103,15 +103,17 @@ class RoadmapExamples:
         goals = self.paths.points[np.where(backwards, first, last)]
         return self._examples(scene, states, goals, moves / lengths[:, None], lengths + rest)
 
-    def label(self, scene, states, goals, rng):
+    def label(self, scene, states, goals, rng, roadmap=None):
         """Examples at given configurations, those from which a roadmap has a path to the goal.
 
         Args:
             scene: index of the scene.
             states, goals: normalised (n, j).
             rng: a NumPy Generator.
+            roadmap: the scene's `Roadmap`; by default a new one.
         """
-        directions, lengths = Roadmap(self.paths.scenes[scene], rng).labels(states, goals, rng)
+        roadmap = roadmap or Roadmap(self.paths.scenes[scene], rng)
+        directions, lengths = roadmap.labels(states, goals, rng)
         has_path = lengths > 0.0  # and is not at the goal
         labelled = (x[has_path] for x in (states, goals, directions, lengths))
         return self._examples(scene, *labelled)

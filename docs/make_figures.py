@@ -2,9 +2,10 @@
 
     python docs/make_figures.py
 
-For each task, and `mixed_scenes`: one test query (where scenes vary, six draws), the arm at its
-start and as a ghost at the goal; and where the scene is fixed, the end-effector paths of the first
-demonstrations, from light (start) to dark (goal). `task_gallery.png` shows all tasks with names.
+For each task, `mixed_scenes` and `containers`: one test query (where scenes vary, six draws), the
+arm at its start and as a ghost at the goal; and where the scene is fixed, the end-effector paths of
+the first demonstrations, from light (start) to dark (goal). `task_gallery.png` shows all tasks with
+names.
 """
 
 from pathlib import Path
@@ -63,7 +64,7 @@ def save_gallery(tiles):
 
 def main():
     gallery = {}
-    for task in tqdm([*envs.TASKS, "mixed_scenes"], unit="task"):
+    for task in tqdm([*envs.TASKS, "mixed_scenes", "containers"], unit="task"):
         env = envs.make(task, render_mode="rgb_array", goal_type="combined")
         if not isinstance(envs.get_task(task).scene, Scene):
             pixels, rng = [], np.random.default_rng(0)

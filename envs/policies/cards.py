@@ -28,7 +28,7 @@ def policy_card(name):
     - `name`, `trainer`, `task`, `goal_type`;
     - `encoder`, `num_points` (of observed points), `link_distances`, `geometry_source`: what the
       policy observes of the scene; None or False for nothing;
-    - `safety_filter`: dict of `margin` (m) and `escape`, or None;
+    - `safety_filter`: dict of `margin` (m), `escape` and others, or None;
     - `success_rate`, its 95% Wilson interval `success_rate_interval`,
       `collision_free_success_rate`, `num_queries`: on test queries of its task;
     - `steps` and their `unit`, `training_seconds`, `date`, `args`: the training, and its flags.

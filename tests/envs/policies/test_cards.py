@@ -20,10 +20,10 @@ def test_cards_agree_with_the_files_and_the_measured_results():
         assert card["goal_type"] == arguments["goal_type"]
         assert card["encoder"] == arguments.get("encoder")
         own = own_safety_filter(path)
-        assert card["safety_filter"] == (own and {"margin": own.margin, "escape": own.escape})
+        assert card["safety_filter"] == (own and own.to_metadata())
         low, high = card["success_rate_interval"]
         assert 0 <= card["collision_free_success_rate"] <= card["success_rate"] <= high
-        assert low <= card["success_rate"] and card["num_queries"] >= 1000
+        assert low <= card["success_rate"] and card["num_queries"] >= 400
     measured = json.loads((ROOT / "benchmarks/results/unseen_obstacles.json").read_text())
     measured = measured["random_boxes_hard"]["dagger, point_cloud"]
     card = policy_card(DAGGER)
