@@ -174,7 +174,7 @@ def _docs(Args):
 
 
 def check(args):
-    """Raise ValueError, in one line, unless every flag is within its range.
+    """Raise ValueError, in one line, unless every flag is within its range, and a path can exist.
 
     Args:
         args: an instance of a dataclass. None, or a word, where a flag may be that, is in range.
@@ -183,11 +183,16 @@ def check(args):
     for field in dataclasses.fields(args):
         limits, value = _range_of(hints[field.name]), getattr(args, field.name)
         values = value if isinstance(value, tuple) else [value]
+        flag = f"--{field.name.replace('_', '-')}"
+        for path in (one for one in values if isinstance(one, Path)):
+            try:
+                path.exists()
+            except OSError as error:  # a name that is too long
+                raise ValueError(f"{flag}: {error.strerror}: {path}") from error
         if limits is None or value is None or isinstance(value, str):
             continue
         for one in values:
             if math.isnan(one) or not limits.least <= one <= limits.most:
-                flag = f"--{field.name.replace('_', '-')}"
                 raise ValueError(f"{flag} must be {limits.words}, got {one!r}")
 
 

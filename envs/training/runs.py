@@ -93,9 +93,10 @@ def parse_args(Args, may_change=()):
     end_with_one_line("nothing was written")
     try:
         args = flags.parse(Args)
+        flags.check(args)
         if args.resume is not None:
             args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
-        flags.check(args)
+            flags.check(args)
     except ValueError as error:
         sys.exit(str(error))
     try:

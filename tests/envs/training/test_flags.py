@@ -162,3 +162,11 @@ def test_workers_default_to_the_cores_that_may_be_used():
     for command in (make_queries, collect, verify, roadmaps, observations, evaluate, sweep):
         (field,) = (one for one in dataclasses.fields(command.Args) if one.name == "workers")
         assert field.default == flags.CORES, command
+
+
+@pytest.mark.parametrize("name", ["observations", "resume"])
+def test_path_with_a_name_that_is_too_long_gives_one_line(name, monkeypatch):
+    pointnet2 = load("pointnet2")
+    monkeypatch.setattr(sys, "argv", ["pointnet2.py", f"--{name}", "a" * 300])
+    with pytest.raises(SystemExit, match=f"^--{name}: File name too long: aaa"):
+        runs.parse_args(pointnet2.Args)
