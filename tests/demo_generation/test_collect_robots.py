@@ -109,7 +109,9 @@ def test_interrupted_collection_of_another_arm_continues_to_the_same_bytes(tmp_p
 def test_all_tasks_of_a_robot_are_those_of_any_robot():
     robot = ROBOTS / "xarm6.yaml"
     pairs = make_queries._check(make_queries.Args(("all",), robot=robot, overwrite=True))
-    names = ("no_obstacles", *(f"random_boxes_{size}" for size in ("easy", "medium", "hard")))
+    names = ["no_obstacles", *(f"random_boxes_{size}" for size in ("easy", "medium", "hard"))]
+    names += ["appearing_boxes", *(f"moving_boxes_{size}" for size in ("easy", "medium", "hard"))]
+    names += ["blocked_goals", "chased_goals"]
     assert pairs == [(f"{name}@{robot}", query_path(f"{name}@{robot}")) for name in names]
     with pytest.raises(ValueError, match="wall is the Panda's"):
         make_queries._check(make_queries.Args(("wall",), robot=robot))
