@@ -27,7 +27,7 @@ from roboarm_nmp.envs.utils.files import write_atomically
 
 NAME = "moving_obstacles.csv"
 HEAD = ("task", "method", "obstacles from", "search", "filter", "queries")
-HEAD += ("success", "95 % interval", "collision-free success", "95 % interval")
+HEAD += ("success", "95 % interval", "collision-free success", "its 95 % interval")
 POINTS = {"geometry_source": "point_cloud"}
 FILTER = {"safety_filter": SafetyFilter(0.01)}
 GOAL = {"env": {"goal_type": "combined"}}
@@ -49,9 +49,9 @@ METHODS = {
     "go": Method("go-to-goal", "go-to-goal", "no", GOAL),
     "go-filter": Method("go-to-goal", "go-to-goal", "no", GOAL | POINTS | FILTER),
     "plan": Method("one plan at the start", "planner", "once", GOAL | POINTS),
-    "policy": Method("DAgger, trained among static obstacles", PRETRAINED, "no", {}),
+    "policy": Method("DAgger", PRETRAINED, "no", {}),
     "policy-replan": Method(
-        "the same, replans when stuck", PRETRAINED, "when stuck", {"replan": True}
+        "DAgger, replans when stuck", PRETRAINED, "when stuck", {"replan": True}
     ),
     "replanning": Method("replanning", "replanning", "when blocked", GOAL | POINTS | FILTER),
 }

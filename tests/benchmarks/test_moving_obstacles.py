@@ -1,0 +1,41 @@
+"""The benchmark of moving obstacles: cells are kept, and shown in the order of tasks and methods."""
+
+import csv
+import json
+
+import moving_obstacles
+import pytest
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder for results; the table goes there, too, and `evaluate` is not called for real."""
+
+    def evaluate(policy, task, **options):
+        shares = {"success_rate": 0.75, "success_rate_interval": (0.5, 0.9)}
+        shares |= {f"collision_free_{name}": value for name, value in shares.items()}
+        source = options.get("geometry_source")
+        return shares | {"geometry_source": source, "num_queries": 4, "safety_filter": None}
+
+    monkeypatch.setattr(moving_obstacles, "evaluate", evaluate)
+    monkeypatch.setattr(moving_obstacles, "RESULTS", tmp_path)
+    monkeypatch.setattr(moving_obstacles, "csv_table", lambda name: "")
+    monkeypatch.setattr(moving_obstacles, "write", lambda tables: None)
+    return tmp_path
+
+
+def test_cells_that_have_a_result_are_not_run_again(folder):
+    args = moving_obstacles.Args(folder, only=("chased_goals",), methods=("plan", "go"))
+    moving_obstacles.main(args)
+    file = folder / "chased_goals--plan.json"
+    result = json.loads(file.read_text())
+    file.write_text(json.dumps(result | {"success_rate": 0.25}))
+    moving_obstacles.main(args)
+    with open(folder / moving_obstacles.NAME, newline="") as table:
+        head, *rows = csv.reader(table)
+    assert head == list(moving_obstacles.HEAD) and len(set(head)) == len(head)
+    shown = [(row[0], row[1], row[2], row[6]) for row in rows]
+    assert shown == [
+        ("`chased_goals`", "go-to-goal", "nowhere", "0.750"),
+        ("`chased_goals`", "one plan at the start", "point cloud", "0.250"),
+    ]
