@@ -2,9 +2,13 @@
 
 import csv
 import json
+import sys
 
-import moving_obstacles
 import pytest
+from paths import ROOT
+
+sys.path.append(str(ROOT / "benchmarks"))
+import moving_obstacles  # noqa: E402
 
 
 @pytest.fixture
