@@ -1,4 +1,4 @@
-"""The benchmark of moving obstacles: cells are kept, and shown in the order of tasks and methods."""
+"""The benchmark of moving obstacles: cells are kept, and shown in order."""
 
 import csv
 import json
