@@ -56,6 +56,9 @@ TRIES = 50
 class MovingScenes:
     """What the distributions of this file share.
 
+    Each has `animate(scene, start, goal, rng)`, too: the scene with motions, drawn with a NumPy
+    Generator for a start and a goal (n,), rad.
+
     Attributes:
         base: the `Scene` without the obstacles that vary.
         boxes: (fewest, most) boxes around the arm.
@@ -69,10 +72,6 @@ class MovingScenes:
     def sample(self, rng):
         """A `Scene` at rest, drawn with a NumPy Generator."""
         return RandomBoxes(*self.boxes, self.base).sample(rng)
-
-    def animate(self, scene, start, goal, rng):
-        """The scene with motions, drawn for a start and a goal (n,), rad."""
-        raise NotImplementedError
 
     def accepts(self, start_free, goal_free):
         """Whether start and goal are free when they have to be: bool (t,), at `check_times`."""
