@@ -21,8 +21,8 @@ def test_every_replay_is_in_a_page_and_every_mark_has_one():
 
 @pytest.mark.parametrize("recorded", [True, False])
 def test_mark_becomes_a_frame_where_there_is_a_recording(recorded):
-    there = {"recordings/demo.html": SimpleNamespace(url="recordings/demo.html")} if recorded else {}
-    files = SimpleNamespace(get_file_from_path=there.get)
+    recording = SimpleNamespace(url="recordings/demo.html") if recorded else None
+    files = SimpleNamespace(get_file_from_path={"recordings/demo.html": recording}.get)
     page = SimpleNamespace(url="guide/viewer.html")
     text = "before\n\n<!-- replay: demo -->\n\nafter"
     shown = record_replays.on_page_markdown(text, page=page, config=None, files=files)
