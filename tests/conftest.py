@@ -1,5 +1,6 @@
 import contextlib
 import importlib.util
+import os
 import random
 import signal
 import sys
@@ -12,6 +13,10 @@ from trainers import GPU
 
 from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
 from roboarm_nmp.envs.training import protocol
+
+# As many threads as a trainer has in a process of its own, whatever benchmarks set when they are
+# imported: results are compared bit for bit.
+torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
 
 # Ctrl-C can be tested also where it is ignored, as in the background of a shell.
 signal.signal(signal.SIGINT, signal.default_int_handler)
