@@ -27,8 +27,8 @@ roboarm evaluate --policy sac-ee-wall-p1-s1
 ```
 
 A name consists of trainer, goal type, encoder (if any), task and seed; `p` is the probability of
-injecting demonstrations (`--demo-prob`). Every policy is measured on the first test queries of the
-task that it was trained on, under the standard rules: 400 steps at most, contacts allowed.
+injecting demonstrations (`--demo-prob`). Every policy is measured on the first test queries of its
+task, under the standard rules: at most 400 steps, contacts allowed.
 Collision-free success counts the episodes that reach the goal without any contact. Intervals are
 95 % Wilson intervals over queries, for this one network; other seeds differ more
 ([results](../benchmark/results.md)).
