@@ -98,7 +98,7 @@ def _rates(card):
     low, high = card["success_rate_interval"]
     rates = card["success_rate"], card["collision_free_success_rate"]
     success, collision_free = (f"{rate:.3f}" for rate in rates)
-    return success, f"{low:.3f} to {high:.3f}", collision_free, f"{card['num_queries']:,}"
+    return success, f"{low:.3f}\u00a0to\u00a0{high:.3f}", collision_free, f"{card['num_queries']:,}"
 
 
 def _table(head, rows):
