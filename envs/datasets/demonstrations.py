@@ -309,9 +309,9 @@ def describe(demos):
 
     `steps`, `waypoints` and `path_length` (rad, sum of the joints' L2 displacements) are means;
     `steps_95` is the 95th percentile; `length_ratio` the mean of path length over the straight
-    line's, in the normalised space; `with_contacts` the number of demonstrations with contacts; `solved` the
-    share of queries with a demonstration within the allowed attempts. The counts of rejected
-    attempts follow.
+    line's, in the normalised space; `with_contacts` the number of demonstrations with contacts;
+    `solved` the share of queries with a demonstration within the allowed attempts. The counts of
+    rejected attempts follow.
     """
     moves = np.diff(demos.states.astype(np.float64), axis=0)
     inside = np.ones(len(moves), bool)
