@@ -76,7 +76,8 @@ def share(value):
 
 
 def interval(result):
-    return "{:.3f} to {:.3f}".format(*result["success_rate_interval"])
+    low, high = result["success_rate_interval"]
+    return f"{low:.3f}\u00a0to\u00a0{high:.3f}"  # stays in one line
 
 
 # --- Tables

@@ -27,8 +27,8 @@ roboarm evaluate --policy sac-ee-wall-p1-s1
 ```
 
 A name consists of trainer, goal type, encoder (if any), task and seed; `p` is the probability of
-injecting demonstrations (`--demo-prob`). Every policy is measured on the first test queries of the
-task that it was trained on, under the standard rules: 400 steps at most, contacts allowed.
+injecting demonstrations (`--demo-prob`). Every policy is measured on the first test queries of its
+task, under the standard rules: at most 400 steps, contacts allowed.
 Collision-free success counts the episodes that reach the goal without any contact. Intervals are
 95 % Wilson intervals over queries, for this one network; other seeds differ more
 ([results](../benchmark/results.md)).
@@ -98,7 +98,7 @@ def _rates(card):
     low, high = card["success_rate_interval"]
     rates = card["success_rate"], card["collision_free_success_rate"]
     success, collision_free = (f"{rate:.3f}" for rate in rates)
-    return success, f"{low:.3f} to {high:.3f}", collision_free, f"{card['num_queries']:,}"
+    return success, f"{low:.3f}\u00a0to\u00a0{high:.3f}", collision_free, f"{card['num_queries']:,}"
 
 
 def _table(head, rows):

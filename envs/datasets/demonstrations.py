@@ -308,10 +308,10 @@ def describe(demos):
     """Statistics of `Demos`: a dict of numbers.
 
     `steps`, `waypoints` and `path_length` (rad, sum of the joints' L2 displacements) are means;
-    `steps_95` is the 95th percentile; `detour` the mean of path length over the straight line's, in
-    the normalised space; `with_contacts` the number of demonstrations with contacts; `solved` the
-    share of queries with a demonstration within the allowed attempts. The counts of rejected
-    attempts follow.
+    `steps_95` is the 95th percentile; `length_ratio` the mean of path length over the straight
+    line's, in the normalised space; `with_contacts` the number of demonstrations with contacts;
+    `solved` the share of queries with a demonstration within the allowed attempts. The counts of
+    rejected attempts follow.
     """
     moves = np.diff(demos.states.astype(np.float64), axis=0)
     inside = np.ones(len(moves), bool)
@@ -331,7 +331,7 @@ def describe(demos):
         "steps": float(steps.mean()),
         "steps_95": float(np.percentile(steps, 95)),
         "path_length": float(length_of(moves * (robot.upper - robot.lower) / 2).mean()),
-        "detour": float((length_of(moves) / straight).mean()),
+        "length_ratio": float((length_of(moves) / straight).mean()),
         "waypoints": float(np.diff(demos.plan_offsets).mean()),
         "with_contacts": int(demos.collided.sum()),
         "solved": len(demos) / (len(demos) + counts.get("queries_given_up", 0)),

@@ -56,6 +56,8 @@ def progress_bar(
         "{desc}{percentage:.0f}%, {n_fmt}/{total_fmt}, {elapsed}<{remaining}, {rate_fmt}{postfix}"
     )
     options |= {"desc": f"{description}: " if description else "", "mininterval": LOG_INTERVAL}
+    # (tqdm moves the cursor to a bar at another position, and draws slow bars every `maxinterval`.)
+    options |= {"position": 0, "maxinterval": LOG_INTERVAL}
     options |= {"delay": LOG_INTERVAL if transient else 0, "file": _LogFile(), "bar_format": form}
     return _LogBar(iterable, **options)
 

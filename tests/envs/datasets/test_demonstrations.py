@@ -213,18 +213,18 @@ def test_statistics_equal_those_by_hand(tmp_path):
     write_demos(tmp_path / "demos.h5", **arguments)
     numbers = describe(load_demos(tmp_path / "demos.h5"))
     half = (PANDA.upper - PANDA.lower) / 2
-    lengths, detours = [], []
+    lengths, ratios = [], []
     for states, plan in zip(arguments["executions"], arguments["plans"], strict=True):
         moves = np.diff(states.astype(np.float64), axis=0)
         lengths.append(sum(np.linalg.norm(move * half) for move in moves))
         straight = np.linalg.norm((plan[-1] - plan[0].astype(np.float64)) / half)
-        detours.append(sum(np.linalg.norm(move) for move in moves) / straight)
+        ratios.append(sum(np.linalg.norm(move) for move in moves) / straight)
     expected = {
         "demonstrations": 3,
         "steps": (2 + 1 + 3) / 3,
         "steps_95": 2.9,
         "path_length": np.mean(lengths),
-        "detour": np.mean(detours),
+        "length_ratio": np.mean(ratios),
         "waypoints": (2 + 3 + 4) / 3,
         "with_contacts": 1,
         "solved": 3 / 4,
