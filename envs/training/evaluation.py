@@ -35,6 +35,7 @@ from roboarm_nmp.envs.policies.baselines import (
     CHECKING,
     OMPL_PLANNERS,
     PLANNERS,
+    SPACE_TIME,
     TIME_LIMIT,
     TRIES,
 )
@@ -133,8 +134,9 @@ class EvaluationOptions:
         for name in ("workers", "tries"):
             if getattr(self, name) < 1:
                 raise EvaluationError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.action_delay < 0:
-            raise EvaluationError(f"action_delay must not be negative, got {self.action_delay}")
+        if not isinstance(self.action_delay, int | np.integer) or self.action_delay < 0:
+            steps = "steps: a whole number, not negative"
+            raise EvaluationError(f"action_delay must be {steps}, got {self.action_delay!r}")
         if self.action_delay and self.real_time:
             raise EvaluationError("action_delay and real_time: give one of them")
         if not 0 < self.time_limit < math.inf:
@@ -358,6 +360,10 @@ def _in_use(policy, options):
             "that observe points or link distances"
         )
     noise = options.sensor_noise
+    if (source is None and env.get("encoder") is None) or policy == SPACE_TIME:
+        for name in ("observe_every", "sensor_noise"):
+            if getattr(options, name) is not None:
+                raise EvaluationError(f"{name}: this policy observes nothing of the scene")
     unseen = (None, GROUND_TRUTH), (None, ORACLE)
     if noise and noise.changes_images and source in unseen[0] and env.get("encoder") in unseen[1]:
         raise EvaluationError(
