@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -719,6 +720,16 @@ def test_header_names_each_option_of_a_filter_once(queries):
     safety_filter = SafetyFilter(escape=False, lookahead=None)
     text = report(evaluate("go-to-goal", "no_obstacles", safety_filter=safety_filter, **options))
     assert "margin 0.01 m, no escape, no velocities\n" in text
+
+
+def test_time_per_action_is_that_of_actions_also_with_a_delay(queries):
+    def slow(observation):
+        time.sleep(0.004)
+        return np.zeros(7)
+
+    options = {"queries": queries, "num_queries": 1, "env": {"max_step": 0.03}}
+    result = evaluate(slow, "no_obstacles", action_delay=20, **options)
+    assert 4.0 <= result["ms_per_action"] < 40.0  # 0.2 per step
 
 
 @pytest.mark.parametrize("given", [{"observe_every": 5}, {"sensor_noise": SensorNoise(latency=2)}])
