@@ -42,7 +42,8 @@ class SensorNoise:
         calibration_mm, calibration_degrees: standard deviation of the error of each camera's
             assumed position along each axis (mm), and orientation about each axis (degrees), drawn
             once an episode.
-        latency: steps from an observation to the step in which it is received.
+        latency: steps from an observation to the step in which it is received. The first one of an
+            episode is received at once.
         seed: of all random numbers.
 
     Raises:
