@@ -231,7 +231,8 @@ if __name__ == "__main__":
 
     latents = None  # the encoded scene of each demonstration; the first time takes minutes
     if args.encoder is not None:
-        encoded = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
+        with runs.errors_of("--encoder"):
+            encoded = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
         latents = torch.as_tensor(np.concatenate(encoded), device=device)
     del files
     run.start(args.total_updates, "update")

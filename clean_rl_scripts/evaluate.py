@@ -167,9 +167,6 @@ def _safety_filter(args):
     from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 
     lookahead = args.lookahead if args.velocities else None
-    if args.safety_margin is not None:
-        options = args.safety_margin, args.escape, args.approach, lookahead
-        return SafetyFilter(*options) if args.safety_margin else False
     flags_given = {
         "--no-escape": not args.escape,
         "--approach": args.approach,
@@ -177,6 +174,14 @@ def _safety_filter(args):
         "--no-velocities": not args.velocities,
     }
     given = [flag for flag, is_given in flags_given.items() if is_given]
+    if args.lookahead and not args.velocities:
+        raise ValueError("--lookahead needs velocities: leave out --no-velocities")
+    if args.safety_margin == 0.0:
+        if given:
+            raise ValueError(f"{given[0]}: there is no safety filter with --safety-margin 0")
+        return False
+    if args.safety_margin is not None:
+        return SafetyFilter(args.safety_margin, args.escape, args.approach, lookahead)
     if not given:
         return None
     own = own_safety_filter(find_policy(args.policy)[0])

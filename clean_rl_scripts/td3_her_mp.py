@@ -201,7 +201,8 @@ class HerReplayBuffer:
 
     `remaining` counts the transitions that follow one in its episode. New episodes overwrite the
     oldest ones from their start on, so that these transitions outlive it. The encoded scene at the
-    end of an observation is stored once per scene: `latents[latent]`.
+    end of an observation is stored once: `latents[latent]`, and after the action
+    `latents[next_latent]`, which is another one where obstacles move.
     """
 
     def __init__(self, env, capacity, her_probability, rng):
@@ -213,7 +214,8 @@ class HerReplayBuffer:
         sizes |= {"next_achieved_goal": goal_size, "desired_goal": goal_size}
         sizes |= {"action": env.action_space.shape[0], "collision": 1}
         self.arrays = {name: np.zeros((capacity, n), np.float32) for name, n in sizes.items()}
-        self.arrays |= {name: np.zeros(capacity, np.int32) for name in ("remaining", "latent")}
+        numbers = "remaining", "latent", "next_latent"
+        self.arrays |= {name: np.zeros(capacity, np.int32) for name in numbers}
         self.latents, self.latent_numbers = np.zeros((1, latent_size), np.float32), {}
         self.env, self.capacity, self.rng = env.unwrapped, capacity, rng
         self.her_probability, self.position, self.size = her_probability, 0, 0
@@ -223,10 +225,11 @@ class HerReplayBuffer:
         index = (self.position + np.arange(len(transitions))) % self.capacity
         for name in transitions[0]:
             width = self.arrays[name].shape[1]  # that of an observation is without the latent
-            values = [np.atleast_1d(transition[name])[:width] for transition in transitions]
-            self.arrays[name][index] = np.stack(values)
-        latent = transitions[0]["observation"][self.arrays["observation"].shape[1] :]
-        self.arrays["latent"][index] = self.latent_number(np.float32(latent))
+            values = np.stack([np.atleast_1d(transition[name]) for transition in transitions])
+            self.arrays[name][index] = values[:, :width]
+            if name.endswith("observation"):
+                latents = map(self.latent_number, np.float32(values[:, width:]))
+                self.arrays[name.replace("observation", "latent")][index] = list(latents)
         self.arrays["remaining"][index] = np.arange(len(transitions))[::-1]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
@@ -252,9 +255,9 @@ class HerReplayBuffer:
         info = {"collision": data["collision"][:, 0] > 0}
         data["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
         data["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
-        latent = self.latents[data.pop("latent")]
-        for name in ("observation", "next_observation"):
-            data[name] = np.hstack([data[name], latent])
+        for name in ("", "next_"):
+            latent = self.latents[data.pop(f"{name}latent")]
+            data[f"{name}observation"] = np.hstack([data[f"{name}observation"], latent])
         return data
 
     def batches(self, number, batch_size, device):

@@ -115,6 +115,8 @@ def _task_scene(args):
     from roboarm_nmp.envs.tasks import get_task, task_with_robot
 
     scene = get_task(task_with_robot(args.task, args.robot)).scene
+    if hasattr(scene, "animate") or not getattr(scene, "is_static", True):
+        raise ValueError(f"--task: obstacles of {args.task} move, and plans are for scenes at rest")
     return scene.sample(np.random.default_rng(args.seed)) if hasattr(scene, "sample") else scene
 
 

@@ -29,6 +29,7 @@ ACTION_MODES = ("relative", "subgoal")
 MAX_EE_TOLERANCE, MAX_CONFIG_TOLERANCE = 1.0, 2.0
 # rad. Turned by this much, the Panda's hand, 0.21 m from flange to fingertips, is 0.02 m away.
 ANGLE_TOLERANCE = 0.1
+MAX_MOTION_TRIES = 1_000
 HORIZON = 400
 STANDARD_RULES = {"max_step": MAX_STEP, "horizon": HORIZON, "stop_on_collision": False}
 """Results under other rules are not comparable."""
@@ -353,6 +354,19 @@ class RoboArmEnv(gym.Env):
         self.set_scene(scene)
         return True
 
+    def sample_moving_query(self, rng):
+        """As `sample_query`, with motions of the obstacles where the scene's distribution has some.
+
+        Raises RuntimeError: the distribution accepts none of many motions.
+        """
+        for _ in range(MAX_MOTION_TRIES):
+            if self.is_animated:
+                self.set_scene(self.scene_at_rest)
+            start, goal = self.sample_query(rng)
+            if self.sample_motions(start, goal, rng):
+                return start, goal
+        raise RuntimeError(f"no motions were accepted for {MAX_MOTION_TRIES} queries")
+
     def reset(self, *, seed=None, options=None):
         """Start an episode from a random feasible start to a random feasible goal.
 
@@ -376,12 +390,7 @@ class RoboArmEnv(gym.Env):
             self.sample_scene(self.np_random)
             self._episodes_in_scene = 0
         self._episodes_in_scene += 1
-        while True:
-            if self.is_animated:
-                self.set_scene(self.scene_at_rest)
-            start, goal = self.sample_query(self.np_random)
-            if self.sample_motions(start, goal, self.np_random):
-                return self._begin(start, goal)
+        return self._begin(*self.sample_moving_query(self.np_random))
 
     def reset_specific(self, start, goal=None, scene=None, goal_pose=None):
         """Start an episode on a given query.

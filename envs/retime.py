@@ -121,6 +121,10 @@ def _checker(args):
         if args.query >= len(queries):
             raise ValueError(f"--query: the numbers are 0 to {len(queries) - 1}, got {args.query}")
         scene = queries[args.query].scene
+    if not scene.is_static:
+        raise ValueError(
+            f"--task: obstacles of {args.task} move, and collisions are checked at rest"
+        )
     return CollisionChecker(scene)
 
 

@@ -384,7 +384,7 @@ def _task_queries(args):
         rng = np.random.default_rng([args.seed, number])
         env.sample_scene(rng)
         try:
-            return Query(*env.sample_query(rng), env.scene)
+            return Query(*env.sample_moving_query(rng), env.scene)
         except RuntimeError as error:
             raise ShowError(f"{args.task}: {error}") from error
 

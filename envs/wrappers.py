@@ -219,8 +219,8 @@ def observed_scene(env):
 class SceneEncodingWrapper(_ObservingWrapper):
     """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
 
-    A scene is encoded once; one with moving obstacles in each step. All attributes of the wrapped
-    environment are available.
+    A scene is encoded once; one with moving obstacles in each step, with the arm where it is. All
+    attributes of the wrapped environment are available.
 
     Args:
         env: a `RoboArmEnv`.

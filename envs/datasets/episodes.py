@@ -158,6 +158,11 @@ def load_demos_for(env, file, task):
         raise DatasetError(
             f"demonstrations have no velocities, and steps up to {MAX_STEP}: unlike the environment"
         )
+    observes = getattr(env, "encoder", None) or getattr(env, "appends_link_distances", False)
+    if observes and not env.scene.is_static:
+        raise DatasetError(
+            "demonstrations among moving obstacles have no observations of the scene"
+        )
     demos = load_demos(file, task)
     if env.stop_on_collision and demos.collided.any():
         raise DatasetError("--stop-on-collision, but some of these demonstrations have contacts")

@@ -138,8 +138,12 @@ class SceneEncoder:
         """z_E of all scenes of `envs.datasets.demonstrations.Demos`: float32 (n, size).
 
         Later calls of the encoder with these scenes return the same numbers.
+
+        Raises ValueError: obstacles move.
         """
         scenes = [demos.scenes[i] for i in range(len(demos))]
+        if not all(scene.is_static for scene in scenes):
+            raise ValueError("demonstrations among moving obstacles cannot be encoded")
         latents = self._encode_all(scenes, demos.task)
         self._of_demos |= zip(scenes, latents, strict=True)
         return latents

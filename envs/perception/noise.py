@@ -22,9 +22,9 @@ from roboarm_nmp.envs.utils.random_streams import Stream
 
 EDGE = 0.05
 """m. Neighbouring pixels whose depths differ by more are at an edge, where pixels may fly."""
-MAX_LATENCY = 1000  # steps
 _WHOLE = ("missing_cameras", "latency", "seed")
-_SHARES = ("dropout", "flying_pixels")
+# The largest values of attributes; of all others 1000.
+_MOST = {"dropout": 1, "flying_pixels": 1, "seed": 2**32 - 1}
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class SensorNoise:
         calibration_mm, calibration_degrees: standard deviation of the error of each camera's
             assumed position along each axis (mm), and orientation about each axis (degrees), drawn
             once an episode.
-        latency: steps from an observation to the step in which it is received.
+        latency: steps from an observation to the step in which it is received. The first one of an
+            episode is received at once.
         seed: of all random numbers.
 
     Raises:
@@ -63,20 +64,17 @@ class SensorNoise:
     def __post_init__(self):
         for field in fields(self):
             name, value = field.name, getattr(self, field.name)
-            if name in _WHOLE:
-                most = MAX_LATENCY if name == "latency" else 2**32 - 1
-                whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-                if not (whole and 0 <= value <= most):
-                    raise ValueError(f"{name} must be a whole number from 0 on, got {value!r}")
-            elif not (is_number(value) and 0 <= value <= (1 if name in _SHARES else 1000)):
-                wanted = "a share in [0, 1]" if name in _SHARES else "a number from 0 on"
-                raise ValueError(f"{name} must be {wanted}, got {value!r}")
+            words, kind = ("a whole number", int) if name in _WHOLE else ("a number", float)
+            most, is_given = _MOST.get(name, 1000), is_number(value) and not isinstance(value, bool)
+            if not (is_given and 0 <= value <= most and kind(value) == value):
+                raise ValueError(f"{name} must be {words} from 0 to {most}, got {value!r}")
+            object.__setattr__(self, name, kind(value))  # NumPy's numbers do not fit into JSON
 
     @classmethod
     def parse(cls, settings):
         """The noise of settings such as `("gaussian=0.005", "missing_cameras=1")`.
 
-        Raises ValueError: an unknown name, or no number.
+        Raises ValueError: an unknown name, one that is given twice, or no number in its range.
         """
         values, names = {}, [field.name for field in fields(cls)]
         for setting in settings:
@@ -85,10 +83,13 @@ class SensorNoise:
                 raise ValueError(
                     f"sensor noise is NAME=VALUE, got {setting!r}: {suggest(name, names)}"
                 )
+            if name in values:
+                raise ValueError(f"sensor noise: {name} is given twice")
             try:
                 values[name] = int(text) if name in _WHOLE else float(text)
             except ValueError as error:
-                raise ValueError(f"sensor noise: {name} needs a number, got {text!r}") from error
+                kind = "a whole number" if name in _WHOLE else "a number"
+                raise ValueError(f"sensor noise: {name} needs {kind}, got {text!r}") from error
         return cls(**values)
 
     def to_metadata(self):

@@ -319,7 +319,11 @@ class SensorWorld:
         """Change to a `Scene` with the arm at joint angles (n, rad).
 
         `number`: of the observation in its episode, for noise.
+
+        Raises ValueError: an obstacle has a motion.
         """
+        if not scene.is_static:
+            raise ValueError("obstacles of this scene move: observe scene.at(t), at a time t")
         self.scene, self.configuration, self._number = scene, configuration, number
         self._caster = None
 

@@ -93,6 +93,8 @@ from roboarm_nmp.envs.scenes.primitives import (
 from roboarm_nmp.envs.utils.files import write_atomically
 
 _MAX_DEPTH = 12  # a scene needs 10
+# Values of a file with aliases, each repeated value counted. (A small file could be gigabytes.)
+_MAX_REPEATED = 1_000_000
 _HEADER = """\
 # A scene for RoboArm-NMP. Lengths in metres, in the frame of the robot's base: x forward, y left,
 # z up. The format is described in envs/scenes/files.py.
@@ -237,9 +239,12 @@ def _mistake(node, reason):
 
 
 class _Loader(yaml.SafeLoader):
-    """Composes nodes, except tagged or deeply nested ones (PyYAML would recurse without limit)."""
+    """Composes nodes, except tagged or deeply nested ones (PyYAML would recurse without limit).
 
-    depth = 0
+    Aliases may repeat up to `_MAX_REPEATED` values.
+    """
+
+    depth = values = 0
 
     def compose_node(self, parent, index):
         event = self.peek_event()
@@ -248,8 +253,16 @@ class _Loader(yaml.SafeLoader):
         if self.depth == _MAX_DEPTH:
             raise _mistake(event, "nested too deeply")
         self.depth += 1
+        before = self.values
         node = super().compose_node(parent, index)
         self.depth -= 1
+        if not isinstance(event, yaml.AliasEvent):
+            self.values += 1
+            node.values = self.values - before
+            return node
+        self.values += getattr(node, "values", 1)  # it has none yet where it contains itself
+        if self.values > _MAX_REPEATED:
+            raise _mistake(event, f"with its aliases, the file has over {_MAX_REPEATED:,} values")
         return node
 
 
@@ -523,8 +536,6 @@ def _motion(fields, what):
     node = fields.get("motion")
     if node is None:
         return None
-    if hasattr(node, "motion"):  # an alias: a small file may have many of a long motion
-        return node.motion
     kinds = {"oscillation": _oscillation, "waypoints": _waypoints}
     parts = _mapping(node, f"motion of {what}", optional=(*kinds, "present"))
     chosen = [kind for kind in kinds if kind in parts]
@@ -536,7 +547,6 @@ def _motion(fields, what):
             motion = Presence(_intervals(parts["present"]), motion)
     except ValueError as error:
         raise _mistake(node, f"motion of {what}: {error}") from error
-    node.motion = motion
     return motion
 
 

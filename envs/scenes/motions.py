@@ -22,8 +22,8 @@ from roboarm_nmp.envs.scenes.numbers import IDENTITY, MAX_LENGTH, is_number, uni
 MAX_SPEED, MAX_ANGULAR_SPEED = 5.0, 20.0
 """m/s and rad/s. Faster motions are rejected: in a physics step of 1/120 s an obstacle would move
 by more than 4 cm, and through a link without any contact."""
-MAX_TIME = 1e6
-"""s, of periods, waypoints and intervals."""
+MIN_SECONDS, MAX_TIME = 1e-3, 1e6
+"""s: the least period, and time from one waypoint to the next; the largest of all times."""
 MAX_WAYPOINTS, MAX_INTERVALS = 1_000, 1_000
 """Of one motion."""
 ONCE, BACK_AND_FORTH, CYCLIC = REPEATS = "once", "back_and_forth", "cyclic"
@@ -37,12 +37,12 @@ class Oscillation:
 
     Args:
         amplitude: m, (x, y, z): the largest displacement.
-        period: s, > 0.
+        period: s, at least `MIN_SECONDS`.
         phase: rad; 0 begins at the obstacle's own pose.
         axis: (x, y, z), of any length but 0, about which the obstacle turns.
         angle: rad, the largest rotation.
 
-    Raises ValueError: a number is not finite or too large, the period is not positive, the axis is
+    Raises ValueError: a number is not finite or too large, the period is too short, the axis is
     zero, or the motion exceeds `MAX_SPEED` or `MAX_ANGULAR_SPEED`.
     """
 
@@ -57,8 +57,9 @@ class Oscillation:
             _set(self, name, _vector(f"the {name} of an oscillation", getattr(self, name), 3))
         for name in ("period", "phase", "angle"):
             _set(self, name, _number(f"the {name} of an oscillation", getattr(self, name)))
-        if self.period <= 0:
-            raise ValueError(f"the period of an oscillation must be positive, got {self.period}")
+        if self.period < MIN_SECONDS:
+            least = f"at least {MIN_SECONDS} s"
+            raise ValueError(f"the period of an oscillation must be {least}, got {self.period}")
         norm = math.hypot(*self.axis)
         if norm < 1e-6:
             raise ValueError("the axis of an oscillation must not be zero")
@@ -89,7 +90,8 @@ class Waypoints:
     Before the first time, the obstacle is at the first waypoint.
 
     Args:
-        times: s, ascending, >= 0: when the obstacle is at each waypoint.
+        times: s, ascending, >= 0, at least `MIN_SECONDS` apart: when the obstacle is at each
+            waypoint.
         displacements: m, (x, y, z) of each waypoint, from the obstacle's own position.
         rotations: a quaternion (x, y, z, w) of each; none: the obstacle does not turn. Between
             two waypoints it takes the shorter way round.
@@ -114,15 +116,17 @@ class Waypoints:
         what = "displacements of waypoints"
         displacements = tuple(_vector(what, one, 3) for one in self.displacements)
         _set(self, "displacements", displacements)
-        _set(self, "rotations", tuple(unit_quaternion(one) for one in self.rotations))
+        rotations = (tuple(map(float, unit_quaternion(one))) for one in self.rotations)
+        _set(self, "rotations", tuple(rotations))
         for name in ("displacements", "rotations"):
             given = len(getattr(self, name))
             if given != count and (given or name == "displacements"):
                 raise ValueError(f"waypoints have {count} times, but {given} {name}")
         if self.repeat not in REPEATS:
             raise ValueError(f"repeat must be one of {', '.join(REPEATS)}, got {self.repeat!r}")
-        if self.times[0] < 0 or any(b <= a for a, b in itertools.pairwise(self.times)):
-            raise ValueError("times of waypoints must be at least 0, and ascend")
+        if self.times[0] < 0 or any(b - a < MIN_SECONDS for a, b in itertools.pairwise(self.times)):
+            least = f"ascend, by at least {MIN_SECONDS} s"
+            raise ValueError(f"times of waypoints must be at least 0, and {least}")
         if self.repeat != ONCE and count == 1:
             raise ValueError(f"a motion of one waypoint cannot be {self.repeat}")
         if self.repeat == CYCLIC and not self._is_closed():

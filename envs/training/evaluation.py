@@ -35,6 +35,7 @@ from roboarm_nmp.envs.policies.baselines import (
     CHECKING,
     OMPL_PLANNERS,
     PLANNERS,
+    SPACE_TIME,
     TIME_LIMIT,
     TRIES,
 )
@@ -133,8 +134,9 @@ class EvaluationOptions:
         for name in ("workers", "tries"):
             if getattr(self, name) < 1:
                 raise EvaluationError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.action_delay < 0:
-            raise EvaluationError(f"action_delay must not be negative, got {self.action_delay}")
+        if not isinstance(self.action_delay, int | np.integer) or self.action_delay < 0:
+            steps = "steps: a whole number, not negative"
+            raise EvaluationError(f"action_delay must be {steps}, got {self.action_delay!r}")
         if self.action_delay and self.real_time:
             raise EvaluationError("action_delay and real_time: give one of them")
         if not 0 < self.time_limit < math.inf:
@@ -358,6 +360,10 @@ def _in_use(policy, options):
             "that observe points or link distances"
         )
     noise = options.sensor_noise
+    if (source is None and env.get("encoder") is None) or policy == SPACE_TIME:
+        for name in ("observe_every", "sensor_noise"):
+            if getattr(options, name) is not None:
+                raise EvaluationError(f"{name}: this policy observes nothing of the scene")
     unseen = (None, GROUND_TRUTH), (None, ORACLE)
     if noise and noise.changes_images and source in unseen[0] and env.get("encoder") in unseen[1]:
         raise EvaluationError(
@@ -401,7 +407,8 @@ MOTION_METRICS = (
 class _Outcome(NamedTuple):
     """The result of one episode; lengths are NaN where the goal was not reached.
 
-    `plan_found`: see `EpisodePolicy`. `motion`: the `MOTION_METRICS`, likewise.
+    `plan_found`: see `EpisodePolicy`. `motion`: the `MOTION_METRICS`, likewise. `actions`: how many
+    the policy computed: with a delay less than one per step.
     """
 
     success: bool
@@ -410,6 +417,7 @@ class _Outcome(NamedTuple):
     path_length: float
     smoothness: float
     motion: tuple[float, ...]
+    actions: int
     policy_seconds: float
     planning_seconds: float
     plan_found: bool | None
@@ -438,7 +446,14 @@ class _Worker:
         began = time.perf_counter()
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
-        trajectory = rollout(self.env, query, act, self.job.delay, planning_seconds)
+        actions = 0
+
+        def counted(observation):
+            nonlocal actions
+            actions += 1
+            return act(observation)
+
+        trajectory = rollout(self.env, query, act and counted, self.job.delay, planning_seconds)
         lengths = [np.nan, np.nan, (np.nan,) * len(MOTION_METRICS)]
         if trajectory.success:
             configurations = trajectory.configurations
@@ -450,6 +465,7 @@ class _Worker:
             trajectory.collides,
             len(trajectory),
             *lengths,
+            actions,
             float(trajectory.times.sum()),
             planning_seconds,
             plan_found,
@@ -503,7 +519,7 @@ def _summary(job, outcomes):
     options, count = job.options, len(outcomes)
     columns = _Outcome(*(np.array(column) for column in zip(*outcomes, strict=True)))
     reached = columns.success
-    actions = int(columns.steps.sum())
+    actions = int(columns.actions.sum())
 
     def share(name, hits):
         low, high = wilson_interval(int(hits.sum()), count)

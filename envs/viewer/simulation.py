@@ -100,7 +100,7 @@ def _random_queries(task, seed):
         rng = np.random.default_rng([seed, number])
         env.sample_scene(rng)
         try:
-            return Query(*env.sample_query(rng), env.scene), None
+            return Query(*env.sample_moving_query(rng), env.scene), None
         except RuntimeError as error:
             raise ValueError(f"{task}: {error}") from error
 

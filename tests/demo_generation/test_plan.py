@@ -147,6 +147,7 @@ START, GOAL = "1 0.4 0 -1.8 0 2.2 0.8", "-1 0.4 0 -1.8 0 2.2 0.8"
         (["--task", "wall", "--goal", "1 2"], "--goal must be 7 finite numbers, got '1 2'"),
         (["--task", "wall", "--goal", "a"], "--goal: could not convert"),
         (["--task", "wall", "--goal", "9 0 0 0 0 0 0"], "--goal: joint 1 is outside its limits"),
+        (["--task", "moving_boxes_easy", "--goal", GOAL], "obstacles of moving_boxes_easy move"),
         (["--cloud", "none.ply", "--goal", GOAL], "none.ply: no such file"),
         (["--cloud", "far.npy", "--goal-pose", "3 0 0 0 0 0 1"], "the arm cannot reach it"),
         (["--cloud", "far.npy", "--goal", GOAL, "--workspace", "1 2"], "--workspace must be 6"),

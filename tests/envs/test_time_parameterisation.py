@@ -217,6 +217,8 @@ def test_command_names_the_file_and_the_reason_in_one_line(tmp_path, capsys, mon
     assert retime.main([*arguments, "--limits", "datasheet"]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"error: {path}: waypoint 1") and error.count("\n") == 1
+    assert retime.main([*arguments, "--task", "moving_boxes_easy"]) == 2
+    assert "--task: obstacles of moving_boxes_easy move" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "toppra", None)  # not installed
     assert retime.main(arguments) == 1
     assert "pip install 'roboarm-nmp[trajectories]'" in capsys.readouterr().err

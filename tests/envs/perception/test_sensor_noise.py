@@ -1,5 +1,8 @@
 """Sensor noise: its statistics, the same numbers for the same seed, latency and rates."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,7 +18,7 @@ from roboarm_nmp.envs.perception.sensors import (
     SensorWorld,
     cardinal,
 )
-from roboarm_nmp.envs.scenes.motions import Oscillation
+from roboarm_nmp.envs.scenes.motions import Oscillation, Presence
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.training.evaluation import EvaluationError, evaluate
 from roboarm_nmp.envs.wrappers import SensorWrapper
@@ -176,6 +179,20 @@ def test_moving_obstacles_are_observed_in_every_step_where_they_are():
     env.close()
 
 
+def test_sensors_need_a_scene_at_one_time():
+    """Of a scene with motions they would observe obstacles where they never are."""
+    late = Presence(((1.0, 2.0),), MOVING.obstacles[0].motion)
+    scene = Scene((replace(BOX, motion=late),))
+    for observe in (
+        observed_points,
+        lambda scene: observed_points(SceneObservation.of(scene, HOME)),
+        lambda scene: SensorWorld().show(scene, HOME),
+    ):
+        with pytest.raises(ValueError, match=r"observe scene\.at\(t\)"):
+            observe(scene)
+    assert len(observed_points(scene.at(0.0))) == 0 < len(observed_points(scene.at(1.5)))
+
+
 def test_sensor_wrapper_has_rate_latency_and_noise():
     sensors = {"cloud": PointCloud(FACING.eye, FACING.target, num_samples=400)}
     env = SensorWrapper(envs.make(MOVING), sensors, sensor_noise=SensorNoise(latency=2))
@@ -210,16 +227,27 @@ def test_evaluation_with_noise_does_not_depend_on_earlier_episodes():
         (["gausian=0.1"], "did you mean gaussian"),
         (["gaussian"], "NAME=VALUE"),
         (["gaussian=much"], "needs a number"),
-        (["gaussian=-1"], "number from 0 on"),
-        (["gaussian=nan"], "number from 0 on"),
-        (["dropout=1.5"], "share"),
-        (["missing_cameras=0.5"], "needs a number"),
-        (["latency=100000"], "whole number"),
+        (["gaussian=-1"], "gaussian must be a number from 0 to 1000"),
+        (["gaussian=nan"], "a number from 0 to 1000"),
+        (["gaussian=1001"], "a number from 0 to 1000"),
+        (["gaussian=0.1", "gaussian=0.2"], "gaussian is given twice"),
+        (["dropout=1.5"], "a number from 0 to 1,"),
+        (["missing_cameras=0.5"], "needs a whole number"),
+        (["latency=100000"], "latency must be a whole number from 0 to 1000"),
     ],
 )
 def test_invalid_noise_is_rejected(settings, complaint):
     with pytest.raises(ValueError, match=complaint):
         SensorNoise.parse(settings)
+
+
+def test_noise_of_numpy_numbers_fits_into_json():
+    noise = SensorNoise(gaussian=np.float32(0.25), missing_cameras=np.int64(1), latency=2.0)
+    assert noise == SensorNoise(gaussian=0.25, missing_cameras=1, latency=2)
+    found = json.loads(json.dumps(noise.to_metadata()))
+    assert found == {"gaussian": 0.25, "missing_cameras": 1, "latency": 2}
+    with pytest.raises(ValueError, match="latency must be a whole number"):
+        SensorNoise(latency=True)
 
 
 def test_invalid_rate_is_rejected():

@@ -13,10 +13,14 @@ from trainers import PATHS, TRAINERS, load, refusal, run_here, run_script
 from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import evaluate
 from roboarm_nmp.envs.datasets.demonstrations import load_demos
-from roboarm_nmp.envs.datasets.episodes import demo_transitions
+from roboarm_nmp.envs.datasets.episodes import demo_transitions, load_demos_for
+from roboarm_nmp.envs.datasets.format import DatasetError
 from roboarm_nmp.envs.perception.encoders import make_encoder
+from roboarm_nmp.envs.scenes.motions import Oscillation
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
 HARD = "random_boxes_hard"
+MOVING = Scene((Box((0.5, 0.2, 0.3), (0.1, 0.1, 0.6), motion=Oscillation((0, 0.3, 0), 1.0)),))
 oracle = make_encoder("oracle")
 SIZE = oracle.size
 
@@ -69,6 +73,43 @@ def test_buffer_samples_have_the_latent_code_of_their_scene(env):
             transition = stored[row[:10].tobytes()]
             np.testing.assert_array_equal(row, transition["observation"])
             np.testing.assert_array_equal(following, transition["next_observation"])
+
+
+@pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
+def test_buffer_samples_have_the_latent_codes_of_moving_obstacles(trainer):
+    env = envs.make(MOVING, encoder="oracle")
+    env.reset(seed=0)
+    buffer, stored = load(trainer).HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0)), {}
+    for _ in range(8):
+        episode = steps(env, 10)
+        stored |= {t["observation"][:10].tobytes(): t for t in episode}
+        buffer.add_episode(episode)
+    env.close()
+    assert len({t["observation"][10:].tobytes() for t in episode}) > 5
+    copy = load(trainer).HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
+    copy.load_state_dict(buffer.state_dict())
+    for one in (buffer, copy):
+        batch = one.sample(200)
+        for row, following in zip(batch["observation"], batch["next_observation"], strict=True):
+            transition = stored[row[:10].tobytes()]
+            np.testing.assert_array_equal(row, transition["observation"])
+            np.testing.assert_array_equal(following, transition["next_observation"])
+
+
+def test_demonstrations_among_moving_obstacles_cannot_have_observations_of_the_scene():
+    class Demos(list):
+        scenes, task = [MOVING], "a task"
+
+    for options in (
+        {"encoder": "oracle"},
+        {"append_link_distances": True, "link_distances": True, "geometry_source": "ground_truth"},
+    ):
+        env = envs.make(MOVING, **options)
+        with pytest.raises(DatasetError, match="among moving obstacles"):
+            load_demos_for(env, "wall", "wall")
+        env.close()
+    with pytest.raises(ValueError, match="among moving obstacles"):
+        oracle.encode_demos(Demos([None]))
 
 
 def test_demonstrations_have_the_latent_code_of_their_scene(env):

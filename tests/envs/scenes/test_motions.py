@@ -160,8 +160,9 @@ def test_scenes_with_motions_are_values():
     [
         (lambda: Oscillation((0, math.nan, 0)), "amplitude"),
         (lambda: Oscillation((0, 0.1)), "3 finite numbers"),
-        (lambda: Oscillation((0, 0.1, 0), period=0), "period .* positive"),
-        (lambda: Oscillation((0, 0.1, 0), period=-1), "period .* positive"),
+        (lambda: Oscillation((0, 0.1, 0), period=0), "period .* at least 0.001 s"),
+        (lambda: Oscillation((0, 0.1, 0), period=-1), "period .* at least 0.001 s"),
+        (lambda: Oscillation(period=1e-320), "period .* at least 0.001 s"),  # its frequency: inf
         (lambda: Oscillation((0, 0.1, 0), phase=math.inf), "phase"),
         (lambda: Oscillation(axis=(0, 0, 0)), "axis"),
         (lambda: Oscillation((0, 1, 0), period=1), "too fast: 6.28 m/s"),
@@ -169,6 +170,7 @@ def test_scenes_with_motions_are_values():
         (lambda: Waypoints((), ()), "1 to 1,000 waypoints"),
         (lambda: Waypoints(range(MAX_WAYPOINTS + 1), ()), "1 to 1,000 waypoints"),
         (lambda: Waypoints((0, 0), ((0, 0, 0),) * 2), "ascend"),
+        (lambda: Waypoints((0, 5e-324), ((0, 0, 0),) * 2, repeat="cyclic"), "at least 0.001 s"),
         (lambda: Waypoints((-1, 0), ((0, 0, 0),) * 2), "at least 0"),
         (lambda: Waypoints((0, math.nan), ((0, 0, 0),) * 2), "times"),
         (lambda: Waypoints((0, 1), ((0, 0, 0),)), "2 times, but 1 displacements"),
@@ -248,6 +250,13 @@ def test_json_of_moving_obstacles_is_exact():
     assert from_lists(json.loads(json.dumps(to_lists(MOVING.obstacles)))) == MOVING.obstacles
 
 
+def test_motion_of_numpy_numbers_is_exact_in_json():
+    turns = np.float32([(0, 0, 0, 1), QUARTER])
+    motion = Waypoints(np.float32([0, 2]), np.zeros((2, 3), np.float32), turns)
+    scene = Scene((Box(PLACE, SIZE, motion=Presence(np.float32([[0, 1]]), motion)),))
+    assert scene_from_json(scene_to_json(scene)) == scene
+
+
 def test_query_file_of_moving_scenes_is_exact(tmp_path):
     path = tmp_path / "queries.h5"
     scenes = [MOVING, Scene(MOVING.obstacles[:2]), MOVING]
@@ -310,7 +319,7 @@ def test_motion_in_a_scene_file(tmp_path, text, motion):
         ("{}", "motion of box must be one of oscillation, waypoints, or present"),
         ("{spin: {period: 2}}", "unknown key spin"),
         ("{oscillation: {amplitude: [0, 1, 0]}}", "oscillation lacks period"),
-        ("{oscillation: {period: 0}}", "motion of box: the period .* must be positive"),
+        ("{oscillation: {period: 0}}", "motion of box: the period .* at least 0.001 s"),
         ("{oscillation: {period: .nan}}", "period of oscillation must be a finite number"),
         ("{oscillation: {amplitude: [0, 9, 0], period: 1}}", "motion of box: .* too fast"),
         ("{waypoints: {times: [1, 1], displacements: [[0, 0, 0], [0, 0, 0]]}}", "ascend"),
@@ -329,16 +338,28 @@ def test_mistake_in_a_motion_is_reported_with_its_line(tmp_path, text, reason):
         load_scene(path)
 
 
-def test_aliases_of_a_motion_are_read_once(tmp_path):
-    """10,000 aliases of a motion of 1,000 waypoints would take minutes, and gigabytes."""
+@pytest.mark.parametrize(
+    ("motion", "again"),
+    [
+        ("&m {waypoints: {times: [%s], displacements: [%s]}}", "*m"),
+        ("{waypoints: &w {times: [%s], displacements: [%s]}}", "{waypoints: *w}"),
+        (
+            "{waypoints: {times: &t [%s], displacements: &d [%s]}}",
+            "{waypoints: {times: *t, displacements: *d}}",
+        ),
+    ],
+)
+def test_small_file_that_repeats_a_long_motion_too_often_is_rejected(tmp_path, motion, again):
+    """10,000 repetitions of 1,000 waypoints would take minutes, and gigabytes."""
     times = ", ".join(map(str, range(MAX_WAYPOINTS)))
     ways = ", ".join(["[0, 0, 0]"] * MAX_WAYPOINTS)
-    motion = f"&m {{waypoints: {{times: [{times}], displacements: [{ways}]}}}}"
     sphere = "\n- sphere: {position: [1, 0, 0], radius: 0.1, motion: "
-    path = tmp_path / "scene.yaml"
-    path.write_text(f"obstacles:{sphere}{motion}}}" + f"{sphere}*m}}" * 500)
-    motions = {id(obstacle.motion) for obstacle in load_scene(path).obstacles}
-    assert len(motions) == 1
+    first, path = f"obstacles:{sphere}{motion % (times, ways)}}}", tmp_path / "scene.yaml"
+    path.write_text(first + f"{sphere}{again}}}" * 2)
+    assert len({obstacle.motion for obstacle in load_scene(path).obstacles}) == 1
+    path.write_text(first + f"{sphere}{again}}}" * 300)
+    with pytest.raises(SceneFileError, match=r"scene.yaml:2\d\d: with its aliases, .* 1,000,000"):
+        load_scene(path)
 
 
 def test_table_of_a_scene_file_cannot_move(tmp_path):

@@ -1,6 +1,7 @@
 """Distributions of scenes with moving and appearing boxes, their tasks and query files."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import roboarm_nmp
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation.make_queries import make_queries
+from roboarm_nmp.envs import arm_env, show
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.moving import free_over_time
 from roboarm_nmp.envs.datasets.format import OutOfDateError
@@ -15,6 +17,7 @@ from roboarm_nmp.envs.datasets.queries import load_queries, query_path
 from roboarm_nmp.envs.scenes import moving_boxes
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.tasks import TASKS
+from roboarm_nmp.envs.viewer import simulation
 
 MOVING = [name for name, task in TASKS.items() if hasattr(task.scene, "animate")]
 KINDS = {"moving": Oscillation, "appearing": Presence, "blocked": Waypoints, "chased": Waypoints}
@@ -90,6 +93,25 @@ def test_environment_draws_motions_for_each_episode_and_repeats_them_for_a_seed(
         scenes.append(env.unwrapped.scene)
     assert scenes[0] == scenes[2] != scenes[1]
     assert not scenes[1].is_static
+    env.close()
+
+
+def test_random_queries_of_viewer_and_show_have_motions(monkeypatch):
+    nowhere = Path("no such file")
+    monkeypatch.setattr(simulation, "query_path", lambda task: nowhere)
+    monkeypatch.setattr(show, "query_path", lambda task: nowhere)
+    viewed = simulation.task_episodes("blocked_goals", seed=2).get("random", 1)[0]
+    shown = show._find_queries(show.Args("blocked_goals", seed=2)).get(1)
+    assert viewed.scene == shown.scene and not viewed.scene.is_static
+    assert not goal_is_free(viewed, [0.0])[0]
+
+
+def test_distribution_that_accepts_no_motions_is_an_error(monkeypatch):
+    monkeypatch.setattr(moving_boxes.MovingBoxes, "accepts", lambda *given: False)
+    monkeypatch.setattr(arm_env, "MAX_MOTION_TRIES", 2)
+    env = roboarm_nmp.make("moving_boxes_easy")
+    with pytest.raises(RuntimeError, match="no motions were accepted for 2 queries"):
+        env.reset(seed=0)
     env.close()
 
 

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +24,7 @@ from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.networks.exported_networks import save_network
+from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.policies.registry import make_policy
 from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -594,6 +596,15 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         ),
         ({"policy": policy, "no-escape": None}, "--no-escape: the policy has no safety filter"),
         ({"policy": policy, "approach": None}, "--approach: the policy has no safety filter"),
+        (
+            {"safety-margin": "0", "approach": None},
+            "--approach: there is no safety filter with --s",
+        ),
+        (
+            {"safety-margin": "0.01", "lookahead": "0.1", "no-velocities": None},
+            "--lookahead needs velocities",
+        ),
+        ({"observe-every": "5"}, "observe_every: this policy observes nothing of the scene"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
@@ -699,5 +710,30 @@ def test_moving_obstacles_are_evaluated_and_a_delay_is_noted(tmp_path, capsys):
     assert "action delay" not in report(found)
     with pytest.raises(EvaluationError, match="give one of them"):
         evaluate("go-to-goal", "wall", action_delay=1, real_time=True)
-    with pytest.raises(EvaluationError, match="must not be negative"):
-        evaluate("go-to-goal", "wall", action_delay=-1)
+    for delay in (-1, 1.5):
+        with pytest.raises(EvaluationError, match="action_delay must be steps"):
+            evaluate("go-to-goal", "wall", action_delay=delay)
+
+
+def test_header_names_each_option_of_a_filter_once(queries):
+    options = {"queries": queries, "num_queries": 1, "goal_type": "combined"}
+    safety_filter = SafetyFilter(escape=False, lookahead=None)
+    text = report(evaluate("go-to-goal", "no_obstacles", safety_filter=safety_filter, **options))
+    assert "margin 0.01 m, no escape, no velocities\n" in text
+
+
+def test_time_per_action_is_that_of_actions_also_with_a_delay(queries):
+    def slow(observation):
+        time.sleep(0.004)
+        return np.zeros(7)
+
+    options = {"queries": queries, "num_queries": 1, "env": {"max_step": 0.03}}
+    result = evaluate(slow, "no_obstacles", action_delay=20, **options)
+    assert 4.0 <= result["ms_per_action"] < 40.0  # 0.2 per step
+
+
+@pytest.mark.parametrize("given", [{"observe_every": 5}, {"sensor_noise": SensorNoise(latency=2)}])
+@pytest.mark.parametrize("policy", ["go-to-goal", "space-time"])
+def test_sensors_of_a_policy_that_observes_no_scene_are_refused(policy, given):
+    with pytest.raises(EvaluationError, match="this policy observes nothing of the scene"):
+        evaluate(policy, "moving_boxes_easy", **given)
