@@ -66,9 +66,6 @@ def _settings(result):
         if "lookahead" in safety_filter:
             ahead = safety_filter["lookahead"]
             margin += ", no velocities" if ahead is None else f", {ahead:g} s ahead"
-        if "lookahead" in safety_filter:
-            ahead = safety_filter["lookahead"]
-            margin += ", no velocities" if ahead is None else f", {ahead:g} s ahead"
     limit, noise = result["time_limit"], result.get("sensor_noise", {})
     return {
         "robot": None if result["robot"] == PANDA.name else result["robot"],
