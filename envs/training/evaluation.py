@@ -401,7 +401,8 @@ MOTION_METRICS = (
 class _Outcome(NamedTuple):
     """The result of one episode; lengths are NaN where the goal was not reached.
 
-    `plan_found`: see `EpisodePolicy`. `motion`: the `MOTION_METRICS`, likewise.
+    `plan_found`: see `EpisodePolicy`. `motion`: the `MOTION_METRICS`, likewise. `actions`: how many
+    the policy chose, fewer than there are steps where these are delayed.
     """
 
     success: bool
@@ -410,6 +411,7 @@ class _Outcome(NamedTuple):
     path_length: float
     smoothness: float
     motion: tuple[float, ...]
+    actions: int
     policy_seconds: float
     planning_seconds: float
     plan_found: bool | None
@@ -438,7 +440,15 @@ class _Worker:
         began = time.perf_counter()
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
-        trajectory = rollout(self.env, query, act, self.job.delay, planning_seconds)
+        actions = 0
+
+        def counted(observation):
+            nonlocal actions
+            actions += 1
+            return act(observation)
+
+        policy = counted if act else None
+        trajectory = rollout(self.env, query, policy, self.job.delay, planning_seconds)
         lengths = [np.nan, np.nan, (np.nan,) * len(MOTION_METRICS)]
         if trajectory.success:
             configurations = trajectory.configurations
@@ -450,6 +460,7 @@ class _Worker:
             trajectory.collides,
             len(trajectory),
             *lengths,
+            actions,
             float(trajectory.times.sum()),
             planning_seconds,
             plan_found,
@@ -503,7 +514,7 @@ def _summary(job, outcomes):
     options, count = job.options, len(outcomes)
     columns = _Outcome(*(np.array(column) for column in zip(*outcomes, strict=True)))
     reached = columns.success
-    actions = int(columns.steps.sum())
+    actions = int(columns.actions.sum())
 
     def share(name, hits):
         low, high = wilson_interval(int(hits.sum()), count)

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -701,3 +702,14 @@ def test_moving_obstacles_are_evaluated_and_a_delay_is_noted(tmp_path, capsys):
         evaluate("go-to-goal", "wall", action_delay=1, real_time=True)
     with pytest.raises(EvaluationError, match="must not be negative"):
         evaluate("go-to-goal", "wall", action_delay=-1)
+
+
+def test_time_per_action_does_not_depend_on_the_delay(queries):
+    def slow(observation):
+        time.sleep(0.01)
+        return observation["desired_goal"] - observation["observation"][:7]
+
+    few = {"queries": queries, "num_queries": 1, "goal_type": "config"}
+    for delay in (0, 8):
+        result = evaluate(slow, "no_obstacles", action_delay=delay, **few)
+        assert result["success_rate"] == 1 and result["ms_per_action"] > 10
