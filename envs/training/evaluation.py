@@ -35,6 +35,8 @@ from roboarm_nmp.envs.policies.baselines import (
     CHECKING,
     OMPL_PLANNERS,
     PLANNERS,
+    REPLANNING,
+    SPACE_TIME,
     TIME_LIMIT,
     TRIES,
 )
@@ -300,6 +302,8 @@ def _with_problems(task, options):
     """The options with the problems as queries, and what the result says of their file."""
     if options.queries is not None:
         raise EvaluationError("queries and problems: give one of them")
+    if options.split != "test":
+        raise EvaluationError(f"split {options.split!r}: problems have no splits")
     problems = load_problems(options.problems, get_task(task).base_scene.robot)
     if problems.rejected:
         raise EvaluationError(
@@ -340,6 +344,8 @@ def _in_use(policy, options):
     env, safety_filter = dict(options.env or {}), options.safety_filter
     env["goal_type"] = options.goal_type or env.get("goal_type", "ee")
     env["stop_on_collision"] = options.stop_on_collision
+    if options.replan and policy == REPLANNING:
+        raise EvaluationError("replan: replanning plans again by itself")
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
     safety_filter = filter_around(policy, safety_filter, options.replan)
@@ -364,6 +370,10 @@ def _in_use(policy, options):
             "sensor_noise: nothing is observed by sensors; choose the geometry source point_cloud, "
             "or a policy that receives an encoded scene"
         )
+    observes = policy in CHECKING and policy != SPACE_TIME
+    observes = observes or options.replan or env.get("encoder") or env.get("link_distances")
+    if not observes and (options.observe_every or (noise and noise.latency)):
+        raise EvaluationError("observe_every and latency: the policy observes nothing of the scene")
     return replace(options, env=env, geometry_source=source, safety_filter=safety_filter)
 
 

@@ -416,6 +416,14 @@ def test_headers_of_different_evaluations_differ():
     assert headers[-3][1]["time limit"] == "2.5 s per query"
 
 
+def test_header_says_once_how_the_filter_takes_moving_obstacles():
+    for lookahead, words in ((0.5, ", 0.5 s ahead"), (None, ", no velocities")):
+        safety_filter = SafetyFilter(FILTER.margin, lookahead=lookahead)
+        result = evaluate("go-to-goal", "wall", num_queries=1, safety_filter=safety_filter)
+        expected = "margin 0.01 m, escapes local minima" + words
+        assert header_of(result)["safety filter"] == expected
+
+
 def test_task_defaults_to_that_of_the_policy(tmp_path):
     (tmp_path / "run").mkdir()
     path = _save(tmp_path / "run" / "policy.pt", task="boxes")
@@ -595,6 +603,19 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         ),
         ({"policy": policy, "no-escape": None}, "--no-escape: the policy has no safety filter"),
         ({"policy": policy, "approach": None}, "--approach: the policy has no safety filter"),
+        (
+            {"safety-margin": "0", "approach": None},
+            "there is no safety filter with --safety-margin",
+        ),
+        (
+            {"safety-margin": "0.01", "no-velocities": None, "lookahead": "0.2"},
+            "--lookahead needs the velocities that --no-velocities leaves out",
+        ),
+        ({"policy": "replanning", "replan": None}, "replan: replanning plans again by itself"),
+        ({"policy": "planner", "tries": "3"}, "--tries is for via-points"),
+        ({"policy": "via-points", "time-limit": "3"}, "--time-limit is for planner and space-time"),
+        ({"observe-every": "5"}, "the policy observes nothing of the scene"),
+        ({"sensor-noise": "latency=3"}, "the policy observes nothing of the scene"),
         ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
         ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
