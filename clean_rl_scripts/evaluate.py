@@ -39,6 +39,7 @@ From Python: `roboarm_nmp.evaluate(policy, task, ...)` returns the same numbers 
 import io
 import json
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -132,6 +133,8 @@ def main(arguments=None):
     try:
         flags.check(args)
         _check_baseline_flags(args)
+        if args.json is not None and args.json == args.image:
+            raise ValueError(f"--json and --image are the same file, {args.json}")
         for path in filter(None, (args.json, args.image)):
             check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
@@ -145,7 +148,7 @@ def main(arguments=None):
         for name in ("robot", *filters, "json", "image"):
             del options[name]
         result = evaluate(**options, progress=True)
-    except ValueError as error:
+    except (ValueError, BrokenProcessPool) as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
     print(report(result | {"policy": args.policy}), flush=True)  # before JSON on /dev/stdout

@@ -9,6 +9,7 @@ for episode in envs.step(actions):              # those that end with this step
 import contextlib
 import functools
 import multiprocessing
+from concurrent.futures.process import BrokenProcessPool
 from typing import NamedTuple
 
 import numpy as np
@@ -135,18 +136,24 @@ class _Process:
             process.start()
         other.close()
 
+    @contextlib.contextmanager
+    def _dying(self):
+        try:
+            yield
+        except (EOFError, OSError):
+            raise BrokenProcessPool("a process with environments has died") from None
+
     def __getattr__(self, name):
         return functools.partial(self._call, name)
 
     def _call(self, *call):
-        self._connection.send(call)
+        with self._dying():
+            self._connection.send(call)
         return self._result
 
     def _result(self):
-        try:
+        with self._dying():
             result = self._connection.recv()
-        except EOFError:
-            raise RuntimeError("a process with environments has died") from None
         if isinstance(result, Exception):
             raise result
         return result

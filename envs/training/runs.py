@@ -37,6 +37,7 @@ import sys
 import threading
 import time
 import typing
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -218,7 +219,9 @@ def _say_plainly(run, kind, error, trace):
         exit_interrupted(error, checkpoint or f"no checkpoint yet; --resume {run} starts again")
     if isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
         text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()
-    elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
+    elif isinstance(error, BrokenProcessPool) or (
+        isinstance(error, OSError) and error.errno in DISK_ERRORS
+    ):
         text = f"error: {error}"
     elif isinstance(error, FloatingPointError):
         text, checkpoint = f"error: training has diverged: {error}; its files are in {run}", ""

@@ -27,7 +27,8 @@ def run(make_worker, arguments, jobs, workers, warn=print):
     the caller is interrupted or closes this generator, running jobs are aborted.
 
     Raises:
-        RuntimeError: processes died `MAX_DEATHS` times without a result between.
+        BrokenProcessPool, a RuntimeError: processes died `MAX_DEATHS` times without a result
+            between.
         Exception: the exception of a job.
     """
     waiting, deaths = collections.deque(jobs), 0
@@ -55,7 +56,7 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             waiting.extendleft(running.values())
             deaths += 1
             if deaths == MAX_DEATHS:
-                raise RuntimeError(f"workers died {deaths} times without a result") from error
+                raise BrokenProcessPool(f"workers died {deaths} times without a result") from error
             warn("a worker died; a new one takes its place")
         except BaseException:
             # Without this, `shutdown` would wait for running jobs, which may take minutes.

@@ -1,5 +1,8 @@
 """envs/training/collection.py: the same episodes in any number of processes."""
 
+import multiprocessing
+from concurrent.futures.process import BrokenProcessPool
+
 import numpy as np
 import pytest
 
@@ -64,3 +67,9 @@ def test_processes_collect_the_same_episodes(alone):
     assert_same(training.observations, also_training.observations)
     with pytest.raises(ValueError):  # of a process, here
         also_training.step(np.full((3, 7), np.nan))
+    for process in multiprocessing.active_children():
+        process.kill()
+        process.join()
+    for _ in range(2):
+        with pytest.raises(BrokenProcessPool, match="a process with environments has died"):
+            also_training.step(np.zeros((3, 7)))

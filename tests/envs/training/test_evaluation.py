@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -636,6 +637,7 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         ({"time-limit": "nan"}, "--time-limit must be above 0, and finite, got nan"),
         ({"json": str(tmp_path)}, "is a directory, not a file"),
         ({"json": str(tmp_path / "no such folder" / "a.json")}, "cannot write"),
+        ({"json": "a.json", "image": "a.json"}, "--json and --image are the same file"),
         ({"image": str(tmp_path / "no such folder" / "a.png")}, "cannot write"),
     ]
     good = {"policy": "go-to-goal", "task": "no_obstacles", "queries": str(query_file)}
@@ -648,6 +650,18 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         assert output.err.startswith("evaluate.py: ") and output.err.count("\n") == 1
     assert command.main(["--policy", "go-to-goal"]) == 2
     assert "go-to-goal has no task of its own: choose one (--task)" in capsys.readouterr().err
+
+
+def test_dead_workers_give_one_line(monkeypatch, capsys):
+    def die(job, progress):
+        raise BrokenProcessPool("workers died 5 times without a result")
+
+    monkeypatch.setattr(evaluation, "_run", die)
+    assert command.main(["--policy", "go-to-goal", "--task", "wall"]) == 2
+    assert capsys.readouterr().err == "evaluate.py: workers died 5 times without a result\n"
+
+
+def test_goal_type_that_does_not_exist_is_rejected():
     with pytest.raises(SystemExit) as stop:
         command.main(["--policy", "random", "--task", "wall", "--goal-type", "poses"])
     assert stop.value.code == 2

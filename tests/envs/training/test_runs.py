@@ -261,6 +261,11 @@ def script(folder, code):
         ),
         ("torch.zeros(10**15)", "error: out of memory .+"),
         ("bytearray(10**15)", "error: out of memory"),
+        (
+            "from concurrent.futures.process import BrokenProcessPool\n"
+            "raise BrokenProcessPool('a process has died')",
+            "error: a process has died",
+        ),
     ],
 )
 def test_errors_that_are_no_mistake_of_the_program_get_a_line(tmp_path, code, message):
