@@ -33,6 +33,11 @@ from roboarm_nmp.envs.training.flags import (
 from roboarm_nmp.envs.utils.files import check_writable
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
+CLOUD_FLAGS = (
+    *("units", "frame", "intrinsics", "recorded_at", "arm_distance", "table", "workspace"),
+    *("cell", "min_points", "point_radius"),
+)
+
 
 @dataclass
 class Args:
@@ -259,6 +264,9 @@ def main(args):
         flags.check(args)
         if (args.cloud is None) == (args.task is None):
             raise ValueError("one of --cloud and --task is needed")
+        given = [name for name in CLOUD_FLAGS if getattr(args, name) != getattr(Args, name)]
+        if args.cloud is None and given:
+            raise ValueError(f"--{given[0].replace('_', '-')} goes with --cloud")
         if (args.goal is None) == (args.goal_pose is None):
             raise ValueError("one of --goal and --goal-pose is needed")
         # Here, because --help need not wait for Numba.

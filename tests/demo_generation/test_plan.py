@@ -150,6 +150,11 @@ BELOW = "0.4 0.3 -0.03 1 0 0 0"  # a pose in the table
         (["--task", "wall", "--goal", "9 0 0 0 0 0 0"], "--goal: joint 1 is outside its limits"),
         (["--cloud", "none.ply", "--goal", GOAL], "none.ply: no such file"),
         (["--cloud", "far.npy", "--goal-pose", "3 0 0 0 0 0 1"], "the arm cannot reach it"),
+        (
+            ["--task", "wall", "--goal", GOAL, "--arm-distance", "0.1"],
+            "-distance goes with --cloud",
+        ),
+        (["--task", "wall", "--goal", GOAL, "--no-table"], "--table goes with --cloud"),
         (["--task", "wall", "--goal-pose", BELOW], "no collision-free configuration has the goal"),
         (
             ["--task", "wall", "--goal-pose", BELOW, "--policy", "go-to-goal"],
