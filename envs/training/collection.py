@@ -8,7 +8,7 @@ for episode in envs.step(actions):              # those that end with this step
 
 import contextlib
 import functools
-import multiprocessing
+import multiprocessing.util
 from concurrent.futures.process import BrokenProcessPool
 from typing import NamedTuple
 
@@ -135,6 +135,8 @@ class _Process:
         with starting_processes():
             process.start()
         other.close()
+        # At the program's end, `multiprocessing` waits for a process, which waits for this.
+        multiprocessing.util.Finalize(self, self._connection.close, exitpriority=0)
 
     @contextlib.contextmanager
     def _dying(self):
@@ -160,8 +162,12 @@ class _Process:
 
 
 def _serve(group, connection):
-    """Do what a `_Process` asks for, until the process that it belongs to ends."""
-    begin_worker()
+    """Do what a `_Process` asks for, until that or the process that it belongs to ends.
+
+    SIGTERM, which `timeout` sends to all processes, does not end this one: the trainer finishes its
+    step and writes a checkpoint.
+    """
+    begin_worker(is_terminable=False)
     torch.set_num_threads(1)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:

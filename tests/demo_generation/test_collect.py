@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import re
@@ -493,6 +494,16 @@ def test_running_jobs_are_aborted_when_the_results_are_closed():
     results.close()
     assert time.monotonic() - begin < 60
     assert children and all(has_ended(child) for child in children)
+
+
+def test_workers_in_order_outlive_the_sigterm_of_a_process_group():
+    results = workers.in_order(abs, itertools.count(), 1)
+    assert next(results) == 0
+    (child,) = worker_processes(psutil.Process())
+    child.terminate()
+    assert [next(results) for _ in range(9)] == [*range(1, 10)]
+    results.close()
+    assert has_ended(child)
 
 
 def test_no_jobs_start_no_workers():

@@ -65,6 +65,10 @@ def test_processes_collect_the_same_episodes(alone):
     for one, other in zip(left, also_left, strict=True):
         assert_same(one, other)
     assert_same(training.observations, also_training.observations)
+    for process in multiprocessing.active_children():
+        process.terminate()  # as `timeout` does
+    for _ in range(5):
+        also_training.step(np.zeros((3, 7)))
     with pytest.raises(ValueError):  # of a process, here
         also_training.step(np.full((3, 7), np.nan))
     for process in multiprocessing.active_children():
