@@ -76,6 +76,7 @@ class RunFlags:
 
 
 MAY_CHANGE = {"resume", "runs_dir", "track"}  # they change no number
+SAME_INTERRUPT = 1.0  # s: `timeout` and `roboarm sweep` may both send a signal that one has sent
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
@@ -407,11 +408,12 @@ class Run:
                     signal.signal(number, self._on_signal)
 
     def _on_signal(self, number, frame):
-        """The first signal lets the current step finish. The next one ends the program at once."""
+        """The first signal lets the current step finish. A later one ends the program at once."""
         interrupt = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
-        raises = self._may_raise or self.interrupted
-        self._interrupt = interrupt
-        if raises:
+        now = time.monotonic()
+        if not self.interrupted:
+            self._interrupt, self._interrupted_at = interrupt, now
+        if self._may_raise or now - self._interrupted_at > SAME_INTERRUPT:
             raise interrupt
 
     @contextlib.contextmanager
