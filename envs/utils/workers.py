@@ -94,6 +94,11 @@ def in_order(work, jobs, workers):
             if not running:
                 return
             yield running.popleft().result()
+    except BaseException:
+        # Without this, `shutdown` would wait for running jobs, and after a death for ever.
+        for process in executor._processes.values():
+            process.kill()
+        raise
     finally:
         executor.shutdown(cancel_futures=True)
 

@@ -1,5 +1,6 @@
 """Collecting and verifying: the same file for any number of workers and of interruptions."""
 
+import collections
 import contextlib
 import dataclasses
 import functools
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import time
 import zlib
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
@@ -504,6 +506,15 @@ def test_workers_in_order_outlive_the_sigterm_of_a_process_group():
     assert [next(results) for _ in range(9)] == [*range(1, 10)]
     results.close()
     assert has_ended(child)
+
+
+def test_death_of_a_worker_ends_results_in_order():
+    results = workers.in_order(abs, itertools.count(), 2)
+    children = [next(results) for _ in range(9)] and worker_processes(psutil.Process())
+    children[0].kill()
+    with pytest.raises(BrokenProcessPool):
+        collections.deque(results)
+    assert all(has_ended(child) for child in children)
 
 
 def test_no_jobs_start_no_workers():
