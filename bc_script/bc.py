@@ -236,6 +236,7 @@ if __name__ == "__main__":
         latents = torch.as_tensor(np.concatenate(encoded), device=device)
     del files
     run.start(args.total_updates, "update")
+    run.repeat_evaluation(actor_average)
 
     while run.step < args.total_updates:
         # ALGO LOGIC: learn

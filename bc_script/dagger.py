@@ -339,6 +339,7 @@ if __name__ == "__main__":
     first = run.step % num_draws
     pool = concat([on_device(one, device) for one in pool[-first:] + pool[:-first]])
     run.start(args.total_updates, "update")
+    run.repeat_evaluation(actor_average)
 
     while run.step < args.total_updates:
         # ALGO LOGIC: learn, while the next examples are drawn

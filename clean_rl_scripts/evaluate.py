@@ -39,13 +39,14 @@ From Python: `roboarm_nmp.evaluate(policy, task, ...)` returns the same numbers 
 import io
 import json
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from PIL import Image
 
-from roboarm_nmp.envs.policies.baselines import TIME_LIMIT, TRIES
+from roboarm_nmp.envs.policies.baselines import OMPL_PLANNERS, TIME_LIMIT, TRIES
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
 from roboarm_nmp.envs.training.evaluation_report import report
@@ -131,6 +132,9 @@ def main(arguments=None):
     args = flags.parse(Args, arguments)
     try:
         flags.check(args)
+        _check_baseline_flags(args)
+        if args.json is not None and args.json == args.image:
+            raise ValueError(f"--json and --image are the same file, {args.json}")
         for path in filter(None, (args.json, args.image)):
             check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
@@ -144,7 +148,7 @@ def main(arguments=None):
         for name in ("robot", *filters, "json", "image"):
             del options[name]
         result = evaluate(**options, progress=True)
-    except ValueError as error:
+    except (ValueError, BrokenProcessPool) as error:
         print(f"evaluate.py: {error}", file=sys.stderr)
         return 2
     print(report(result | {"policy": args.policy}), flush=True)  # before JSON on /dev/stdout
@@ -161,12 +165,19 @@ def main(arguments=None):
     return 0
 
 
+def _check_baseline_flags(args):
+    """Raise ValueError for flags of another baseline, which would have no effect."""
+    if args.tries != TRIES and args.policy != "via-points":
+        raise ValueError("--tries is for via-points")
+    if args.time_limit != TIME_LIMIT and args.policy not in OMPL_PLANNERS:
+        raise ValueError(f"--time-limit is for {' and '.join(OMPL_PLANNERS)}")
+
+
 def _safety_filter(args):
     """The flags' safety filter as for `evaluate`. Raises ValueError: there is none to change."""
     from roboarm_nmp.envs.policies.registry import find_policy, own_safety_filter
     from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 
-    lookahead = args.lookahead if args.velocities else None
     flags_given = {
         "--no-escape": not args.escape,
         "--approach": args.approach,
@@ -174,20 +185,20 @@ def _safety_filter(args):
         "--no-velocities": not args.velocities,
     }
     given = [flag for flag, is_given in flags_given.items() if is_given]
-    if args.lookahead and not args.velocities:
-        raise ValueError("--lookahead needs velocities: leave out --no-velocities")
-    if args.safety_margin == 0.0:
-        if given:
-            raise ValueError(f"{given[0]}: there is no safety filter with --safety-margin 0")
-        return False
+    if {"--lookahead", "--no-velocities"} <= {*given}:
+        raise ValueError("--lookahead needs the velocities that --no-velocities leaves out")
+    if given and args.safety_margin == 0:
+        raise ValueError(f"{given[0]}: there is no safety filter with --safety-margin 0")
+    lookahead = args.lookahead if args.velocities else None
     if args.safety_margin is not None:
-        return SafetyFilter(args.safety_margin, args.escape, args.approach, lookahead)
+        options = args.safety_margin, args.escape, args.approach, lookahead
+        return SafetyFilter(*options) if args.safety_margin else False
     if not given:
         return None
     own = own_safety_filter(find_policy(args.policy)[0])
     if own is None:
         raise ValueError(f"{given[0]}: the policy has no safety filter; --safety-margin adds one")
-    if not {"--lookahead", "--no-velocities"} & set(given):
+    if not {"--lookahead", "--no-velocities"} & {*given}:
         lookahead = own.lookahead
     options = {"approach": own.approach or args.approach, "lookahead": lookahead}
     return replace(own, escape=own.escape and args.escape, **options)

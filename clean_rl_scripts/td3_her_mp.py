@@ -380,6 +380,7 @@ if __name__ == "__main__":
     envs.encode_demos()
     run.start(args.total_timesteps, "step")
     envs.begin_episodes(args.seed, run.step)
+    run.repeat_evaluation(agent.actor_average)
     # END SHARED
 
     while run.step < args.total_timesteps and not run.reached(args.stop_at_success):

@@ -33,7 +33,10 @@ from roboarm_nmp.envs.training.flags import (
 from roboarm_nmp.envs.utils.files import check_writable
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
-MAX_GOALS = 8  # configurations with the goal's pose that the planner may reach, the nearest first
+CLOUD_FLAGS = (
+    *("units", "frame", "intrinsics", "recorded_at", "arm_distance", "table", "workspace"),
+    *("cell", "min_points", "point_radius"),
+)
 
 
 @dataclass
@@ -151,19 +154,16 @@ def _observed_scene(args, robot):
     return ObservedScene(points=points, point_radius=args.point_radius, robot=robot, **options)
 
 
-def _goals(args, robot, checker, start):
-    """The configurations (k, n), rad, that the goal may be, the nearest first."""
-    if args.goal is not None:
-        return _configuration("--goal", args.goal, robot)[None]
-    from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
+def _goal(args, robot, start):
+    """The goal as an argument of `Planner.plan`: `goal` (n,), rad, or `goal_pose` (7,)."""
+    from roboarm_nmp.envs.policies.pose_goals import goal_configuration
 
+    if args.goal is not None:
+        return {"goal": _configuration("--goal", args.goal, robot)}
     pose = _numbers("--goal-pose", args.goal_pose, 7)
-    if len(inverse_kinematics(robot, pose, args.seed, near=start)) == 0:
+    if goal_configuration(robot, pose, start) is None:
         raise ValueError("--goal-pose: the arm cannot reach it")
-    goals = inverse_kinematics(robot, pose, args.seed, checker=checker, near=start)
-    if len(goals) == 0:
-        raise ValueError("--goal-pose: the arm reaches it only in collision")
-    return goals[:MAX_GOALS]
+    return {"goal_pose": pose}
 
 
 def _check_end(flag, configuration, checker):
@@ -183,8 +183,8 @@ def _check_end(flag, configuration, checker):
         raise ValueError(f"{flag} is in collision: a point is {1000 * depth:.0f} mm inside {name}")
 
 
-def _planned(args, scene, start, goals):
-    """A path (k, n), rad, of the planner to one of the goals, and its computing time (s).
+def _planned(args, scene, start, goal):
+    """A path (k, n), rad, of the planner to a `_goal`, and its computing time (s).
 
     Raises PlanningError: there is none.
     """
@@ -193,15 +193,15 @@ def _planned(args, scene, start, goals):
 
     planner = Planner(RoboArmEnv(scene))
     began = time.perf_counter()
-    goal = goals if len(goals) > 1 else goals[0]
-    path = planner.plan(start, goal, seed=args.seed, time_limit=args.time_limit)
+    path = planner.plan(start, seed=args.seed, time_limit=args.time_limit, **goal)
     return path, time.perf_counter() - began
 
 
-def _rolled_out(args, scene, start, goal):
+def _rolled_out(args, checker, start, goal=None, goal_pose=None):
     """The `Trajectory` of a policy from start to goal. Raises ValueError: it cannot act here."""
     from roboarm_nmp import envs
     from roboarm_nmp.envs.datasets.queries import Query
+    from roboarm_nmp.envs.policies.pose_goals import goal_configuration
     from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
     from roboarm_nmp.envs.policies.rollout import rollout
 
@@ -214,6 +214,11 @@ def _rolled_out(args, scene, start, goal):
     if own_safety_filter(policy) or options.get("link_distances"):
         options |= {"link_distances": True}
         options.setdefault("geometry_source", "ground_truth")
+    scene = checker.scene
+    if goal is None:
+        goal = goal_configuration(scene.robot, goal_pose, start, checker)
+    if goal is None:
+        raise ValueError("--goal-pose: the arm reaches it only in collision")
     env = envs.make(scene, **options)
     query = Query(start.astype(np.float32), goal.astype(np.float32), scene)
     begin = make_policy(policy, env, args.seed, time_limit=args.time_limit)
@@ -261,6 +266,9 @@ def main(args):
         flags.check(args)
         if (args.cloud is None) == (args.task is None):
             raise ValueError("one of --cloud and --task is needed")
+        given = [name for name in CLOUD_FLAGS if getattr(args, name) != getattr(Args, name)]
+        if args.cloud is None and given:
+            raise ValueError(f"--{given[0].replace('_', '-')} goes with --cloud")
         if (args.goal is None) == (args.goal_pose is None):
             raise ValueError("one of --goal and --goal-pose is needed")
         # Here, because --help need not wait for Numba.
@@ -282,16 +290,17 @@ def main(args):
         else:
             scene = _observed_scene(args, load_robot(args.robot or PANDA.name))
         start, checker = _configuration("--start", args.start, scene.robot), CollisionChecker(scene)
-        goals = _goals(args, scene.robot, checker, start)
+        goal = _goal(args, scene.robot, start)
         if args.cloud is not None:
             _check_end("--start", start, checker)
-            _check_end("--goal", goals[0], checker)
+            if args.goal is not None:
+                _check_end("--goal", goal["goal"], checker)
         if args.policy == "planner":
-            path, seconds = _planned(args, scene, start, goals)
+            path, seconds = _planned(args, scene, start, goal)
             times, configurations = timed(path, scene.robot)
             print(f"planned in {1000 * seconds:.0f} ms: {len(path)} waypoints")
         else:
-            episode = _rolled_out(args, scene, start, goals[0])
+            episode = _rolled_out(args, checker, start, **goal)
             path = configurations = episode.configurations
             reached = "reached" if episode.success else "not reached"
             seconds = episode.times.sum()

@@ -8,7 +8,8 @@ for episode in envs.step(actions):              # those that end with this step
 
 import contextlib
 import functools
-import multiprocessing
+import multiprocessing.util
+from concurrent.futures.process import BrokenProcessPool
 from typing import NamedTuple
 
 import numpy as np
@@ -134,27 +135,39 @@ class _Process:
         with starting_processes():
             process.start()
         other.close()
+        # At the program's end, `multiprocessing` waits for a process, which waits for this.
+        multiprocessing.util.Finalize(self, self._connection.close, exitpriority=0)
+
+    @contextlib.contextmanager
+    def _dying(self):
+        try:
+            yield
+        except (EOFError, OSError):
+            raise BrokenProcessPool("a process with environments has died") from None
 
     def __getattr__(self, name):
         return functools.partial(self._call, name)
 
     def _call(self, *call):
-        self._connection.send(call)
+        with self._dying():
+            self._connection.send(call)
         return self._result
 
     def _result(self):
-        try:
+        with self._dying():
             result = self._connection.recv()
-        except EOFError:
-            raise RuntimeError("a process with environments has died") from None
         if isinstance(result, Exception):
             raise result
         return result
 
 
 def _serve(group, connection):
-    """Do what a `_Process` asks for, until the process that it belongs to ends."""
-    begin_worker()
+    """Do what a `_Process` asks for, until that or the process that it belongs to ends.
+
+    SIGTERM, which `timeout` sends to all processes, does not end this one: the trainer finishes its
+    step and writes a checkpoint.
+    """
+    begin_worker(is_terminable=False)
     torch.set_num_threads(1)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:

@@ -35,6 +35,7 @@ from roboarm_nmp.envs.policies.baselines import (
     CHECKING,
     OMPL_PLANNERS,
     PLANNERS,
+    REPLANNING,
     SPACE_TIME,
     TIME_LIMIT,
     TRIES,
@@ -302,6 +303,8 @@ def _with_problems(task, options):
     """The options with the problems as queries, and what the result says of their file."""
     if options.queries is not None:
         raise EvaluationError("queries and problems: give one of them")
+    if options.split != "test":
+        raise EvaluationError(f"split {options.split!r}: problems have no splits")
     problems = load_problems(options.problems, get_task(task).base_scene.robot)
     if problems.rejected:
         raise EvaluationError(
@@ -342,6 +345,8 @@ def _in_use(policy, options):
     env, safety_filter = dict(options.env or {}), options.safety_filter
     env["goal_type"] = options.goal_type or env.get("goal_type", "ee")
     env["stop_on_collision"] = options.stop_on_collision
+    if options.replan and policy == REPLANNING:
+        raise EvaluationError("replan: replanning plans again by itself")
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
     safety_filter = filter_around(policy, safety_filter, options.replan)
@@ -408,7 +413,7 @@ class _Outcome(NamedTuple):
     """The result of one episode; lengths are NaN where the goal was not reached.
 
     `plan_found`: see `EpisodePolicy`. `motion`: the `MOTION_METRICS`, likewise. `actions`: how many
-    the policy computed: with a delay less than one per step.
+    the policy chose, fewer than there are steps where these are delayed.
     """
 
     success: bool
@@ -453,7 +458,8 @@ class _Worker:
             actions += 1
             return act(observation)
 
-        trajectory = rollout(self.env, query, act and counted, self.job.delay, planning_seconds)
+        policy = counted if act else None
+        trajectory = rollout(self.env, query, policy, self.job.delay, planning_seconds)
         lengths = [np.nan, np.nan, (np.nan,) * len(MOTION_METRICS)]
         if trajectory.success:
             configurations = trajectory.configurations

@@ -359,10 +359,11 @@ class PolicyRun(Run):
 
         Returns:
             Whether no policy of the run was better so far. False if a signal has interrupted the
-            evaluation.
+            evaluation: the resumed run repeats it (`repeat_evaluation`).
         """
         queries, envs, device = self.validation, self.eval_envs, self.device
         bar = {"description": "validation"}
+        self._progress["unfinished_evaluation"] = True
         if self.interrupted:
             return False
         try:
@@ -377,10 +378,18 @@ class PolicyRun(Run):
                 self.log_image("eval/rollout", image)
         except KeyboardInterrupt:
             return False
+        del self._progress["unfinished_evaluation"]
         is_best = self.is_best(result["success_rate"])
         values = {"validation success": result["success_rate"], "best": self.best_score}
         self.show(**{name: f"{value:.3f}" for name, value in values.items()})
         return is_best
+
+    def repeat_evaluation(self, policy):
+        """At the start of a resumed run: the evaluation that a signal ended, if there was one."""
+        if "unfinished_evaluation" in self._progress:
+            if self.validate(policy):
+                self.save_policy(policy)
+            self.checkpoint()
 
     def save_policy(self, policy):
         """Write `policy.pt` for `evaluate.py` and others.

@@ -37,6 +37,7 @@ import sys
 import threading
 import time
 import typing
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -75,6 +76,7 @@ class RunFlags:
 
 
 MAY_CHANGE = {"resume", "runs_dir", "track"}  # they change no number
+SAME_INTERRUPT = 1.0  # s: `timeout` and `roboarm sweep` may both send a signal that one has sent
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
@@ -218,7 +220,9 @@ def _say_plainly(run, kind, error, trace):
         exit_interrupted(error, checkpoint or f"no checkpoint yet; --resume {run} starts again")
     if isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
         text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()
-    elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
+    elif isinstance(error, BrokenProcessPool) or (
+        isinstance(error, OSError) and error.errno in DISK_ERRORS
+    ):
         text = f"error: {error}"
     elif isinstance(error, FloatingPointError):
         text, checkpoint = f"error: training has diverged: {error}; its files are in {run}", ""
@@ -404,11 +408,12 @@ class Run:
                     signal.signal(number, self._on_signal)
 
     def _on_signal(self, number, frame):
-        """The first signal lets the current step finish. The next one ends the program at once."""
+        """The first signal lets the current step finish. A later one ends the program at once."""
         interrupt = Terminated() if number == signal.SIGTERM else KeyboardInterrupt()
-        raises = self._may_raise or self.interrupted
-        self._interrupt = interrupt
-        if raises:
+        now = time.monotonic()
+        if not self.interrupted:
+            self._interrupt, self._interrupted_at = interrupt, now
+        if self._may_raise or now - self._interrupted_at > SAME_INTERRUPT:
             raise interrupt
 
     @contextlib.contextmanager

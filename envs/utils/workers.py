@@ -27,7 +27,8 @@ def run(make_worker, arguments, jobs, workers, warn=print):
     the caller is interrupted or closes this generator, running jobs are aborted.
 
     Raises:
-        RuntimeError: processes died `MAX_DEATHS` times without a result between.
+        BrokenProcessPool, a RuntimeError: processes died `MAX_DEATHS` times without a result
+            between.
         Exception: the exception of a job.
     """
     waiting, deaths = collections.deque(jobs), 0
@@ -55,7 +56,7 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             waiting.extendleft(running.values())
             deaths += 1
             if deaths == MAX_DEATHS:
-                raise RuntimeError(f"workers died {deaths} times without a result") from error
+                raise BrokenProcessPool(f"workers died {deaths} times without a result") from error
             warn("a worker died; a new one takes its place")
         except BaseException:
             # Without this, `shutdown` would wait for running jobs, which may take minutes.
@@ -82,7 +83,9 @@ def in_order(work, jobs, workers):
         yield from map(work, jobs)
         return
     context, jobs, running = multiprocessing.get_context("spawn"), iter(jobs), collections.deque()
-    executor = concurrent.futures.ProcessPoolExecutor(workers, context, _start, (_same, (work,)))
+    # Not ended by the SIGTERM of a process group (`timeout`): the caller finishes its step first.
+    begin = (_same, (work,), False)
+    executor = concurrent.futures.ProcessPoolExecutor(workers, context, _start, begin)
     try:
         while True:
             for job in itertools.islice(jobs, 2 * workers - len(running)):
@@ -91,6 +94,11 @@ def in_order(work, jobs, workers):
             if not running:
                 return
             yield running.popleft().result()
+    except BaseException:
+        # Without this, `shutdown` would wait for running jobs, and after a death for ever.
+        for process in executor._processes.values():
+            process.kill()
+        raise
     finally:
         executor.shutdown(cancel_futures=True)
 
@@ -122,16 +130,21 @@ def starting_processes():
             signal.raise_signal(number)
 
 
-def begin_worker():
-    """What a process of `starting_processes` does first. It ends when its parent was killed."""
+def begin_worker(is_terminable=True):
+    """What a process of `starting_processes` does first. It ends when its parent was killed.
+
+    Args:
+        is_terminable: whether SIGTERM ends the process, too.
+    """
     # SIGINT stays blocked: a terminal sends Ctrl-C to this process, too, but the parent handles it.
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    if is_terminable:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     threading.Thread(target=_follow_parent, daemon=True).start()
 
 
-def _start(make_worker, arguments):
+def _start(make_worker, arguments, is_terminable=True):
     global _worker
-    begin_worker()
+    begin_worker(is_terminable)
     _worker = make_worker(*arguments)
 
 

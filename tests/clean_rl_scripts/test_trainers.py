@@ -211,11 +211,11 @@ def signal_at(monkeypatch, step, number):
     monkeypatch.setattr(runs.Run, "advance", advance_and_signal)
 
 
-def interrupted_run(trainer, folder, capsys):
+def interrupted_run(trainer, folder, capsys, flags=FEW_QUERIES):
     """The folder of a run that a signal ends, its exit code and its last line."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as end:
-        run_here(*command(trainer, folder, *FEW_QUERIES)[1:])
+        run_here(*command(trainer, folder, *flags)[1:])
     (run,) = folder.iterdir()
     return run, end.value.code, capsys.readouterr().err.splitlines()[-1]
 
@@ -242,8 +242,8 @@ def test_signal_between_evaluations_ends_in_a_checkpoint(
         same(*(torch.load(one / "checkpoint.pt", weights_only=True) for one in (whole, run)))
 
 
-def test_signal_during_an_evaluation_ends_it_at_once(
-    tmp_path, monkeypatch, capsys, trainer, short_episodes
+def test_evaluation_that_a_signal_ends_is_repeated_by_the_resumed_run(
+    tmp_path, monkeypatch, capsys, trainer, finished_run
 ):
     def evaluate(*_, **__):
         os.kill(os.getpid(), signal.SIGTERM)
@@ -251,11 +251,11 @@ def test_signal_during_an_evaluation_ends_it_at_once(
 
     with monkeypatch.context() as patch:
         patch.setattr(protocol, "evaluate", evaluate)
-        run, code, line = interrupted_run(trainer, tmp_path, capsys)
+        run, code, line = interrupted_run(trainer, tmp_path, capsys, FINISHED[trainer])
     assert code == 143 and "600; --resume" in line
     assert not (run / "policy.pt").exists()
     run_here(PATHS[trainer], "--resume", run)
-    assert json.loads((run / "result.json").read_text())["policy_step"] == 1200
+    same(*(torch.load(one / "checkpoint.pt", weights_only=True) for one in (finished_run, run)))
 
 
 @pytest.mark.parametrize("stop, steps", [(None, 1200), (1.0, 600)])

@@ -1,8 +1,10 @@
 """Collecting and verifying: the same file for any number of workers and of interruptions."""
 
+import collections
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import re
@@ -12,6 +14,7 @@ import subprocess
 import sys
 import time
 import zlib
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
@@ -493,6 +496,25 @@ def test_running_jobs_are_aborted_when_the_results_are_closed():
     results.close()
     assert time.monotonic() - begin < 60
     assert children and all(has_ended(child) for child in children)
+
+
+def test_workers_in_order_outlive_the_sigterm_of_a_process_group():
+    results = workers.in_order(abs, itertools.count(), 1)
+    assert next(results) == 0
+    (child,) = worker_processes(psutil.Process())
+    child.terminate()
+    assert [next(results) for _ in range(9)] == [*range(1, 10)]
+    results.close()
+    assert has_ended(child)
+
+
+def test_death_of_a_worker_ends_results_in_order():
+    results = workers.in_order(abs, itertools.count(), 2)
+    children = [next(results) for _ in range(9)] and worker_processes(psutil.Process())
+    children[0].kill()
+    with pytest.raises(BrokenProcessPool):
+        collections.deque(results)
+    assert all(has_ended(child) for child in children)
 
 
 def test_no_jobs_start_no_workers():

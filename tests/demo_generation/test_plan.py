@@ -137,6 +137,7 @@ def test_task_is_the_geometry_instead(query, tmp_path):
 
 
 START, GOAL = "1 0.4 0 -1.8 0 2.2 0.8", "-1 0.4 0 -1.8 0 2.2 0.8"
+BELOW = "0.4 0.3 -0.03 1 0 0 0"  # a pose in the table
 
 
 @pytest.mark.parametrize(
@@ -150,6 +151,16 @@ START, GOAL = "1 0.4 0 -1.8 0 2.2 0.8", "-1 0.4 0 -1.8 0 2.2 0.8"
         (["--task", "moving_boxes_easy", "--goal", GOAL], "obstacles of moving_boxes_easy move"),
         (["--cloud", "none.ply", "--goal", GOAL], "none.ply: no such file"),
         (["--cloud", "far.npy", "--goal-pose", "3 0 0 0 0 0 1"], "the arm cannot reach it"),
+        (
+            ["--task", "wall", "--goal", GOAL, "--arm-distance", "0.1"],
+            "-distance goes with --cloud",
+        ),
+        (["--task", "wall", "--goal", GOAL, "--no-table"], "--table goes with --cloud"),
+        (["--task", "wall", "--goal-pose", BELOW], "no collision-free configuration has the goal"),
+        (
+            ["--task", "wall", "--goal-pose", BELOW, "--policy", "go-to-goal"],
+            "--goal-pose: the arm reaches it only in collision",
+        ),
         (["--cloud", "far.npy", "--goal", GOAL, "--workspace", "1 2"], "--workspace must be 6"),
         (["--cloud", "far.npy", "--goal", GOAL, "--policy", "no"], "no such policy"),
         (["--cloud", "far.npy", "--goal", GOAL, "--output", "a.txt"], "must end in"),

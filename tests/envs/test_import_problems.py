@@ -182,6 +182,8 @@ def test_evaluation_of_unusable_problems_says_what_to_do(folder, tmp_path):
         roboarm_nmp.evaluate("go-to-goal", problems=folder)
     with pytest.raises(EvaluationError, match="give one of them"):
         roboarm_nmp.evaluate("go-to-goal", problems=folder, queries="a.h5")
+    with pytest.raises(EvaluationError, match="problems have no splits"):
+        roboarm_nmp.evaluate("go-to-goal", problems=folder, split="validation")
 
 
 def test_image_of_a_problem(folder, tmp_path):

@@ -1,5 +1,8 @@
 """envs/training/collection.py: the same episodes in any number of processes."""
 
+import multiprocessing
+from concurrent.futures.process import BrokenProcessPool
+
 import numpy as np
 import pytest
 
@@ -62,5 +65,15 @@ def test_processes_collect_the_same_episodes(alone):
     for one, other in zip(left, also_left, strict=True):
         assert_same(one, other)
     assert_same(training.observations, also_training.observations)
+    for process in multiprocessing.active_children():
+        process.terminate()  # as `timeout` does
+    for _ in range(5):
+        also_training.step(np.zeros((3, 7)))
     with pytest.raises(ValueError):  # of a process, here
         also_training.step(np.full((3, 7), np.nan))
+    for process in multiprocessing.active_children():
+        process.kill()
+        process.join()
+    for _ in range(2):
+        with pytest.raises(BrokenProcessPool, match="a process with environments has died"):
+            also_training.step(np.zeros((3, 7)))

@@ -261,6 +261,11 @@ def script(folder, code):
         ),
         ("torch.zeros(10**15)", "error: out of memory .+"),
         ("bytearray(10**15)", "error: out of memory"),
+        (
+            "from concurrent.futures.process import BrokenProcessPool\n"
+            "raise BrokenProcessPool('a process has died')",
+            "error: a process has died",
+        ),
     ],
 )
 def test_errors_that_are_no_mistake_of_the_program_get_a_line(tmp_path, code, message):
@@ -306,8 +311,9 @@ while run.step < 10:
 """
 
 
-def test_signal_in_the_loop_ends_a_run_in_a_checkpoint(tmp_path):
-    ended, _ = script(tmp_path, LOOP % "pass")
+def test_signals_in_the_loop_end_a_run_in_a_checkpoint(tmp_path):
+    # `timeout` sends it to all processes, and so does a search to its trainers.
+    ended, _ = script(tmp_path, LOOP % "os.kill(os.getpid(), signal.SIGTERM)")
     run = sorted(tmp_path.iterdir())[-1]
     assert ended.returncode == 143
     line = f"terminated; checkpoint at update 3; --resume {run} continues there"
@@ -317,7 +323,8 @@ def test_signal_in_the_loop_ends_a_run_in_a_checkpoint(tmp_path):
 
 
 def test_second_signal_ends_a_run_at_once(tmp_path):
-    ended, _ = script(tmp_path, LOOP % "os.kill(os.getpid(), signal.SIGTERM)")
+    later = "runs.SAME_INTERRUPT = 0.0; os.kill(os.getpid(), signal.SIGTERM)"
+    ended, _ = script(tmp_path, LOOP % later)
     run = sorted(tmp_path.iterdir())[-1]
     assert ended.returncode == 143
     line = f"terminated; no checkpoint yet; --resume {run} starts again"
