@@ -16,6 +16,7 @@ import signal
 import socket
 import threading
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import resource_tracker
 
 MAX_DEATHS = 5  # without a single result between them
 
@@ -119,6 +120,7 @@ def starting_processes():
         for number in numbers:  # not only blocked: another thread may receive them
             if callable(signal.getsignal(number)):
                 handlers[number] = signal.signal(number, lambda one, frame: arrived.append(one))
+    resource_tracker.ensure_running()  # before: its start unblocks both signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
