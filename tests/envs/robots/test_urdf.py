@@ -510,6 +510,15 @@ def test_pairs_and_gain_are_cached_and_a_damaged_cache_is_made_again(urdf, tmp_p
     assert Robot.from_urdf(**arm) == first
 
 
+def test_urdf_is_loaded_a_few_times_only(urdf, tmp_path, monkeypatch):
+    # A mesh of 20 MB takes a second each time.
+    monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path))
+    loads, load = [], p.loadURDF
+    monkeypatch.setattr(p, "loadURDF", lambda *args, **more: loads.append(1) or load(*args, **more))
+    Robot.from_urdf(urdf(ARM), end_effector="tool")
+    assert len(loads) == 2  # for the pairs of links, and for the gain
+
+
 def test_pybullet_is_left_without_connections(urdf):
     before = [p.isConnected(client) for client in range(20)]
     with pytest.raises(RobotError):
