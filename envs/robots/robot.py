@@ -85,7 +85,7 @@ class Robot:
         end_effector_frame: index of the frame that moves it.
         end_effector_position: m, (3,), the end effector's position in that frame.
         base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
-        mesh_digest: SHA-256 (hex) of the meshes of the links that may collide; empty for `PANDA`.
+        mesh_digest: SHA-256 (hex) of the URDF's collision shapes; empty for `PANDA`.
         source: the file that names the robot, for scene files; empty for `PANDA`.
         xml: the URDF's text, with absolute paths of meshes; empty if PyBullet can read the file.
         datasheet_lower, datasheet_upper: position limits (n,) of the manufacturer's datasheet, rad

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import json
 import math
 import re
 import warnings
@@ -246,7 +247,7 @@ class _Tree:
         links: names of the links, parents first.
         elements: a link's XML element.
         joints: a joint's XML element, parents first.
-        mesh_digest: SHA-256 (hex) of the collision meshes.
+        mesh_digest: SHA-256 (hex) of the collision shapes.
     """
 
     def __init__(self, path, packages):
@@ -375,9 +376,16 @@ class _Tree:
                             f"vertex that is not there"
                         )
                     if kind == "collision":
+                        if file.suffix.lower() == ".stl" and _is_text(contents):
+                            raise RobotError(
+                                f"{self.path}: link {link.get('name')!r}: PyBullet cannot use mesh "
+                                f"{file}, an STL file of text: save it as a binary one"
+                            )
                         shapes += contents.count(b"\no ") + contents.count(b"\ng ")
                         digest.update(contents)
-            shapes += len(link.findall("collision"))
+            for shape in link.findall("collision"):
+                digest.update(_beside_mesh(shape))
+                shapes += 1
         if shapes > MAX_SHAPES:
             raise RobotError(f"{self.path}: {shapes} collision shapes, at most {MAX_SHAPES}")
         self.mesh_digest = digest.hexdigest()
@@ -392,7 +400,8 @@ class _Tree:
         if file.suffix.lower() not in MESH_ENDINGS:
             raise RobotError(f"{where}: must end in {', '.join(MESH_ENDINGS)}")
         if not file.is_file():
-            raise RobotError(f"{where}: no such file ({file})")
+            hint = ": name its folder in `packages`" if given.startswith("package://") else ""
+            raise RobotError(f"{where}: no such file ({file}){hint}")
         return file
 
     def axis(self, joint):
@@ -627,6 +636,26 @@ def _read(path):
     if root.tag != "robot":
         raise RobotError(f"{path}: no URDF: its first element is not <robot>")
     return root
+
+
+def _beside_mesh(collision):
+    """What a `collision` element has beside a mesh's contents, as bytes: placement and sizes.
+
+    Nothing, if that is a mesh in the link's own frame.
+    """
+    usual, found = {"xyz": 0.0, "rpy": 0.0, "scale": 1.0}, []
+    for element in collision.iter():
+        for name in NUMBERS:
+            values = [float(part) for part in element.get(name, "").split()]
+            if any(value != usual.get(name) for value in values):
+                found.append([element.tag, name, values])
+    return json.dumps(found).encode() if found else b""
+
+
+def _is_text(stl):
+    """Whether an STL file is one of text. A binary one has 50 bytes for each triangle."""
+    size = 84 + 50 * int.from_bytes(stl[80:84], "little")
+    return stl.startswith(b"solid") and b"facet" in stl[:1000] and len(stl) != size
 
 
 def _has_its_vertices(obj):

@@ -239,6 +239,7 @@ MESH = "0 0 0", "0 0 0", '<mesh filename="{}"/>'
         (TWO + joint("1", "a", "b", more='<mimic joint="9"/>'), "mimics '9'"),
         (link("a", ("0 0 0", "0 0 0", '<box size="1 1 inf"/>')), "not finite numbers"),
         (link("a", (*MESH[:2], MESH[2].format("missing.stl"))), "no such file"),
+        (link("a", (*MESH[:2], MESH[2].format("package://x/m.stl"))), "its folder in `packages`"),
         (link("a", (*MESH[:2], MESH[2].format("/etc/passwd"))), "outside of"),
         (link("a", (*MESH[:2], MESH[2].format("../../../x.stl"))), "outside of"),
         (link("a") + link("a"), "two links"),
@@ -270,6 +271,7 @@ def test_unusable_urdf_is_rejected_with_its_reason(urdf, elements, reason):
         (b'<!DOCTYPE r [<!ENTITY a "aaaa">]><robot name="&a;"/>', "entities"),
         (b"<robot name='a'>" + b" " * 5_000_000 + b"</robot>", "more than 5 MB"),
         (b'<robot name="x" xmlns:xacro="u"><xacro:macro name="m"/></robot>', "run `xacro`"),
+        (b'<robot name="x" xmlns:xacro="u"><xacro:include filename="a"/></robot>', "run `xacro`"),
     ],
 )
 def test_malformed_file_is_rejected_with_its_reason(tmp_path, contents, reason):
@@ -296,6 +298,26 @@ def test_mesh_without_triangles_is_rejected(urdf, contents, ending):
     (path.parent / f"x.{ending}").write_bytes(contents)
     with pytest.raises(RobotError, match="PyBullet cannot"):
         Robot.from_urdf(path)
+
+
+def test_stl_file_of_text_is_named(urdf):
+    path = urdf(TWO + joint("1", "a", "b") + link("c", (*MESH[:2], MESH[2].format("x.stl"))))
+    path.write_text(path.read_text().replace("</robot>", joint("2", "b", "c") + "</robot>"))
+    corners = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+    text = f"solid x\nfacet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\nendsolid\n"
+    (path.parent / "x.stl").write_text(text)
+    with pytest.raises(RobotError, match=r"x\.stl, an STL file of text"):
+        Robot.from_urdf(path)
+
+
+@pytest.mark.parametrize("text", ["0.05 0.06 0.2", "0 0 0.15", "0.1 0 0"])
+def test_arms_with_other_collision_shapes_differ(urdf, text):
+    options = {"end_effector": "l1", "gain": 0.5}
+    arm = Robot.from_urdf(urdf(chain(2)), **options)
+    same = Robot.from_urdf(urdf(chain(2).replace(f'"{text}"', f'"{text}0"')), **options)
+    other = Robot.from_urdf(urdf(chain(2).replace(f'"{text}"', f'"{text}01"')), **options)
+    assert arm == same != other
+    assert arm.self_collision_pairs == other.self_collision_pairs
 
 
 @pytest.mark.parametrize("kind", ["collision", "visual"])
