@@ -463,14 +463,14 @@ class Robot:
             for b in range(a + 1, links.stop):
                 may_collide = int((a, b) in self.self_collision_pairs)
                 p.setCollisionFilterPair(body, body, a, b, may_collide, physicsClientId=client)
-        for index, position in zip(self.held_indices, self.held_positions, strict=True):
+        for index, least, most in self._ranges():
             lower, upper = p.getJointInfo(body, index, physicsClientId=client)[8:10]
-            if lower <= upper and not lower <= position <= upper:  # a limit would push it back
+            if lower <= upper and not lower <= least <= most <= upper:  # it would stop the joint
                 p.changeDynamics(
                     body,
                     index,
-                    jointLowerLimit=min(lower, position),
-                    jointUpperLimit=max(upper, position),
+                    jointLowerLimit=min(lower, least),
+                    jointUpperLimit=max(upper, most),
                     physicsClientId=client,
                 )
         if self.held_indices:
@@ -483,6 +483,13 @@ class Robot:
                 physicsClientId=client,
             )
         return body
+
+    def _ranges(self):
+        """PyBullet's index of each movable joint, and its least and largest position."""
+        yield from zip(self.held_indices, self.held_positions, self.held_positions, strict=True)
+        yield from zip(self.joint_indices, self.lower.tolist(), self.upper.tolist(), strict=True)
+        for index, joint, scale, offset in self.mimics:
+            yield index, *sorted(scale * x[joint] + offset for x in (self.lower, self.upper))
 
     def load_coarse(self, client, colour):
         """Load the arm for images only: its collision shapes, in one colour. Returns its body id.

@@ -29,6 +29,7 @@ BLOCK = 4_000_000  # bytes of a mesh that are read at once
 MESH_ENDINGS = (".obj", ".stl", ".dae")
 MOVABLE = ("revolute", "continuous", "prismatic")
 DEFAULT_EFFORT = 1_000.0  # N m or N, where a URDF has none
+WIDENED = "limits of joints, where the file has wider ones"  # since then, gains are others
 LIGHT = "0.001", "0.000001"  # kg, kg m^2: of frames, such as a tool's
 MAX_NUMBER, MAX_NORM_ERROR = 1e6, 0.01
 NUMBERS = ("xyz", "rpy", "size", "radius", "length", "scale", "value", "ixx", "iyy", "izz")
@@ -113,6 +114,9 @@ def robot_from_urdf(
         else:
             raise RobotError(f"{path}: {joint!r} mimics {leader!r}, which cannot move")
     frames, placements = _frames(tree, joints, positions, mimics)
+    for joint in tree.joints.values():
+        if joint.get("type") != "fixed" and joint.find("limit") is None:
+            ElementTree.SubElement(joint, "limit")  # PyBullet loads no joint without
     ElementTree.indent(tree.root)  # PyBullet breaks lines of more than 8,191 letters
     xml = ElementTree.tostring(tree.root, "unicode")
     index, link_index, shapes = bullet_indices(path, xml)
@@ -184,7 +188,7 @@ def robot_from_urdf(
         observed_pose=tuple(contact_free),
     )
     if gain is None:
-        gain = cached("gain", robot, [GAINS], lambda: calibrate(robot)[0])
+        gain = cached("gain", robot, [GAINS, WIDENED], lambda: calibrate(robot)[0])
         robot = dataclasses.replace(robot, gains=(gain,) * len(joints))
     return robot
 

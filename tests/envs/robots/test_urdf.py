@@ -532,6 +532,22 @@ def test_pairs_and_gain_are_cached_and_a_damaged_cache_is_made_again(urdf, tmp_p
     assert Robot.from_urdf(**arm) == first
 
 
+@pytest.mark.parametrize("limit", ['<limit lower="-1" upper="1" effort="50"/>', ""])
+def test_arm_moves_within_limits_that_replace_the_urdfs(urdf, limit):
+    mimic = f'{limit}<mimic joint="j1" multiplier="-1"/>'
+    joints = joint("j1", "l0", "l1", more=limit) + joint("j2", "l1", "l2", more=mimic)
+    path = urdf("".join(link(f"l{i}", BAR) for i in range(3)) + joints)
+    robot = Robot.from_urdf(path, limits={"j1": (-3.0, 3.0)}, gain=0.6)
+    client = p.connect(p.DIRECT)
+    body = robot.load(client, drawn=False)
+    for _ in range(200):
+        robot.command(client, body, [2.5])
+        p.stepSimulation(physicsClientId=client)
+    angles = [p.getJointState(body, index, physicsClientId=client)[0] for index in (0, 1)]
+    p.disconnect(client)
+    np.testing.assert_allclose(angles, [2.5, -2.5], atol=0.01)
+
+
 def test_urdf_is_loaded_a_few_times_only(urdf, tmp_path, monkeypatch):
     # A mesh of 20 MB takes a second each time.
     monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path))
