@@ -92,6 +92,8 @@ class Robot:
             or m, where they are others than the URDF's; None otherwise.
         urdf_velocity: limits of the velocity (n,) in the URDF, None if it has none, or for `PANDA`.
         gains: of the position controllers (n,).
+        acceleration_steps: environment steps in which a plan's sub-goals reach full speed after a
+            waypoint, and slow down before the next.
         contact_free: a configuration without contacts (n,).
         observed_pose: the configuration (n,) in which sensors observe a scene: always the same, so
             that an encoded scene depends on the scene alone.
@@ -137,6 +139,7 @@ class Robot:
     attached: tuple = ()
     carriers: tuple = ()
     urdf_velocity: list | None = None
+    acceleration_steps: int = 1
 
     def __post_init__(self):
         names = ("lower", "upper", "velocity", "acceleration", "jerk", "effort")
@@ -170,6 +173,8 @@ class Robot:
         content["attached"] = [one.described() for one in self.attached]
         if not self.attached:
             del content["attached"], content["carriers"]
+        if self.acceleration_steps == 1:
+            del content["acceleration_steps"]
         text = json.dumps(_rounded(content), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -198,6 +203,8 @@ class Robot:
             base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
             gain: of the position controllers; by default from a calibration
                 (`envs.robots.control`).
+            acceleration_steps: environment steps, 1 to 100, in which the sub-goals of a plan reach
+                full speed after a waypoint, and slow down before the next.
             velocity, acceleration, jerk: limits of trajectories, rad/s, rad/s^2, rad/s^3 (or m): a
                 number, or a dict from names of joints. By default the velocities are the URDF's, if
                 it has some, and the others are unknown.

@@ -28,6 +28,7 @@ MAX_MESH = {"collision": 20_000_000, "visual": 30_000_000}  # bytes of one
 BLOCK = 4_000_000  # bytes of a mesh that are read at once
 MESH_ENDINGS = (".obj", ".stl", ".dae")
 MOVABLE = ("revolute", "continuous", "prismatic")
+MAX_STEPS = 100  # of acceleration
 DEFAULT_EFFORT = 1_000.0  # N m or N, where a URDF has none
 WIDENED = "limits of joints, where the file has wider ones"  # since then, gains are others
 LIGHT = "0.001", "0.000001"  # kg, kg m^2: of frames, such as a tool's
@@ -51,6 +52,7 @@ def robot_from_urdf(
     base_position=(0.0, 0.0, 0.0),
     base_orientation=(0.0, 0.0, 0.0, 1.0),
     gain=None,
+    acceleration_steps=1,
     velocity=None,
     acceleration=None,
     jerk=None,
@@ -67,6 +69,7 @@ def robot_from_urdf(
         base_position=base_position,
         base_orientation=base_orientation,
         gain=gain,
+        acceleration_steps=acceleration_steps,
     )
     tree = _Tree(Path(path), packages)
     movable = [joint for joint in tree.joints if tree.is_movable(joint)]
@@ -167,6 +170,7 @@ def robot_from_urdf(
         end_effector_frame=frame,
         end_effector_position=tuple(position + rotation @ np.array(end_effector_position)),
         gains=(gain or 0.6,) * len(joints),
+        acceleration_steps=acceleration_steps,
         contact_free=tuple(bounds.mean(1)),
         observed_pose=tuple(bounds.mean(1)),
         base_position=tuple(map(float, base_position)),
@@ -207,7 +211,7 @@ def _motion_limits(path, name, given, joints, own=None):
     return [given[joint] for joint in joints]
 
 
-def _check_options(path, joints, fixed, pairs, positive, gain, **vectors):
+def _check_options(path, joints, fixed, pairs, positive, gain, acceleration_steps, **vectors):
     """Raise RobotError for an option of another type, or one that is not finite."""
 
     def are_numbers(values, count):
@@ -237,6 +241,8 @@ def _check_options(path, joints, fixed, pairs, positive, gain, **vectors):
         ]
     if gain is not None and not (are_numbers([gain], 1) and 0 < gain <= 1):
         wrong.append(f"gain {gain}, which must be in (0, 1]")
+    if not isinstance(acceleration_steps, int) or not 1 <= acceleration_steps <= MAX_STEPS:
+        wrong.append(f"acceleration_steps {acceleration_steps}, which must be 1 to {MAX_STEPS}")
     if not wrong and abs(np.linalg.norm(vectors["base_orientation"]) - 1) > MAX_NORM_ERROR:
         wrong.append(f"base_orientation {vectors['base_orientation']}: its norm is not 1")
     if wrong:

@@ -390,6 +390,8 @@ def test_frame_without_inertial_is_light(urdf):
     [
         {"gain": float("nan")},
         {"gain": -1},
+        {"acceleration_steps": 0},
+        {"acceleration_steps": 1.5},
         {"base_position": (0, 0)},
         {"base_orientation": (0, 0, 0, 2)},
         {"end_effector_position": (0, 0, float("inf"))},
@@ -454,6 +456,9 @@ def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
     assert robot.name == "arm" and robot.gains == (0.5,) * 3 and robot.held_positions == (0.01,)
     assert robot.upper.tolist() == [1.5, 1.5, 1.0] and robot.end_effector_offset == (0, 0, 0.1)
     assert load_robot(file) == robot
+    file.write_text(file.read_text() + "acceleration_steps: 5\n")
+    slower = load_robot(file)
+    assert slower.acceleration_steps == 5 and slower != robot  # demonstrations differ
 
 
 def test_robot_file_adds_limits_of_trajectories_and_the_datasheet(urdf, tmp_path):
@@ -502,6 +507,7 @@ def test_robot_file_adds_limits_of_trajectories_and_the_datasheet(urdf, tmp_path
         ("{", "no YAML"),
         ("urdf: x.urdf\njerk: [5]", "jerk must be a float or dict"),
         ("urdf: x.urdf\ngain: true", "gain must be a float"),
+        ("urdf: x.urdf\nacceleration_steps: 1.5", "acceleration_steps must be a int"),
     ],
 )
 def test_malformed_robot_file_is_rejected_with_its_reason(tmp_path, text, reason):
