@@ -97,6 +97,9 @@ def robot_from_urdf(
     for joint in fixed or {}:
         if joint not in others:
             raise RobotError(f"{path}: fixed: {joint!r} is none of the other joints {others}")
+    for joint in limits or {}:
+        if joint not in tree.joints:
+            raise RobotError(f"{path}: limits: no joint {joint!r}, but {', '.join(tree.joints)}")
     for joint in datasheet_limits or {}:
         if joint not in joints:
             raise RobotError(f"{path}: datasheet_limits: {joint!r} is none of the joints {joints}")

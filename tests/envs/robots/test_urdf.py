@@ -433,6 +433,8 @@ def test_options_that_do_not_fit_are_rejected(urdf):
         Robot.from_urdf(path, end_effector="tool", joints=["turn", "grip"])
     with pytest.raises(RobotError, match="fixed: 'turn' is none of the other joints"):
         Robot.from_urdf(path, end_effector="tool", fixed={"turn": 0.0})
+    with pytest.raises(RobotError, match="limits: no joint 'trun', but turn"):
+        Robot.from_urdf(path, end_effector="tool", limits={"trun": (-1, 1)})
     with pytest.raises(RobotError, match="acceleration: no limit of slide, roll"):
         Robot.from_urdf(path, end_effector="tool", acceleration={"turn": 5})
     with pytest.raises(RobotError, match="velocity: 'grip' is none of the joints"):
