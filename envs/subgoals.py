@@ -11,6 +11,8 @@ SUBGOAL_SPACING = 0.95 * MAX_STEP
 def subgoals(path, robot):
     """Points along a path at most `SUBGOAL_SPACING` apart, including all waypoints.
 
+    Near waypoints they are closer, if the robot has `acceleration_steps`.
+
     Args:
         path: (k, n), rad.
         robot: the `Robot`, with n joints.
@@ -25,12 +27,18 @@ def all_subgoals(plan, plan_offsets, robot):
     """The sub-goals of all plans (k, n), and the offset of each plan's first sub-goal (n + 1,)."""
     waypoints = robot.normalise(plan.astype(np.float64))
     moves = np.diff(waypoints, axis=0)
-    steps = np.ceil(np.sqrt(np.square(moves).sum(1)) / SUBGOAL_SPACING)
-    steps = np.maximum(steps, 1).astype(np.int64)
+    lengths, n = np.sqrt(np.square(moves).sum(1)) / SUBGOAL_SPACING, robot.acceleration_steps
+    # How far 1, 2, ... steps lead at most, with lengths of 1/n, 2/n, ..., 1, 1, ..., 2/n, 1/n.
+    steps = np.arange(2, 2 * n + 3 + int(lengths.max(initial=0.0)))
+    reach = np.cumsum(np.minimum(steps // 2, n)) / n
+    steps = np.searchsorted(reach, lengths) + 1
     steps[plan_offsets[1:-1] - 1] = 1  # from the end of a plan to the start of the next
     move = np.repeat(np.arange(len(moves)), steps)
     first = np.concatenate([[0], np.cumsum(steps)])  # sub-goals before each waypoint
-    share = (np.arange(len(move)) - first[move] + 1) / steps[move]
+    number = np.arange(len(move)) - first[move]
+    length = np.minimum(np.minimum(number + 1, steps[move] - number), n)
+    done = np.concatenate([[0], np.cumsum(length)])
+    share = (done[1:] - done[first[move]]) / (done[first[move + 1]] - done[first[move]])
     points = np.concatenate([waypoints[:1], waypoints[move] + moves[move] * share[:, None]])
     return points, np.concatenate([first[plan_offsets[:-1]], [len(points)]])
 

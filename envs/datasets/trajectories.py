@@ -336,7 +336,7 @@ def _read_csv(path, robot):
     _check_size(path)
     joints = robot.num_joints
     wanted = [f"q{joint}" for joint in range(1, joints + 1)]
-    with open(path, newline="", encoding="utf-8") as file:
+    with open(path, newline="", encoding="utf-8-sig") as file:  # of Excel, too
         rows = csv.DictReader(file, skipinitialspace=True)
         found = rows.fieldnames or ()
         missing = [name for name in wanted if name not in found]

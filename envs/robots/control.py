@@ -26,38 +26,46 @@ def calibrate(robot, gains=GAINS, seed=0):
     Returns:
         gain, and the share of the commanded displacement that was executed with it (1: all of it).
     """
-    shares = [_executed(robot, gain, np.random.default_rng(seed)) for gain in gains]
-    best = int(np.argmin(np.abs(np.array(shares) - 1.0)))
-    return gains[best], shares[best]
-
-
-def _executed(robot, gain, rng):
     client = p.connect(p.DIRECT)
     try:
         p.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=client
         )
         p.setGravity(0, 0, -9.81, physicsClientId=client)
-        robot = dataclasses.replace(robot, gains=(gain,) * robot.num_joints)
-        body = robot.load(client, drawn=False)
+        body = robot.load(client, drawn=False)  # once: large meshes take a second
         for link in range(-1, p.getNumJoints(body, physicsClientId=client)):
             p.setCollisionFilterGroupMask(body, link, 0, 0, physicsClientId=client)
-        commanded = executed = 0.0
-        for _ in range(NUM_POSES):
-            state = rng.uniform(-0.7, 0.7, robot.num_joints)
-            direction = rng.normal(size=robot.num_joints)
-            direction *= STEP / np.linalg.norm(direction)
-            robot.set_configuration(client, body, robot.denormalise(state))
-            for step in range(NUM_STEPS):
-                robot.command(client, body, robot.denormalise(state + direction).tolist())
-                for _ in range(SUBSTEPS):
-                    p.stepSimulation(physicsClientId=client)
-                joints = p.getJointStates(body, robot.joint_indices, physicsClientId=client)
-                after = robot.normalise([joint[0] for joint in joints])
-                if step >= NUM_STEPS // 2:  # at speed
-                    executed += (after - state) @ direction / STEP
-                    commanded += STEP
-                state = after
-        return executed / commanded
+        shares = [
+            _executed(
+                dataclasses.replace(robot, gains=(gain,) * robot.num_joints),
+                client,
+                body,
+                np.random.default_rng(seed),
+            )
+            for gain in gains
+        ]
     finally:
         p.disconnect(client)
+    best = int(np.argmin(np.abs(np.array(shares) - 1.0)))
+    return gains[best], shares[best]
+
+
+def _executed(robot, client, body, rng):
+    """The share of the commanded displacement that is executed with the robot's gains."""
+    commanded = executed = 0.0
+    for _ in range(NUM_POSES):
+        state = rng.uniform(-0.7, 0.7, robot.num_joints)
+        direction = rng.normal(size=robot.num_joints)
+        direction *= STEP / np.linalg.norm(direction)
+        robot.set_configuration(client, body, robot.denormalise(state))
+        for step in range(NUM_STEPS):
+            robot.command(client, body, robot.denormalise(state + direction).tolist())
+            for _ in range(SUBSTEPS):
+                p.stepSimulation(physicsClientId=client)
+            joints = p.getJointStates(body, robot.joint_indices, physicsClientId=client)
+            after = robot.normalise([joint[0] for joint in joints])
+            if step >= NUM_STEPS // 2:  # at speed
+                executed += (after - state) @ direction / STEP
+                commanded += STEP
+            state = after
+    return executed / commanded

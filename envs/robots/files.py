@@ -12,6 +12,7 @@ packages: {iiwa_description: ../iiwa_description}
 base_position: [0, 0, 0]
 base_orientation: [0, 0, 0, 1]
 gain: 0.6
+acceleration_steps: 5            # in which a plan's sub-goals reach full speed
 velocity: 2.0                    # of trajectories, rad/s; or joint by joint, as with jerk
 acceleration: 10                 # rad/s^2
 jerk: {joint_1: 1000, …}         # rad/s^3
@@ -44,6 +45,7 @@ KEYS = {
     "base_position": list,
     "base_orientation": list,
     "gain": NUMBER,
+    "acceleration_steps": int,
     "velocity": (*NUMBER, dict),
     "acceleration": (*NUMBER, dict),
     "jerk": (*NUMBER, dict),
@@ -102,7 +104,7 @@ def _read(path):
             raise RobotError(f"{path}: unknown key {key!r}: known are {', '.join(KEYS)}")
         if not isinstance(value, KEYS[key]) or isinstance(value, bool):
             kinds = KEYS[key] if isinstance(KEYS[key], tuple) else (KEYS[key],)
-            names = " or ".join(kind.__name__ for kind in kinds if kind is not int)
+            names = " or ".join(kind.__name__ for kind in kinds if kind in (kinds[0], dict))
             raise RobotError(f"{path}: {key} must be a {names}, got {value!r}")
     return options
 

@@ -85,13 +85,15 @@ class Robot:
         end_effector_frame: index of the frame that moves it.
         end_effector_position: m, (3,), the end effector's position in that frame.
         base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
-        mesh_digest: SHA-256 (hex) of the meshes of the links that may collide; empty for `PANDA`.
+        mesh_digest: SHA-256 (hex) of the URDF's collision shapes; empty for `PANDA`.
         source: the file that names the robot, for scene files; empty for `PANDA`.
         xml: the URDF's text, with absolute paths of meshes; empty if PyBullet can read the file.
         datasheet_lower, datasheet_upper: position limits (n,) of the manufacturer's datasheet, rad
             or m, where they are others than the URDF's; None otherwise.
         urdf_velocity: limits of the velocity (n,) in the URDF, None if it has none, or for `PANDA`.
         gains: of the position controllers (n,).
+        acceleration_steps: environment steps in which a plan's sub-goals reach full speed after a
+            waypoint, and slow down before the next.
         contact_free: a configuration without contacts (n,).
         observed_pose: the configuration (n,) in which sensors observe a scene: always the same, so
             that an encoded scene depends on the scene alone.
@@ -137,6 +139,7 @@ class Robot:
     attached: tuple = ()
     carriers: tuple = ()
     urdf_velocity: list | None = None
+    acceleration_steps: int = 1
 
     def __post_init__(self):
         names = ("lower", "upper", "velocity", "acceleration", "jerk", "effort")
@@ -170,6 +173,8 @@ class Robot:
         content["attached"] = [one.described() for one in self.attached]
         if not self.attached:
             del content["attached"], content["carriers"]
+        if self.acceleration_steps == 1:
+            del content["acceleration_steps"]
         text = json.dumps(_rounded(content), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -198,6 +203,8 @@ class Robot:
             base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
             gain: of the position controllers; by default from a calibration
                 (`envs.robots.control`).
+            acceleration_steps: environment steps, 1 to 100, in which the sub-goals of a plan reach
+                full speed after a waypoint, and slow down before the next.
             velocity, acceleration, jerk: limits of trajectories, rad/s, rad/s^2, rad/s^3 (or m): a
                 number, or a dict from names of joints. By default the velocities are the URDF's, if
                 it has some, and the others are unknown.
@@ -463,14 +470,14 @@ class Robot:
             for b in range(a + 1, links.stop):
                 may_collide = int((a, b) in self.self_collision_pairs)
                 p.setCollisionFilterPair(body, body, a, b, may_collide, physicsClientId=client)
-        for index, position in zip(self.held_indices, self.held_positions, strict=True):
+        for index, least, most in self._ranges():
             lower, upper = p.getJointInfo(body, index, physicsClientId=client)[8:10]
-            if lower <= upper and not lower <= position <= upper:  # a limit would push it back
+            if lower <= upper and not lower <= least <= most <= upper:  # it would stop the joint
                 p.changeDynamics(
                     body,
                     index,
-                    jointLowerLimit=min(lower, position),
-                    jointUpperLimit=max(upper, position),
+                    jointLowerLimit=min(lower, least),
+                    jointUpperLimit=max(upper, most),
                     physicsClientId=client,
                 )
         if self.held_indices:
@@ -483,6 +490,13 @@ class Robot:
                 physicsClientId=client,
             )
         return body
+
+    def _ranges(self):
+        """PyBullet's index of each movable joint, and its least and largest position."""
+        yield from zip(self.held_indices, self.held_positions, self.held_positions, strict=True)
+        yield from zip(self.joint_indices, self.lower.tolist(), self.upper.tolist(), strict=True)
+        for index, joint, scale, offset in self.mimics:
+            yield index, *sorted(scale * x[joint] + offset for x in (self.lower, self.upper))
 
     def load_coarse(self, client, colour):
         """Load the arm for images only: its collision shapes, in one colour. Returns its body id.

@@ -14,6 +14,7 @@ MAX_FILE, MAX_DEPTH, MAX_ELEMENTS = 5_000_000, 30, 50_000  # bytes, nested eleme
 MAX_HULL = 100_000  # vertices of the convex hulls of all collision meshes
 # PyBullet may crash while it loads a hostile file, so another process tries it first.
 MAX_SECONDS, MAX_MEMORY = 4, 1_000_000_000  # of its processor time; bytes
+XACRO_LEFTOVERS = ("xacro:arg", "xacro:property")  # do no harm
 LARGEST = 1000.0  # m, of a mesh's coordinates
 TRIAL = """
 import json, os, resource, sys
@@ -60,14 +61,14 @@ def read_xml(path):
         raise RobotError(f"{path}: not text: {error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise RobotError(f"{path}: has a document type or entities, which no robot needs")
-    if "xmlns:xacro" in text and "xacro:macro" in text:
-        raise RobotError(f"{path}: has xacro macros: run `xacro` on it first")
     # Some URDFs have extensions of other programs, with prefixes that they do not declare.
     parser, builder, depth, number = expat.ParserCreate(), ElementTree.TreeBuilder(), 0, 0
 
     def start(tag, attributes):
         nonlocal depth, number
         depth, number = depth + 1, number + 1
+        if tag.startswith("xacro:") and tag not in XACRO_LEFTOVERS:
+            raise RobotError(f"{path}: has the element {tag}: run `xacro` on it first")
         if number > MAX_ELEMENTS:
             raise RobotError(f"{path}: more than {MAX_ELEMENTS:,} elements")
         if depth > MAX_DEPTH:

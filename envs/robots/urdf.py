@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import hashlib
+import json
 import math
 import re
 import warnings
@@ -27,7 +28,9 @@ MAX_MESH = {"collision": 20_000_000, "visual": 30_000_000}  # bytes of one
 BLOCK = 4_000_000  # bytes of a mesh that are read at once
 MESH_ENDINGS = (".obj", ".stl", ".dae")
 MOVABLE = ("revolute", "continuous", "prismatic")
+MAX_STEPS = 100  # of acceleration
 DEFAULT_EFFORT = 1_000.0  # N m or N, where a URDF has none
+WIDENED = "limits of joints, where the file has wider ones"  # since then, gains are others
 LIGHT = "0.001", "0.000001"  # kg, kg m^2: of frames, such as a tool's
 MAX_NUMBER, MAX_NORM_ERROR = 1e6, 0.01
 NUMBERS = ("xyz", "rpy", "size", "radius", "length", "scale", "value", "ixx", "iyy", "izz")
@@ -49,6 +52,7 @@ def robot_from_urdf(
     base_position=(0.0, 0.0, 0.0),
     base_orientation=(0.0, 0.0, 0.0, 1.0),
     gain=None,
+    acceleration_steps=1,
     velocity=None,
     acceleration=None,
     jerk=None,
@@ -65,6 +69,7 @@ def robot_from_urdf(
         base_position=base_position,
         base_orientation=base_orientation,
         gain=gain,
+        acceleration_steps=acceleration_steps,
     )
     tree = _Tree(Path(path), packages)
     movable = [joint for joint in tree.joints if tree.is_movable(joint)]
@@ -92,6 +97,9 @@ def robot_from_urdf(
     for joint in fixed or {}:
         if joint not in others:
             raise RobotError(f"{path}: fixed: {joint!r} is none of the other joints {others}")
+    for joint in limits or {}:
+        if joint not in tree.joints:
+            raise RobotError(f"{path}: limits: no joint {joint!r}, but {', '.join(tree.joints)}")
     for joint in datasheet_limits or {}:
         if joint not in joints:
             raise RobotError(f"{path}: datasheet_limits: {joint!r} is none of the joints {joints}")
@@ -112,6 +120,9 @@ def robot_from_urdf(
         else:
             raise RobotError(f"{path}: {joint!r} mimics {leader!r}, which cannot move")
     frames, placements = _frames(tree, joints, positions, mimics)
+    for joint in tree.joints.values():
+        if joint.get("type") != "fixed" and joint.find("limit") is None:
+            ElementTree.SubElement(joint, "limit")  # PyBullet loads no joint without
     ElementTree.indent(tree.root)  # PyBullet breaks lines of more than 8,191 letters
     xml = ElementTree.tostring(tree.root, "unicode")
     index, link_index, shapes = bullet_indices(path, xml)
@@ -162,6 +173,7 @@ def robot_from_urdf(
         end_effector_frame=frame,
         end_effector_position=tuple(position + rotation @ np.array(end_effector_position)),
         gains=(gain or 0.6,) * len(joints),
+        acceleration_steps=acceleration_steps,
         contact_free=tuple(bounds.mean(1)),
         observed_pose=tuple(bounds.mean(1)),
         base_position=tuple(map(float, base_position)),
@@ -183,7 +195,7 @@ def robot_from_urdf(
         observed_pose=tuple(contact_free),
     )
     if gain is None:
-        gain = cached("gain", robot, [GAINS], lambda: calibrate(robot)[0])
+        gain = cached("gain", robot, [GAINS, WIDENED], lambda: calibrate(robot)[0])
         robot = dataclasses.replace(robot, gains=(gain,) * len(joints))
     return robot
 
@@ -202,7 +214,7 @@ def _motion_limits(path, name, given, joints, own=None):
     return [given[joint] for joint in joints]
 
 
-def _check_options(path, joints, fixed, pairs, positive, gain, **vectors):
+def _check_options(path, joints, fixed, pairs, positive, gain, acceleration_steps, **vectors):
     """Raise RobotError for an option of another type, or one that is not finite."""
 
     def are_numbers(values, count):
@@ -232,6 +244,8 @@ def _check_options(path, joints, fixed, pairs, positive, gain, **vectors):
         ]
     if gain is not None and not (are_numbers([gain], 1) and 0 < gain <= 1):
         wrong.append(f"gain {gain}, which must be in (0, 1]")
+    if not isinstance(acceleration_steps, int) or not 1 <= acceleration_steps <= MAX_STEPS:
+        wrong.append(f"acceleration_steps {acceleration_steps}, which must be 1 to {MAX_STEPS}")
     if not wrong and abs(np.linalg.norm(vectors["base_orientation"]) - 1) > MAX_NORM_ERROR:
         wrong.append(f"base_orientation {vectors['base_orientation']}: its norm is not 1")
     if wrong:
@@ -246,7 +260,7 @@ class _Tree:
         links: names of the links, parents first.
         elements: a link's XML element.
         joints: a joint's XML element, parents first.
-        mesh_digest: SHA-256 (hex) of the collision meshes.
+        mesh_digest: SHA-256 (hex) of the collision shapes.
     """
 
     def __init__(self, path, packages):
@@ -375,9 +389,16 @@ class _Tree:
                             f"vertex that is not there"
                         )
                     if kind == "collision":
+                        if file.suffix.lower() == ".stl" and _is_text(contents):
+                            raise RobotError(
+                                f"{self.path}: link {link.get('name')!r}: PyBullet cannot use mesh "
+                                f"{file}, an STL file of text: save it as a binary one"
+                            )
                         shapes += contents.count(b"\no ") + contents.count(b"\ng ")
                         digest.update(contents)
-            shapes += len(link.findall("collision"))
+            for shape in link.findall("collision"):
+                digest.update(_beside_mesh(shape))
+                shapes += 1
         if shapes > MAX_SHAPES:
             raise RobotError(f"{self.path}: {shapes} collision shapes, at most {MAX_SHAPES}")
         self.mesh_digest = digest.hexdigest()
@@ -392,7 +413,8 @@ class _Tree:
         if file.suffix.lower() not in MESH_ENDINGS:
             raise RobotError(f"{where}: must end in {', '.join(MESH_ENDINGS)}")
         if not file.is_file():
-            raise RobotError(f"{where}: no such file ({file})")
+            hint = ": name its folder in `packages`" if given.startswith("package://") else ""
+            raise RobotError(f"{where}: no such file ({file}){hint}")
         return file
 
     def axis(self, joint):
@@ -627,6 +649,26 @@ def _read(path):
     if root.tag != "robot":
         raise RobotError(f"{path}: no URDF: its first element is not <robot>")
     return root
+
+
+def _beside_mesh(collision):
+    """What a `collision` element has beside a mesh's contents, as bytes: placement and sizes.
+
+    Nothing, if that is a mesh in the link's own frame.
+    """
+    usual, found = {"xyz": 0.0, "rpy": 0.0, "scale": 1.0}, []
+    for element in collision.iter():
+        for name in NUMBERS:
+            values = [float(part) for part in element.get(name, "").split()]
+            if any(value != usual.get(name) for value in values):
+                found.append([element.tag, name, values])
+    return json.dumps(found).encode() if found else b""
+
+
+def _is_text(stl):
+    """Whether an STL file is one of text. A binary one has 50 bytes for each triangle."""
+    size = 84 + 50 * int.from_bytes(stl[80:84], "little")
+    return stl.startswith(b"solid") and b"facet" in stl[:1000] and len(stl) != size
 
 
 def _has_its_vertices(obj):

@@ -1,6 +1,7 @@
 """Demonstration files: round trip, replay; errors of bad files name them."""
 
 import dataclasses
+import math
 import time
 from pathlib import Path
 
@@ -200,6 +201,25 @@ def test_subgoals_are_close_and_contain_the_waypoints(made):
         np.testing.assert_allclose(points[[0, -1]], waypoints[[0, -1]], rtol=0, atol=1e-12)
     assert SUBGOAL_SPACING < MAX_STEP == 0.03
     assert subgoals(plans[0][[0, 0]], PANDA).shape == (2, 7)  # standing still
+
+
+@pytest.mark.parametrize("steps", [2, 5])
+def test_subgoals_speed_up_and_slow_down_between_waypoints(steps):
+    robot = dataclasses.replace(PANDA, acceleration_steps=steps)
+    state = np.zeros(7)
+    for length in (1e-4, 0.01, 0.1, 1.0):
+        path = robot.denormalise([state, state + length / math.sqrt(7), state])
+        points = subgoals(path, robot)
+        there = len(points) // 2
+        np.testing.assert_allclose(points[there], state + length / math.sqrt(7), atol=1e-12)
+        np.testing.assert_allclose(points, points[::-1], atol=1e-12)  # braking mirrors speeding up
+        moved = np.linalg.norm(np.diff(points, axis=0), axis=1)[:there]
+        assert moved.max() <= SUBGOAL_SPACING + 1e-12
+        speeds = np.concatenate([[0.0], moved, [0.0]])
+        assert np.abs(np.diff(speeds)).max() <= SUBGOAL_SPACING / steps + 1e-12
+        # One step less would not do.
+        less = [min(i + 1, there - 1 - i, steps) for i in range(there - 1)]
+        assert sum(less) * SUBGOAL_SPACING / steps < length
 
 
 def test_same_contents_same_bytes(path, made, tmp_path):

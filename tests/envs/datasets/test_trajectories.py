@@ -136,6 +136,15 @@ def test_joint_path_is_read_as_it_was_written(name, tmp_path):
     np.testing.assert_array_equal(configurations, PATH)
 
 
+def test_csv_file_with_a_byte_order_mark_is_read(tmp_path):
+    save_joint_path(tmp_path / "a.csv", PATH, np.arange(len(PATH)))
+    (tmp_path / "b.csv").write_bytes("\ufeff".encode() + (tmp_path / "a.csv").read_bytes())
+    header = ",".join(f"q{i}" for i in range(1, 8))
+    (tmp_path / "c.csv").write_text(f"{header}\n{','.join(map(str, PATH[0]))}\n", "utf-8-sig")
+    np.testing.assert_array_equal(load_joint_path(tmp_path / "b.csv", PANDA)[1], PATH)
+    np.testing.assert_array_equal(load_joint_path(tmp_path / "c.csv", PANDA)[1], PATH[:1])
+
+
 @pytest.mark.parametrize("name", ["a.csv", "a.npz"])
 def test_file_of_an_episode_has_its_states_actions_contacts_and_times(name, tmp_path):
     states = PANDA.normalise(PATH).astype(np.float32)

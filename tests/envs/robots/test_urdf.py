@@ -239,6 +239,7 @@ MESH = "0 0 0", "0 0 0", '<mesh filename="{}"/>'
         (TWO + joint("1", "a", "b", more='<mimic joint="9"/>'), "mimics '9'"),
         (link("a", ("0 0 0", "0 0 0", '<box size="1 1 inf"/>')), "not finite numbers"),
         (link("a", (*MESH[:2], MESH[2].format("missing.stl"))), "no such file"),
+        (link("a", (*MESH[:2], MESH[2].format("package://x/m.stl"))), "its folder in `packages`"),
         (link("a", (*MESH[:2], MESH[2].format("/etc/passwd"))), "outside of"),
         (link("a", (*MESH[:2], MESH[2].format("../../../x.stl"))), "outside of"),
         (link("a") + link("a"), "two links"),
@@ -270,6 +271,7 @@ def test_unusable_urdf_is_rejected_with_its_reason(urdf, elements, reason):
         (b'<!DOCTYPE r [<!ENTITY a "aaaa">]><robot name="&a;"/>', "entities"),
         (b"<robot name='a'>" + b" " * 5_000_000 + b"</robot>", "more than 5 MB"),
         (b'<robot name="x" xmlns:xacro="u"><xacro:macro name="m"/></robot>', "run `xacro`"),
+        (b'<robot name="x" xmlns:xacro="u"><xacro:include filename="a"/></robot>', "run `xacro`"),
     ],
 )
 def test_malformed_file_is_rejected_with_its_reason(tmp_path, contents, reason):
@@ -296,6 +298,26 @@ def test_mesh_without_triangles_is_rejected(urdf, contents, ending):
     (path.parent / f"x.{ending}").write_bytes(contents)
     with pytest.raises(RobotError, match="PyBullet cannot"):
         Robot.from_urdf(path)
+
+
+def test_stl_file_of_text_is_named(urdf):
+    path = urdf(TWO + joint("1", "a", "b") + link("c", (*MESH[:2], MESH[2].format("x.stl"))))
+    path.write_text(path.read_text().replace("</robot>", joint("2", "b", "c") + "</robot>"))
+    corners = "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+    text = f"solid x\nfacet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\nendsolid\n"
+    (path.parent / "x.stl").write_text(text)
+    with pytest.raises(RobotError, match=r"x\.stl, an STL file of text"):
+        Robot.from_urdf(path)
+
+
+@pytest.mark.parametrize("text", ["0.05 0.06 0.2", "0 0 0.15", "0.1 0 0"])
+def test_arms_with_other_collision_shapes_differ(urdf, text):
+    options = {"end_effector": "l1", "gain": 0.5}
+    arm = Robot.from_urdf(urdf(chain(2)), **options)
+    same = Robot.from_urdf(urdf(chain(2).replace(f'"{text}"', f'"{text}0"')), **options)
+    other = Robot.from_urdf(urdf(chain(2).replace(f'"{text}"', f'"{text}01"')), **options)
+    assert arm == same != other
+    assert arm.self_collision_pairs == other.self_collision_pairs
 
 
 @pytest.mark.parametrize("kind", ["collision", "visual"])
@@ -368,6 +390,8 @@ def test_frame_without_inertial_is_light(urdf):
     [
         {"gain": float("nan")},
         {"gain": -1},
+        {"acceleration_steps": 0},
+        {"acceleration_steps": 1.5},
         {"base_position": (0, 0)},
         {"base_orientation": (0, 0, 0, 2)},
         {"end_effector_position": (0, 0, float("inf"))},
@@ -409,6 +433,8 @@ def test_options_that_do_not_fit_are_rejected(urdf):
         Robot.from_urdf(path, end_effector="tool", joints=["turn", "grip"])
     with pytest.raises(RobotError, match="fixed: 'turn' is none of the other joints"):
         Robot.from_urdf(path, end_effector="tool", fixed={"turn": 0.0})
+    with pytest.raises(RobotError, match="limits: no joint 'trun', but turn"):
+        Robot.from_urdf(path, end_effector="tool", limits={"trun": (-1, 1)})
     with pytest.raises(RobotError, match="acceleration: no limit of slide, roll"):
         Robot.from_urdf(path, end_effector="tool", acceleration={"turn": 5})
     with pytest.raises(RobotError, match="velocity: 'grip' is none of the joints"):
@@ -432,6 +458,9 @@ def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
     assert robot.name == "arm" and robot.gains == (0.5,) * 3 and robot.held_positions == (0.01,)
     assert robot.upper.tolist() == [1.5, 1.5, 1.0] and robot.end_effector_offset == (0, 0, 0.1)
     assert load_robot(file) == robot
+    file.write_text(file.read_text() + "acceleration_steps: 5\n")
+    slower = load_robot(file)
+    assert slower.acceleration_steps == 5 and slower != robot  # demonstrations differ
 
 
 def test_robot_file_adds_limits_of_trajectories_and_the_datasheet(urdf, tmp_path):
@@ -480,6 +509,7 @@ def test_robot_file_adds_limits_of_trajectories_and_the_datasheet(urdf, tmp_path
         ("{", "no YAML"),
         ("urdf: x.urdf\njerk: [5]", "jerk must be a float or dict"),
         ("urdf: x.urdf\ngain: true", "gain must be a float"),
+        ("urdf: x.urdf\nacceleration_steps: 1.5", "acceleration_steps must be a int"),
     ],
 )
 def test_malformed_robot_file_is_rejected_with_its_reason(tmp_path, text, reason):
@@ -508,6 +538,31 @@ def test_pairs_and_gain_are_cached_and_a_damaged_cache_is_made_again(urdf, tmp_p
     for file in files:
         file.write_bytes(b"[[1, ")
     assert Robot.from_urdf(**arm) == first
+
+
+@pytest.mark.parametrize("limit", ['<limit lower="-1" upper="1" effort="50"/>', ""])
+def test_arm_moves_within_limits_that_replace_the_urdfs(urdf, limit):
+    mimic = f'{limit}<mimic joint="j1" multiplier="-1"/>'
+    joints = joint("j1", "l0", "l1", more=limit) + joint("j2", "l1", "l2", more=mimic)
+    path = urdf("".join(link(f"l{i}", BAR) for i in range(3)) + joints)
+    robot = Robot.from_urdf(path, limits={"j1": (-3.0, 3.0)}, gain=0.6)
+    client = p.connect(p.DIRECT)
+    body = robot.load(client, drawn=False)
+    for _ in range(200):
+        robot.command(client, body, [2.5])
+        p.stepSimulation(physicsClientId=client)
+    angles = [p.getJointState(body, index, physicsClientId=client)[0] for index in (0, 1)]
+    p.disconnect(client)
+    np.testing.assert_allclose(angles, [2.5, -2.5], atol=0.01)
+
+
+def test_urdf_is_loaded_a_few_times_only(urdf, tmp_path, monkeypatch):
+    # A mesh of 20 MB takes a second each time.
+    monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path))
+    loads, load = [], p.loadURDF
+    monkeypatch.setattr(p, "loadURDF", lambda *args, **more: loads.append(1) or load(*args, **more))
+    Robot.from_urdf(urdf(ARM), end_effector="tool")
+    assert len(loads) == 2  # for the pairs of links, and for the gain
 
 
 def test_pybullet_is_left_without_connections(urdf):
