@@ -7,9 +7,8 @@
 A policy for new scenes. It imitates the directions of a roadmap's smoothed paths, from random
 configurations near such paths and from those that the policy itself visits (DAgger: Ross et al.,
 2011). It observes the encoded scene (`--encoder`) and the signed distance of each link, here and at
-the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a safety filter
-(`envs.policies.safety_filter`). For an algorithm of your own, copy this file and change the parts
-under `# ALGO LOGIC`. The part between `# SHARED` and `# END SHARED` is the same in `bc.py`.
+the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a safety filter. For an algorithm of
+your own, copy this file and change the parts under `# ALGO LOGIC`; `# SHARED` is as in `bc.py`.
 """
 
 import functools

@@ -211,8 +211,7 @@ class HerReplayBuffer:
 
     `remaining` counts the transitions that follow one in its episode. New episodes overwrite the
     oldest ones from their start on, so that these transitions outlive it. The encoded scene at the
-    end of an observation is stored once: `latents[latent]`, and after the action
-    `latents[next_latent]`, which is another one where obstacles move.
+    end of an observation is stored once: `latents[latent]`; of the next one `latents[next_latent]`.
     """
 
     def __init__(self, env, capacity, her_probability, rng):
