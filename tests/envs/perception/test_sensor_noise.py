@@ -217,7 +217,7 @@ def test_evaluation_with_noise_does_not_depend_on_earlier_episodes():
     assert results[0]["sensor_noise"] == {"gaussian": 0.01, "missing_cameras": 1}
     assert results[0]["success_rate"] == results[1]["success_rate"]
     assert results[0]["path_length"] == results[1]["path_length"]
-    with pytest.raises(EvaluationError, match="nothing is observed by sensors"):
+    with pytest.raises(EvaluationError, match="this policy observes nothing of the scene"):
         evaluate("go-to-goal", "wall", sensor_noise=noise, num_queries=1)
 
 
