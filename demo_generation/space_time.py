@@ -1,4 +1,4 @@
-"""Planning in space and time: a reference that knows how obstacles will move.
+"""Planning in space and time: a reference that receives all future motions.
 
     from roboarm_nmp.demo_generation.space_time import SpaceTimePlanner
 

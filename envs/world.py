@@ -246,7 +246,7 @@ class World:
 
     @property
     def time(self):
-        """Seconds since the arm was placed, of simulated time; or as `place` was told."""
+        """Seconds since the arm was placed, of simulated time; or as given to `place`."""
         return self._substep * TIME_STEP
 
     @property

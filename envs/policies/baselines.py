@@ -8,8 +8,8 @@
 - planner: follows a plan of OMPL's RRT-Connect, which may search for a limited time;
 - replanning: follows a plan, watches it, and plans again whenever it is blocked
   (`envs.policies.replanning`);
-- space-time: follows a plan that knows how the obstacles will move, the reference in scenes with
-  moving obstacles (`demo_generation.space_time`).
+- space-time: follows a plan that was made with the future motions of obstacles, the reference where
+  obstacles move (`demo_generation.space_time`).
 
 Of a goal pose, the goal configuration is one that inverse kinematics finds, the nearest one to the
 start; `via-points` and `planner` need one without collisions.

@@ -2,7 +2,7 @@
 
     scene, places = Containers().sample_with_places(rng)
 
-For policies that have to reach into things. Sizes, heights and positions are uniform in the ranges
+For policies that reach into containers. Sizes, heights and positions are uniform in the ranges
 below. There is neither the standard table nor the floor, so places may be below the robot's base.
 """
 

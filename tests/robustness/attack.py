@@ -4,7 +4,7 @@
     python tests/robustness/attack.py --only files --number 1000
     python tests/robustness/attack.py --only networks --repeat 1234
 
-Attacks: `networks` (network files with one to three things changed at random, each in a process of
+Attacks: `networks` (network files with one to three values changed at random, each in a process of
 its own), `files` (bits flipped and files cut off, of every kind that is written), `robots` (URDFs,
 their meshes and YAML files, changed likewise), `clouds` (point clouds of every format, changed
 likewise), `problems` (files of problems and scenes in other programs' formats, changed likewise),
