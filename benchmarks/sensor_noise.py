@@ -116,14 +116,16 @@ def results(folder, task, noise):
 
 
 def wide_table(folder, task):
-    """A row per kind of noise: success of each method, then collision-free success."""
+    """A row per kind of noise: success and collision-free success of the methods that were run."""
     kinds = ("success", "success_rate"), ("collision-free", "collision_free_success_rate")
-    head = ["noise", *(f"{LABELS[name]}: {kind}" for kind, _ in kinds for name in LABELS)]
+    cells = {noise: results(folder, task, noise) for noise in NOISES}
+    names = [name for name in LABELS if any(name in found for found in cells.values())]
+    head = ["noise", *(f"{LABELS[name]}: {kind}" for name in names for kind, _ in kinds)]
     rows = []
-    for noise, (label, _) in NOISES.items():
-        if found := results(folder, task, noise):
-            rates = [found.get(name, {}).get(key) for _, key in kinds for name in LABELS]
-            rows.append([label, *map(share, rates)])
+    for noise, found in cells.items():
+        if found:
+            rates = [found.get(name, {}).get(key) for name in names for _, key in kinds]
+            rows.append([NOISES[noise][0], *map(share, rates)])
     return head, rows
 
 
