@@ -43,5 +43,10 @@ def test_table_of_accepted_noise_has_a_row_per_task_and_kind(calls, tmp_path):
     sensor_noise.main(args)
     with open(tmp_path / "noise_accepted.csv", newline="") as file:
         _, *rows = csv.reader(file)
-    assert [row[2] for row in rows[:4]] == ["none", "depth, 5 mm", "dropout, 10 %", "one camera missing"]
+    assert [row[2] for row in rows[:4]] == [
+        "none",
+        "depth, 5 mm",
+        "dropout, 10 %",
+        "one camera missing",
+    ]
     assert len(rows) == 8 and calls[0][2] is None and calls[2][2].gaussian == 0.005
