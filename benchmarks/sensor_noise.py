@@ -6,7 +6,7 @@
 Each cell is `roboarm evaluate` on the first `--num` test queries of a task with one kind of noise;
 its result is a JSON file in `--folder`, and cells that have one are not run again. All methods
 observe four point clouds. `--shard 0/2` and `--shard 1/2` share the cells between two processes.
-The tables of docs/benchmark/sensor_noise.md show all cells with a result.
+Tables show the cells with a result; docs/benchmark/sensor_noise.md has that of `--only accepted`.
 """
 
 import csv
