@@ -6,6 +6,7 @@ benchmarks/results, shown as it is.
 """
 
 import csv
+import io
 import re
 from pathlib import Path
 
@@ -44,6 +45,14 @@ def csv_table(name):
     with open(RESULTS / name, newline="") as file:
         head, *rows = csv.reader(file)
     return table(head, rows)
+
+
+def write_csv(name, head, rows):
+    """Write a file of benchmarks/results, and its table into the pages that have its marks."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows([head, *rows])
+    write_atomically(RESULTS / name, text.getvalue().encode())
+    write({name: csv_table(name)})
 
 
 def csv_tables():

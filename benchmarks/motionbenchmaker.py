@@ -13,8 +13,6 @@ PyBullet, the obstacles' shapes are prepared, the path is searched and shortened
 should run. A plan is then followed in the simulator: it must reach the goal without contact.
 """
 
-import csv
-import io
 import os
 import statistics
 import time
@@ -24,14 +22,13 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import tyro
-from markdown_tables import RESULTS, csv_table, write
+from markdown_tables import write_csv
 
 from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.demo_generation.planning import Planner, PlanningError
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.datasets.problems import load_problems
 from roboarm_nmp.envs.import_problems import import_problems, summary
-from roboarm_nmp.envs.utils.files import write_atomically
 from roboarm_nmp.envs.utils.progress import progress_bar
 
 NAME = "motionbenchmaker.csv"
@@ -103,10 +100,7 @@ def main(args):
     rows.append(row_of("all", *sums))
     print(", ".join(f"{name} {value}" for name, value in zip(HEAD, rows[-1], strict=True)))
     if args.num is None:
-        text = io.StringIO(newline="")
-        csv.writer(text, lineterminator="\n").writerows([HEAD, *rows])
-        write_atomically(RESULTS / NAME, text.getvalue().encode())
-        write({NAME: csv_table(NAME)})
+        write_csv(NAME, HEAD, rows)
 
 
 if __name__ == "__main__":

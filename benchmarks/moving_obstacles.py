@@ -7,8 +7,6 @@ file in `--folder`, and cells that have one are not run again. The table of
 docs/benchmark/moving_obstacles.md shows all of them.
 """
 
-import csv
-import io
 import json
 import os
 from dataclasses import dataclass
@@ -18,7 +16,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import tyro
-from markdown_tables import RESULTS, csv_table, interval, share, write
+from markdown_tables import interval, share, write_csv
 
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.tasks import TASKS
@@ -96,10 +94,7 @@ def main(args):
             file = args.folder / f"{task}--{name}.json"
             if file.exists():
                 rows.append(row_of(task, method, json.loads(file.read_text())))
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows([HEAD, *rows])
-    write_atomically(RESULTS / NAME, text.getvalue().encode())
-    write({NAME: csv_table(NAME)})
+    write_csv(NAME, HEAD, rows)
 
 
 if __name__ == "__main__":

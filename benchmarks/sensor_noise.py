@@ -9,8 +9,6 @@ observe four point clouds. `--shard 0/2` and `--shard 1/2` share the cells betwe
 Tables show the cells with a result; docs/benchmark/sensor_noise.md has that of `--only accepted`.
 """
 
-import csv
-import io
 import json
 import os
 from dataclasses import dataclass
@@ -20,7 +18,7 @@ from typing import Literal
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import tyro
-from markdown_tables import RESULTS, csv_table, interval, share, write
+from markdown_tables import interval, share, write_csv
 from moving_obstacles import METHODS
 
 from roboarm_nmp.envs.perception.noise import SensorNoise
@@ -148,14 +146,10 @@ def main(args):
     args.folder.mkdir(parents=True, exist_ok=True)
     run(args, ACCEPTED if args.only == "accepted" else NOISES)
     if args.only == "accepted":
-        tables = {"noise_accepted.csv": accepted_table(args.folder)}
+        write_csv("noise_accepted.csv", *accepted_table(args.folder))
     else:
-        tables = {f"noise_{task}.csv": wide_table(args.folder, task) for task in TASKS}
-    for name, (head, rows) in tables.items():
-        text = io.StringIO(newline="")
-        csv.writer(text, lineterminator="\n").writerows([head, *rows])
-        write_atomically(RESULTS / name, text.getvalue().encode())
-    write({name: csv_table(name) for name in tables})
+        for task in TASKS:
+            write_csv(f"noise_{task}.csv", *wide_table(args.folder, task))
 
 
 if __name__ == "__main__":

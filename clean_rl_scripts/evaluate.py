@@ -185,7 +185,7 @@ def _safety_filter(args):
         "--no-velocities": not args.velocities,
     }
     given = [flag for flag, is_given in flags_given.items() if is_given]
-    if {"--lookahead", "--no-velocities"} <= {*given}:
+    if {"--lookahead", "--no-velocities"} <= set(given):
         raise ValueError("--lookahead needs the velocities that --no-velocities leaves out")
     if given and args.safety_margin == 0:
         raise ValueError(f"{given[0]}: there is no safety filter with --safety-margin 0")
@@ -198,7 +198,7 @@ def _safety_filter(args):
     own = own_safety_filter(find_policy(args.policy)[0])
     if own is None:
         raise ValueError(f"{given[0]}: the policy has no safety filter; --safety-margin adds one")
-    if not {"--lookahead", "--no-velocities"} & {*given}:
+    if not {"--lookahead", "--no-velocities"} & set(given):
         lookahead = own.lookahead
     options = {"approach": own.approach or args.approach, "lookahead": lookahead}
     return replace(own, escape=own.escape and args.escape, **options)

@@ -4,6 +4,7 @@ import csv
 import json
 import sys
 
+import markdown_tables
 import pytest
 from paths import ROOT
 
@@ -22,9 +23,8 @@ def folder(tmp_path, monkeypatch):
         return shares | {"geometry_source": source, "num_queries": 4, "safety_filter": None}
 
     monkeypatch.setattr(moving_obstacles, "evaluate", evaluate)
-    monkeypatch.setattr(moving_obstacles, "RESULTS", tmp_path)
-    monkeypatch.setattr(moving_obstacles, "csv_table", lambda name: "")
-    monkeypatch.setattr(moving_obstacles, "write", lambda tables: None)
+    monkeypatch.setattr(markdown_tables, "RESULTS", tmp_path)
+    monkeypatch.setattr(markdown_tables, "pages", list)
     return tmp_path
 
 
