@@ -267,7 +267,7 @@ def measure(args, number, progress):
     Returns dict way -> (seconds (n,), solved (n,), checks, length), and the seconds for sampling a
     query.
     """
-    options = {name: getattr(args, name) for name in collect.OPTIONS}
+    options = collect.options_of(args)
     ways = {"ours": Ours(options), "plain": Plain(options)}
     seconds, solved = {way: [] for way in ways}, {way: [] for way in ways}
     drawing = 0.0
@@ -296,7 +296,7 @@ def measure(args, number, progress):
 
 def random_scenes(number, progress):
     """Our demonstrations per second on `random_boxes_hard`, and the share of queries solved."""
-    collector = collect.Collector(vars(collect.Args("random_boxes_hard")))
+    collector = collect.Collector(collect.options_of(collect.Args("random_boxes_hard")))
     collector(number)
     seconds = given_up = 0.0
     for index in range(number):

@@ -24,6 +24,7 @@ from roboarm_nmp.demo_generation.planning import Planner, PlanningError
 from roboarm_nmp.envs.datasets.demonstrations import demo_path, write_demos
 from roboarm_nmp.envs.datasets.journal import Journal, journal_of
 from roboarm_nmp.envs.datasets.queries import query_path, validate
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.training import flags
@@ -42,6 +43,7 @@ from roboarm_nmp.envs.utils.random_streams import Stream
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 MAX_QUERIES = 100  # tried for one demonstration
+ATTEMPTS = 3  # plans tried on a query of the Panda
 REASONS = ("no_plan", "missed", "collided", "too_long")
 
 
@@ -67,8 +69,9 @@ class Args:
     """Longest motion (normalised) that the planner tries at once; 0 for OMPL's choice."""
     simplify: NonNegativeInt = 1
     """Rounds of removing vertices of a plan and cutting its corners."""
-    attempts: PositiveInt = 3
-    """Plans tried on a query before it is given up for a new one (paper: 3)."""
+    attempts: PositiveInt | None = None
+    """Plans tried on a query before it is given up for a new one. By default 3 (paper); 1 for other
+    arms than the Panda, where many a random query has no plan."""
     allow_collisions: bool = False
     """Accept demonstrations with contact that reach the goal (the paper's rule)."""
     output: Path | None = None
@@ -95,6 +98,15 @@ OPTIONS = (
 PLANNER_OPTIONS = ("planner", "max_checks", "clearance", "planner_range", "simplify")
 # Those of files that were made before these were options, such as the pretrained files.
 EARLIER_OPTIONS = {"planner_range": 0.0, "simplify": 3}
+
+
+def options_of(args):
+    """The `OPTIONS` in `args`, whose task is known, as a dict."""
+    options = {name: getattr(args, name) for name in OPTIONS}
+    if args.attempts is None:
+        is_panda = envs.get_task(args.task).base_scene.robot == PANDA
+        options["attempts"] = ATTEMPTS if is_panda else 1
+    return options
 
 
 def make_planner(env, options):
@@ -275,7 +287,7 @@ def main(args):
     try:
         args = replace(args, task=task_with_robot(args.task, args.robot), robot=None)
         path = _check(args)
-        options = {name: getattr(args, name) for name in OPTIONS}
+        options = options_of(args)
         counts = collect(path, args.num, options, args.workers, args.ray_address)
     except OSError as error:
         sys.exit(

@@ -39,8 +39,7 @@ TASK, NUM = "double_walls", 16
 
 def options(**changes):
     """What a demonstration depends on, as the command's defaults have it."""
-    args = collect.Args(TASK)
-    return {name: getattr(args, name) for name in collect.OPTIONS} | changes
+    return collect.options_of(collect.Args(TASK)) | changes
 
 
 def command(output, *flags, num=NUM, task=TASK):

@@ -80,8 +80,8 @@ def test_plans_of_a_larger_arm_keep_a_larger_distance():
 
 def test_interrupted_collection_of_another_arm_continues_to_the_same_bytes(tmp_path, monkeypatch):
     task = f"no_obstacles@{ROBOTS / 'xarm6.yaml'}"
-    args = collect.Args(task)
-    options = {name: getattr(args, name) for name in collect.OPTIONS}
+    options = collect.options_of(collect.Args(task))
+    assert options["attempts"] == 1 and collect.options_of(collect.Args("wall"))["attempts"] == 3
     whole, again = tmp_path / "whole.h5", tmp_path / "again.h5"
     collect.collect(whole, 3, options, progress=False)
     append = collect.Journal.append
