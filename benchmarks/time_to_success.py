@@ -1,0 +1,283 @@
+"""How long until a policy is good? SAC and HER: ours, Stable-Baselines3's and SBX's.
+
+    pip install -c constraints.txt -e ".[bench]"
+    pip install sbx-rl                                            # for `sbx`
+    python benchmarks/time_to_success.py --folder time_to_success
+    python benchmarks/time_to_success.py --folder time_to_success --task double_walls
+
+Each run trains until 0.9 of 200 fresh queries of `no_obstacles` are solved (goal `ee`), or 0.75 of
+those of `double_walls`, for at most an hour. The queries have a seed of their own, and are the same
+for all. They are solved after every 10,000 environment steps; the clock stands still meanwhile. A
+run has a process of its own, and one thread.
+
+- `ours`: `sac_her_mp.py` with default flags (on `double_walls` with `--demo-prob 1`).
+- `earlier`: the same with the defaults of 2026-11-27, `EARLIER`.
+- `sb3`: Stable-Baselines3's SAC with its `HerReplayBuffer` and its defaults.
+- `sb3-ours`, `sbx-ours`: Stable-Baselines3 and SBX with our rates, discount, number of
+  environments, updates per step, network inputs and (SBX) LayerNorm and frequency of the policy's
+  updates.
+
+A run that is done has a file in `--folder`, and is not repeated. The table shows medians over
+seeds.
+"""
+
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import runpy
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Literal
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import numpy as np
+import torch
+import tyro
+from markdown_tables import write_csv
+
+from roboarm_nmp import envs
+from roboarm_nmp.clean_rl_scripts import sac_her_mp
+from roboarm_nmp.envs.datasets.queries import Query
+from roboarm_nmp.envs.training import flags, protocol
+
+LEARNERS = "ours", "earlier", "sb3", "sb3-ours", "sbx-ours"
+EARLIER = []
+GOALS = {"no_obstacles": 0.9, "double_walls": 0.75}  # success rates
+QUERIES, QUERY_SEED, INTERVAL, LIMIT = 200, 20_261_127, 10_000, 3600.0
+
+
+@dataclasses.dataclass
+class Args:
+    folder: Path
+    """where results are kept, a JSON file per run"""
+    task: Literal["no_obstacles", "double_walls"] = "no_obstacles"
+    """task; Stable-Baselines3 and SBX have no demonstrations, so `double_walls` is for ours"""
+    only: tuple[Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"], ...] = ()
+    """learners; by default all that can learn the task"""
+    seeds: tuple[flags.Seed, ...] = (1, 2, 3)
+    """seeds, one run each"""
+    limit: flags.PositiveFloat = LIMIT
+    """seconds of training at most"""
+    one: tyro.conf.Suppress[bool] = False
+
+
+def fresh_queries(task):
+    """The `QUERIES` queries that decide, none of which is in the task's file."""
+    env, rng = envs.make(task), np.random.default_rng(QUERY_SEED)
+    env.reset(seed=0)
+    queries = [Query(*env.sample_query(rng), env.unwrapped.scene) for _ in range(QUERIES)]
+    env.close()
+    return queries
+
+
+class Clock:
+    """Seconds of training; solves the fresh queries now and then, while the clock stands still."""
+
+    def __init__(self, task, limit):
+        self.goal, self.limit, self.queries = GOALS[task], limit, fresh_queries(task)
+        self.envs = protocol.make_eval_envs(task, QUERIES)
+        self.curve, self.paused, self.began = [], 0.0, None
+
+    def start(self):
+        self.began = time.perf_counter()
+
+    def evaluate(self, policy, steps, updates):
+        """Whether training ends here: `policy`, a module as for `protocol.evaluate`, is good."""
+        now = time.perf_counter()
+        result = protocol.evaluate(policy, self.envs, self.queries, torch.device("cpu"))
+        seconds = now - self.began - self.paused
+        self.paused += time.perf_counter() - now
+        point = {"steps": steps, "updates": updates, "seconds": seconds}
+        self.curve.append(point | {"success": result["success_rate"]})
+        print(json.dumps(self.curve[-1]), flush=True)
+        return result["success_rate"] >= self.goal or seconds >= self.limit
+
+
+def train_ours(task, seed, clock, changed):
+    """Run the trainer as it is, but for the queries that it is validated on."""
+
+    class Done(Exception):
+        pass
+
+    def start(run, *args):
+        started(run, *args)
+        clock.start()
+
+    def validate(run, policy):
+        steps = max(0, run.step - run.args.learning_starts)
+        if clock.evaluate(policy, run.step, int(steps * run.args.updates_per_step)):
+            raise Done
+        return False
+
+    started = protocol.PolicyRun.start
+    protocol.PolicyRun.start, protocol.PolicyRun.validate = start, validate
+    script = sac_her_mp.__file__
+    sys.argv = [script, "--task", task, "--seed", str(seed), "--eval-every", str(INTERVAL)]
+    sys.argv += ["--runs-dir", os.environ["TMPDIR"], "--total-timesteps", "10000000", *changed]
+    sys.argv += ["--demo-prob", "1"] * (task == "double_walls")
+    with contextlib.suppress(Done):
+        runpy.run_path(script, run_name="__main__")
+
+
+class OurFeatures(torch.nn.Module):
+    """Stable-Baselines3's features extractor with the inputs of our networks."""
+
+    def __init__(self, observation_space):
+        super().__init__()
+        self.features = sac_her_mp.Features(our_args(), envs.make("no_obstacles"))
+        self.features_dim = self.features.size
+
+    def forward(self, data):
+        return self.features(data["observation"], data["desired_goal"])
+
+
+def our_args():
+    args = sac_her_mp.Args()
+    args.task = "no_obstacles"
+    return args
+
+
+def train_peer(name, task, seed, clock):
+    """Stable-Baselines3 or SBX."""
+    from stable_baselines3 import HerReplayBuffer
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.env_util import make_vec_env
+
+    torch.set_num_threads(1)
+    args, ours, kind = our_args(), name.endswith("-ours"), name.split("-")[0]
+    her = {"n_sampled_goal": 4, "goal_selection_strategy": "future"}
+    options = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": her, "seed": seed}
+    options |= {"learning_starts": args.learning_starts, "device": "cpu"}  # after the first episode
+    number = args.num_envs if ours else 1
+    if ours:
+        steps = round(1 / args.updates_per_step)
+        options |= {"learning_rate": args.q_lr, "gamma": args.gamma, "tau": args.tau}
+        options |= {"train_freq": steps, "gradient_steps": args.num_envs}
+    if kind == "sbx":
+        from sbx import SAC
+
+        options["policy_kwargs"] = sbx_networks(args)
+        options |= {"policy_delay": args.policy_frequency, "qf_learning_rate": args.q_lr}
+    else:
+        from stable_baselines3 import SAC
+
+        size = [args.hidden_size] * args.num_hidden_layers
+        networks = {"features_extractor_class": OurFeatures, "net_arch": size}
+        options["policy_kwargs"] = networks if ours else {}
+
+    class Policy(torch.nn.Module):
+        def forward(self, **data):
+            data = {key: value.numpy() for key, value in data.items()}
+            return torch.from_numpy(np.array(model.predict(data, deterministic=True)[0]))
+
+    class Evaluate(BaseCallback):
+        def _on_training_start(self):
+            clock.start()
+
+        def _on_step(self):
+            if self.num_timesteps % INTERVAL >= number:
+                return True
+            return not clock.evaluate(Policy(), self.num_timesteps, model._n_updates)
+
+    vec_env = make_vec_env(envs.gymnasium_id(task), number, seed=seed)
+    model = SAC("MultiInputPolicy", vec_env, **options)
+    model.learn(10_000_000, callback=Evaluate())
+
+
+def sbx_networks(args):
+    """SBX's networks with our inputs, which it receives as one vector."""
+    import jax.numpy as jnp
+    from sbx.common.policies import SquashedGaussianActor, VectorCritic
+
+    features = sac_her_mp.Features(args, envs.make("no_obstacles"))
+    middle, half_range = features.middle.numpy(), features.half_range.numpy()
+    joints = len(middle)
+
+    def inputs(flat):
+        goal, observation = flat[:, 3:6], flat[:, 6:]  # the hand's position is also in observation
+        angles = observation[:, :joints] * half_range + middle
+        to_goal = 5.0 * (goal - observation[:, features.ee])
+        return jnp.concatenate([observation, goal, jnp.sin(angles), jnp.cos(angles), to_goal], 1)
+
+    class Actor(SquashedGaussianActor):
+        def __call__(self, flat):
+            return super().__call__(inputs(flat))
+
+    class Critic(VectorCritic):
+        def __call__(self, flat, action):
+            return super().__call__(inputs(flat), action)
+
+    size = [args.hidden_size] * args.num_hidden_layers
+    networks = {"actor_class": Actor, "vector_critic_class": Critic}
+    return networks | {"net_arch": size, "layer_norm": True}
+
+
+def run_one(args, name, seed):
+    """Train in this process; the result goes to the folder."""
+    clock = Clock(args.task, args.limit)
+    if name in ("ours", "earlier"):
+        train_ours(args.task, seed, clock, EARLIER if name == "earlier" else [])
+    else:
+        train_peer(name, args.task, seed, clock)
+    reached = clock.curve[-1]["success"] >= clock.goal
+    result = {"task": args.task, "learner": name, "seed": seed, "reached": reached}
+    path = file_of(args, name, seed)
+    path.write_text(json.dumps(result | clock.curve[-1] | {"curve": clock.curve}, indent=1) + "\n")
+
+
+def file_of(args, name, seed):
+    return args.folder / f"{args.task}-{name}-{seed}.json"
+
+
+def rows_of(args, names):
+    """Cells of the table, a row per learner that has a result."""
+    rows, base = [], None
+    for name in names:
+        files = [file_of(args, name, seed) for seed in args.seeds]
+        runs = [json.loads(file.read_text()) for file in files if file.exists()]
+        if not runs:
+            continue
+        runs.sort(key=lambda run: run["seconds"] if run["reached"] else math.inf)
+        run, reached = runs[(len(runs) - 1) // 2], sum(run["reached"] for run in runs)
+        more = "" if run["reached"] else "more than "
+        base = base or run["seconds"]
+        row = [name, f"{reached} of {len(runs)}", f"{more}{run['seconds'] / 60:.1f}"]
+        row += [f"{run['steps']:,}", f"{run['updates']:,}", f"{max_success(run):.3f}"]
+        rows.append([*row, f"{more}{run['seconds'] / base:.1f}"])
+    return rows
+
+
+def max_success(run):
+    return max(point["success"] for point in run["curve"])
+
+
+def main():
+    args = tyro.cli(Args, description=__doc__)
+    flags.check(args)
+    names = args.only or (LEARNERS if args.task == "no_obstacles" else LEARNERS[:2])
+    if args.one:
+        run_one(args, names[0], args.seeds[0])
+        return
+    args.folder.mkdir(parents=True, exist_ok=True)
+    for seed in args.seeds:
+        for name in names:
+            if not file_of(args, name, seed).exists():
+                print(f"{args.task}, {name}, seed {seed}", flush=True)
+                command = [sys.executable, __file__, "--one", "--folder", str(args.folder)]
+                command += ["--task", args.task, "--only", name, "--seeds", str(seed)]
+                with tempfile.TemporaryDirectory() as folder:
+                    env = os.environ | {"TMPDIR": folder}
+                    subprocess.run([*command, "--limit", str(args.limit)], check=True, env=env)
+    head = ["learner", "runs that reached it", "minutes", "environment steps", "updates"]
+    head += ["best success rate", "minutes / minutes of `ours`"]
+    write_csv(f"time_to_success_{args.task}.csv", head, rows_of(args, names))
+
+
+if __name__ == "__main__":
+    main()

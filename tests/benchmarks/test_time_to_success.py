@@ -1,0 +1,58 @@
+"""The benchmark of the time to a good policy: the clock stands still while queries are solved."""
+
+import json
+import sys
+import time
+
+import pytest
+from paths import ROOT
+
+sys.path.append(str(ROOT / "benchmarks"))
+import time_to_success  # noqa: E402
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """Two queries, solved after every 200 steps."""
+    monkeypatch.setattr(time_to_success, "QUERIES", 2)
+    monkeypatch.setattr(time_to_success, "INTERVAL", 200)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["time_to_success.py"])
+
+
+def test_the_clock_counts_training_only(small, monkeypatch):
+    clock = time_to_success.Clock("no_obstacles", 3600.0)
+    monkeypatch.setattr(
+        time_to_success.protocol,
+        "evaluate",
+        lambda *args: time.sleep(0.5) or {"success_rate": 0.89 + 0.01 * len(clock.curve)},
+    )
+    clock.start()
+    assert not clock.evaluate(None, 200, 0)
+    assert clock.evaluate(None, 400, 0)  # 0.90
+    assert [point["success"] for point in clock.curve] == [0.89, 0.9]
+    assert clock.curve[-1]["seconds"] < 0.1
+
+
+def test_ours_trains_until_the_limit_and_validates_on_fresh_queries(small, tmp_path):
+    args = time_to_success.Args(tmp_path, only=("ours",), seeds=(1,), limit=0.001)
+    time_to_success.run_one(args, "ours", 1)
+    result = json.loads(time_to_success.file_of(args, "ours", 1).read_text())
+    assert result["steps"] == 200 and not result["reached"] and len(result["curve"]) == 1
+    assert list(tmp_path.glob("no_obstacles__sac_her_mp__1__*"))  # the trainer itself ran
+
+
+def test_rows_show_the_median_run_and_what_did_not_reach_it(tmp_path):
+    args = time_to_success.Args(tmp_path, only=("ours", "sb3"))
+    for name, minutes, reached in (
+        ("ours", (5, 4, 9), (True, True, True)),
+        ("sb3", (60, 20, 60), (False, True, False)),
+    ):
+        for seed, (minute, good) in enumerate(zip(minutes, reached, strict=True), start=1):
+            run = {"reached": good, "seconds": 60.0 * minute, "steps": 1000 * minute}
+            run |= {"updates": 500 * minute, "curve": [{"success": 0.9 if good else 0.4}]}
+            time_to_success.file_of(args, name, seed).write_text(json.dumps(run))
+    assert time_to_success.rows_of(args, args.only) == [
+        ["ours", "3 of 3", "5.0", "5,000", "2,500", "0.900", "1.0"],
+        ["sb3", "1 of 3", "more than 60.0", "60,000", "30,000", "0.400", "more than 12.0"],
+    ]
