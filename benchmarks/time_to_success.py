@@ -11,8 +11,9 @@ for all. They are solved after every 10,000 environment steps; the clock stands 
 run has a process of its own, and one thread.
 
 - `ours`: `sac_her_mp.py` with default flags (on `double_walls` with `--demo-prob 1`).
-- `earlier`: the same with the defaults of 2026-11-27, `EARLIER`.
-- `sb3`: Stable-Baselines3's SAC with its `HerReplayBuffer` and its defaults.
+- `earlier`: the same with hindsight goals drawn evenly from the rest of an episode, `EARLIER`.
+- `sb3`: Stable-Baselines3's SAC with its `HerReplayBuffer` and its defaults, but 2,000 random
+  steps first, because it needs a whole episode.
 - `sb3-ours`, `sbx-ours`: Stable-Baselines3 and SBX with our rates, discount, number of
   environments, updates per step, network inputs and (SBX) LayerNorm and frequency of the policy's
   updates.
@@ -47,7 +48,7 @@ from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.training import flags, protocol
 
 LEARNERS = "ours", "earlier", "sb3", "sb3-ours", "sbx-ours"
-EARLIER = []
+EARLIER = ["--her-exponent", "1"]
 GOALS = {"no_obstacles": 0.9, "double_walls": 0.75}  # success rates
 QUERIES, QUERY_SEED, INTERVAL, LIMIT = 200, 20_261_127, 10_000, 3600.0
 

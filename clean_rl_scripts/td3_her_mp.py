@@ -36,6 +36,8 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """transitions per update"""
     her_probability: flags.Share = 0.8
     """share of sampled transitions whose goal is replaced by one reached later in their episode"""
+    her_exponent: flags.PositiveFloat = 2.0
+    """preference for goals that are reached soon (1: none, HER's strategy `future`)"""
     demo_prob: flags.Share | None = None
     """train on the queries of the task's demonstrations; when an episode fails, its demonstration
     enters the replay buffer with this probability (the paper's p). Without it: random queries"""
@@ -204,7 +206,7 @@ class HerReplayBuffer:
     end of an observation is stored once: `latents[latent]`; of the next one `latents[next_latent]`.
     """
 
-    def __init__(self, env, capacity, her_probability, rng):
+    def __init__(self, env, capacity, her_probability, rng, her_exponent=1.0):
         spaces, encoder = env.observation_space, getattr(env, "encoder", None)
         latent_size = 0 if encoder is None else encoder.size
         observation_size = spaces["observation"].shape[0] - latent_size
@@ -217,7 +219,8 @@ class HerReplayBuffer:
         self.arrays |= {name: np.zeros(capacity, np.int32) for name in numbers}
         self.latents, self.latent_numbers = np.zeros((1, latent_size), np.float32), {}
         self.env, self.capacity, self.rng = env.unwrapped, capacity, rng
-        self.her_probability, self.position, self.size = her_probability, 0, 0
+        self.her_probability, self.her_exponent = her_probability, her_exponent
+        self.position = self.size = 0
 
     def add_episode(self, transitions):
         """`transitions`: a list of dicts with the float arrays' names as keys."""
@@ -245,7 +248,7 @@ class HerReplayBuffer:
         """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
         index = self.rng.integers(self.size, size=batch_size)
         data = {name: array[index] for name, array in self.arrays.items()}
-        later = self.rng.random(batch_size) * (data.pop("remaining") + 1)
+        later = self.rng.random(batch_size) ** self.her_exponent * (data.pop("remaining") + 1)
         later = (index + later.astype(np.int64)) % self.capacity
         relabel = self.rng.random(batch_size) < self.her_probability
         hindsight_goal = self.arrays["next_achieved_goal"][later]
@@ -372,7 +375,7 @@ if __name__ == "__main__":
     # SHARED: run and episodes
     explore, update = (cuda_graphs.graphed(f, args, device) for f in (agent.explore, agent.update))
     rng = np.random.default_rng(args.seed)
-    rb = HerReplayBuffer(eval_envs[0], BUFFER_SIZE, args.her_probability, rng)
+    rb = HerReplayBuffer(eval_envs[0], BUFFER_SIZE, args.her_probability, rng, args.her_exponent)
     counts, losses = {"updates": 0, "demos_injected": 0}, {}
     state = agent.checkpoint_state() | {"buffer": rb, "rng": rng, "counts": counts}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)

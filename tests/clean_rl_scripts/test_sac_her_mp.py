@@ -173,6 +173,17 @@ def test_relabelled_goals_are_reached_later_in_the_same_episode():
     assert abs(counts / len(first) - 1 / 6).max() < 0.06
 
 
+def test_goals_reached_soon_are_preferred():
+    env = envs.make("no_obstacles")
+    buffer = sac.HerReplayBuffer(env, 100, 1.0, np.random.default_rng(0), her_exponent=2.0)
+    buffer.add_episode(episode(6, 0, env))
+    batch = buffer.sample(20_000)
+    goal = batch["desired_goal"][batch["next_achieved_goal"][:, 0] == 0, 0].astype(int)
+    # The square of a uniform number is below x with probability sqrt(x).
+    expected = np.diff(np.sqrt(np.arange(7) / 6))
+    np.testing.assert_allclose(np.bincount(goal, minlength=6) / len(goal), expected, atol=0.03)
+
+
 def test_share_of_relabelled_goals():
     env = envs.make("no_obstacles")
     buffer = sac.HerReplayBuffer(env, 100, 0.8, np.random.default_rng(0))
