@@ -59,12 +59,15 @@ SCRIPTS = {
     "td3": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
 }
 STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
-# Settings for long runs (docs/algorithms).
+# Settings for long runs (docs/algorithms), with hindsight goals drawn evenly, as in the paper.
+HINDSIGHT = ["--her-exponent", "1"]
 RECIPES = {
     "bc": ["--eval-every", "25000"],
-    "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3"],
-    "td3": ["--gamma", "0.98", "--num-hidden-layers", "3", "--preactivation-penalty", "0.1"],
+    "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3", *HINDSIGHT],
+    "td3": ["--gamma", "0.98", "--num-hidden-layers", "3", "--preactivation-penalty", "0.1"]
+    + HINDSIGHT,
 }
+EARLIER_DEFAULTS = {"her_exponent": 1.0}  # of runs from before it was a flag
 GOALS = {"ee": "end-effector", "config": "configuration", "combined": "combined"}
 ENCODERS = {
     "vae": "VAE",
@@ -143,7 +146,7 @@ class Cell:
             return False
         given = self.flags()
         for flag, value in dict(zip(given[::2], given[1::2], strict=True)).items():
-            had = args.get(flag.removeprefix("--").replace("-", "_"))
+            had = (EARLIER_DEFAULTS | args).get(flag.removeprefix("--").replace("-", "_"))
             if str(had) != value and not (isinstance(had, float) and had == float(value)):
                 return False
         return True
