@@ -65,7 +65,8 @@ class Args:
     """seeds, one run each"""
     limit: flags.PositiveFloat = LIMIT
     """seconds of training at most"""
-    one: tyro.conf.Suppress[bool] = False
+    in_process: bool = False
+    """train the first learner with the first seed in this process; the command does so itself"""
 
 
 def fresh_queries(task):
@@ -262,7 +263,7 @@ def main():
     args = tyro.cli(Args, description=__doc__)
     flags.check(args)
     names = args.only or (LEARNERS if args.task == "no_obstacles" else LEARNERS[:2])
-    if args.one:
+    if args.in_process:
         run_one(args, names[0], args.seeds[0])
         return
     args.folder.mkdir(parents=True, exist_ok=True)
@@ -270,7 +271,7 @@ def main():
         for name in names:
             if not file_of(args, name, seed).exists():
                 print(f"{args.task}, {name}, seed {seed}", flush=True)
-                command = [sys.executable, __file__, "--one", "--folder", str(args.folder)]
+                command = [sys.executable, __file__, "--in-process", "--folder", str(args.folder)]
                 command += ["--task", args.task, "--only", name, "--seeds", str(seed)]
                 with tempfile.TemporaryDirectory() as folder:
                     env = os.environ | {"TMPDIR": folder}

@@ -56,3 +56,29 @@ def test_rows_show_the_median_run_and_what_did_not_reach_it(tmp_path):
         ["ours", "3 of 3", "5.0", "5,000", "2,500", "0.900", "1.0"],
         ["sb3", "1 of 3", "more than 60.0", "60,000", "30,000", "0.400", "more than 12.0"],
     ]
+
+
+def test_each_run_has_a_process_and_is_not_repeated(tmp_path, monkeypatch):
+    commands = []
+
+    def run(command, check, env):
+        commands.append(command)
+        args = time_to_success.tyro.cli(time_to_success.Args, args=command[2:])
+        assert args.in_process and env["TMPDIR"]
+        result = {
+            "reached": True,
+            "seconds": 60.0,
+            "steps": 1,
+            "updates": 1,
+            "curve": [{"success": 1}],
+        }
+        time_to_success.file_of(args, args.only[0], args.seeds[0]).write_text(json.dumps(result))
+
+    monkeypatch.setattr(time_to_success.subprocess, "run", run)
+    written = []
+    monkeypatch.setattr(time_to_success, "write_csv", lambda *table: written.append(table))
+    monkeypatch.setattr(sys, "argv", ["x", "--folder", str(tmp_path), "--task", "double_walls"])
+    for _ in range(2):
+        time_to_success.main()
+    assert len(commands) == 6  # two learners, three seeds
+    assert [len(rows) for _, _, rows in written] == [2, 2]
