@@ -46,7 +46,7 @@ from tqdm import tqdm
 
 # How many attempts, and how many of them share a process.
 SIZES = {
-    **{"networks": 10_000, "files": 20_000, "robots": 2_000, "clouds": 10_000},
+    **{"networks": 10_000, "files": 20_000, "robots": 10_000, "clouds": 10_000},
     **{"problems": 10_000, "trajectories": 10_000, "flags": 2_000, "environments": 20_000},
     **{"kills": 50},
 }
