@@ -341,7 +341,7 @@ def test_rewards_and_hindsight_of_injected_demonstrations():
 @pytest.fixture(scope="module")
 def demo_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("demos") / "demos.h5"
-    options = {name: getattr(collect.Args("no_obstacles"), name) for name in collect.OPTIONS}
+    options = collect.options_of(collect.Args("no_obstacles"))
     collect.collect(path, 4, options, progress=False)
     return path
 

@@ -38,8 +38,7 @@ def file(tmp_path_factory):
     file = shutil.copy(EXAMPLE, folder / "xarm6.yaml")
     task = f"no_obstacles@{file}"
     make_queries.make_queries(query_path(task), task, 0, 4, 3, progress=False)
-    args = collect.Args(task)
-    options = {name: getattr(args, name) for name in collect.OPTIONS}
+    options = collect.options_of(collect.Args(task))
     collect.collect(demo_path(task), 3, options, progress=False)
     sizes = {"scenes": 2, "paths_per_scene": 6, "num_nodes": 150, "workers": 1}
     roadmaps.collect(roadmaps.Args(folder / "roadmaps", robot=file, **sizes), progress=False)

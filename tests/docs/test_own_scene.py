@@ -314,7 +314,7 @@ def test_training_refuses_demonstrations_of_another_scene_of_this_name(other):
 
 
 def test_a_collection_does_not_go_on_in_a_changed_scene(inside):
-    options = {name: getattr(collect.Args("my_scene.yaml"), name) for name in collect.OPTIONS}
+    options = collect.options_of(collect.Args("my_scene.yaml"))
     journal = collect.journal_of(Path("new.h5"))
     with contextlib.closing(collect.Journal(journal, options)) as opened:
         opened.append({"index": 0})

@@ -453,7 +453,7 @@ def test_an_unsolvable_query_is_rejected_and_counted(monkeypatch):
 
 
 def test_collected_demonstrations_have_their_scenes(tmp_path):
-    options = {name: getattr(collect.Args(HARD), name) for name in collect.OPTIONS}
+    options = collect.options_of(collect.Args(HARD))
     collector = collect.Collector(options)
     journal = collect.Journal(collect.journal_of(tmp_path / "demos.h5"), options)
     for index in range(3):

@@ -49,7 +49,7 @@ def make_files(folder):
     save_network(paths["network"], Mixed(), inputs(), {"kind": "encoder"})
     paths["queries"], paths["demos"] = folder / "mine_queries.h5", folder / "mine_demos.h5"
     make_queries.make_queries(paths["queries"], str(task), 0, 20, 5, progress=False)
-    options = {name: getattr(collect.Args(str(task)), name) for name in collect.OPTIONS}
+    options = collect.options_of(collect.Args(str(task)))
     collect.collect(paths["demos"], 4, options, progress=False)
     paths["journal"] = journal_of(folder / "other.h5")
     with contextlib.closing(Journal(paths["journal"], options)) as journal:
@@ -94,8 +94,7 @@ def content_of(kind, path):
         arrays = [array for demo in demos for array in (demo.plan, demo.states, demo.actions)]
         return digest(demos.parameters, demos.made_by, demos.seed, *arrays)
     if kind == "journal":
-        options = {name: getattr(collect.Args("x"), name) for name in collect.OPTIONS}
-        options["task"] = str(path.with_name("mine.yaml"))
+        options = collect.options_of(collect.Args(str(path.with_name("mine.yaml"))))
         with contextlib.closing(Journal(path, options)) as journal:
             return {index: digest(entry) for index, entry in journal.entries.items()}
     if kind == "roadmaps":

@@ -190,8 +190,7 @@ def _make_inputs(folder):
     save_scene(Scene(), folder / "mine.yaml")
     (folder / "trainer.py").write_text(TRAINER)
     (folder / "empty.h5").touch()
-    args = collect.Args("wall")
-    options = {name: getattr(args, name) for name in collect.OPTIONS}
+    options = collect.options_of(collect.Args("wall"))
     collect.collect(folder / "demos_of_wall.h5", 1, options, progress=False)
     small = {"scenes": 2, "paths_per_scene": 4, "num_nodes": 100, "workers": 1}
     roadmaps.collect(roadmaps.Args(folder / "roadmaps", **small), progress=False)
