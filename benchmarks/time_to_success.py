@@ -34,6 +34,7 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Literal
+from unittest import mock
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
@@ -118,12 +119,12 @@ def train_ours(task, seed, clock, changed):
         return False
 
     started = protocol.PolicyRun.start
-    protocol.PolicyRun.start, protocol.PolicyRun.validate = start, validate
     script = sac_her_mp.__file__
     sys.argv = [script, "--task", task, "--seed", str(seed), "--eval-every", str(INTERVAL)]
     sys.argv += ["--runs-dir", os.environ["TMPDIR"], "--total-timesteps", "10000000", *changed]
     sys.argv += ["--demo-prob", "1"] * (task == "double_walls")
-    with contextlib.suppress(Done):
+    changed_run = mock.patch.multiple(protocol.PolicyRun, start=start, validate=validate)
+    with changed_run, contextlib.suppress(Done):
         runpy.run_path(script, run_name="__main__")
 
 
