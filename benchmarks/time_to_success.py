@@ -18,8 +18,8 @@ run has a process of its own, and one thread.
   environments, updates per step, network inputs and (SBX) LayerNorm and frequency of the policy's
   updates.
 
-A run that is done has a file in `--folder`, and is not repeated. The table shows medians over
-seeds.
+A run that is done has a file in `--folder`, and is not repeated. The table shows the
+median run over seeds; of an even number of runs, the faster one of the two in the middle.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 from unittest import mock
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -48,7 +48,8 @@ from roboarm_nmp.clean_rl_scripts import sac_her_mp
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.training import flags, protocol
 
-LEARNERS = "ours", "earlier", "sb3", "sb3-ours", "sbx-ours"
+Learner = Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"]
+LEARNERS, WITH_DEMOS = get_args(Learner), ("ours", "earlier")
 EARLIER = ["--her-exponent", "1"]
 GOALS = {"no_obstacles": 0.9, "double_walls": 0.75}  # success rates
 QUERIES, QUERY_SEED, INTERVAL, LIMIT = 200, 20_261_127, 10_000, 3600.0
@@ -60,7 +61,7 @@ class Args:
     """where results are kept, a JSON file per run"""
     task: Literal["no_obstacles", "double_walls"] = "no_obstacles"
     """task; Stable-Baselines3 and SBX have no demonstrations, so `double_walls` is for ours"""
-    only: tuple[Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"], ...] = ()
+    only: tuple[Learner, ...] = ()
     """learners; by default all that can learn the task"""
     seeds: tuple[flags.Seed, ...] = (1, 2, 3)
     """seeds, one run each"""
@@ -224,7 +225,7 @@ def sbx_networks(args):
 def run_one(args, name, seed):
     """Train in this process; the result goes to the folder."""
     clock = Clock(args.task, args.limit)
-    if name in ("ours", "earlier"):
+    if name in WITH_DEMOS:
         train_ours(args.task, seed, clock, EARLIER if name == "earlier" else [])
     else:
         train_peer(name, args.task, seed, clock)
@@ -263,7 +264,10 @@ def max_success(run):
 def main():
     args = tyro.cli(Args, description=__doc__)
     flags.check(args)
-    names = args.only or (LEARNERS if args.task == "no_obstacles" else LEARNERS[:2])
+    able = LEARNERS if args.task == "no_obstacles" else WITH_DEMOS
+    names = args.only or able
+    if not set(names) <= set(able):
+        sys.exit(f"--only: on {args.task}, with demonstrations, there are {' and '.join(able)}")
     if args.in_process:
         run_one(args, names[0], args.seeds[0])
         return

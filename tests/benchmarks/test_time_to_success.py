@@ -35,11 +35,13 @@ def test_the_clock_counts_training_only(small, monkeypatch):
 
 
 def test_ours_trains_until_the_limit_and_validates_on_fresh_queries(small, tmp_path):
+    run = dict(vars(time_to_success.protocol.PolicyRun))
     args = time_to_success.Args(tmp_path, only=("ours",), seeds=(1,), limit=0.001)
     time_to_success.run_one(args, "ours", 1)
     result = json.loads(time_to_success.file_of(args, "ours", 1).read_text())
     assert result["steps"] == 200 and not result["reached"] and len(result["curve"]) == 1
     assert list(tmp_path.glob("no_obstacles__sac_her_mp__1__*"))  # the trainer itself ran
+    assert vars(time_to_success.protocol.PolicyRun) == run  # and is as before
 
 
 def test_rows_show_the_median_run_and_what_did_not_reach_it(tmp_path):
