@@ -59,15 +59,17 @@ SCRIPTS = {
     "td3": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
 }
 STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
-# Settings for long runs (docs/algorithms), with hindsight goals drawn evenly, as in the paper.
-HINDSIGHT = ["--her-exponent", "1"]
+# Settings for long runs (docs/algorithms). As in the paper, hindsight goals are drawn evenly, and
+# networks do not know the arm's Jacobian.
+AS_IN_THE_PAPER = ["--her-exponent", "1", "--no-jacobian"]
 RECIPES = {
     "bc": ["--eval-every", "25000"],
-    "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3", *HINDSIGHT],
+    "sac": ["--gamma", "0.98", "--target-entropy", "-14", "--num-hidden-layers", "3"]
+    + AS_IN_THE_PAPER,
     "td3": ["--gamma", "0.98", "--num-hidden-layers", "3", "--preactivation-penalty", "0.1"]
-    + HINDSIGHT,
+    + AS_IN_THE_PAPER,
 }
-EARLIER_DEFAULTS = {"her_exponent": 1.0}  # of runs from before it was a flag
+EARLIER_DEFAULTS = {"her_exponent": 1.0, "jacobian": False}  # of runs from before they were flags
 GOALS = {"ee": "end-effector", "config": "configuration", "combined": "combined"}
 ENCODERS = {
     "vae": "VAE",
@@ -144,9 +146,12 @@ class Cell:
         # Goal minus configuration is an input of all runs but the oldest.
         if has_configuration and not args.get("relative_configuration", "plain_networks" in args):
             return False
-        given = self.flags()
-        for flag, value in dict(zip(given[::2], given[1::2], strict=True)).items():
-            had = (EARLIER_DEFAULTS | args).get(flag.removeprefix("--").replace("-", "_"))
+        given, values = iter(self.flags()), {}
+        for flag in given:
+            name = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
+            values[name] = "False" if flag.startswith("--no-") else next(given)
+        for name, value in values.items():
+            had = (EARLIER_DEFAULTS | args).get(name)
             if str(had) != value and not (isinstance(had, float) and had == float(value)):
                 return False
         return True

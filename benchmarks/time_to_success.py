@@ -11,7 +11,8 @@ for all. They are solved after every 10,000 environment steps; the clock stands 
 run has a process of its own, and one thread.
 
 - `ours`: `sac_her_mp.py` with default flags (on `double_walls` with `--demo-prob 1`).
-- `earlier`: the same with hindsight goals drawn evenly from the rest of an episode, `EARLIER`.
+- `earlier`: the same without what makes it fast: hindsight goals are drawn evenly from the rest of
+  an episode, and the networks do not know the arm's Jacobian (`EARLIER`).
 - `sb3`: Stable-Baselines3's SAC with its `HerReplayBuffer` and its defaults, but 2,000 random
   steps first, because it needs a whole episode.
 - `sb3-ours`, `sbx-ours`: Stable-Baselines3 and SBX with our rates, discount, number of
@@ -50,7 +51,7 @@ from roboarm_nmp.envs.training import flags, protocol
 
 Learner = Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"]
 LEARNERS, WITH_DEMOS = get_args(Learner), ("ours", "earlier")
-EARLIER = ["--her-exponent", "1"]
+EARLIER = ["--her-exponent", "1", "--no-jacobian"]
 GOALS = {"no_obstacles": 0.9, "double_walls": 0.75}  # success rates
 QUERIES, QUERY_SEED, INTERVAL, LIMIT = 200, 20_261_127, 10_000, 3600.0
 
@@ -116,6 +117,7 @@ def train_ours(task, seed, clock, changed):
     def validate(run, policy):
         steps = max(0, run.step - run.args.learning_starts)
         if clock.evaluate(policy, run.step, int(steps * run.args.updates_per_step)):
+            run.close()
             raise Done
         return False
 
@@ -201,13 +203,30 @@ def sbx_networks(args):
 
     features = sac_her_mp.Features(args, envs.make("no_obstacles"))
     middle, half_range = features.middle.numpy(), features.half_range.numpy()
-    joints = len(middle)
+    joints, chain = len(middle), features.jacobian
+    weights, biases, per_state = (
+        array.numpy() for array in (chain.weights, chain.biases, chain.per_state)
+    )
+
+    def towards(state, position, vector):  # as `JacobianTranspose` does it
+        values = state @ per_state.T + chain.middle.numpy()
+        cosines, sines = jnp.cos(values), jnp.sin(values)
+        vectors = jnp.concatenate([position, vector], 1)
+        frames = [(vectors @ weights[0].T + biases[0])[:, 12:]]
+        for i in range(1, joints):
+            a, b, c = jnp.split(frames[-1] @ weights[i].T + biases[i], 3, 1)
+            frames.append(cosines[:, i - 1 : i] * a + sines[:, i - 1 : i] * b + c)
+        px, py, _, vx, vy, _ = jnp.moveaxis(jnp.stack(frames, 1), 2, 0)
+        return (px * vy - py * vx) @ per_state
 
     def inputs(flat):
         goal, observation = flat[:, 3:6], flat[:, 6:]  # the hand's position is also in observation
         angles = observation[:, :joints] * half_range + middle
-        to_goal = 5.0 * (goal - observation[:, features.ee])
-        return jnp.concatenate([observation, goal, jnp.sin(angles), jnp.cos(angles), to_goal], 1)
+        position, parts = observation[:, features.ee], [observation, goal]
+        parts += [jnp.sin(angles), jnp.cos(angles), 5.0 * (goal - position)]
+        pull = towards(observation[:, :joints], position, parts[-1])
+        parts += [pull, pull / (jnp.linalg.norm(pull, axis=1, keepdims=True) + 1e-6)]
+        return jnp.concatenate(parts, 1)
 
     class Actor(SquashedGaussianActor):
         def __call__(self, flat):

@@ -17,6 +17,7 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
+from roboarm_nmp.envs.networks.kinematics import JacobianTranspose
 from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
 
@@ -65,6 +66,8 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: flags.Layers = 2
     """number of hidden layers of policy and critics"""
+    jacobian: bool = True
+    """network inputs: how the joints move the end effector straight to the goal (Jacobian)"""
     plain_networks: bool = False
     """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not twice `max_step`)"""
     bf16: bool | None = None
@@ -121,6 +124,9 @@ class Features(nn.Module):
         self.plain, self.goal_type = args.plain_networks, args.goal_type
         robot, spaces = env.unwrapped.robot, env.observation_space
         self.num_joints = robot.num_joints
+        self.jacobian = None
+        if args.jacobian and not self.plain and self.goal_type != "config":
+            self.jacobian = JacobianTranspose(robot, rotates=self.goal_type == "pose")
         low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
@@ -145,6 +151,10 @@ class Features(nn.Module):
                 inputs.append(5.0 * pose_difference(observation[:, self.ee], desired_goal))
             if self.goal_type in ("ee", "combined"):
                 inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
+            if self.jacobian is not None:
+                position = observation[:, self.ee][:, :3]
+                towards = self.jacobian(observation[:, :joints], position, inputs[-1])
+                inputs += [towards, towards / (towards.norm(dim=1, keepdim=True) + 1e-6)]
             if self.goal_type in ("config", "combined"):
                 inputs.append(5.0 * (desired_goal[:, :joints] - observation[:, :joints]))
         if self.distances is not None:
@@ -326,9 +336,10 @@ class TD3:
     def update(self, data, of_policy):
         """An update on a batch, `of_policy` or not. Returns tensors whose means are logged."""
         args, scale = self.args, self.actor.action_scale
-        features = self.actor.features(data["observation"], data["desired_goal"])
+        both = torch.cat([data["observation"], data["next_observation"]])
+        features = self.actor.features(both, data["desired_goal"].repeat(2, 1))
+        features, next_features = features.chunk(2)
         with torch.no_grad():
-            next_features = self.actor.features(data["next_observation"], data["desired_goal"])
             next_actions, _ = self.actor_target.get_action(next_features)
             clipped_noise = POLICY_NOISE * torch.randn_like(next_actions)
             clipped_noise = clipped_noise.clamp(-NOISE_CLIP, NOISE_CLIP)

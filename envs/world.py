@@ -4,7 +4,6 @@
 `envs.perception.sensors.SensorWorld`.
 """
 
-import contextlib
 import math
 import os
 import subprocess
@@ -497,9 +496,11 @@ class World:
     def __del__(self):
         # A world that was never closed must not keep one of PyBullet's connections.
         if getattr(self, "client", None) is not None:
-            with contextlib.suppress(TypeError):  # at the end of the process PyBullet is gone
+            try:
                 if p.isConnected(self.client):
                     p.disconnect(physicsClientId=self.client)
+            except (AttributeError, TypeError):  # at the end of the process PyBullet is gone
+                pass
 
 
 def _velocities(before, after):

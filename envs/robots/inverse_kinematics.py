@@ -74,7 +74,7 @@ def inverse_kinematics(
     targets = np.hstack([poses[:, :3], np.reshape(rotations, (-1, 9))])
     solved = np.empty(states.shape[:2], dtype=np.bool_)
     limits = _STOP * MAX_DISTANCE, _STOP * MAX_ANGLE
-    solve_batch(states, _chain(robot), targets, *limits, ITERATIONS, solved)
+    solve_batch(states, kinematic_chain(robot), targets, *limits, ITERATIONS, solved)
     found = []
     for good, own, start in zip(solved, states, origin, strict=True):
         own = own[good]
@@ -94,7 +94,7 @@ def _distinct(states):
     return np.reshape(kept, (-1, states.shape[1]))
 
 
-def _chain(robot):
+def kinematic_chain(robot):
     """The frames between base and end effector, as `kernels` has them."""
     frames, index = [], robot.end_effector_frame
     while index >= 0:

@@ -43,8 +43,9 @@ def result(name, seed, success, **more):
 
 def args_of(name):
     """What a run of the cell's own recipe has in its JSON."""
-    given = CELLS[name].flags()
-    return {f[2:].replace("-", "_"): v for f, v in zip(given[::2], given[1::2], strict=True)}
+    given = [flag for flag in CELLS[name].flags() if flag != "--no-jacobian"]
+    args = {f[2:].replace("-", "_"): v for f, v in zip(given[::2], given[1::2], strict=True)}
+    return args | {"jacobian": False}
 
 
 def baseline(success):

@@ -14,6 +14,7 @@ from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.envs.datasets.demonstrations import Demos, load_demos
 from roboarm_nmp.envs.datasets.episodes import demo_transitions
 from roboarm_nmp.envs.datasets.format import QueryScenes
+from roboarm_nmp.envs.networks.kinematics import JacobianTranspose
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import protocol
 from roboarm_nmp.envs.training.protocol import stack
@@ -36,7 +37,7 @@ def test_polyak_update_by_hand():
 def test_log_probability_is_that_of_a_squashed_gaussian():
     torch.manual_seed(0)
     actor = sac.Actor(sac.Args(bf16=False), panda_env()).eval()
-    observation, goal = torch.randn(64, 10), torch.randn(64, 3)
+    observation, goal = 0.3 * torch.randn(64, 10), 0.3 * torch.randn(64, 3)  # not saturated
     action, log_prob = actor.get_action(actor.features(observation, goal))
     mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
     std = (-5 + 3.5 * (torch.tanh(log_std) + 1)).exp()
@@ -60,14 +61,21 @@ def test_network_inputs(goal_type):
         goal_type, np.hstack([goal_state, goal_position])
     )
     expected = [state, position, goal, np.sin(c), np.cos(c)]
-    expected += [5 * (goal_position - position)] * (goal_type != "config")
-    expected += [5 * (goal_state - state)] * (goal_type != "ee")
+    to_goal = [5 * (goal_position - position)] * (goal_type != "config")
+    to_goal_state = [5 * (goal_state - state)] * (goal_type != "ee")
     observation = np.hstack([state, position])
-    features = sac.Features(sac.Args(goal_type=goal_type), panda_env(goal_type))
     tensors = torch.tensor(observation).float(), torch.tensor(goal).float()
-    inputs = features(*tensors).numpy()
-    assert inputs.shape == (5, features.size)
-    np.testing.assert_allclose(inputs, np.hstack(expected), atol=1e-5)
+    for jacobian in (True, False):
+        args = sac.Args(goal_type=goal_type, jacobian=jacobian)
+        features = sac.Features(args, panda_env(goal_type))
+        inputs, added = features(*tensors).numpy(), []
+        if jacobian and to_goal:
+            given = tensors[0][:, :7], tensors[0][:, 7:], torch.tensor(to_goal[0]).float()
+            added = [JacobianTranspose(PANDA)(*given).numpy()]
+            added.append(added[0] / np.linalg.norm(added[0], axis=1, keepdims=True))
+        assert inputs.shape == (5, features.size)
+        numbers = np.hstack([*expected, *to_goal, *added, *to_goal_state])
+        np.testing.assert_allclose(inputs, numbers, atol=1e-5)
     plain = sac.Features(sac.Args(goal_type=goal_type, plain_networks=True), panda_env(goal_type))
     np.testing.assert_array_equal(plain(*tensors), torch.cat(tensors, dim=1))
 
@@ -75,11 +83,15 @@ def test_network_inputs(goal_type):
 def test_network_inputs_of_goal_poses():
     env = panda_env("pose")
     features = sac.Features(sac.Args(goal_type="pose"), env)
+    without = sac.Features(sac.Args(goal_type="pose", jacobian=False), env)
     configurations = np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (2, 7))
     here, there = PANDA.end_effector_pose(configurations)
     observation = np.hstack([PANDA.normalise(configurations[0]), here])
     given = torch.tensor(observation).float()[None], torch.tensor(there).float()[None]
     inputs = features(*given)[0].numpy()
+    assert features.size == without.size + 14
+    np.testing.assert_allclose(inputs[:-14], without(*given)[0], atol=1e-6)
+    inputs = inputs[:-14]
     turn = Rotation.from_quat(there[3:]) * Rotation.from_quat(here[3:]).inv()
     axis = turn.as_rotvec() / turn.magnitude()
     expected = [there[:3] - here[:3], axis * np.sin(turn.magnitude() / 2)]

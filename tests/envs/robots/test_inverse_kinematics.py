@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from paths import ROOT
 from scipy.spatial.transform import Rotation
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.networks.kinematics import JacobianTranspose
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.inverse_kinematics import MAX_ANGLE, MAX_DISTANCE, inverse_kinematics
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -83,6 +85,28 @@ def test_poses_of_the_end_effector_are_pybullets(robot):
         np.testing.assert_allclose(pose[:3], position, atol=1e-6)
         assert (Rotation.from_quat(pose[3:]) * rotation.inv()).magnitude() < 1e-6
         assert pose[3:][np.abs(pose[3:]).argmax()] > 0
+
+
+def test_jacobian_transpose_is_the_change_of_the_pose(robot):
+    rng, step = np.random.default_rng(2), 1e-5
+    states = rng.uniform(-1.0, 1.0, (30, robot.num_joints))
+    vectors = rng.standard_normal((30, 6))
+    expected, angular = np.empty_like(states), np.empty_like(states)
+    for i, unit in enumerate(np.eye(robot.num_joints)):
+        after, before = (
+            robot.end_effector_pose(robot.denormalise(states + sign * step / 2 * unit))
+            for sign in (1.0, -1.0)
+        )
+        turns = Rotation.from_quat(after[:, 3:]) * Rotation.from_quat(before[:, 3:]).inv()
+        change = np.hstack([after[:, :3] - before[:, :3], turns.as_rotvec()])
+        expected[:, i] = (change * vectors).sum(1) / step
+        angular[:, i] = (turns.as_rotvec() * vectors[:, 3:]).sum(1) / step
+    positions = robot.forward_kinematics(robot.denormalise(states))
+    given = [torch.tensor(array, dtype=torch.float32) for array in (states, positions, vectors)]
+    whole = JacobianTranspose(robot, rotates=True)(*given).numpy()
+    np.testing.assert_allclose(whole, expected, atol=2e-5)
+    linear = JacobianTranspose(robot)(given[0], given[1], given[2][:, :3]).numpy()
+    np.testing.assert_allclose(linear, expected - angular, atol=2e-5)
 
 
 def test_end_effector_of_the_panda_is_turned_as_its_hand():
