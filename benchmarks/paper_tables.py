@@ -60,7 +60,7 @@ SCRIPTS = {
 }
 STEPS = {"bc": "--total-updates", "sac": "--total-timesteps", "td3": "--total-timesteps"}
 # Settings for long runs (docs/algorithms). As in the paper, hindsight goals are drawn evenly, and
-# networks do not know the arm's Jacobian.
+# the arm's Jacobian is no input of the networks.
 AS_IN_THE_PAPER = ["--her-exponent", "1", "--no-jacobian"]
 RECIPES = {
     "bc": ["--eval-every", "25000"],

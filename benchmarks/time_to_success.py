@@ -12,7 +12,7 @@ run has a process of its own, and one thread.
 
 - `ours`: `sac_her_mp.py` with default flags (on `double_walls` with `--demo-prob 1`).
 - `earlier`: the same without what makes it fast: hindsight goals are drawn evenly from the rest of
-  an episode, and the networks do not know the arm's Jacobian (`EARLIER`).
+  an episode, and the arm's Jacobian is no input of the networks (`EARLIER`).
 - `sb3`: Stable-Baselines3's SAC with its `HerReplayBuffer` and its defaults, but 2,000 random
   steps first, because it needs a whole episode.
 - `sb3-ours`, `sbx-ours`: Stable-Baselines3 and SBX with our rates, discount, number of

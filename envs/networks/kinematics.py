@@ -1,5 +1,6 @@
 """An arm's kinematics as inputs of networks."""
 
+import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
@@ -7,15 +8,19 @@ import torch.nn.functional as F
 from roboarm_nmp.envs.robots.inverse_kinematics import kinematic_chain
 from roboarm_nmp.envs.robots.kernels import JOINT, MIDDLE, POSITION, PRISMATIC, ROTATION, SCALE
 
+# With a row vector x, cos x ALONG + sin x ACROSS + x FIXED is x in a frame that is turned about z.
+ALONG, FIXED = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 1.0])
+ACROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
 
 class JacobianTranspose(nn.Module):
     """The end effector's Jacobian, transposed, times a vector.
 
     That is the direction in which the joints move the end effector fastest along the vector.
 
-    Position and vector are transformed from the base to the frame of one joint after the other. A
-    turn about the joint, whose axis is z, is a sum of three constant matrices, of which two are
-    multiplied by the cosine and the sine of its angle. So a joint is a layer of three parts.
+    Position and vector are transformed from the base to the frame of one joint after the other,
+    whose axis is z. The turn of a joint is a sum of three constant matrices, two of them times the
+    cosine and the sine of its angle. So from joint to joint there is a layer of three parts.
 
     Args:
         robot: an `envs.robots.robot.Robot`.
@@ -24,35 +29,31 @@ class JacobianTranspose(nn.Module):
 
     def __init__(self, robot, rotates=False):
         super().__init__()
-        chain = torch.tensor(kinematic_chain(robot))
-        moving = chain[chain[:, JOINT] >= 0]
         self.size = 9 if rotates else 6  # position, vector, angular part
-        # With a row vector x, cosine x a + sine x b + x c is x in a frame that is turned about z.
-        a, c = torch.diag(torch.tensor([1.0, 1.0, 0.0])), torch.diag(torch.tensor([0.0, 0.0, 1.0]))
-        b = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-        parts, pushed = torch.stack([torch.zeros(3, 3), torch.zeros(3, 3), torch.eye(3)]), False
-        turn, origin, weights, biases = torch.eye(3).double(), torch.zeros(3).double(), [], []
+        vectors, chain = np.eye(self.size // 3), kinematic_chain(robot)
+        moving = chain[chain[:, JOINT] >= 0]
+        parts, slides, weights, biases = (0 * ALONG, 0 * ACROSS, ALONG + FIXED), False, [], []
+        turn, origin = np.eye(3), np.zeros(3)
         for row in chain:
-            # The next frame has x turn - origin.
+            # x in the frame of the joint before is x turn - origin in this one.
             rotation = row[ROTATION:].reshape(3, 3)
             turn, origin = turn @ rotation, (origin + row[POSITION:ROTATION]) @ rotation
             if row[JOINT] < 0:
                 continue
-            parts = [torch.block_diag(*[part @ turn] * (self.size // 3)) for part in parts.double()]
-            bias = torch.zeros(3, self.size).double()
-            bias[0, :3], bias[2, :3] = -turn[2] * pushed, -origin
-            weights.append(torch.cat(parts, 1).T)
+            bias = np.zeros((3, self.size))
+            bias[0, :3] = -turn[2] * slides  # times the value of the joint before
+            bias[2, :3] = -origin
+            weights.append(np.hstack([np.kron(vectors, part @ turn) for part in parts]).T)
             biases.append(bias.ravel())
-            # A prismatic joint, instead of turning, moves the frame along z.
-            pushed = bool(row[PRISMATIC])
-            parts = torch.stack([0 * a, 0 * b, a + c] if pushed else [a, b, c])
-            turn, origin = torch.eye(3).double(), torch.zeros(3).double()
-        per_state = moving[:, SCALE, None] * F.one_hot(moving[:, JOINT].long(), robot.num_joints)
-        self.register_buffer("weights", torch.stack(weights).float())
-        self.register_buffer("biases", torch.stack(biases).float())
-        self.register_buffer("per_state", per_state.float())  # joints' values, mimicked ones too
-        self.register_buffer("middle", moving[:, MIDDLE].float())
-        self.register_buffer("is_prismatic", moving[:, PRISMATIC] > 0)
+            slides = row[PRISMATIC] > 0
+            parts = (0 * ALONG, 0 * ACROSS, ALONG + FIXED) if slides else (ALONG, ACROSS, FIXED)
+            turn, origin = np.eye(3), np.zeros(3)
+        per_state = moving[:, SCALE, None] * (moving[:, JOINT, None] == np.arange(robot.num_joints))
+        numbers = {"weights": weights, "biases": biases, "middle": moving[:, MIDDLE]}
+        numbers["per_state"] = per_state  # of joints' values, those of mimicking joints, too
+        for name, values in numbers.items():
+            self.register_buffer(name, torch.tensor(np.array(values), dtype=torch.float32))
+        self.register_buffer("is_prismatic", torch.tensor(moving[:, PRISMATIC] > 0))
 
     def forward(self, state, position, vector):
         """(N, n), (N, 3), (N, 3 or 6) -> (N, n): per unit of the normalised configuration.
@@ -66,8 +67,8 @@ class JacobianTranspose(nn.Module):
         x = F.linear(x, self.weights[0], self.biases[0])[:, 2 * self.size :]
         frames = [x]
         for i in range(1, len(self.weights)):
-            a, b, c = F.linear(x, self.weights[i], self.biases[i]).split(self.size, 1)
-            x = first[i - 1] * a + (second[i - 1] * b + c)
+            along, across, fixed = F.linear(x, self.weights[i], self.biases[i]).split(self.size, 1)
+            x = first[i - 1] * along + (second[i - 1] * across + fixed)
             frames.append(x)
         frames = torch.stack(frames, 1)
         px, py, _, vx, vy, vz = frames[:, :, :6].unbind(2)
