@@ -67,7 +67,8 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     num_hidden_layers: flags.Layers = 2
     """number of hidden layers of policy and critics"""
     jacobian: bool = True
-    """network inputs: how the joints move the end effector straight to the goal (Jacobian)"""
+    """network inputs: how the joints move the end effector straight to the goal (Jacobian); without
+    effect where the goal is a configuration, and on plain networks"""
     plain_networks: bool = False
     """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not twice `max_step`)"""
     bf16: bool | None = None

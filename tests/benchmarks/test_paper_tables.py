@@ -157,6 +157,15 @@ def test_runs_with_other_flags_do_not_count_beside_the_cells_own(results):
     assert ["0.900" in runs[1], runs[1].endswith("| recipe |")] == [True, True]
 
 
+def test_runs_with_inputs_that_the_recipe_switches_off_are_not_its_own():
+    name = "td3-ee-wall-p1"
+    args = args_of(name)
+    assert CELLS[name].is_recipe_of(args)
+    assert not CELLS[name].is_recipe_of(args | {"jacobian": True})
+    del args["jacobian"]  # a run from before there was the flag
+    assert CELLS[name].is_recipe_of(args)
+
+
 def test_own_algorithm_stands_in_the_tables(results, tmp_path):
     header, *rows = paper_tables.CELLS.read_text().splitlines()
     (tmp_path / "cells.csv").write_text("\n".join([header, *rows, "mine,ee,wall,wall,1,yes,,,"]))

@@ -7,6 +7,8 @@ import time
 import pytest
 from paths import ROOT
 
+from roboarm_nmp.envs.training import runs
+
 sys.path.append(str(ROOT / "benchmarks"))
 import time_to_success  # noqa: E402
 
@@ -34,7 +36,9 @@ def test_the_clock_counts_training_only(small, monkeypatch):
     assert clock.curve[-1]["seconds"] < 0.1
 
 
-def test_ours_trains_until_the_limit_and_validates_on_fresh_queries(small, tmp_path):
+def test_ours_trains_until_the_limit_and_validates_on_fresh_queries(small, monkeypatch, tmp_path):
+    closed, close = [], runs.Run.close
+    monkeypatch.setattr(runs.Run, "close", lambda run: closed.append(run) or close(run))
     run = dict(vars(time_to_success.protocol.PolicyRun))
     args = time_to_success.Args(tmp_path, only=("ours",), seeds=(1,), limit=0.001)
     time_to_success.run_one(args, "ours", 1)
@@ -42,6 +46,7 @@ def test_ours_trains_until_the_limit_and_validates_on_fresh_queries(small, tmp_p
     assert result["steps"] == 200 and not result["reached"] and len(result["curve"]) == 1
     assert list(tmp_path.glob("no_obstacles__sac_her_mp__1__*"))  # the trainer itself ran
     assert vars(time_to_success.protocol.PolicyRun) == run  # and is as before
+    assert len(closed) == 1  # an open progress bar would move later ones of this process
 
 
 def test_rows_show_the_median_run_and_what_did_not_reach_it(tmp_path):

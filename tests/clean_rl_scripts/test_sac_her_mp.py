@@ -91,6 +91,10 @@ def test_network_inputs_of_goal_poses():
     inputs = features(*given)[0].numpy()
     assert features.size == without.size + 14
     np.testing.assert_allclose(inputs[:-14], without(*given)[0], atol=1e-6)
+    difference = torch.tensor(inputs[-20:-14])[None]
+    towards = JacobianTranspose(PANDA, rotates=True)(given[0][:, :7], given[0][:, 7:10], difference)
+    np.testing.assert_allclose(inputs[-14:-7], towards[0], atol=1e-5)
+    np.testing.assert_allclose(inputs[-7:], towards[0] / towards.norm(), atol=1e-5)
     inputs = inputs[:-14]
     turn = Rotation.from_quat(there[3:]) * Rotation.from_quat(here[3:]).inv()
     axis = turn.as_rotvec() / turn.magnitude()
