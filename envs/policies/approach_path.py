@@ -7,16 +7,23 @@ centimetres are free. A policy that follows such a path needs no safety filter t
 would stop it. Between its start's path and its goal's path it acts as usual. There the goal that it
 observes is the free end of the goal's path, like a pre-grasp in grasp planning.
 
-The climb is local and does not search. One step moves along the gradient of the softmin of all
+From there, the path to a goal goes straight back along the end effector's axis z, out of a box or a
+compartment, if there is room and the way is not long (`retreat_path`).
+
+Both are local and do not search. One step of the climb moves along the gradient of the softmin of all
 rows of link distances. Between two boards, the nearest of which alternates, steps would only go
 back and forth, so the direction is averaged over steps. The constraints of the safety filter keep
 every row from becoming smaller (`envs.policies.safety_filter`).
 """
 
+import math
+
 import numpy as np
 
 from roboarm_nmp.envs.collision.checker import self_distances
 from roboarm_nmp.envs.collision.kernels import project
+from roboarm_nmp.envs.robots.inverse_kinematics import kinematic_chain
+from roboarm_nmp.envs.robots.kernels import move_back
 
 # The clearances were compared on validation queries, how paths climb on problems of
 # MotionBenchMaker: docs/lab_notebook.md, "Approach paths".
@@ -27,6 +34,13 @@ STEP = 0.003  # L2, normalised; with 0.012, paths jump through obstacles
 SOFTMIN = 0.006  # m: a row weighs exp(-(distance - smallest) / SOFTMIN)
 MOMENTUM = 0.9
 PROJECTION_SWEEPS = 12
+# From there a goal's path goes back by RETREAT, and keeps RETREAT_CLEARANCE, or what there is. It
+# does so where something is nearer than OPEN, if its end has MORE_ROOM, or if the way over its end
+# is at most DETOUR times as long as the straight one.
+RETREAT, RETREAT_CLEARANCE, OPEN, MORE_ROOM = 0.3, 0.02, 0.15, 0.1  # m
+DETOUR = 1.5
+# Steps of an episode. If the arm is not at the free end until then, the path does not go back.
+GIVE_UP = 150
 # L2, normalised. A path is followed STRIDE points at a time. The next ones are due when the arm is
 # nearer than TRACKING; the goal's path begins when the arm is nearer than REACHED to its free end.
 STRIDE, TRACKING, REACHED = 3, 0.006, 0.01
@@ -56,16 +70,58 @@ def approach_path(robot, state, link_distances_at, clearance=GOAL_CLEARANCE):
             break
         direction = MOMENTUM * direction + gradient / length
         length = np.linalg.norm(direction)
-        wanted, least = STEP * direction / length, np.minimum(distances, clearance)
-        move = _project(wanted, rows, least)
-        # Again with the distances at the end of the step, extrapolated back to its start.
-        end = np.clip(path[-1] + move, -1.0, 1.0)
-        there = _rows(robot, end, link_distances_at, clearance)
-        there[:, 0] -= there[:, 1:] @ move
-        move = _project(wanted, np.concatenate([rows, there]), np.concatenate([least, least]))
+        wanted = STEP * direction / length
+        move = _move(robot, path[-1], wanted, rows, link_distances_at, clearance)
         direction = move * length / max(np.linalg.norm(move), 1e-9)
         path.append(np.clip(path[-1] + move, -1.0, 1.0))
     return np.array(path)
+
+
+def retreat_path(robot, state, arm, link_distances_at):
+    """A path straight back along the end effector's axis z, normalised, float64 (k, n).
+
+    Link distances alone show no way out of a box or a compartment, and a hand has come in along
+    this axis. k is 1 in the open, where there is no room for all of the path, and where it leads
+    neither to more room nor nearer to the arm.
+
+    Args:
+        robot: the `Robot`.
+        state: (n,), normalised.
+        arm: the configuration (n,), normalised, that the path should lead to.
+        link_distances_at: a function like `CollisionChecker.link_distances`.
+    """
+    chain, path, positions = kinematic_chain(robot), [np.array(state, np.float64)], []
+    room = link_distances_at(path[0])[:, 0].min()
+    if room >= OPEN:
+        return np.array(path)
+    while len(path) <= MAX_STEPS:
+        back = path[-1].copy()
+        positions.append(move_back(back, chain))
+        if math.dist(positions[0], positions[-1]) >= RETREAT:
+            break
+        wanted = STEP * (back - path[-1]) / max(np.linalg.norm(back - path[-1]), 1e-9)
+        rows = _rows(robot, path[-1], link_distances_at, RETREAT_CLEARANCE)
+        move = _move(robot, path[-1], wanted, rows, link_distances_at, RETREAT_CLEARANCE)
+        if move @ wanted < 0.5 * STEP**2:
+            return np.array(path[:1])
+        path.append(np.clip(path[-1] + move, -1.0, 1.0))
+    else:
+        return np.array(path[:1])
+    has_room = link_distances_at(path[-1])[:, 0].min() >= room + MORE_ROOM
+    straight, left = (np.linalg.norm(path[i] - arm) for i in (0, -1))
+    is_on_the_way = STEP * (len(path) - 1) + left <= DETOUR * straight
+    return np.array(path if has_room or is_on_the_way else path[:1])
+
+
+def _move(robot, state, wanted, rows, link_distances_at, clearance):
+    """The move (n,) nearest to the wanted one after which no row is smaller, or all have room."""
+    least = np.minimum(rows[:, 0], clearance)
+    move = _project(wanted, rows, least)
+    # Again with the distances at the end of the step, extrapolated back to its start.
+    end = np.clip(state + move, -1.0, 1.0)
+    there = _rows(robot, end, link_distances_at, clearance)
+    there[:, 0] -= there[:, 1:] @ move
+    return _project(wanted, np.concatenate([rows, there]), np.concatenate([least, least]))
 
 
 def _rows(robot, state, link_distances_at, clearance):
@@ -100,6 +156,7 @@ class ApproachPaths:
         self._fine_at = env.get_wrapper_attr("fine_link_distances_at")
         self._retreat = self._approach = None  # `_Following`, from the first observation on
         self._free_end = {}  # what is observed of the goal until the arm is at its path's free end
+        self._retreats, self._steps = True, 0
         self._planned_for = None  # scene and goal: both may change during an episode
 
     def __call__(self, observation):
@@ -108,10 +165,13 @@ class ApproachPaths:
             path = approach_path(self._env.robot, state, self._fine_at, START_CLEARANCE)
             self._retreat = _Following(path)
         if "goal_link_distances" in observation:
-            planned_for = self._env.scene, observation["desired_goal"].tobytes()
+            self._steps += 1
+            if self._steps > GIVE_UP and not self._has_begun():
+                self._retreats = False
+            planned_for = self._env.scene, observation["desired_goal"].tobytes(), self._retreats
             if planned_for != self._planned_for:
                 self._planned_for = planned_for
-                self._plan_approach(observation["desired_goal"])
+                self._plan_approach(observation["desired_goal"], state)
         action = self._retreat(state)
         if action is not None:
             return action
@@ -119,9 +179,16 @@ class ApproachPaths:
             return self._approach(state)
         return self._act(observation | self._free_end)
 
-    def _plan_approach(self, goal):
+    def _has_begun(self):
+        return self._approach is not None and self._approach.has_begun
+
+    def _plan_approach(self, goal, arm):
         robot, self._approach, self._free_end = self._env.robot, None, {}
-        path = approach_path(robot, goal[: robot.num_joints], self._fine_at)[::-1]
+        path = approach_path(robot, goal[: robot.num_joints], self._fine_at)
+        if self._retreats:
+            retreat = retreat_path(robot, path[-1], arm, self._fine_at)
+            path = np.concatenate([path, retreat[1:]])
+        path = path[::-1]
         if len(path) == 1:
             return
         self._approach = _Following(path, stays=True)
@@ -136,9 +203,14 @@ class _Following:
     def __init__(self, path, stays=False):
         self._path, self._stays, self._due, self._ended = path, stays, 0, False
 
+    @property
+    def has_begun(self):
+        """Whether the arm follows the path, or did."""
+        return self._due > 0
+
     def may_begin(self, state):
         """Whether the arm is at the beginning of the path, or was."""
-        return self._due > 0 or np.linalg.norm(state - self._path[0]) < REACHED
+        return self.has_begun or np.linalg.norm(state - self._path[0]) < REACHED
 
     def __call__(self, state):
         last = len(self._path) - 1

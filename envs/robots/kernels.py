@@ -210,3 +210,20 @@ def solve_batch(states, chain, targets, max_distance, max_angle, iterations, sol
                 _jacobian(chain, joints, jacobian)
                 damping = DAMPING_SHARE * square + LEAST_DAMPING
                 _step(state, jacobian, error, damping, free, matrix, vector)
+
+
+@compiled
+def move_back(state, chain):
+    """Move a state (n,) so that the end effector goes back along its axis z, and does not turn.
+
+    By 1 mm, or less at joint limits and near singularities. Returns the position before.
+    """
+    rotation, joints = np.empty(9), np.empty((chain.shape[0], 6))
+    error, jacobian = np.zeros(6), np.empty((6, state.shape[0]))
+    position = _place(state, chain, rotation, joints)
+    for i in range(3):
+        error[i] = -0.001 * rotation[3 * i + 2]
+    _jacobian(chain, joints, jacobian)
+    free, matrix, vector = np.empty(state.shape[0], dtype=np.bool_), np.empty((6, 6)), np.empty(6)
+    _step(state, jacobian, error, 1e-4, free, matrix, vector)
+    return position
