@@ -265,8 +265,9 @@ def version_of_filter(result):
     made_with = result.get("safety_filter")
     if made_with is None:
         return VERSION
-    # The first two differ in the escape from local minima only.
-    return max(made_with.get("version", 1), 1 if made_with["escape"] else 2)
+    # The first two differ in the escape from local minima only, the last two in approach paths.
+    version = max(made_with.get("version", 1), 1 if made_with["escape"] else 2)
+    return 4 if version == 3 and not made_with.get("approach") else version
 
 
 def is_older(result):

@@ -99,8 +99,8 @@ class Args:
     """the safety filter takes the velocities of obstacles into account, estimated from successive
     observations; otherwise each observation counts as if nothing moved"""
     approach: bool = False
-    """add approach paths to the safety filter: out of starts, and into goals, that are nearer to
-    obstacles than its margin (docs/guide/safety_filter.md)"""
+    """add approach paths to the safety filter: out of starts near obstacles, and into goals near
+    obstacles or in boxes and compartments (docs/guide/safety_filter.md)"""
     observe_every: flags.PositiveInt | None = None
     """steps from one observation of the scene to the next, with the arm where it is; by default
     static scenes are observed once, and scenes with moving obstacles in every step"""

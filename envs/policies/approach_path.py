@@ -10,8 +10,8 @@ observes is the free end of the goal's path, like a pre-grasp in grasp planning.
 From there, the path to a goal goes straight back along the end effector's axis z, out of a box or a
 compartment, if there is room and the way is not long (`retreat_path`).
 
-Both are local and do not search. One step of the climb moves along the gradient of the softmin of all
-rows of link distances. Between two boards, the nearest of which alternates, steps would only go
+Both are local and do not search. One step of the climb moves along the gradient of the softmin of
+all rows of link distances. Between two boards, the nearest of which alternates, steps would only go
 back and forth, so the direction is averaged over steps. The constraints of the safety filter keep
 every row from becoming smaller (`envs.policies.safety_filter`).
 """

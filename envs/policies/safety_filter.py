@@ -51,8 +51,9 @@ from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 
 # Of the filter's behaviour, recorded in results. 1: other escapes, no virtual obstacles. 2: slow
-# arrivals counted as local minima, and the gain was the same near a goal as elsewhere.
-VERSION = 3
+# arrivals counted as local minima, and the gain was the same near a goal as elsewhere. 3: approach
+# paths of goals did not go back.
+VERSION = 4
 
 LOOKAHEAD, MAX_LOOKAHEAD = 0.0, 1.0  # s, by default and at most
 # The numbers below were chosen on validation and fresh queries: docs/lab_notebook.md.
@@ -94,7 +95,7 @@ class SafetyFilter:
         margin: m, minimum distance of every link from the scene and from other links.
         escape: whether to escape from local minima.
         approach: whether to follow approach paths, which need no margin, out of a start and into a
-            goal in a tight place (`envs.policies.approach_path`).
+            goal in a tight place, a box or a compartment (`envs.policies.approach_path`).
         lookahead: s, from 0 to `MAX_LOOKAHEAD`: distances count as they will be after this time if
             obstacles continue to approach as they do now; None: as if no obstacle moved.
 

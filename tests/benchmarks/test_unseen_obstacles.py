@@ -60,7 +60,8 @@ def test_results_of_other_flags_files_or_fewer_queries_are_run_again():
     for change in (
         {"num_queries": 100},
         {"flags": [*unseen.CELLS[name], "--seed", "1"]},
-        {"safety_filter": safety_filter | {"version": VERSION - 1}},
+        {"safety_filter": safety_filter | {"version": 2}},
+        {"safety_filter": safety_filter | {"version": 3, "approach": True}},
         {"safety_filter": {"margin": 0.01, "escape": True}},
     ):
         assert not unseen.is_done(done | change, name, 200)
@@ -76,6 +77,8 @@ def test_results_of_other_flags_files_or_fewer_queries_are_run_again():
     assert {unseen._mark(done | {"safety_filter": one}) for one in (first, second)} == {"‡"}
     assert unseen._mark(done | {"safety_filter": first | {"escape": True}}) == "\\*"
     assert not unseen.is_done(done | {"safety_filter": second}, name, 200)
+    # The third and the fourth differ in approach paths only.
+    assert unseen.is_done(done | {"safety_filter": safety_filter | {"version": 3}}, name, 200)
 
 
 def test_policy_of_a_run_is_kept_by_name_with_its_flags(tmp_path, monkeypatch):

@@ -7,15 +7,21 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.policies.approach_path import (
+    GIVE_UP,
     GOAL_CLEARANCE,
+    RETREAT,
+    RETREAT_CLEARANCE,
     START_CLEARANCE,
     STEP,
     approach_path,
+    retreat_path,
 )
 from roboarm_nmp.envs.policies.registry import make_policy
 from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import matrix
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
 FREE = np.float32([0.9, 0.1, 0.0, -1.8, 0.0, 2.2, 0.8])
@@ -126,3 +132,75 @@ def test_goal_and_scene_may_change_during_an_episode():
     env.close()
     assert np.abs(asked[0] - PANDA.normalise(IN_SHELF)).max() > 0.01
     assert np.array_equal(asked[1], other)
+
+
+def open_box(lid=False):
+    """A box around the hand of `IN_BOX`, 30 cm wide inside, whose walls are 25 cm high."""
+    walls = [Box((0.55 + x, 0.0, 0.125), (0.02, 0.34, 0.25)) for x in (-0.16, 0.16)]
+    walls += [Box((0.55, y, 0.125), (0.3, 0.02, 0.25)) for y in (-0.16, 0.16)]
+    if lid:  # above the arm, where the hand would go back to
+        walls.append(Box((0.55, 0.0, 0.6), (0.4, 0.4, 0.02)))
+    return Scene(tuple(walls), table=None, floor=None)
+
+
+DOWN = [0.55, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]
+IN_BOX = inverse_kinematics(PANDA, DOWN, checker=CollisionChecker(open_box()), near=FREE)[0]
+
+
+def test_retreat_goes_straight_back_out_of_a_box():
+    checker, state = CollisionChecker(open_box()), PANDA.normalise(IN_BOX)
+    path = retreat_path(PANDA, state, PANDA.normalise(FREE), checker.link_distances)
+    assert np.array_equal(path[0], state) and np.abs(path).max() <= 1.0
+    assert np.allclose(np.linalg.norm(np.diff(path, axis=0), axis=1), STEP, rtol=0.3)
+    poses = np.array([PANDA.end_effector_pose(PANDA.denormalise(one)) for one in path])
+    back = poses[:, :3] - poses[0, :3]
+    assert np.abs(back[:, :2]).max() < 0.02 and RETREAT <= back[-1, 2] < RETREAT + 0.01
+    axes = np.array([matrix(pose[3:])[:, 2] for pose in poses])
+    assert axes @ axes[0] == pytest.approx(1.0, abs=0.005)
+    distances = checker.link_distances(path)[..., 0]
+    assert (distances >= np.minimum(distances[0], RETREAT_CLEARANCE) - 0.001).all()
+    assert checker.is_free(path).all()
+
+
+def test_retreat_needs_a_tight_place_and_room_and_is_no_detour():
+    def end(scene, arm):
+        at, state = CollisionChecker(scene).link_distances, PANDA.normalise(IN_BOX)
+        path = retreat_path(PANDA, state, arm, at)
+        return path[-1] if len(path) > 1 else None
+
+    state, arm = PANDA.normalise(IN_BOX), PANDA.normalise(FREE)
+    assert end(open_box(), arm) is not None
+    assert end(Scene(table=None, floor=None), arm) is None
+    assert end(open_box(lid=True), arm) is None
+    # Along a wall there is no more room at the end, so it should be on the way.
+    wall = Scene((Box((0.55, 0.16, 0.5), (0.3, 0.02, 1.0)),), table=None, floor=None)
+    assert end(wall, state + 0.05) is None
+    assert end(wall, end(open_box(), arm)) is not None
+
+
+def observed_goals(steps):
+    """The goals that a policy observes, in steps in which the arm does not move, (steps, 7)."""
+    env = envs.make("no_obstacles", goal_type="config", **WITH_DISTANCES)
+    observation, _ = env.reset_specific(FREE, IN_BOX.astype(np.float32), open_box())
+    asked = []
+
+    def act(observation):
+        asked.append(observation["desired_goal"])
+        return np.zeros(7)
+
+    safety_filter = SafetyFilter(escape=False, approach=True)
+    act_safely = safety_filter.filter_policy(act, env, np.random.default_rng(0))
+    for _ in range(steps):
+        act_safely(observation)
+    env.close()
+    return np.array(asked)
+
+
+def test_goal_in_a_box_is_approached_from_outside_until_that_takes_too_long():
+    goals, goal = observed_goals(GIVE_UP + 2), PANDA.normalise(IN_BOX)
+    heights = [PANDA.forward_kinematics(PANDA.denormalise(one))[2] for one in goals]
+    assert np.allclose(heights[:GIVE_UP], heights[0], atol=1e-6)
+    assert heights[0] > 0.1 + 0.9 * RETREAT
+    at = CollisionChecker(open_box()).link_distances
+    free_end = approach_path(PANDA, goal, at)[-1]
+    assert np.allclose(goals[GIVE_UP:], free_end, atol=1e-5)
