@@ -52,6 +52,7 @@ METHODS = {
         "DAgger, replans when stuck", PRETRAINED, "when stuck", {"replan": True}
     ),
     "replanning": Method("replanning", "replanning", "when blocked", GOAL | POINTS | FILTER),
+    "space-time": Method("space-time, a reference", "space-time", "of the future", GOAL),
 }
 
 

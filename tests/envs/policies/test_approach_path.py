@@ -170,7 +170,7 @@ def test_retreat_needs_a_tight_place_and_room_and_is_no_detour():
 
     state, arm = PANDA.normalise(IN_BOX), PANDA.normalise(FREE)
     assert end(open_box(), arm) is not None
-    assert end(Scene(table=None, floor=None), arm) is None
+    assert end(Scene(table=None, floor=None), end(open_box(), arm)) is None
     assert end(open_box(lid=True), arm) is None
     # Along a wall there is no more room at the end, so it should be on the way.
     wall = Scene((Box((0.55, 0.16, 0.5), (0.3, 0.02, 1.0)),), table=None, floor=None)
