@@ -36,7 +36,7 @@ MOMENTUM = 0.9
 PROJECTION_SWEEPS = 12
 # From there a goal's path goes back by RETREAT, and keeps RETREAT_CLEARANCE, or what there is. It
 # does so where something is nearer than OPEN, if its end has MORE_ROOM, or if the way over its end
-# is at most DETOUR times as long as the straight one.
+# is at most DETOUR times as long as the straight one (docs/lab_notebook.md, "Straight back").
 RETREAT, RETREAT_CLEARANCE, OPEN, MORE_ROOM = 0.3, 0.02, 0.15, 0.1  # m
 DETOUR = 1.5
 # Steps of an episode. If the arm is not at the free end until then, the path does not go back.
