@@ -47,6 +47,7 @@ from markdown_tables import write_csv
 from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import sac_her_mp
 from roboarm_nmp.envs.datasets.queries import Query
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import flags, protocol
 
 Learner = Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"]
@@ -163,7 +164,8 @@ def train_peer(name, task, seed, clock):
     number = args.num_envs if ours else 1
     if ours:
         steps = round(1 / args.updates_per_step)
-        options |= {"learning_rate": args.q_lr, "gamma": args.gamma, "tau": args.tau}
+        gamma = sac_her_mp.discount_factor(args.gamma, PANDA)
+        options |= {"learning_rate": args.q_lr, "gamma": gamma, "tau": args.tau}
         options |= {"train_freq": steps, "gradient_steps": args.num_envs}
     if kind == "sbx":
         from sbx import SAC

@@ -46,8 +46,9 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     enters the replay buffer with this probability (the paper's p). Without it: random queries"""
     demos: Path | None = None
     """demonstration file to use with --demo-prob; by default the task's own"""
-    gamma: flags.Share = 0.95
-    """discount factor (CleanRL: 0.99)"""
+    gamma: flags.Share | Literal["auto"] = "auto"
+    """discount factor (CleanRL: 0.99); `auto`: 0.95, and 0.98 for arms with a joint that turns all
+    the way round, as an arm at its limit may have to"""
     tau: flags.PositiveShare = 0.005
     """share of the critics that moves into the target critics per update"""
     policy_lr: flags.PositiveFloat = 1e-3
@@ -310,6 +311,16 @@ def updates_due(step, args):
     return int(end * args.updates_per_step) - int(begin * args.updates_per_step)
 
 
+WHOLE_TURN = 6.28  # rad
+
+
+def discount_factor(gamma, robot):
+    """`--gamma` as a number, for an `envs.robots.robot.Robot`."""
+    if gamma != "auto":
+        return gamma
+    return 0.98 if (robot.upper - robot.lower).max() >= WHOLE_TURN else 0.95
+
+
 # END SHARED
 
 
@@ -317,6 +328,7 @@ def updates_due(step, args):
 class SAC:
     def __init__(self, args, env, device):
         self.args, self.target_entropy = args, args.target_entropy
+        self.gamma = discount_factor(args.gamma, env.unwrapped.robot)
         if args.target_entropy == "auto":
             self.target_entropy = -float(env.action_space.shape[0])
         self.actor = Actor(args, env).to(device)
@@ -333,7 +345,7 @@ class SAC:
 
     def checkpoint_state(self):
         """The parts of a checkpoint, by name."""
-        flags = "args", "target_entropy"
+        flags = "args", "target_entropy", "gamma"
         return {name: part for name, part in vars(self).items() if name not in flags}
 
     @torch.no_grad()
@@ -355,7 +367,7 @@ class SAC:
             next_actions, next_log_pi = self.actor.get_action(next_features)
             min_qf_next_target = self.critics_target(next_features, next_actions).amin(0)
             next_value = min_qf_next_target - alpha * next_log_pi
-            next_q_value = data["reward"] + args.gamma * (1.0 - data["terminated"]) * next_value
+            next_q_value = data["reward"] + self.gamma * (1.0 - data["terminated"]) * next_value
         qf_values = self.critics(features, data["action"])
         qf_losses = (qf_values - next_q_value).square().mean(1)  # of Q1 and of Q2
         self.q_optimizer.zero_grad()

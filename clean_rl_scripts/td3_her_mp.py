@@ -11,6 +11,7 @@ paper's sections 2 and 5. For an algorithm of your own, copy this file and chang
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -44,8 +45,9 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     enters the replay buffer with this probability (the paper's p). Without it: random queries"""
     demos: Path | None = None
     """demonstration file to use with --demo-prob; by default the task's own"""
-    gamma: flags.Share = 0.95
-    """discount factor (CleanRL: 0.99)"""
+    gamma: flags.Share | Literal["auto"] = "auto"
+    """discount factor (CleanRL: 0.99); `auto`: 0.95, and 0.98 for arms with a joint that turns all
+    the way round, as an arm at its limit may have to"""
     tau: flags.PositiveShare = 0.005
     """share of policy and critics that moves into the target networks, per update of the policy"""
     policy_lr: flags.PositiveFloat = 1e-3
@@ -300,6 +302,16 @@ def updates_due(step, args):
     return int(end * args.updates_per_step) - int(begin * args.updates_per_step)
 
 
+WHOLE_TURN = 6.28  # rad
+
+
+def discount_factor(gamma, robot):
+    """`--gamma` as a number, for an `envs.robots.robot.Robot`."""
+    if gamma != "auto":
+        return gamma
+    return 0.98 if (robot.upper - robot.lower).max() >= WHOLE_TURN else 0.95
+
+
 # END SHARED
 
 
@@ -309,7 +321,7 @@ POLICY_NOISE, NOISE_CLIP = 0.2, 0.5  # of the critics' target, in units of the a
 
 class TD3:
     def __init__(self, args, env, device):
-        self.args = args
+        self.args, self.gamma = args, discount_factor(args.gamma, env.unwrapped.robot)
         self.actor, self.actor_target = (Actor(args, env).to(device) for _ in range(2))
         self.actor_target.load_state_dict(self.actor.state_dict())
         self.actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
@@ -323,7 +335,8 @@ class TD3:
 
     def checkpoint_state(self):
         """The parts of a checkpoint, by name."""
-        return {name: part for name, part in vars(self).items() if name != "args"}
+        flags = "args", "gamma"
+        return {name: part for name, part in vars(self).items() if name not in flags}
 
     @torch.no_grad()
     def explore(self, data):
@@ -347,7 +360,7 @@ class TD3:
             next_actions = (next_actions + scale * clipped_noise).clamp(-scale, scale)
             min_qf_next_target = self.critics_target(next_features, next_actions).amin(0)
             not_terminated = 1.0 - data["terminated"]
-            next_q_value = data["reward"] + args.gamma * not_terminated * min_qf_next_target
+            next_q_value = data["reward"] + self.gamma * not_terminated * min_qf_next_target
         qf_values = self.critics(features, data["action"])
         qf_losses = (qf_values - next_q_value).square().mean(1)  # of Q1 and of Q2
         self.q_optimizer.zero_grad()

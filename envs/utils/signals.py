@@ -1,10 +1,14 @@
 """Ctrl-C and SIGTERM (`kill`, `timeout`, cluster schedulers) end a command with one line.
 
+So does, without a line, a reader that closes a command's output (`roboarm train sac --help | head`).
+
 A command calls `end_with_one_line` first, and again as soon as another advice holds:
 
     end_with_one_line("the same command continues")
 """
 
+import os
+import select
 import signal
 import sys
 
@@ -28,10 +32,22 @@ def end_with_one_line(advice):
     def hook(kind, error, trace):
         if isinstance(error, KeyboardInterrupt):
             exit_interrupted(error, advice)
+        if isinstance(error, BrokenPipeError) and _output_is_closed():
+            sys.exit(128 + signal.SIGPIPE)
         sys.__excepthook__(kind, error, trace)
 
     signal.signal(signal.SIGTERM, terminate)
     sys.excepthook = hook
+
+
+def _output_is_closed():
+    """Whether nobody reads stdout any more. If so, the rest goes nowhere: Python writes it at exit."""
+    poll = select.poll()
+    poll.register(sys.stdout, 0)
+    if not any(event & select.POLLERR for _, event in poll.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return True
 
 
 def exit_interrupted(interrupt, advice):

@@ -45,6 +45,20 @@ def file(tmp_path_factory):
     return file
 
 
+@pytest.mark.parametrize(("script", "kind"), [("sac_her_mp", "SAC"), ("td3_her_mp", "TD3")])
+def test_discount_factor_is_higher_where_a_joint_turns_all_the_way_round(script, kind):
+    module = load(script)
+    for arm, discounts in (("xarm6", (0.98, 0.9)), ("iiwa", (0.95, 0.9))):
+        env = envs.make(f"no_obstacles@{EXAMPLE.with_stem(arm)}", goal_type="ee")
+        agents = (
+            getattr(module, kind)(module.Args(bf16=False, gamma=gamma), env, torch.device("cpu"))
+            for gamma in ("auto", 0.9)
+        )
+        assert tuple(agent.gamma for agent in agents) == discounts
+        env.close()
+    assert module.discount_factor("auto", panda_env().unwrapped.robot) == 0.95
+
+
 @pytest.mark.parametrize("trainer", SHORT)
 def test_trainer_trains_another_arm(trainer, file, tmp_path, monkeypatch, short_episodes):
     monkeypatch.chdir(file.parent)

@@ -75,3 +75,27 @@ def test_signal_while_workers_are_started_ends_in_one_line(number, code, word, t
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
     (line,) = ended.stderr.splitlines()
     assert ended.returncode == code and line.startswith(word)
+
+
+ENDLESS = """
+from roboarm_nmp.envs.utils.signals import end_with_one_line
+end_with_one_line("start again")
+while True:
+    print("more")
+"""
+
+
+def test_reader_that_closes_the_output_ends_a_command_without_a_word():
+    process = subprocess.Popen(
+        [sys.executable, "-c", ENDLESS], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "more\n"
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    assert process.wait(timeout=30) == 141
+
+
+def test_other_broken_pipe_keeps_its_traceback():
+    code = ENDLESS.replace('print("more")', "raise BrokenPipeError")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 1 and "BrokenPipeError" in ended.stderr
