@@ -304,8 +304,8 @@ def load_checkpoint(args, parts):
             _restore(part, state[name])
     except KeyError as error:
         sys.exit(f"--resume: {path} is of another version: it has no {error.args[0]}")
-    except RuntimeError as error:  # networks of other sizes
-        sys.exit(f"--resume: {path} is of another version: {error}")
+    except RuntimeError:  # PyTorch's, which lists all weights
+        sys.exit(f"--resume: {path} is of another version: the layers of its {name} are others")
     torch.set_rng_state(state["torch_rng"])
     if "cuda_rng" in state:
         torch.cuda.set_rng_state(state["cuda_rng"], args.device)

@@ -170,7 +170,7 @@ def test_checkpoint_restores_every_part(parse, tmp_path):
     ):
         with pytest.raises(SystemExit, match=f"of another version: it has no {name}"):
             runs.load_checkpoint(args, after | newer)
-    with pytest.raises(SystemExit, match=r"of another version: (.|\n)*size mismatch for weight"):
+    with pytest.raises(SystemExit, match="of another version: the layers of its model are others$"):
         runs.load_checkpoint(args, after | {"model": torch.nn.Linear(4, 2)})
 
 
