@@ -1,6 +1,6 @@
 """Ctrl-C and SIGTERM (`kill`, `timeout`, cluster schedulers) end a command with one line.
 
-So does, without a line, a reader that closes a command's output (`roboarm train sac --help | head`).
+So does, without a line, a reader that closes its output (`roboarm train sac --help | head`).
 
 A command calls `end_with_one_line` first, and again as soon as another advice holds:
 
@@ -41,7 +41,7 @@ def end_with_one_line(advice):
 
 
 def _output_is_closed():
-    """Whether nobody reads stdout any more. If so, the rest goes nowhere: Python writes it at exit."""
+    """Whether nobody reads stdout any more. What Python writes there at exit then goes nowhere."""
     poll = select.poll()
     poll.register(sys.stdout, 0)
     if not any(event & select.POLLERR for _, event in poll.poll(0)):
