@@ -4,12 +4,17 @@
 
 Each cell is `roboarm evaluate` on the first `--num` test queries of a task; its result is a JSON
 file in `--folder`, and cells that have one are not run again. The table of
-docs/benchmark/moving_obstacles.md shows all of them.
+docs/benchmark/moving_obstacles.md shows all of them. Other seeds of the policy have a table of
+their own, with seed 1 where the folder has its cell:
+
+    python benchmarks/moving_obstacles.py --folder moving_results_1000 --num 1000 \
+        --only appearing_boxes --methods policy-replan --seeds 2 runs/RUN 3 runs/RUN
 """
 
+import itertools
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +28,10 @@ from roboarm_nmp.envs.tasks import TASKS
 from roboarm_nmp.envs.training.evaluation import evaluate
 from roboarm_nmp.envs.utils.files import write_atomically
 
-NAME = "moving_obstacles.csv"
+NAME, SEEDS = "moving_obstacles.csv", "moving_obstacles_seeds.csv"
 HEAD = ("task", "method", "obstacles from", "search", "filter", "queries")
 HEAD += ("success", "95 % interval", "collision-free success", "its 95 % interval")
+SEEDS_HEAD = ("task", "method", "seed", *HEAD[5:])
 POINTS = {"geometry_source": "point_cloud"}
 FILTER = {"safety_filter": SafetyFilter(0.01)}
 GOAL = {"env": {"goal_type": "combined"}}
@@ -68,34 +74,54 @@ class Args:
     """Only these methods."""
     workers: int = 1
     """Processes."""
+    seeds: dict[int, str] = field(default_factory=dict)
+    """Other seeds of the policy: pairs of a seed and a policy."""
+
+
+def rates_of(result):
+    """Cells of a row: queries, success and collision-free success with their intervals."""
+    cells = [result["num_queries"]]
+    for name in ("success_rate", "collision_free_success_rate"):
+        cells += [share(result[name]), interval(result[f"{name}_interval"])]
+    return cells
 
 
 def row_of(task, method, result):
     """A row of the table."""
     source = (result["geometry_source"] or "nowhere").replace("_", " ")
     cells = [f"`{task}`", method.label, source, method.search]
-    cells += ["yes" if result["safety_filter"] else "no", result["num_queries"]]
-    for name in ("success_rate", "collision_free_success_rate"):
-        cells += [share(result[name]), interval(result[f"{name}_interval"])]
-    return cells
+    return [*cells, "yes" if result["safety_filter"] else "no", *rates_of(result)]
+
+
+def cell(folder, task, name, seed):
+    """The file of a result."""
+    return folder / f"{task}--{name}{f'--seed-{seed}' if seed > 1 else ''}.json"
 
 
 def main(args):
     args.folder.mkdir(parents=True, exist_ok=True)
-    for task in args.only or TASKS_HERE:
-        for name in args.methods:
-            file, method = args.folder / f"{task}--{name}.json", METHODS[name]
-            if not file.exists():
-                options = {"num_queries": args.num, "workers": args.workers, **method.options}
-                result = evaluate(method.policy, task, progress=True, **options)
-                write_atomically(file, json.dumps(result, indent=1).encode())
-    rows = []
-    for task in TASKS_HERE:
-        for name, method in METHODS.items():
-            file = args.folder / f"{task}--{name}.json"
+    for seed, policy in (args.seeds or {1: PRETRAINED}).items():
+        for task in args.only or TASKS_HERE:
+            for name in args.methods:
+                file, method = cell(args.folder, task, name, seed), METHODS[name]
+                if not file.exists():
+                    options = {"num_queries": args.num, "workers": args.workers, **method.options}
+                    acting = policy if method.policy == PRETRAINED else method.policy
+                    result = evaluate(acting, task, progress=True, **options)
+                    write_atomically(file, json.dumps(result, indent=1).encode())
+    rows, rows_of_seeds = [], []
+    for task, (name, method) in itertools.product(TASKS_HERE, METHODS.items()):
+        for seed in sorted({1, *args.seeds}):
+            file = cell(args.folder, task, name, seed)
             if file.exists():
-                rows.append(row_of(task, method, json.loads(file.read_text())))
-    write_csv(NAME, HEAD, rows)
+                result = json.loads(file.read_text())
+                rows_of_seeds.append([f"`{task}`", method.label, seed, *rates_of(result)])
+                if seed == 1:
+                    rows.append(row_of(task, method, result))
+    if args.seeds:
+        write_csv(SEEDS, SEEDS_HEAD, rows_of_seeds)
+    else:
+        write_csv(NAME, HEAD, rows)
 
 
 if __name__ == "__main__":

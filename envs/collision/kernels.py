@@ -1884,3 +1884,21 @@ def edge_pixels(depth, classes, nothing, edge):
             if most - least > edge:
                 front[row, column], back[row, column] = least, most
     return front, back
+
+
+@compiled
+def pixels_with_neighbours(depth, hit, distance, least):
+    """Which pixels that hit have at least so many of their eight neighbours near: bool, as `hit`.
+
+    A neighbour is near if it hits, too, and its depth (m) is at most `distance` away.
+    """
+    height, width = depth.shape
+    kept = np.zeros((height, width), np.bool_)
+    for row in range(height):
+        for column in range(width):
+            near = -1  # the pixel itself
+            for r in range(max(row - 1, 0), min(row + 2, height)):
+                for c in range(max(column - 1, 0), min(column + 2, width)):
+                    near += hit[r, c] and abs(depth[r, c] - depth[row, column]) <= distance
+            kept[row, column] = hit[row, column] and near >= least
+    return kept

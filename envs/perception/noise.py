@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.kernels import AXES, EYE, edge_pixels
+from roboarm_nmp.envs.collision.kernels import AXES, EYE, edge_pixels, pixels_with_neighbours
 from roboarm_nmp.envs.perception.ray_casting import NOTHING
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.utils.names import suggest
@@ -22,6 +22,8 @@ from roboarm_nmp.envs.utils.random_streams import Stream
 
 EDGE = 0.05
 """m. Neighbouring pixels whose depths differ by more are at an edge, where pixels may fly."""
+EDGE_NEIGHBOURS = 3
+"""Neighbours that a pixel needs for `edge_filter`: as many as a face's pixel in a corner has."""
 _WHOLE = ("missing_cameras", "latency", "seed")
 # The largest values of attributes; of all others 1000.
 _MOST = {"dropout": 1, "flying_pixels": 1, "seed": 2**32 - 1}
@@ -29,7 +31,7 @@ _MOST = {"dropout": 1, "flying_pixels": 1, "seed": 2**32 - 1}
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What depth cameras get wrong. All of it is off by default.
+    """What depth cameras get wrong, and how their drivers filter it. All of it is off by default.
 
     Attributes:
         gaussian: m, standard deviation of each depth.
@@ -44,6 +46,8 @@ class SensorNoise:
             once an episode.
         latency: steps from an observation to the step in which it is received. The first one of an
             episode is received at once.
+        edge_filter: m: a pixel with less than `EDGE_NEIGHBOURS` of its eight neighbours within this
+            depth of its own gets no depth, which removes most flying pixels, after all noise.
         seed: of all random numbers.
 
     Raises:
@@ -59,6 +63,7 @@ class SensorNoise:
     calibration_mm: float = 0.0
     calibration_degrees: float = 0.0
     latency: int = 0
+    edge_filter: float = 0.0
     seed: int = 0
 
     def __post_init__(self):
@@ -176,6 +181,8 @@ class NoiseOfSensor:
         if noise.dropout:
             hit &= rng.random(depth.shape, np.float32) >= noise.dropout
         hit &= (depth > 0) & (depth < far)
+        if noise.edge_filter:
+            hit = pixels_with_neighbours(depth, hit, np.float32(noise.edge_filter), EDGE_NEIGHBOURS)
         return np.where(hit, depth, np.float32(far)), np.where(hit, classes, np.uint8(NOTHING))
 
 

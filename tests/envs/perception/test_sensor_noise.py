@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
+from roboarm_nmp.envs.collision.kernels import pixels_with_neighbours
 from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.perception.sensors import (
@@ -72,6 +73,21 @@ def test_flying_pixels_are_between_front_and_back():
     assert flying.sum() > 50 and not (flying & ~at_edge).any()
     assert 0.4 < flying.sum() / at_edge.sum() < 0.6
     assert ((depth >= low - 1e-6) & (depth <= high + 1e-6)).all()
+
+
+def test_edge_filter_removes_flying_pixels_and_keeps_faces():
+    truth, whole = image(SensorNoise())
+    depth, classes = image(SensorNoise(flying_pixels=1.0))
+    flying = np.abs(depth - truth) > 0.05
+    filtered, left = image(SensorNoise(flying_pixels=1.0, edge_filter=0.03))
+    assert flying.sum() > 100
+    assert (left[flying] != NOTHING).mean() < 0.1 < (classes[flying] != NOTHING).mean()
+    kept = left != NOTHING
+    np.testing.assert_array_equal(filtered[kept], depth[kept])
+    _, alone = image(SensorNoise(edge_filter=0.03))
+    assert (alone == whole).mean() > 0.99
+    lone = pixels_with_neighbours(np.eye(3, dtype=np.float32), np.eye(3) > 0, np.float32(0.1), 3)
+    assert not lone.any()
 
 
 def test_calibration_error_moves_and_turns_a_cloud_rigidly():
