@@ -94,6 +94,8 @@ class Args:
     """Test queries of each cell."""
     only: Literal["all", "accepted"] = "all"
     """All kinds of noise, or only `ACCEPTED`, for a table of their own."""
+    kinds: tuple[str, ...] = ()
+    """Only these kinds of noise, names of `NOISES`."""
     tasks: tuple[str, ...] = TASKS
     """Only these tasks."""
     methods: tuple[str, ...] = tuple(LABELS)
@@ -157,7 +159,7 @@ def accepted_table(folder):
 
 def main(args):
     args.folder.mkdir(parents=True, exist_ok=True)
-    run(args, ACCEPTED if args.only == "accepted" else NOISES)
+    run(args, args.kinds or (ACCEPTED if args.only == "accepted" else NOISES))
     if args.only == "accepted":
         write_csv("noise_accepted.csv", *accepted_table(args.folder))
     else:
