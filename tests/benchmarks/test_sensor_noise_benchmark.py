@@ -31,11 +31,18 @@ def test_shards_share_all_cells_and_none_is_run_twice(calls, tmp_path):
     for shard in ("0/2", "1/2", "0/2"):
         sensor_noise.main(sensor_noise.Args(tmp_path, num=4, methods=("policy",), shard=shard))
     noises = [noise for _, task, noise, _ in calls if task == "moving_boxes_medium"]
-    assert len(calls) == 2 * len(sensor_noise.NOISES) and len(noises) == len(set(noises)) == 25
+    assert len(calls) == 2 * len(sensor_noise.NOISES) and len(noises) == len(set(noises)) == 28
     with open(tmp_path / "noise_random_boxes_hard.csv", newline="") as file:
         head, *rows = csv.reader(file)
     assert head == ["noise", "DAgger: success", "DAgger: collision-free"]
-    assert [row[1:] for row in rows] == [["0.750", "0.750"]] * 25
+    assert [row[1:] for row in rows] == [["0.750", "0.750"]] * 28
+
+
+def test_only_the_given_kinds_are_run(calls, tmp_path):
+    kinds = ("none", "flying-30-filter")
+    sensor_noise.main(sensor_noise.Args(tmp_path, num=4, methods=("policy",), kinds=kinds))
+    assert len(calls) == 4
+    assert {noise.edge_filter if noise else None for _, _, noise, _ in calls} == {None, 0.03}
 
 
 def test_table_of_accepted_noise_has_a_row_per_task_and_kind(calls, tmp_path):
