@@ -17,7 +17,10 @@ def folder(tmp_path, monkeypatch):
     """A folder for results; the table goes there, too, and `evaluate` is not called for real."""
 
     def evaluate(policy, task, **options):
-        shares = {"success_rate": 0.75, "success_rate_interval": (0.5, 0.9)}
+        shares = {
+            "success_rate": {"runs/A": 0.5, "runs/B": 0.6}.get(policy, 0.75),
+            "success_rate_interval": (0.5, 0.9),
+        }
         shares |= {f"collision_free_{name}": value for name, value in shares.items()}
         source = options.get("geometry_source")
         return shares | {"geometry_source": source, "num_queries": 4, "safety_filter": None}
@@ -43,3 +46,16 @@ def test_cells_that_have_a_result_are_not_run_again(folder):
         ("`chased_goals`", "go-to-goal", "nowhere", "0.750"),
         ("`chased_goals`", "one plan at the start", "point cloud", "0.250"),
     ]
+
+
+def test_other_seeds_have_a_table_of_their_own(folder):
+    args = moving_obstacles.Args(folder, only=("chased_goals",), methods=("policy-replan",))
+    moving_obstacles.main(args)
+    before = (folder / moving_obstacles.NAME).read_bytes()
+    args.seeds = {2: "runs/A", 3: "runs/B"}
+    moving_obstacles.main(args)
+    with open(folder / moving_obstacles.SEEDS, newline="") as table:
+        head, *rows = csv.reader(table)
+    assert head == list(moving_obstacles.SEEDS_HEAD)
+    assert [(row[2], row[4]) for row in rows] == [("1", "0.750"), ("2", "0.500"), ("3", "0.600")]
+    assert (folder / moving_obstacles.NAME).read_bytes() == before
