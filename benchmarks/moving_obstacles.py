@@ -5,7 +5,7 @@
 Each cell is `roboarm evaluate` on the first `--num` test queries of a task; its result is a JSON
 file in `--folder`, and cells that have one are not run again. The table of
 docs/benchmark/moving_obstacles.md shows all of them. Other seeds of the policy have a table of
-their own, with seed 1 where the folder has its cell:
+their own, beside seed 1, the pretrained one:
 
     python benchmarks/moving_obstacles.py --folder moving_results_1000 --num 1000 \
         --only appearing_boxes --methods policy-replan --seeds 2 runs/RUN 3 runs/RUN
@@ -75,7 +75,7 @@ class Args:
     workers: int = 1
     """Processes."""
     seeds: dict[int, str] = field(default_factory=dict)
-    """Other seeds of the policy: pairs of a seed and a policy."""
+    """Other seeds than 1 of the policy: pairs of a seed and a policy."""
 
 
 def rates_of(result):
@@ -95,29 +95,32 @@ def row_of(task, method, result):
 
 def cell(folder, task, name, seed):
     """The file of a result."""
-    return folder / f"{task}--{name}{f'--seed-{seed}' if seed > 1 else ''}.json"
+    return folder / f"{task}--{name}{f'--seed-{seed}' if seed != 1 else ''}.json"
 
 
 def main(args):
+    if 1 in args.seeds:
+        raise SystemExit("--seeds: seed 1 is the pretrained policy")
     args.folder.mkdir(parents=True, exist_ok=True)
-    for seed, policy in (args.seeds or {1: PRETRAINED}).items():
-        for task in args.only or TASKS_HERE:
-            for name in args.methods:
-                file, method = cell(args.folder, task, name, seed), METHODS[name]
-                if not file.exists():
-                    options = {"num_queries": args.num, "workers": args.workers, **method.options}
-                    acting = policy if method.policy == PRETRAINED else method.policy
-                    result = evaluate(acting, task, progress=True, **options)
-                    write_atomically(file, json.dumps(result, indent=1).encode())
+    for seed, policy in ({1: PRETRAINED} | args.seeds).items():
+        for task, name in itertools.product(args.only or TASKS_HERE, args.methods):
+            file, method = cell(args.folder, task, name, seed), METHODS[name]
+            learned = method.policy == PRETRAINED
+            if (learned or seed == 1) and not file.exists():
+                options = {"num_queries": args.num, "workers": args.workers, **method.options}
+                acting = policy if learned else method.policy
+                result = evaluate(acting, task, progress=True, **options)
+                write_atomically(file, json.dumps(result, indent=1).encode())
     rows, rows_of_seeds = [], []
     for task, (name, method) in itertools.product(TASKS_HERE, METHODS.items()):
         for seed in sorted({1, *args.seeds}):
             file = cell(args.folder, task, name, seed)
             if file.exists():
                 result = json.loads(file.read_text())
-                rows_of_seeds.append([f"`{task}`", method.label, seed, *rates_of(result)])
                 if seed == 1:
                     rows.append(row_of(task, method, result))
+                if method.policy == PRETRAINED:
+                    rows_of_seeds.append([f"`{task}`", method.label, seed, *rates_of(result)])
     if args.seeds:
         write_csv(SEEDS, SEEDS_HEAD, rows_of_seeds)
     else:

@@ -32,8 +32,9 @@ LABELS = {
     "plan": "one plan",
     "replanning": "replanning",
 }
-# Three strengths of each kind: words for the table, and settings. (The filter's 3 cm were chosen on
-# validation queries: docs/lab_notebook.md.)
+# Chosen on validation queries: docs/lab_notebook.md.
+FILTER = {"edge_filter": 0.03}
+# Three strengths of each kind: words for the table, and settings.
 NOISES = {
     "none": ("none", {}),
     "gaussian-2": ("depth, 2 mm", {"gaussian": 0.002}),
@@ -51,18 +52,9 @@ NOISES = {
     "flying-10": ("flying pixels, 10 %", {"flying_pixels": 0.1}),
     "flying-30": ("flying pixels, 30 %", {"flying_pixels": 0.3}),
     "flying-100": ("flying pixels, 100 %", {"flying_pixels": 1.0}),
-    "flying-10-filter": (
-        "flying pixels, 10 %, edge filter",
-        {"flying_pixels": 0.1, "edge_filter": 0.03},
-    ),
-    "flying-30-filter": (
-        "flying pixels, 30 %, edge filter",
-        {"flying_pixels": 0.3, "edge_filter": 0.03},
-    ),
-    "flying-100-filter": (
-        "flying pixels, 100 %, edge filter",
-        {"flying_pixels": 1.0, "edge_filter": 0.03},
-    ),
+    "flying-10-filter": ("flying pixels, 10 %, edge filter", {"flying_pixels": 0.1} | FILTER),
+    "flying-30-filter": ("flying pixels, 30 %, edge filter", {"flying_pixels": 0.3} | FILTER),
+    "flying-100-filter": ("flying pixels, 100 %, edge filter", {"flying_pixels": 1.0} | FILTER),
     "missing-1": ("one camera missing", {"missing_cameras": 1}),
     "missing-2": ("two cameras missing", {"missing_cameras": 2}),
     "missing-3": ("three cameras missing", {"missing_cameras": 3}),

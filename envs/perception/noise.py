@@ -46,8 +46,8 @@ class SensorNoise:
             once an episode.
         latency: steps from an observation to the step in which it is received. The first one of an
             episode is received at once.
-        edge_filter: m: a pixel with less than `EDGE_NEIGHBOURS` of its eight neighbours within this
-            depth of its own gets no depth, which removes most flying pixels, after all noise.
+        edge_filter: m: a pixel with fewer than `EDGE_NEIGHBOURS` of its eight neighbours within
+            this depth of its own gets no depth, which removes most flying pixels, after all noise.
         seed: of all random numbers.
 
     Raises:

@@ -52,10 +52,11 @@ def test_other_seeds_have_a_table_of_their_own(folder):
     args = moving_obstacles.Args(folder, only=("chased_goals",), methods=("policy-replan",))
     moving_obstacles.main(args)
     before = (folder / moving_obstacles.NAME).read_bytes()
-    args.seeds = {2: "runs/A", 3: "runs/B"}
+    args.seeds, args.methods = {2: "runs/A", 3: "runs/B"}, ("policy-replan", "go")
     moving_obstacles.main(args)
     with open(folder / moving_obstacles.SEEDS, newline="") as table:
         head, *rows = csv.reader(table)
     assert head == list(moving_obstacles.SEEDS_HEAD)
     assert [(row[2], row[4]) for row in rows] == [("1", "0.750"), ("2", "0.500"), ("3", "0.600")]
     assert (folder / moving_obstacles.NAME).read_bytes() == before
+    assert [file.name for file in folder.glob("*--go*")] == ["chased_goals--go.json"]
