@@ -37,11 +37,11 @@ from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, group_points, world_sha
 from roboarm_nmp.envs.collision.kernels import (
     free_batch,
     link_distances_batch,
-    motion,
     motion_batch,
     rrt_connect,
     shortcut,
     signed_distances_batch,
+    single_motion,
 )
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes import primitives
@@ -221,7 +221,7 @@ class CollisionChecker:
         The function assumes that the start is free, and does not validate its arguments.
         """
         rule, endpoint_margins = self._rule(margin, clearance, endpoint_margins, resolution)
-        return functools.partial(motion, rule, endpoint_margins[0], self._arm, self._world, False)
+        return functools.partial(single_motion, rule, endpoint_margins[0], *self._arm, *self._world)
 
     def find_path(
         self,

@@ -624,6 +624,15 @@ def motion(rule, endpoint_margins, arm, world, end_known, start, end):
 
 
 @compiled
+def single_motion(
+    rule, ends, chain, bodies, pairs, vertices, cells, rows, points, groups, ball, start, end
+):
+    """`motion` for Python, which takes longer to pass nested tuples than their arrays."""
+    arm, world = (chain, bodies, pairs, vertices, cells), (rows, points, groups, ball)
+    return motion(rule, ends, arm, world, False, start, end)
+
+
+@compiled
 def motion_batch(starts, stops, rule, endpoint_margins, arm, world, ends_known, checks):
     """Write `CollisionChecker.motion_checks` of motions (m, n), (m, n) to `checks` (m,)."""
     begins = np.ones(starts.shape[0], np.bool_)
