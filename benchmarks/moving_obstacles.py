@@ -33,6 +33,7 @@ HEAD = ("task", "method", "obstacles from", "search", "filter", "queries")
 HEAD += ("success", "95 % interval", "collision-free success", "its 95 % interval")
 SEEDS_HEAD = ("task", "method", "seed", *HEAD[5:])
 POINTS = {"geometry_source": "point_cloud"}
+TRUTH = {"geometry_source": "ground_truth"}
 FILTER = {"safety_filter": SafetyFilter(0.01)}
 GOAL = {"env": {"goal_type": "combined"}}
 PRETRAINED = "dagger-combined-point_cloud-random_boxes_hard-s1"
@@ -52,12 +53,15 @@ class Method:
 METHODS = {
     "go": Method("go-to-goal", "go-to-goal", "no", GOAL),
     "go-filter": Method("go-to-goal", "go-to-goal", "no", GOAL | POINTS | FILTER),
+    "go-filter-truth": Method("go-to-goal", "go-to-goal", "no", GOAL | TRUTH | FILTER),
     "plan": Method("one plan at the start", "planner", "once", GOAL | POINTS),
+    "plan-truth": Method("one plan at the start", "planner", "once", GOAL | TRUTH),
     "policy": Method("DAgger", PRETRAINED, "no", {}),
     "policy-replan": Method(
         "DAgger, replans when stuck", PRETRAINED, "when stuck", {"replan": True}
     ),
     "replanning": Method("replanning", "replanning", "when blocked", GOAL | POINTS | FILTER),
+    "replanning-truth": Method("replanning", "replanning", "when blocked", GOAL | TRUTH | FILTER),
     "space-time": Method("space-time, a reference", "space-time", "of the future", GOAL),
 }
 

@@ -32,7 +32,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_cells_that_have_a_result_are_not_run_again(folder):
-    args = moving_obstacles.Args(folder, only=("chased_goals",), methods=("plan", "go"))
+    methods = "plan-truth", "plan", "go"
+    args = moving_obstacles.Args(folder, only=("chased_goals",), methods=methods)
     moving_obstacles.main(args)
     file = folder / "chased_goals--plan.json"
     result = json.loads(file.read_text())
@@ -45,6 +46,7 @@ def test_cells_that_have_a_result_are_not_run_again(folder):
     assert shown == [
         ("`chased_goals`", "go-to-goal", "nowhere", "0.750"),
         ("`chased_goals`", "one plan at the start", "point cloud", "0.250"),
+        ("`chased_goals`", "one plan at the start", "ground truth", "0.750"),
     ]
 
 
@@ -60,3 +62,10 @@ def test_other_seeds_have_a_table_of_their_own(folder):
     assert [(row[2], row[4]) for row in rows] == [("1", "0.750"), ("2", "0.500"), ("3", "0.600")]
     assert (folder / moving_obstacles.NAME).read_bytes() == before
     assert [file.name for file in folder.glob("*--go*")] == ["chased_goals--go.json"]
+
+
+def test_seed_of_the_pretrained_policy_is_refused(folder):
+    args = moving_obstacles.Args(folder, methods=("policy-replan",), seeds={1: "runs/A"})
+    with pytest.raises(SystemExit, match="pretrained"):
+        moving_obstacles.main(args)
+    assert not list(folder.iterdir())
