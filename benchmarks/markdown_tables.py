@@ -47,6 +47,14 @@ def csv_table(name):
     return table(head, rows)
 
 
+def csv_rows(name):
+    """Rows of a file of benchmarks/results as dicts; none if there is no such file."""
+    if not (RESULTS / name).exists():
+        return []
+    with open(RESULTS / name, newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def write_csv(name, head, rows):
     """Write a file of benchmarks/results, and its table into the pages that have its marks."""
     text = io.StringIO(newline="")

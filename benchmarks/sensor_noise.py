@@ -6,7 +6,8 @@
 Each cell is `roboarm evaluate` on the first `--num` test queries of a task with one kind of noise;
 its result is a JSON file in `--folder`, and cells that have one are not run again. All methods
 observe four point clouds. `--shard 0/2` and `--shard 1/2` share the cells between two processes.
-Tables show the cells with a result; docs/benchmark/sensor_noise.md has that of `--only accepted`.
+The cells go into the tables of docs/benchmark/sensor_noise.md. With `--only accepted`, its first
+table shows these cells alone; in the others, cells that were not run stay as they are.
 """
 
 import json
@@ -18,7 +19,7 @@ from typing import Literal
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import tyro
-from markdown_tables import interval, share, write_csv
+from markdown_tables import NOTHING, csv_rows, interval, share, write_csv
 from moving_obstacles import METHODS
 
 from roboarm_nmp.envs.perception.noise import SensorNoise
@@ -121,17 +122,21 @@ def results(folder, task, noise):
 
 
 def wide_table(folder, task):
-    """A row per kind of noise: success and collision-free success of the methods that were run."""
+    """A row per kind of noise: success and collision-free success of the methods that were run.
+
+    A cell without a result in `folder` keeps what the table has.
+    """
     kinds = ("success", "success_rate"), ("collision-free", "collision_free_success_rate")
-    cells = {noise: results(folder, task, noise) for noise in NOISES}
-    names = [name for name in LABELS if any(name in found for found in cells.values())]
-    head = ["noise", *(f"{LABELS[name]}: {kind}" for name in names for kind, _ in kinds)]
-    rows = []
-    for noise, found in cells.items():
-        if found:
-            rates = [found.get(name, {}).get(key) for name in names for _, key in kinds]
-            rows.append([NOISES[noise][0], *map(share, rates)])
-    return head, rows
+    shown = {row["noise"]: row for row in csv_rows(f"noise_{task}.csv")}
+    for noise, (words, _) in NOISES.items():
+        row = shown.setdefault(words, {})
+        for name, result in results(folder, task, noise).items():
+            row |= {f"{LABELS[name]}: {kind}": share(result[key]) for kind, key in kinds}
+    columns = [f"{label}: {kind}" for label in LABELS.values() for kind, _ in kinds]
+    columns = [column for column in columns if any(column in row for row in shown.values())]
+    rows = [(words, shown[words]) for words, _ in NOISES.values() if shown[words]]
+    cells = [[words, *(row.get(column, NOTHING) for column in columns)] for words, row in rows]
+    return ["noise", *columns], cells
 
 
 def accepted_table(folder):

@@ -45,6 +45,21 @@ def test_only_the_given_kinds_are_run(calls, tmp_path):
     assert {noise.edge_filter if noise else None for _, _, noise, _ in calls} == {None, 0.03}
 
 
+def test_cells_of_other_folders_stay_in_the_table(calls, tmp_path):
+    task, folder = "random_boxes_hard", tmp_path / "other"
+    first = sensor_noise.Args(tmp_path, num=4, methods=("policy",), tasks=(task,))
+    sensor_noise.main(first)
+    second = sensor_noise.Args(
+        folder, num=4, methods=("plan",), tasks=(task,), kinds=("flying-30",)
+    )
+    sensor_noise.main(second)
+    with open(tmp_path / f"noise_{task}.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["DAgger: success"] for row in rows] == ["0.750"] * 28
+    plans = {row["noise"]: row["one plan: collision-free"] for row in rows}
+    assert {words for words, cell in plans.items() if cell == "0.750"} == {"flying pixels, 30 %"}
+
+
 def test_table_of_accepted_noise_has_a_row_per_task_and_kind(calls, tmp_path):
     args = sensor_noise.Args(tmp_path, num=4, methods=("policy",), only="accepted")
     sensor_noise.main(args)
