@@ -3,9 +3,9 @@
     python benchmarks/moving_obstacles.py --folder moving_results --num 200
 
 Each cell is `roboarm evaluate` on the first `--num` test queries of a task; its result is a JSON
-file in `--folder`, and cells that have one are not run again. The table of
-docs/benchmark/moving_obstacles.md shows all of them. Other seeds of the policy have a table of
-their own, beside seed 1, the pretrained one:
+file in `--folder`, and cells that have one are not run again. They go into the table of
+docs/benchmark/moving_obstacles.md, where other cells stay as they are. Other seeds of the policy
+have a table of their own, beside seed 1, the pretrained one:
 
     python benchmarks/moving_obstacles.py --folder moving_results_1000 --num 1000 \
         --only appearing_boxes --methods policy-replan --seeds 2 runs/RUN 3 runs/RUN
@@ -21,7 +21,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import tyro
-from markdown_tables import interval, share, write_csv
+from markdown_tables import csv_rows, interval, share, write_csv
 
 from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.tasks import TASKS
@@ -33,6 +33,7 @@ HEAD = ("task", "method", "obstacles from", "search", "filter", "queries")
 HEAD += ("success", "95 % interval", "collision-free success", "its 95 % interval")
 SEEDS_HEAD = ("task", "method", "seed", *HEAD[5:])
 POINTS = {"geometry_source": "point_cloud"}
+SOURCES = ("nowhere", "point cloud", "ground truth")
 TRUTH = {"geometry_source": "ground_truth"}
 FILTER = {"safety_filter": SafetyFilter(0.01)}
 GOAL = {"env": {"goal_type": "combined"}}
@@ -97,6 +98,18 @@ def row_of(task, method, result):
     return [*cells, "yes" if result["safety_filter"] else "no", *rates_of(result)]
 
 
+def with_others(rows):
+    """`rows` and the other rows of the table, which were not run in this folder, in order."""
+    present = [list(row.values()) for row in csv_rows(NAME)]
+    shown = {tuple(row[:3]): row for row in (*present, *rows)}
+    labels = list(dict.fromkeys(method.label for method in METHODS.values()))
+
+    def place(row):
+        return TASKS_HERE.index(row[0].strip("`")), labels.index(row[1]), SOURCES.index(row[2])
+
+    return sorted(shown.values(), key=place)
+
+
 def cell(folder, task, name, seed):
     """The file of a result."""
     return folder / f"{task}--{name}{f'--seed-{seed}' if seed != 1 else ''}.json"
@@ -128,7 +141,7 @@ def main(args):
     if args.seeds:
         write_csv(SEEDS, SEEDS_HEAD, rows_of_seeds)
     else:
-        write_csv(NAME, HEAD, rows)
+        write_csv(NAME, HEAD, with_others(rows))
 
 
 if __name__ == "__main__":

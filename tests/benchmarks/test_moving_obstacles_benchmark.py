@@ -50,6 +50,20 @@ def test_cells_that_have_a_result_are_not_run_again(folder):
     ]
 
 
+def test_rows_of_other_folders_stay_and_rows_are_in_order(folder):
+    def rows_after(method):
+        args = moving_obstacles.Args(folder / method, only=("chased_goals",), methods=(method,))
+        moving_obstacles.main(args)
+        with open(folder / moving_obstacles.NAME, newline="") as table:
+            return [row[1:3] for row in csv.reader(table)][1:]
+
+    truth, points = ["replanning", "ground truth"], ["replanning", "point cloud"]
+    assert rows_after("replanning-truth") == [truth]
+    assert rows_after("replanning") == [points, truth]
+    assert rows_after("go") == [["go-to-goal", "nowhere"], points, truth]
+    assert rows_after("replanning") == [["go-to-goal", "nowhere"], points, truth]
+
+
 def test_other_seeds_have_a_table_of_their_own(folder):
     args = moving_obstacles.Args(folder, only=("chased_goals",), methods=("policy-replan",))
     moving_obstacles.main(args)
