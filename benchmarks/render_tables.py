@@ -19,7 +19,7 @@ REMARK = (
     "Success is reaching the goal, contacts allowed. Go-to-goal moves straight to the goal. "
     "DAgger has a safety filter and receives link distances from the same source as its "
     "observation. The paper's policies have neither. The last two methods of `random_boxes_hard` "
-    "search, the others do not. Each policy is one seed, except BC and SAC on `wall` with three."
+    "search, the others do not. Each policy is one seed, except BC and, on `wall`, SAC with three."
 )
 
 
