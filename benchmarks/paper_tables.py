@@ -21,7 +21,6 @@ import datetime
 import fnmatch
 import json
 import os
-import signal
 import statistics
 import subprocess
 import sys
@@ -46,6 +45,7 @@ from roboarm_nmp.envs.networks.exported_networks import to_float16
 from roboarm_nmp.envs.training.evaluation import wilson_interval
 from roboarm_nmp.envs.training.flags import PositiveInt, Seed, check
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
+from roboarm_nmp.envs.utils.signals import end_with_one_line
 
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = ROOT / "benchmarks/results/paper_cells.csv"
@@ -639,6 +639,8 @@ def _check(args, cells):
 
 
 def main():
+    # The trainer ends too: `subprocess.run` sees to that, whatever is raised.
+    end_with_one_line("the same command goes on from the last checkpoint")
     args = tyro.cli(Args, description=__doc__)
     cells = read_cells()
     try:
@@ -650,19 +652,18 @@ def main():
         results = load_results(folders)
         for cell in cells:
             found = of_recipe(cell, results)
-            reached = f"ours {pooled(found)[0]:.3f}" if found else "not run"
+            reached = f"ours {pooled(found)[0]:.3f}, seeds: {len(found)}" if found else "not run"
             print(f"{cell.name:60} paper {share(cell.mean)}   {reached}")
+        seeds = [len(of_recipe(cell, results)) for cell in cells]
+        done, thrice = (sum(number >= least for number in seeds) for least in (1, 3))
+        print(f"{len(cells)} cells: {done} were run, {thrice} of them with three seeds or more")
         return
-    # `kill` ends the trainer too: `subprocess.run` does that for whatever is raised.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("killed; the same command goes on"))
     for cell in chosen:
         for seed in args.seeds:
             try:
                 run(cell, seed, args.steps, args.num_queries, args.runs_dir, args.keep_policies)
             except subprocess.CalledProcessError as error:
                 sys.exit(f"error: {cell.name}, seed {seed}: exit code {error.returncode}")
-            except KeyboardInterrupt:
-                sys.exit("interrupted; the same command goes on from the last checkpoint")
     results = load_results(folders)
     baselines, unseen = load_references()
     if results:

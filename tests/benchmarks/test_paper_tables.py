@@ -4,6 +4,7 @@ import contextlib
 import functools
 import json
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -178,6 +179,18 @@ def test_own_algorithm_stands_in_the_tables(results, tmp_path):
     paper_tables.draw_success(cells, results, {}, tmp_path / "success.png")
 
 
+def test_list_counts_seeds(results, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(paper_tables, "POLICIES", tmp_path)
+    monkeypatch.setattr(paper_tables, "end_with_one_line", lambda advice: None)
+    monkeypatch.setattr(sys, "argv", ["paper_tables.py", "--list"])
+    paper_tables.main()
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert last == f"{len(CELLS)} cells: 4 were run, 1 of them with three seeds or more"
+    lines = {line.split()[0]: line for line in lines}
+    assert lines["bc-combined-no_obstacles"].endswith("paper 0.986   ours 0.982, seeds: 3")
+    assert lines["td3-ee-wall-p1"].endswith("paper 0.959   not run")
+
+
 def test_figures_are_drawn(results, tmp_path):
     unseen = {"wall": {"dagger, point_cloud": {"success_rate": 0.99}}}
     story = functools.partial(paper_tables.draw_story, baselines=BASELINES, unseen=unseen)
@@ -210,7 +223,8 @@ def test_a_trainer_does_not_outlive_the_command(tmp_path):
             time.sleep(0.05)
         trainers = process.children()
         process.terminate()
-        assert b"killed" in process.communicate(timeout=20)[1] and process.returncode == 1
+        assert b"terminated; the same command" in process.communicate(timeout=20)[1]
+        assert process.returncode == 128 + signal.SIGTERM
         assert len(trainers) == 1 and not trainers[0].is_running()
     finally:  # also where the assertions fail
         with contextlib.suppress(psutil.NoSuchProcess):
