@@ -2,7 +2,7 @@
 
     python benchmarks/paper_tables.py --list                        # the cells, and which are done
     python benchmarks/paper_tables.py --only 'bc-*-double_walls' --steps 150000
-    python benchmarks/paper_tables.py --only sac-ee-wall-p1 --seeds 1 2 3 4
+    python benchmarks/paper_tables.py --only sac-ee-wall-p1 --seeds 1 2 3 4 --jobs 2
     python benchmarks/paper_tables.py                  # only writes the tables and figures
 
 A cell is a run: algorithm, goal type, task, p of the demo injection. It is trained with its script
@@ -24,6 +24,7 @@ import os
 import statistics
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -616,6 +617,10 @@ class Args:
     keep_policies: bool = True
     """keep policies among the pretrained ones; otherwise only the results, and policies stay in
     `--runs-dir`"""
+    jobs: PositiveInt = 1
+    """policies at a time; with more than one, each writes its output to a file in `--runs-dir`"""
+    tables: bool = True
+    """write the tables and figures at the end"""
     list: bool = False
     """list cells and what is done; run none"""
 
@@ -638,6 +643,46 @@ def _check(args, cells):
     return list(dict.fromkeys(chosen))
 
 
+def run_in_turn(cells, seed, args):
+    for cell in cells:
+        try:
+            run(cell, seed, args.steps, args.num_queries, args.runs_dir, args.keep_policies)
+        except subprocess.CalledProcessError as error:
+            sys.exit(f"error: {cell.name}, seed {seed}: exit code {error.returncode}")
+
+
+def run_side_by_side(policies, args):
+    """Run cells, `args.jobs` policies at a time, each in a process with a log.
+
+    `policies`: dict of (name, seed) -> the policy's cells. Where one fails, the others go on.
+    """
+    waiting, running, failed = list(policies), {}, []
+    options = ["--steps", str(args.steps), "--num-queries", str(args.num_queries)]
+    options += ["--runs-dir", args.runs_dir, "--no-tables"]
+    options += [] if args.keep_policies else ["--no-keep-policies"]
+    try:
+        while waiting or running:
+            while waiting and len(running) < args.jobs:
+                name, seed = waiting.pop(0)
+                cells = [cell.name for cell in policies[name, seed]]
+                command = [sys.executable, __file__, *options, "--seeds", str(seed), "--only"]
+                with open(args.runs_dir / f"{name}.log", "wb") as log:
+                    running[name] = subprocess.Popen([*command, *cells], stdout=log, stderr=log)
+                print(f"{name}: begins; its output is in {log.name}", flush=True)
+            time.sleep(0.2)
+            for name in [name for name, process in running.items() if process.poll() is not None]:
+                code = running.pop(name).returncode
+                failed += [name] * (code != 0)
+                print(f"{name}: {'ends' if code == 0 else f'exit code {code}'}", flush=True)
+    finally:
+        for process in running.values():
+            process.terminate()
+        for process in running.values():
+            process.wait()
+    if failed:
+        sys.exit(f"error: {', '.join(failed)}: {args.runs_dir} has the logs")
+
+
 def main():
     # The trainer ends too: `subprocess.run` sees to that, whatever is raised.
     end_with_one_line("the same command goes on from the last checkpoint")
@@ -658,12 +703,18 @@ def main():
         done, thrice = (sum(number >= least for number in seeds) for least in (1, 3))
         print(f"{len(cells)} cells: {done} were run, {thrice} of them with three seeds or more")
         return
+    policies = {}  # trained once, and evaluated on one task after the other
     for cell in chosen:
         for seed in args.seeds:
-            try:
-                run(cell, seed, args.steps, args.num_queries, args.runs_dir, args.keep_policies)
-            except subprocess.CalledProcessError as error:
-                sys.exit(f"error: {cell.name}, seed {seed}: exit code {error.returncode}")
+            trained = replace(cell, task=cell.trained_on)
+            policies.setdefault((f"{trained.name}-s{seed}", seed), []).append(cell)
+    if args.jobs > 1:
+        run_side_by_side(policies, args)
+    else:
+        for (_, seed), of_policy in policies.items():
+            run_in_turn(of_policy, seed, args)
+    if not args.tables:
+        return
     results = load_results(folders)
     baselines, unseen = load_references()
     if results:

@@ -211,27 +211,52 @@ def test_figure_of_tasks_shows_means_over_seeds(results, monkeypatch):
     assert sorted(heights) == pytest.approx([0.83, 0.95, 0.982])  # seeds: 0.981, 0.982, 0.983
 
 
-def test_a_trainer_does_not_outlive_the_command(tmp_path):
+@pytest.mark.parametrize("cells", [["bc-ee-boxes"], ["bc-ee-boxes", "bc-ee-wall"]])
+def test_trainers_do_not_outlive_the_command(tmp_path, cells):
     script = ROOT / "benchmarks" / "paper_tables.py"
-    flags = ["--only", "bc-ee-boxes", "--steps", "1000000", "--runs-dir", str(tmp_path)]
-    process = psutil.Popen([sys.executable, str(script), *flags], stderr=subprocess.PIPE)
-    trainers = []
+    flags = ["--steps", "1000000", "--runs-dir", str(tmp_path), "--jobs", str(len(cells))]
+    command = [sys.executable, str(script), *flags, "--only", *cells]
+    process = psutil.Popen(command, stderr=subprocess.PIPE)
+    begun = []
     try:
         until = time.time() + 120
-        while not list(tmp_path.glob("*/*/args.json")):
+        while len(list(tmp_path.glob("*/*/args.json"))) < len(cells):
             assert time.time() < until
             time.sleep(0.05)
-        trainers = process.children()
+        begun = process.children(recursive=True)
         process.terminate()
         assert b"terminated; the same command" in process.communicate(timeout=20)[1]
         assert process.returncode == 128 + signal.SIGTERM
-        assert len(trainers) == 1 and not trainers[0].is_running()
+        assert len(begun) >= len(cells) and not any(one.is_running() for one in begun)
     finally:  # also where the assertions fail
         with contextlib.suppress(psutil.NoSuchProcess):
-            trainers += process.children()
-        for one in (*trainers, process):
+            begun += process.children(recursive=True)
+        for one in (*begun, process):
             with contextlib.suppress(psutil.NoSuchProcess):
                 one.kill()
+
+
+def test_policies_run_side_by_side(tmp_path, monkeypatch, capsys):
+    cells = ["bc-ee-wall", "bc-combined-vae-random_boxes_hard-on-three_shelves", "bc-ee-boxes"]
+    flags = ["--num-queries", "10", "--steps", "100", "--runs-dir", str(tmp_path), "--no-tables"]
+    monkeypatch.setattr(paper_tables, "end_with_one_line", lambda advice: None)
+    command = ["paper_tables.py", *flags, "--jobs", "2", "--only"]
+    monkeypatch.setattr(sys, "argv", [*command, *cells])
+    paper_tables.main()
+    policies = ["bc-ee-wall-s1", "bc-combined-vae-random_boxes_hard-s1", "bc-ee-boxes-s1"]
+    lines = capsys.readouterr().out.splitlines()
+    for policy, cell in zip(policies, cells, strict=True):
+        log = tmp_path / f"{policy}.log"
+        assert log.read_text() == f"{cell}-s1: done before\n"
+        begins = lines.index(f"{policy}: begins; its output is in {log}")
+        assert begins < lines.index(f"{policy}: ends")
+    ended = [line.endswith("ends") for line in lines]
+    assert not any(ended[:2]) and any(ended[:3])  # two at a time
+    tmp_path.joinpath("bc-ee-wall-s9").touch()  # where the run's folder would be
+    monkeypatch.setattr(sys, "argv", [*command, "bc-ee-wall", "--seeds", "9", "1"])
+    with pytest.raises(SystemExit, match="error: bc-ee-wall-s9: .* has the logs"):
+        paper_tables.main()
+    assert "bc-ee-wall-s1: ends" in capsys.readouterr().out
 
 
 @pytest.fixture
