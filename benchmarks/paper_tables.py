@@ -93,8 +93,7 @@ REFERENCES = {
 }
 HEAD = [
     *("task", "method", "geometry source", "search", "success", "95 % interval"),
-    *("collision-free", "queries", "seeds", "range over seeds", "training steps"),
-    "paper's success",
+    *("collision-free", "queries", "seeds (range)", "training steps", "paper's success"),
 ]
 LONG_RUN = 7_000_000  # steps of the paper's runs with encoders (section 5.3)
 
@@ -331,6 +330,12 @@ def mean_success(cell, results):
     return statistics.mean(result["success_rate"] for result in of_recipe(cell, results))
 
 
+def seeds_of(found):
+    """The number of a cell's seeds, and the lowest and highest success."""
+    rates = [result["success_rate"] for result in found]
+    return str(len(found)) + f" ({share(min(rates))} to {share(max(rates))})" * (len(found) > 1)
+
+
 def steps_of(found):
     """How long a cell's results were trained."""
     return " or ".join(f"{steps:,}" for steps in sorted({result["steps"] for result in found}))
@@ -351,12 +356,12 @@ def results_table(cells, results, baselines):
         for cell in of_task:
             if found := of_recipe(cell, results):
                 rows.append([f"`{task}`", method_of(cell), SOURCES[cell.encoder], "no"])
-                rows[-1] += _numbers(found, len(found), steps_of(found), cell.mean)
+                rows[-1] += _numbers(found, seeds_of(found), steps_of(found), cell.mean)
         best = max((c for c in of_task if c.encoder and c.mean is not None), default=None,
                    key=lambda cell: cell.mean)  # fmt: skip
         if best:
             rows.append([f"`{task}`", f"paper's best: {method_of(best)}", SOURCES[best.encoder]])
-            rows[-1] += ["no", *[NOTHING] * 4, "4", NOTHING, f"{LONG_RUN:,}"]
+            rows[-1] += ["no", NOTHING, NOTHING, NOTHING, NOTHING, "4", f"{LONG_RUN:,}"]
             rows[-1] += [share(best.mean)]
         for name, (method, source, search) in REFERENCES.items():
             if one := baselines.get(task, {}).get(name):
@@ -368,10 +373,7 @@ def results_table(cells, results, baselines):
 
 def _numbers(found, seeds, steps, paper):
     success, ends, free, count = pooled(found)
-    rates = [result["success_rate"] for result in found]
-    spread = f"{share(min(rates))} to {share(max(rates))}" if len(found) > 1 else NOTHING
-    numbers = [share(success), interval(ends), share(free), f"{count:,}"]
-    return [*numbers, seeds, spread, steps, share(paper)]
+    return [share(success), interval(ends), share(free), f"{count:,}", seeds, steps, share(paper)]
 
 
 def hindsight_table(cells, results):
@@ -381,7 +383,7 @@ def hindsight_table(cells, results):
         if found := of_recipe(cell, results):
             hindsight = "no" if cell.hindsight == "no" else "yes"
             rows.append([cell.label, hindsight])
-            rows[-1] += _numbers(found, len(found), steps_of(found), cell.mean)
+            rows[-1] += _numbers(found, seeds_of(found), steps_of(found), cell.mean)
     return table(["method", "hindsight", *HEAD[4:]], rows)
 
 
