@@ -651,6 +651,7 @@ def _check(args, cells):
 
 
 def run_in_turn(cells, seed, args):
+    """Run the cells of one policy. Where one fails, the command ends."""
     for cell in cells:
         try:
             run(cell, seed, args.steps, args.num_queries, args.runs_dir, args.keep_policies)

@@ -225,7 +225,7 @@ def test_trainers_do_not_outlive_the_command(tmp_path, cells):
             time.sleep(0.05)
         begun = process.children(recursive=True)
         process.terminate()
-        assert b"terminated; the same command" in process.communicate(timeout=20)[1]
+        assert b"terminated; the same command" in process.communicate(timeout=60)[1]
         assert process.returncode == 128 + signal.SIGTERM
         assert len(begun) >= len(cells) and not any(one.is_running() for one in begun)
     finally:  # also where the assertions fail
