@@ -21,7 +21,6 @@ import datetime
 import fnmatch
 import json
 import os
-import statistics
 import subprocess
 import sys
 import time
@@ -325,9 +324,9 @@ def of_recipe(cell, results):
     return [result for result in found if cell.is_recipe_of(result["args"])] or found
 
 
-def mean_success(cell, results):
+def success_of(cell, results):
     """Over the seeds of a cell that was run."""
-    return statistics.mean(result["success_rate"] for result in of_recipe(cell, results))
+    return pooled(of_recipe(cell, results))[0]
 
 
 def seeds_of(found):
@@ -423,13 +422,13 @@ def runs_table(cells, results):
 
 
 def below_table(cells, results):
-    """Markdown: cells whose mean is far below the paper's."""
+    """Markdown: cells that are far below the paper's mean."""
     rows = []
     for cell in cells:
         if cell.mean is not None and cell.name in results:
-            mean = mean_success(cell, results)
-            if mean < cell.mean - FAR_BELOW:
-                rows.append([f"`{cell.name}`", share(mean), share(cell.mean)])
+            success = success_of(cell, results)
+            if success < cell.mean - FAR_BELOW:
+                rows.append([f"`{cell.name}`", share(success), share(cell.mean)])
     return table(["cell", "success", "paper's success"], rows)
 
 
@@ -477,7 +476,7 @@ def draw_story(cells, results, baselines, unseen, path):
             axes.bar(x, high - low, 0.7, low, color="0.9", label="go-to-goal to RRT-Connect")
         of_task = [cell for cell in cells if cell.task == task]
         papers = [cell.mean for cell in of_task if cell.mean is not None]
-        rates = (papers, [mean_success(c, results) for c in of_task if c.name in results])
+        rates = (papers, [success_of(c, results) for c in of_task if c.name in results])
         observed = unseen.get(task, {}).get("dagger, point_cloud")
         rates += ([observed["success_rate"]] if observed else [],)
         for name, found in zip(marks, rates, strict=True):

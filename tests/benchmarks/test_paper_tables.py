@@ -147,6 +147,13 @@ def test_tables_list_what_was_run_and_name_what_was_not(results):
         assert len({line.count("|") for line in rows}) == 1
 
 
+def test_all_tables_weigh_seeds_by_their_queries(results):
+    results["sac-ee-double_walls-p1"] += [result("sac-ee-double_walls-p1", 2, 0.7, num_queries=100)]
+    tables = paper_tables.tables(list(CELLS.values()), results, BASELINES)
+    assert "| none | no | 0.829 | [" in tables["paper-ee"]  # (8,300 + 70) / 10,100
+    assert "| `sac-ee-double_walls-p1` | 0.829 | 0.916 |" in tables["paper-below"]
+
+
 def test_runs_with_other_flags_do_not_count_beside_the_cells_own(results):
     name = "sac-ee-double_walls-p1"  # so far with other flags, and far below the paper
     results[name] += [result(name, 2, 0.9, args=args_of(name), kept=False)]
