@@ -2,7 +2,7 @@
 
     python benchmarks/paper_tables.py --list                        # the cells, and which are done
     python benchmarks/paper_tables.py --only 'bc-*-double_walls' --steps 150000
-    python benchmarks/paper_tables.py --only sac-ee-wall-p1 --seeds 1 2 3 4 --jobs 2
+    python benchmarks/paper_tables.py --only sac-ee-wall-p1 --seeds 1 2 3 4 --workers 2
     python benchmarks/paper_tables.py                  # only writes the tables and figures
 
 A cell is a run: algorithm, goal type, task, p of the demo injection. It is trained with its script
@@ -43,7 +43,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.networks.exported_networks import to_float16
 from roboarm_nmp.envs.training.evaluation import wilson_interval
-from roboarm_nmp.envs.training.flags import PositiveInt, Seed, check
+from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers, check
 from roboarm_nmp.envs.utils.files import check_folder, write_atomically
 from roboarm_nmp.envs.utils.signals import end_with_one_line
 
@@ -623,7 +623,7 @@ class Args:
     keep_policies: bool = True
     """keep policies among the pretrained ones; otherwise only the results, and policies stay in
     `--runs-dir`"""
-    jobs: PositiveInt = 1
+    workers: Workers = 1
     """policies at a time; with more than one, each writes its output to a file in `--runs-dir`"""
     tables: bool = True
     """write the tables and figures at the end"""
@@ -659,7 +659,7 @@ def run_in_turn(cells, seed, args):
 
 
 def run_side_by_side(policies, args):
-    """Run cells, `args.jobs` policies at a time, each in a process with a log.
+    """Run cells, `args.workers` policies at a time, each in a process with a log.
 
     `policies`: dict of (name, seed) -> the policy's cells. Where one fails, the others go on.
     """
@@ -669,7 +669,7 @@ def run_side_by_side(policies, args):
     options += [] if args.keep_policies else ["--no-keep-policies"]
     try:
         while waiting or running:
-            while waiting and len(running) < args.jobs:
+            while waiting and len(running) < args.workers:
                 name, seed = waiting.pop(0)
                 cells = [cell.name for cell in policies[name, seed]]
                 command = [sys.executable, __file__, *options, "--seeds", str(seed), "--only"]
@@ -715,7 +715,7 @@ def main():
         for seed in args.seeds:
             trained = replace(cell, task=cell.trained_on)
             policies.setdefault((f"{trained.name}-s{seed}", seed), []).append(cell)
-    if args.jobs > 1:
+    if args.workers > 1:
         run_side_by_side(policies, args)
     else:
         for (_, seed), of_policy in policies.items():

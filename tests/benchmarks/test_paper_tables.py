@@ -222,7 +222,7 @@ def test_figure_of_tasks_shows_means_over_seeds(results, monkeypatch):
 @pytest.mark.parametrize("cells", [["bc-ee-boxes"], ["bc-ee-boxes", "bc-ee-wall"]])
 def test_trainers_do_not_outlive_the_command(tmp_path, cells):
     script = ROOT / "benchmarks" / "paper_tables.py"
-    flags = ["--steps", "1000000", "--runs-dir", str(tmp_path), "--jobs", str(len(cells))]
+    flags = ["--steps", "1000000", "--runs-dir", str(tmp_path), "--workers", str(len(cells))]
     command = [sys.executable, str(script), *flags, "--only", *cells]
     process = psutil.Popen(command, stderr=subprocess.PIPE)
     begun = []
@@ -248,7 +248,7 @@ def test_policies_run_side_by_side(tmp_path, monkeypatch, capsys):
     cells = ["bc-ee-wall", "bc-combined-vae-random_boxes_hard-on-three_shelves", "bc-ee-boxes"]
     flags = ["--num-queries", "10", "--steps", "100", "--runs-dir", str(tmp_path), "--no-tables"]
     monkeypatch.setattr(paper_tables, "end_with_one_line", lambda advice: None)
-    command = ["paper_tables.py", *flags, "--jobs", "2", "--only"]
+    command = ["paper_tables.py", *flags, "--workers", "2", "--only"]
     monkeypatch.setattr(sys, "argv", [*command, *cells])
     paper_tables.main()
     policies = ["bc-ee-wall-s1", "bc-combined-vae-random_boxes_hard-s1", "bc-ee-boxes-s1"]
