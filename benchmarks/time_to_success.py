@@ -10,9 +10,9 @@ those of `double_walls`, for at most an hour. The queries have a seed of their o
 for all. They are solved after every 10,000 environment steps; the clock stands still meanwhile. A
 run has a process of its own, and one thread.
 
-- `ours`: `sac_her_mp.py` with default flags (on `double_walls` with `--demo-prob 1`).
-- `earlier`: the same without what makes it fast: hindsight goals are drawn evenly from the rest of
-  an episode, and the arm's Jacobian is no input of the networks (`EARLIER`).
+- `ours`: `sac_her_mp.py` with default flags, on `double_walls` with `--demo-prob 1 --bc-weight 5`.
+- `earlier`: without what makes it fast: hindsight goals are drawn evenly from the rest of an
+  episode, the arm's Jacobian is no input of the networks, and no behavioural cloning (`EARLIER`).
 - `sb3`: Stable-Baselines3's SAC with its `HerReplayBuffer` and its defaults, but 2,000 random
   steps first, because it needs a whole episode.
 - `sb3-ours`, `sbx-ours`: Stable-Baselines3 and SBX with our rates, discount, number of
@@ -52,7 +52,7 @@ from roboarm_nmp.envs.training import flags, protocol
 
 Learner = Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"]
 LEARNERS, WITH_DEMOS = get_args(Learner), ("ours", "earlier")
-EARLIER = ["--her-exponent", "1", "--no-jacobian"]
+EARLIER = ["--her-exponent", "1", "--no-jacobian", "--bc-weight", "0"]
 GOALS = {"no_obstacles": 0.9, "double_walls": 0.75}  # success rates
 QUERIES, QUERY_SEED, INTERVAL, LIMIT = 200, 20_261_127, 10_000, 3600.0
 
@@ -125,8 +125,9 @@ def train_ours(task, seed, clock, changed):
     started = protocol.PolicyRun.start
     script = sac_her_mp.__file__
     sys.argv = [script, "--task", task, "--seed", str(seed), "--eval-every", str(INTERVAL)]
-    sys.argv += ["--runs-dir", os.environ["TMPDIR"], "--total-timesteps", "10000000", *changed]
-    sys.argv += ["--demo-prob", "1"] * (task == "double_walls")
+    sys.argv += ["--runs-dir", os.environ["TMPDIR"], "--total-timesteps", "10000000"]
+    sys.argv += ["--demo-prob", "1", "--bc-weight", "5"] * (task == "double_walls")
+    sys.argv += changed
     changed_run = mock.patch.multiple(protocol.PolicyRun, start=start, validate=validate)
     with changed_run, contextlib.suppress(Done):
         runpy.run_path(script, run_name="__main__")

@@ -19,9 +19,11 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
+from roboarm_nmp.envs.datasets.episodes import demo_transitions
 from roboarm_nmp.envs.networks.kinematics import JacobianTranspose
 from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
+from roboarm_nmp.envs.utils.progress import progress_bar
 
 
 @dataclass
@@ -46,6 +48,12 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     enters the replay buffer with this probability (the paper's p). Without it: random queries"""
     demos: Path | None = None
     """demonstration file to use with --demo-prob; by default the task's own"""
+    bc_weight: flags.NonNegativeFloat = 0.0
+    """with --demo-prob, weight of behavioural cloning in the policy's loss: the mean squared
+    difference from demonstrated actions (Fujimoto and Gu, 2021). Try 5 where obstacles block the
+    straight way"""
+    demo_batch_size: flags.PositiveInt = 128
+    """transitions of demonstrations in every batch, besides the others, with --bc-weight"""
     gamma: flags.Share | Literal["auto"] = "auto"
     """discount factor (CleanRL: 0.99); `auto`: 0.95, and 0.98 for arms with a joint that turns all
     the way round, as an arm at its limit may have to"""
@@ -209,10 +217,14 @@ class Actor(nn.Module):
         log_prob = log_prob - 2 * (math.log(2) - x_t - F.softplus(-2 * x_t))  # log(1 - tanh(x_t)^2)
         return self.action_scale * torch.tanh(x_t), log_prob.sum(1)
 
+    def mean_action(self, features):
+        """The deterministic action (N, n)."""
+        mean = self.mlp(features)[:, : self.features.num_joints]
+        return self.action_scale * torch.tanh(mean)
+
     def forward(self, observation, achieved_goal, desired_goal, **_):
         """The deterministic action (N, n), for evaluation; policy.pt contains this function."""
-        mean = self.mlp(self.features(observation, desired_goal))[:, : self.features.num_joints]
-        return self.action_scale * torch.tanh(mean)
+        return self.mean_action(self.features(observation, desired_goal))
 
 
 # ALGO LOGIC: replay buffer
@@ -305,6 +317,21 @@ class HerReplayBuffer:
             self.latent_number(latent)
 
 
+def buffer_of_demos(demos, env, args, rng):
+    """A `HerReplayBuffer` with all transitions of `Demos`, in which `env` has the same goals."""
+    size, exponent = int(demos.offsets[-1]), args.her_exponent
+    buffer = HerReplayBuffer(env, size, args.her_probability, rng, exponent)
+    for demo in progress_bar(demos, "demonstrations", unit="demonstration", transient=True):
+        buffer.add_episode(demo_transitions(demo, env))
+    return buffer
+
+
+def joined(batches, more):
+    """Yield batches with the rows of those of `more` after their own."""
+    for batch, rows in zip(batches, more, strict=True):
+        yield {name: torch.cat([value, rows[name]]) for name, value in batch.items()}
+
+
 def updates_due(step, args):
     """Number of updates in the last `num_envs` steps; the first `learning_starts` have none."""
     begin, end = (max(0, s - args.learning_starts) for s in (step - args.num_envs, step))
@@ -381,6 +408,12 @@ class SAC:
             actions, log_pi = self.actor.get_action(features)
             min_qf_pi = self.critics(features, actions).amin(0)
             actor_loss = (alpha * log_pi - min_qf_pi).mean()
+            if args.bc_weight > 0:  # the last transitions are those of demonstrations
+                demonstrated = data["action"][-args.demo_batch_size :]
+                difference = self.actor.mean_action(features[-len(demonstrated) :]) - demonstrated
+                bc_loss = (difference / self.actor.action_scale).square().sum(1).mean()
+                actor_loss = actor_loss + args.bc_weight * bc_loss
+                losses["bc_loss"] = bc_loss
             surplus = log_pi.detach().mean() + (self.target_entropy or 0.0)
             alpha_loss = -self.log_alpha.exp() * surplus * (self.target_entropy is not None)
             self.actor_optimizer.zero_grad()
@@ -399,7 +432,7 @@ if __name__ == "__main__":
     device = runs.seed_torch(args)
     validation, test = protocol.load_task(args)
     env_arguments = protocol.env_arguments_of(args)
-    envs = protocol.make_training_envs(args, args.demo_prob, args.demos)
+    envs = protocol.make_training_envs(args, args.demo_prob, args.demos, args.bc_weight)
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     # END SHARED
 
@@ -413,6 +446,8 @@ if __name__ == "__main__":
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
     envs.encode_demos()
     run.start(args.total_timesteps, "step")
+    if args.bc_weight > 0:
+        demo_rb = buffer_of_demos(envs.demos, eval_envs[0], args, rng)
     envs.begin_episodes(args.seed, run.step)
     run.repeat_evaluation(agent.actor_average)
     # END SHARED
@@ -437,7 +472,10 @@ if __name__ == "__main__":
 
         # ALGO LOGIC: learn
         due = updates_due(global_step, args) if rb.size > 0 else 0
-        for data in rb.batches(due, args.batch_size, device):
+        batches = rb.batches(due, args.batch_size, device)
+        if args.bc_weight > 0:
+            batches = joined(batches, demo_rb.batches(due, args.demo_batch_size, device))
+        for data in batches:
             losses |= update(data, counts["updates"] % args.policy_frequency == 0)
             counts["updates"] += 1
             if counts["updates"] % 1000 == 0:

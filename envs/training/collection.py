@@ -46,6 +46,7 @@ class TrainingEnvs:
 
     Attributes:
         observations: of every environment, a list of dicts.
+        demos: the `Demos` whose queries are theirs, or None.
 
     Args:
         envs: a list of environments.
@@ -56,6 +57,7 @@ class TrainingEnvs:
 
     def __init__(self, envs, demo_prob=None, processes=0):
         self._num_envs, self.observations = len(envs), []
+        self.demos = envs[0].demos if isinstance(envs[0], DemoQueriesWrapper) else None
         parts = np.array_split(np.arange(len(envs)), min(max(1, processes), len(envs)))
         groups = [_Group([envs[i] for i in part], int(part[0]), demo_prob) for part in parts]
         self._spans = [slice(part[0], part[-1] + 1) for part in parts]

@@ -41,7 +41,10 @@ GROUPS = {
         *("observe_every", "sensor_noise"),
     ),
     "safety_filter": ("safety_margin", "escape", "approach", "lookahead"),
-    "data": ("demo_prob", "demos", "num_demos", "paths", "observations", "validation_share"),
+    "data": (
+        *("demo_prob", "demos", "num_demos", "bc_weight", "demo_batch_size"),
+        *("paths", "observations", "validation_share"),
+    ),
     OTHERS: (),
     "evaluation": (
         *("eval_every", "eval_queries", "test_queries", "stop_at_success", "eval_scenes"),

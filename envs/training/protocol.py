@@ -169,13 +169,14 @@ def make_eval_envs(task, num_queries, **kwargs):
     return rendering + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
 
 
-def make_training_envs(args, demo_prob=None, demos=None):
+def make_training_envs(args, demo_prob=None, demos=None, bc_weight=0.0):
     """`args.num_envs` environments, with random queries or those of demonstrations (`demo_prob`).
 
     Args:
         args: the flags, with `EnvFlags` among them.
         demo_prob: value of the flag --demo-prob, if the trainer has it.
         demos: value of the flag --demos, a file; by default the task's own.
+        bc_weight: value of the flag --bc-weight, which needs demonstrations.
 
     Returns:
         The `envs.training.collection.TrainingEnvs`.
@@ -183,8 +184,9 @@ def make_training_envs(args, demo_prob=None, demos=None):
     Raises:
         SystemExit: an argument is rejected, or the demonstrations do not fit.
     """
-    if demo_prob is None and demos is not None:
-        sys.exit("--demos goes with --demo-prob")
+    if demo_prob is None and (demos is not None or bc_weight > 0):
+        flag = "--demos" if demos is not None else "--bc-weight"
+        sys.exit(f"{flag} goes with --demo-prob")
     made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
     # A GPU waits for its environments; on a CPU they take less time than the updates.
     processes = min(args.num_envs, CORES) if torch.device(args.device).type == "cuda" else 0
