@@ -308,6 +308,8 @@ def buffer_of_demos(demos, env, args, rng):
     """A `HerReplayBuffer` with all transitions of `Demos`, in which `env` has the same goals."""
     size, exponent = int(demos.offsets[-1]), args.her_exponent
     buffer = HerReplayBuffer(env, size, args.her_probability, rng, exponent)
+    if args.encoder is not None:
+        env.encoder.encode_demos(demos)  # the environments may have done so in other processes
     for demo in progress_bar(demos, "demonstrations", unit="demonstration", transient=True):
         buffer.add_episode(demo_transitions(demo, env))
     return buffer

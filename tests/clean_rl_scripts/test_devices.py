@@ -35,7 +35,7 @@ def test_update_evaluation_and_resume_on_another_device(
 ):
     more = [*ENCODED, "--demos", few_demos] if encoded else ["--goal-type", "ee"]
     if encoded and trainer != "bc":
-        more = [*more, "--demo-prob", "1"]
+        more = [*more, "--demo-prob", "1", "--bc-weight", "2"]
     run_here(*command(trainer, tmp_path, *flags(trainer), "--device", another_device, *more)[1:])
     (run,) = tmp_path.iterdir()
     state = torch.load(run / "checkpoint.pt", weights_only=True)

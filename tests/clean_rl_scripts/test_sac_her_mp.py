@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import load, panda_env, run_script
+from trainers import ONE_EVALUATION, PATHS, load, panda_env, run_here, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.demo_generation import collect
@@ -16,7 +16,7 @@ from roboarm_nmp.envs.datasets.episodes import demo_transitions
 from roboarm_nmp.envs.datasets.format import QueryScenes
 from roboarm_nmp.envs.networks.kinematics import JacobianTranspose
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.training import protocol
+from roboarm_nmp.envs.training import cuda_graphs, protocol
 from roboarm_nmp.envs.training.protocol import stack
 
 sac = load("sac_her_mp")
@@ -404,6 +404,57 @@ def test_successful_episodes_inject_no_demonstration(tmp_path, demo_file, monkey
     failures = round(episodes * (1 - events.Scalars("charts/success")[-1].value))
     assert 0 < failures < episodes
     assert events.Scalars("charts/demos_injected")[-1].value == failures
+
+
+CLONING = ["--demo-prob", "1", "--bc-weight", "5", "--demo-batch-size", "6"]
+
+
+@pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
+def test_cloning_adds_demonstrated_transitions_to_every_batch(
+    trainer, tmp_path, demo_file, monkeypatch
+):
+    batches, graphed = [], cuda_graphs.graphed
+
+    def recorded(function, args, device):
+        def call(data, *options):
+            batches.append(data)
+            return function(data, *options)
+
+        is_update = function.__name__ == "update"
+        return call if is_update else graphed(function, args, device)
+
+    monkeypatch.setattr(cuda_graphs, "graphed", recorded)
+    # A goal is reached where it is the last of its episode: none is relabelled.
+    flags = [*CLONING, "--demos", str(demo_file), "--her-probability", "0", *ONE_EVALUATION]
+    run_script(trainer, tmp_path, *flags)
+    env, demos = panda_env(), load_demos(demo_file)
+    episodes = [demo_transitions(demo, env) for demo in demos]
+    entries = [(transition, episode[-1]) for episode in episodes for transition in episode]
+    seen, names = set(), ("observation", "action", "next_observation", "desired_goal")
+    stacked = {name: np.float32([one[name] for one, _ in entries]) for name in names}
+    assert len(batches) == 100
+    for batch in batches:
+        assert all(len(value) == 16 + 6 for value in batch.values())
+        rows = {name: value[-6:].numpy() for name, value in batch.items()}
+        for i in range(6):
+            alike = [(stacked[name] == rows[name][i]).all(1) for name in names]
+            (which,) = np.flatnonzero(np.all(alike, axis=0))
+            seen.add(which)
+            one, last = entries[which]
+            assert rows["terminated"][i] == (one is last) and rows["reward"][i] == (one is last) - 1
+    assert len(seen) > 0.8 * min(len(entries), 600 / 2)  # all of them, not the first alone
+
+
+@pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
+def test_resumed_run_with_cloning_is_the_same(trainer, tmp_path, demo_file):
+    flags = [*CLONING, "--demos", str(demo_file), "--eval-queries", "1", "--test-queries", "0"]
+    whole = run_script(trainer, tmp_path / "whole", *flags)
+    parts = run_script(trainer, tmp_path / "parts", *flags, "--total-timesteps", "600")
+    run_here(PATHS[trainer], "--resume", parts, "--total-timesteps", "1200")
+    one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, parts))
+    for name in ("actor", "actor_average", "critics"):
+        for key, tensor in one[name].items():
+            assert torch.equal(tensor, other[name][key]), (name, key)
 
 
 # --- Real runs

@@ -303,6 +303,7 @@ def test_run_folder_is_printed_before_demonstrations_are_encoded(
             "this file is for the task 'wall', not 'no_obstacles'",
         ),
         (["--demos", "demos.h5"], "--demos goes with --demo-prob"),
+        (["--bc-weight", "5"], "--bc-weight goes with --demo-prob"),
     ],
 )
 def test_bad_flags_are_rejected(tmp_path, flags, message, capsys):  # by a shared block

@@ -28,7 +28,7 @@ SHORT = {
     "bc": ["--total-updates", "300", "--eval-every", "300", "--num-modes", "2"],
     "dagger": ["--task", "no_obstacles"],
 }
-SHORT["td3_her_mp"] += ["--demo-prob", "1"]
+SHORT["td3_her_mp"] += ["--demo-prob", "1", "--bc-weight", "2"]
 
 
 @pytest.fixture(scope="module")

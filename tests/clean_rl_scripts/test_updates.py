@@ -94,9 +94,16 @@ def squashed_gaussian(actor, features, noise):
     return 0.06 * action, density.log_prob(action).sum(1)
 
 
-@pytest.mark.parametrize("target_entropy", [-7.0, None])
-def test_update_of_sac(target_entropy):
+def cloning_loss(mean, data):
+    """Mean squared difference of tanh(mean) (N, 7) from the last ten actions, in units of 0.06."""
+    difference = torch.tanh(mean)[-10:] - data["action"][-10:] / 0.06
+    return difference.square().sum() / 10
+
+
+@pytest.mark.parametrize("target_entropy, bc_weight", [(-7.0, 0.0), (None, 0.0), (-7.0, 3.0)])
+def test_update_of_sac(target_entropy, bc_weight):
     flags = {"tau": 0.1, "policy_average": 0.2, "target_entropy": target_entropy}
+    flags |= {"bc_weight": bc_weight, "demo_batch_size": 10}
     agent = make(sac, "SAC", gamma=0.9, alpha=0.3, **flags)
     take_apart(agent, "critics_target")
     old, data = state(agent), batch()
@@ -122,6 +129,10 @@ def test_update_of_sac(target_entropy):
     action, density = squashed_gaussian(old["actor"], now, noises[1])
     q = values(new["critics"], now, action)
     loss = (0.3 * density - q.amin(0)).mean()
+    if bc_weight:
+        bc_loss = cloning_loss(old["actor"].mlp(now)[:, :7], data)
+        torch.testing.assert_close(losses["bc_loss"], bc_loss, rtol=1e-3, atol=1e-5)
+        loss = loss + bc_weight * bc_loss
     torch.testing.assert_close(losses["actor_loss"], loss, rtol=1e-3, atol=1e-4)
     before, after = (list(one["actor"].parameters()) for one in (old, new))
     assert_adam_step(before, after, loss, agent.args.policy_lr)
@@ -143,8 +154,10 @@ def test_alpha_follows_the_target_entropy(target_entropy, direction):
     assert (agent.log_alpha.item() - math.log(0.2)) * direction > 0
 
 
-def test_update_of_td3():
+@pytest.mark.parametrize("bc_weight", [0.0, 3.0])
+def test_update_of_td3(bc_weight):
     flags = {"tau": 0.1, "policy_average": 0.2, "preactivation_penalty": 0.4}
+    flags |= {"bc_weight": bc_weight, "demo_batch_size": 10}
     agent = make(td3, "TD3", gamma=0.9, **flags)
     take_apart(agent, "actor_target", "critics_target")
     old, data = state(agent), batch()
@@ -173,6 +186,10 @@ def test_update_of_td3():
     preactivation = old["actor"].mlp(now)
     q = values(new["critics"], now, 0.06 * torch.tanh(preactivation))[0]
     loss = 0.4 * preactivation.square().mean() - q.mean()
+    if bc_weight:
+        bc_loss = cloning_loss(preactivation, data)
+        torch.testing.assert_close(losses["bc_loss"], bc_loss, rtol=1e-3, atol=1e-5)
+        loss = loss + bc_weight * bc_loss
     torch.testing.assert_close(losses["actor_loss"], loss, rtol=1e-3, atol=1e-4)
     before, after = (list(one["actor"].parameters()) for one in (old, new))
     assert_adam_step(before, after, loss, agent.args.policy_lr)
