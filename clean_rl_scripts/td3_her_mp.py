@@ -48,9 +48,9 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     demos: Path | None = None
     """demonstration file to use with --demo-prob; by default the task's own"""
     bc_weight: flags.NonNegativeFloat = 0.0
-    """with --demo-prob, weight of behavioural cloning in the policy's loss: the mean squared
-    difference from demonstrated actions (Fujimoto and Gu, 2021). Try 5 where obstacles block the
-    straight way"""
+    """with --demo-prob, weight of behavioural cloning in the policy's loss: the squared difference
+    from demonstrated actions, in units of the action scale (Fujimoto and Gu, 2021). Measured: 5, on
+    double_walls"""
     demo_batch_size: flags.PositiveInt = 128
     """transitions of demonstrations in every batch, besides the others, with --bc-weight"""
     gamma: flags.Share | Literal["auto"] = "auto"
