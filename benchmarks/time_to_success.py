@@ -2,7 +2,7 @@
 
     pip install -c constraints.txt -e ".[bench]"
     pip install sbx-rl                                            # for `sbx`
-    python benchmarks/time_to_success.py --folder time_to_success
+    python benchmarks/time_to_success.py --folder time_to_success --workers 2
     python benchmarks/time_to_success.py --folder time_to_success --task double_walls
 
 Each run trains until 0.9 of 200 fresh queries of `no_obstacles` are solved (goal `ee`), or 0.75 of
@@ -19,12 +19,15 @@ run has a process of its own, and one thread.
   environments, updates per step, network inputs and (SBX) LayerNorm and frequency of the policy's
   updates.
 
-A run that is done has a file in `--folder`, and is not repeated. The table shows the
-median run over seeds; of an even number of runs, the faster one of the two in the middle.
+A run that is done has a file in `--folder`, beside the log of its output, and is not repeated. The
+table shows the median run over seeds; of an even number of runs, the faster one of the two in the
+middle. The success of all runs over time goes to a file of benchmarks/results and a figure of the
+docs.
 """
 
 import contextlib
 import dataclasses
+import io
 import json
 import math
 import os
@@ -33,28 +36,35 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, get_args
 from unittest import mock
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import matplotlib
 import numpy as np
 import torch
 import tyro
-from markdown_tables import write_csv
+from markdown_tables import NOTHING, ROOT, write_csv
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
 
 from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import sac_her_mp
 from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.training import flags, protocol
+from roboarm_nmp.envs.utils.files import write_atomically
 
 Learner = Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"]
 LEARNERS, WITH_DEMOS = get_args(Learner), ("ours", "earlier")
 EARLIER = ["--her-exponent", "1", "--no-jacobian", "--bc-weight", "0"]
 GOALS = {"no_obstacles": 0.9, "double_walls": 0.75}  # success rates
 QUERIES, QUERY_SEED, INTERVAL, LIMIT = 200, 20_261_127, 10_000, 3600.0
+ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"  # of JAX
 
 
 @dataclasses.dataclass
@@ -64,9 +74,11 @@ class Args:
     task: Literal["no_obstacles", "double_walls"] = "no_obstacles"
     """task; Stable-Baselines3 and SBX have no demonstrations, so `double_walls` is for ours"""
     only: tuple[Learner, ...] = ()
-    """learners; by default all that can learn the task"""
+    """learners to run, by default all that can learn the task; the table has all in `--folder`"""
     seeds: tuple[flags.Seed, ...] = (1, 2, 3)
     """seeds, one run each"""
+    workers: flags.Workers = 1
+    """runs at a time, one core each"""
     limit: flags.PositiveFloat = LIMIT
     """seconds of training at most"""
     in_process: bool = False
@@ -257,30 +269,86 @@ def run_one(args, name, seed):
     path.write_text(json.dumps(result | clock.curve[-1] | {"curve": clock.curve}, indent=1) + "\n")
 
 
+def run_in_process(args, name, seed):
+    """`run_one` in a process of its own; the trainer's run folder is gone afterwards."""
+    command = [sys.executable, __file__, "--in-process", "--folder", str(args.folder)]
+    command += ["--task", args.task, "--only", name, "--seeds", str(seed)]
+    path = file_of(args, name, seed).with_suffix(".log")
+    print(f"{args.task}, {name}, seed {seed}: begins; its output is in {path}", flush=True)
+    with tempfile.TemporaryDirectory() as folder, open(path, "w") as log:
+        subprocess.run(
+            [*command, "--limit", str(args.limit)],
+            check=True,
+            env=os.environ | {"TMPDIR": folder, "XLA_FLAGS": ONE_THREAD},
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+    print(f"{args.task}, {name}, seed {seed}: ends", flush=True)
+
+
 def file_of(args, name, seed):
     return args.folder / f"{args.task}-{name}-{seed}.json"
 
 
-def rows_of(args, names):
-    """Cells of the table, a row per learner that has a result."""
-    rows, base = [], None
+def runs_of(args, names):
+    """Learner -> results of its runs, of the learners that have results."""
+    runs = {}
     for name in names:
         files = [file_of(args, name, seed) for seed in args.seeds]
-        runs = [json.loads(file.read_text()) for file in files if file.exists()]
-        if not runs:
-            continue
-        runs.sort(key=lambda run: run["seconds"] if run["reached"] else math.inf)
-        run, reached = runs[(len(runs) - 1) // 2], sum(run["reached"] for run in runs)
+        runs[name] = [json.loads(file.read_text()) for file in files if file.exists()]
+    return {name: own for name, own in runs.items() if own}
+
+
+def median(runs):
+    """The median run; those that did not reach the goal are the slowest."""
+    runs = sorted(runs, key=lambda run: run["seconds"] if run["reached"] else math.inf)
+    return runs[(len(runs) - 1) // 2]
+
+
+def rows_of(all_runs):
+    """Cells of the table, a row per learner."""
+    rows, ours = [], all_runs.get("ours")
+    for name, runs in all_runs.items():
+        run, reached = median(runs), sum(run["reached"] for run in runs)
         more = "" if run["reached"] else "more than "
-        base = base or run["seconds"]
         row = [name, f"{reached} of {len(runs)}", f"{more}{run['seconds'] / 60:.1f}"]
         row += [f"{run['steps']:,}", f"{run['updates']:,}", f"{max_success(run):.3f}"]
-        rows.append([*row, f"{more}{run['seconds'] / base:.1f}"])
+        ratio = f"{more}{run['seconds'] / median(ours)['seconds']:.1f}" if ours else NOTHING
+        rows.append([*row, ratio])
     return rows
 
 
 def max_success(run):
     return max(point["success"] for point in run["curve"])
+
+
+def curve_rows(all_runs):
+    """Success of all runs after each evaluation."""
+    return [
+        [name, run["seed"], point["steps"], round(point["seconds"], 1), point["success"]]
+        for name, runs in all_runs.items()
+        for run in runs
+        for point in run["curve"]
+    ]
+
+
+def figure_of(task, all_runs):
+    """A PNG file's bytes: success over minutes of training, a line per run."""
+    figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
+    axes.axhline(GOALS[task], color="0.4", linestyle="--", linewidth=1)
+    for i, (name, runs) in enumerate(all_runs.items()):
+        for run in runs:
+            minutes = [0.0] + [point["seconds"] / 60 for point in run["curve"]]
+            success = [0.0] + [point["success"] for point in run["curve"]]
+            label = name if run is runs[0] else None
+            axes.plot(minutes, success, "o-", color=f"C{i}", linewidth=1.2, ms=3, label=label)
+    axes.set(xlabel="minutes of training", ylabel=f"success on {task}", xlim=(0, None), ylim=(0, 1))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="center right")
+    contents = io.BytesIO()
+    figure.savefig(contents, format="png", dpi=110)
+    plt.close(figure)
+    return contents.getvalue()
 
 
 def main():
@@ -294,18 +362,17 @@ def main():
         run_one(args, names[0], args.seeds[0])
         return
     args.folder.mkdir(parents=True, exist_ok=True)
-    for seed in args.seeds:
-        for name in names:
-            if not file_of(args, name, seed).exists():
-                print(f"{args.task}, {name}, seed {seed}", flush=True)
-                command = [sys.executable, __file__, "--in-process", "--folder", str(args.folder)]
-                command += ["--task", args.task, "--only", name, "--seeds", str(seed)]
-                with tempfile.TemporaryDirectory() as folder:
-                    env = os.environ | {"TMPDIR": folder}
-                    subprocess.run([*command, "--limit", str(args.limit)], check=True, env=env)
+    runs = [(name, seed) for seed in args.seeds for name in names]
+    waiting = [run for run in runs if not file_of(args, *run).exists()]
+    with ThreadPoolExecutor(args.workers) as pool:
+        list(pool.map(lambda run: run_in_process(args, *run), waiting))
     head = ["learner", "runs that reached it", "minutes", "environment steps", "updates"]
     head += ["best success rate", "minutes / minutes of `ours`"]
-    write_csv(f"time_to_success_{args.task}.csv", head, rows_of(args, names))
+    all_runs, name = runs_of(args, able), f"time_to_success_{args.task}"
+    write_csv(f"{name}.csv", head, rows_of(all_runs))
+    curve_head = ["learner", "seed", "environment steps", "seconds", "success"]
+    write_csv(f"{name}_curves.csv", curve_head, curve_rows(all_runs))
+    write_atomically(ROOT / "docs" / "figures" / f"{name}.png", figure_of(args.task, all_runs))
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ def test_ours_trains_until_the_limit_and_validates_on_fresh_queries(small, monke
 
 
 def test_rows_show_the_median_run_and_what_did_not_reach_it(tmp_path):
-    args = time_to_success.Args(tmp_path, only=("ours", "sb3"))
+    args = time_to_success.Args(tmp_path)
     for name, minutes, reached in (
         ("ours", (5, 4, 9), (True, True, True)),
         ("sb3", (60, 20, 60), (False, True, False)),
@@ -59,33 +59,38 @@ def test_rows_show_the_median_run_and_what_did_not_reach_it(tmp_path):
             run = {"reached": good, "seconds": 60.0 * minute, "steps": 1000 * minute}
             run |= {"updates": 500 * minute, "curve": [{"success": 0.9 if good else 0.4}]}
             time_to_success.file_of(args, name, seed).write_text(json.dumps(run))
-    assert time_to_success.rows_of(args, args.only) == [
-        ["ours", "3 of 3", "5.0", "5,000", "2,500", "0.900", "1.0"],
-        ["sb3", "1 of 3", "more than 60.0", "60,000", "30,000", "0.400", "more than 12.0"],
-    ]
+    runs = time_to_success.runs_of(args, time_to_success.LEARNERS)
+    ours = ["ours", "3 of 3", "5.0", "5,000", "2,500", "0.900"]
+    sb3 = ["sb3", "1 of 3", "more than 60.0", "60,000", "30,000", "0.400"]
+    assert time_to_success.rows_of(runs) == [[*ours, "1.0"], [*sb3, "more than 12.0"]]
+    assert time_to_success.rows_of({"sb3": runs["sb3"]}) == [[*sb3, "–"]]  # nothing to divide by
 
 
 def test_each_run_has_a_process_and_is_not_repeated(tmp_path, monkeypatch):
     commands = []
 
-    def run(command, check, env):
+    def run(command, check, env, stdout, stderr):
         commands.append(command)
         args = time_to_success.tyro.cli(time_to_success.Args, args=command[2:])
         assert args.in_process and env["TMPDIR"]
-        result = {
-            "reached": True,
-            "seconds": 60.0,
-            "steps": 1,
-            "updates": 1,
-            "curve": [{"success": 1}],
-        }
-        time_to_success.file_of(args, args.only[0], args.seeds[0]).write_text(json.dumps(result))
+        name, seed = args.only[0], args.seeds[0]
+        point = {"seconds": 60.04 * seed, "steps": 1000, "updates": 1, "success": 0.8}
+        result = {"reached": True, "seed": seed, **point, "curve": [point]}
+        time_to_success.file_of(args, name, seed).write_text(json.dumps(result))
 
     monkeypatch.setattr(time_to_success.subprocess, "run", run)
-    written = []
-    monkeypatch.setattr(time_to_success, "write_csv", lambda *table: written.append(table))
-    monkeypatch.setattr(sys, "argv", ["x", "--folder", str(tmp_path), "--task", "double_walls"])
-    for _ in range(2):
+    monkeypatch.setattr(time_to_success, "ROOT", tmp_path)
+    (tmp_path / "docs" / "figures").mkdir(parents=True)
+    written = {}
+    monkeypatch.setattr(
+        time_to_success, "write_csv", lambda name, *table: written.update({name: table})
+    )
+    command = ["x", "--folder", str(tmp_path), "--task", "double_walls"]
+    for more in ([], ["--only", "earlier"]):
+        monkeypatch.setattr(sys, "argv", [*command, *more])
         time_to_success.main()
     assert len(commands) == 6  # two learners, three seeds
-    assert [len(rows) for _, _, rows in written] == [2, 2]
+    table, curves = (written[f"time_to_success_double_walls{end}.csv"] for end in ("", "_curves"))
+    assert [row[0] for row in table[1]] == ["ours", "earlier"]  # all in the folder, run now or not
+    assert len(curves[1]) == 6 and curves[1][1] == ["ours", 2, 1000, 120.1, 0.8]
+    assert (tmp_path / "docs/figures/time_to_success_double_walls.png").stat().st_size > 5000
