@@ -29,7 +29,6 @@ import contextlib
 import dataclasses
 import io
 import json
-import math
 import os
 import runpy
 import subprocess
@@ -301,7 +300,7 @@ def runs_of(args, names):
 
 def median(runs):
     """The median run; those that did not reach the goal are the slowest."""
-    runs = sorted(runs, key=lambda run: run["seconds"] if run["reached"] else math.inf)
+    runs = sorted(runs, key=lambda run: (not run["reached"], run["seconds"]))
     return runs[(len(runs) - 1) // 2]
 
 
