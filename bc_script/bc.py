@@ -20,16 +20,17 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs.datasets.demonstrations import load_demos
-from roboarm_nmp.envs.datasets.episodes import observed
-from roboarm_nmp.envs.networks.poses import pose_difference
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.episodes import observed
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
+from roboarm_nmp.training import cuda_graphs, protocol, runs
+from roboarm_nmp.training.network_parts import pose_difference
+from roboarm_nmp.utils import flags
 
 
 @dataclass
 class Args(protocol.PolicyFlags):
-    # More flags are in `envs/training/protocol.py` (task) and `envs/training/runs.py` (run).
+    # More flags: `roboarm_nmp.training.protocol` (task), `roboarm_nmp.training.runs` (run).
     goal_type: Literal["ee", "config", "combined", "pose"] = "combined"
     """what the goal is: end-effector position, configuration, both, or end-effector pose"""
     demos: tuple[Path, ...] = ()

@@ -23,23 +23,23 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
+from roboarm_nmp.datasets.queries import Query
+from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.arm_env import end_effector_size
-from roboarm_nmp.envs.datasets.queries import Query
-from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
-from roboarm_nmp.envs.networks.poses import pose_difference
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
-from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
-from roboarm_nmp.envs.utils import workers
-from roboarm_nmp.envs.utils.progress import progress_bar
-from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
+from roboarm_nmp.training import cuda_graphs, protocol, runs
+from roboarm_nmp.training.network_parts import pose_difference
+from roboarm_nmp.utils import flags, workers
+from roboarm_nmp.utils.progress import progress_bar
+from roboarm_nmp.utils.random_streams import Stream
 
 
 @dataclass
 class Args(protocol.PolicyFlags):
-    # More flags are in `envs/training/protocol.py` (task) and `envs/training/runs.py` (run).
+    # More flags: `roboarm_nmp.training.protocol` (task), `roboarm_nmp.training.runs` (run).
     task: str = "random_boxes_hard"
     """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
     goal_type: Literal["config", "combined", "pose"] = "combined"

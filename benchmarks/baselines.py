@@ -25,9 +25,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from markdown_tables import NOTHING, share, table, write
 
-from roboarm_nmp.envs.datasets.queries import load_queries, query_path
+from roboarm_nmp.datasets.queries import load_queries, query_path
 from roboarm_nmp.envs.tasks import STATIC_TASKS
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks/results/baselines.json"

@@ -41,15 +41,15 @@ import numpy as np
 from tqdm import tqdm
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import STATIC_TASKS, with_robot
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 CONTACT_RANGE = 0.01  # m
 SCENES = 40  # of each distribution

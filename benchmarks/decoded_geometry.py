@@ -33,9 +33,9 @@ import torch.nn as nn
 import torch.nn.functional as F
 from tqdm import tqdm
 
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.demonstrations import load_demos
-from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.perception.encoders import (
     DECODED_REACH,
     MAX_OBSTACLES,

@@ -52,8 +52,8 @@ from roboarm_nmp.envs.collision.checker import RESOLUTION
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.subgoals import subgoals
-from roboarm_nmp.envs.utils.bullet import pybullet as p
-from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.utils.bullet import pybullet as p
+from roboarm_nmp.utils.random_streams import Stream
 
 # The tasks for the plain way: those with a fixed scene, a table and a floor.
 FIXED = [

@@ -34,7 +34,7 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs.robots.control import SUBSTEPS
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 EPISODE = 100  # steps
 

@@ -25,11 +25,11 @@ import torch
 from tqdm import tqdm
 
 import roboarm_nmp
-from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.perception import geometry_source, point_clouds
 from roboarm_nmp.envs.perception.encoders import NetworkEncoder, make_encoder
-from roboarm_nmp.envs.policies.registry import find_policy, make_policy
-from roboarm_nmp.envs.policies.rollout import rollout
+from roboarm_nmp.evaluation.rollout import rollout
+from roboarm_nmp.policies.registry import find_policy, make_policy
 
 TASK = "random_boxes_hard"
 SHOWN = ("rendering", "encoding", "planning", "action", "total")
@@ -89,7 +89,7 @@ def times(policy, queries, source=None, time_limit=5.0):
     """Means (s) of what is `SHOWN`, and `success_rate`.
 
     Args:
-        policy: as `envs.policies.registry.find_policy` takes it.
+        policy: as `policies.registry.find_policy` takes it.
         queries: list of `Query`.
         source: geometry source of a planner, or instead of a policy's own; None for that,
             otherwise `ground_truth`.

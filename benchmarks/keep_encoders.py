@@ -22,12 +22,12 @@ from pathlib import Path
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from roboarm_nmp.envs.datasets.format import attribute
-from roboarm_nmp.envs.datasets.observations import open_shard
-from roboarm_nmp.envs.datasets.shards import shard_path
-from roboarm_nmp.envs.networks.exported_networks import to_float16
+from roboarm_nmp.datasets.format import attribute
+from roboarm_nmp.datasets.observations import open_shard
+from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.envs.perception.encoders import DECODER, PRETRAINED
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.networks.exported_networks import to_float16
+from roboarm_nmp.utils.files import write_atomically
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from paper_tables import FIGURES, commit

@@ -10,7 +10,7 @@ import io
 import re
 from pathlib import Path
 
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"

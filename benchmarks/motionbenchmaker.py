@@ -7,7 +7,7 @@ FOLDER has a folder a set, such as `bookshelf_tall_panda`, with `scene####.yaml`
 `request####.yaml`: those of MotionBenchMaker, or of VAMP's archive of them
 (docs/benchmark/motionbenchmaker.md). The gripper is as open as the files say, 0.065 m a finger.
 
-Each problem is planned once by `demo_generation.planning.Planner` with its defaults and ground
+Each problem is planned once by `planning.planner.Planner` with its defaults and ground
 truth, in one thread, for at most 5 s. The duration is that of `plan`: start and goal are checked in
 PyBullet, the obstacles' shapes are prepared, the path is searched and shortened. Nothing else
 should run. A plan is then followed in the simulator: it must reach the goal without contact.
@@ -24,12 +24,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import tyro
 from markdown_tables import write_csv
 
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.demo_generation.planning import Planner, PlanningError
+from roboarm_nmp.datasets.import_problems import import_problems, summary
+from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.envs import RoboArmEnv
-from roboarm_nmp.envs.datasets.problems import load_problems
-from roboarm_nmp.envs.import_problems import import_problems, summary
-from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner, PlanningError
+from roboarm_nmp.utils.progress import progress_bar
 
 NAME = "motionbenchmaker.csv"
 HEAD = ("set", "problems", "imported", "plan found within 5 s", "followed without contact")

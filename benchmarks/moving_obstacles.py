@@ -23,10 +23,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import tyro
 from markdown_tables import csv_rows, interval, share, write_csv
 
-from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.tasks import TASKS
-from roboarm_nmp.envs.training.evaluation import evaluate
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.policies.safety_filter import SafetyFilter
+from roboarm_nmp.utils.files import write_atomically
 
 NAME, SEEDS = "moving_obstacles.csv", "moving_obstacles_seeds.csv"
 HEAD = ("task", "method", "obstacles from", "search", "filter", "queries")

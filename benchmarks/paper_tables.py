@@ -7,7 +7,7 @@
 
 A cell is a run: algorithm, goal type, task, p of the demo injection. It is trained with its script
 (flags that differ from the defaults: `RECIPES`) in `--runs-dir`, where one that was stopped goes
-on. Its best policy by validation goes to envs/policies/pretrained, in half precision, is
+on. Its best policy by validation goes to src/roboarm_nmp/policies/pretrained, in half precision, is
 evaluated on test queries as it is there, and gets its result beside it, in JSON: what has one is
 done, with the same flags and as many steps or more; on more queries than before the same policy is
 only evaluated again. (With `--no-keep-policies` the result stays alone.) The tables and figures of
@@ -40,16 +40,16 @@ from markdown_tables import NOTHING, interval, share, table, write
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.networks.exported_networks import to_float16
-from roboarm_nmp.envs.training.evaluation import wilson_interval
-from roboarm_nmp.envs.training.flags import PositiveInt, Seed, Workers, check
-from roboarm_nmp.envs.utils.files import check_folder, write_atomically
-from roboarm_nmp.envs.utils.signals import end_with_one_line
+from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.evaluation.evaluate import wilson_interval
+from roboarm_nmp.networks.exported_networks import to_float16
+from roboarm_nmp.utils.files import check_folder, write_atomically
+from roboarm_nmp.utils.flags import PositiveInt, Seed, Workers, check
+from roboarm_nmp.utils.signals import end_with_one_line
 
 ROOT = Path(__file__).resolve().parent.parent
 CELLS = ROOT / "benchmarks/results/paper_cells.csv"
-POLICIES = ROOT / "envs" / "policies" / "pretrained"
+POLICIES = ROOT / "src" / "roboarm_nmp" / "policies" / "pretrained"
 BASELINES = ROOT / "benchmarks/results/baselines.json"
 UNSEEN = ROOT / "benchmarks/results/unseen_obstacles.json"
 FIGURES = ROOT / "docs" / "figures"

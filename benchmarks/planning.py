@@ -4,7 +4,7 @@
     python benchmarks/planning.py    # random_boxes_hard; about 3 minutes
     python benchmarks/planning.py --task benchmaker_bookshelf_thin --split original
 
-`ours` is `demo_generation.planning.Planner` with its defaults: RRT-Connect alternates with
+`ours` is `planning.planner.Planner` with its defaults: RRT-Connect alternates with
 LBKPIECE1, margins shrink, and one round of shortening follows. Two others check one configuration
 at a time in PyBullet's world, asked from Python. They make up to three searches with smaller and
 smaller margins, as `Planner` did before `envs.collision.checker`. `pybullet_same_options` has our
@@ -31,13 +31,13 @@ from ompl import base as ob
 from tqdm import tqdm
 
 from roboarm_nmp import envs
-from roboarm_nmp.demo_generation import planning
-from roboarm_nmp.demo_generation.planning import MARGIN, MARGIN_GROWTH, Planner, PlanningError
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.collision.checker import RESOLUTION
-from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.planning import planner as planning
+from roboarm_nmp.planning.planner import MARGIN, MARGIN_GROWTH, Planner, PlanningError
+from roboarm_nmp.utils.bullet import pybullet as p
 
 
 class PyBulletValidity:

@@ -17,16 +17,16 @@ import time
 import numpy as np
 
 import roboarm_nmp
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.demo_generation.planning import Planner, PlanningError
-from roboarm_nmp.envs.datasets.queries import Query, load_queries
-from roboarm_nmp.envs.datasets.trajectories import timed
+from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
 from roboarm_nmp.envs.perception.sensors import PointCloud, SensorWorld, cardinal
-from roboarm_nmp.envs.policies.registry import find_policy, make_policy
-from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import ObservedScene
-from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.evaluation.rollout import rollout
+from roboarm_nmp.motions.trajectories import timed
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner, PlanningError
+from roboarm_nmp.policies.registry import find_policy, make_policy
+from roboarm_nmp.utils.progress import progress_bar
 
 STEPS = ("preparation", "scene", "plan", "joint path")
 

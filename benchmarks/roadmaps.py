@@ -26,11 +26,11 @@ import numpy as np
 from tqdm import tqdm
 
 from roboarm_nmp import envs
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.demo_generation.planning import Planner, PlanningError
 from roboarm_nmp.demo_generation.roadmaps import OPTIONS, Args, Roadmap, random_paths_of_scene
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner, PlanningError
 
 SEED = 2**32 - 1  # the highest: hardly anybody's collection
 

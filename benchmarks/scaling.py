@@ -23,8 +23,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import matplotlib
 
-from roboarm_nmp.envs.datasets.shards import shard_paths
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.datasets.shards import shard_paths
+from roboarm_nmp.utils.files import write_atomically
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

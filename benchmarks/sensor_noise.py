@@ -23,8 +23,8 @@ from markdown_tables import NOTHING, csv_rows, interval, share, write_csv
 from moving_obstacles import METHODS
 
 from roboarm_nmp.envs.perception.noise import SensorNoise
-from roboarm_nmp.envs.training.evaluation import evaluate
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.utils.files import write_atomically
 
 TASKS = ("random_boxes_hard", "moving_boxes_medium")
 LABELS = {

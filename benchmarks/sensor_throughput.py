@@ -29,9 +29,9 @@ from roboarm_nmp.envs.perception.sensors import (
     cardinal,
     deproject,
 )
-from roboarm_nmp.envs.policies.registry import find_policy, make_policy
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.wrappers import SensorWrapper
+from roboarm_nmp.policies.registry import find_policy, make_policy
+from roboarm_nmp.utils.bullet import pybullet as p
 
 TASK = "random_boxes_hard"
 POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"

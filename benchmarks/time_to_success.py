@@ -53,10 +53,11 @@ import matplotlib.pyplot as plt
 
 from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import sac_her_mp
-from roboarm_nmp.envs.datasets.queries import Query
+from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.training import flags, protocol
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.training import protocol
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.files import write_atomically
 
 Learner = Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"]
 LEARNERS, WITH_DEMOS = get_args(Learner), ("ours", "earlier")

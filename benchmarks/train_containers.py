@@ -38,19 +38,20 @@ import torch
 
 from roboarm_nmp import envs
 from roboarm_nmp.bc_script import dagger
+from roboarm_nmp.datasets.queries import Query
+from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
-from roboarm_nmp.envs.datasets.queries import Query
-from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
-from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source, ground_truth_checker
 from roboarm_nmp.envs.perception.point_clouds import NUM_POINTS, POINT_CLOUD, remember_points
-from roboarm_nmp.envs.policies.rollout import rollout
-from roboarm_nmp.envs.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
-from roboarm_nmp.envs.training import flags, protocol
-from roboarm_nmp.envs.utils.files import write_atomically
-from roboarm_nmp.envs.utils.progress import progress_bar
-from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.evaluation.rollout import rollout
+from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
+from roboarm_nmp.training import protocol
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.files import write_atomically
+from roboarm_nmp.utils.progress import progress_bar
+from roboarm_nmp.utils.random_streams import Stream
 
 TASK = "random_boxes_hard"  # in the policies' metadata
 EXAMPLES_PER_DRAW = 256  # all of one scene

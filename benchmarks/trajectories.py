@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.utils.progress import progress_bar
 
 MILLISECOND, SPACING = 0.001, 0.005
 TOLERANCE = 1e-6
@@ -86,10 +86,10 @@ def main():
     if args.num < 1:
         parser.error("--num must be at least 1")
     # Here, so that --help does not wait for OMPL and Numba.
-    from roboarm_nmp.demo_generation.planning import Planner, PlanningError
+    from roboarm_nmp.datasets.queries import load_queries
     from roboarm_nmp.envs.collision.checker import CollisionChecker
-    from roboarm_nmp.envs.datasets.queries import load_queries
-    from roboarm_nmp.envs.time_parameterisation import time_parameterise
+    from roboarm_nmp.motions.time_parameterisation import time_parameterise
+    from roboarm_nmp.planning.planner import Planner, PlanningError
 
     env = envs.make(args.task)
     planner, robot, queries = Planner(env), env.robot, load_queries(args.task, "validation")

@@ -19,12 +19,12 @@ from PIL import Image
 from unseen_obstacles import BASELINES, HARD, load_results, others_results, papers_best
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.policies.registry import find_policy, make_policy
-from roboarm_nmp.envs.policies.rollout import rollout
-from roboarm_nmp.envs.show import render_configurations
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.tasks import STATIC_TASKS
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.evaluation.rollout import rollout
+from roboarm_nmp.policies.registry import find_policy, make_policy
+from roboarm_nmp.utils.files import write_atomically
+from roboarm_nmp.viewer.show import render_configurations
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -26,19 +26,19 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from markdown_tables import NOTHING, interval, share, table, write
 
-from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
-from roboarm_nmp.envs.networks.exported_networks import to_float16
+from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.perception.encoders import PRETRAINED
-from roboarm_nmp.envs.policies.registry import PolicyError, find_policy
-from roboarm_nmp.envs.policies.safety_filter import VERSION
 from roboarm_nmp.envs.tasks import STATIC_TASKS
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.networks.exported_networks import to_float16
+from roboarm_nmp.policies.registry import PolicyError, find_policy
+from roboarm_nmp.policies.safety_filter import VERSION
+from roboarm_nmp.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks/results/unseen_obstacles.json"
 BASELINES = ROOT / "benchmarks/results/baselines.json"
 PAPER_CELLS = ROOT / "benchmarks/results/paper_cells.csv"
-POLICIES = ROOT / "envs" / "policies" / "pretrained"
+POLICIES = ROOT / "src" / "roboarm_nmp" / "policies" / "pretrained"
 HARD = "random_boxes_hard"
 # The margin of the safety filter: see docs/lab_notebook.md.
 GROUND_TRUTH = ["--safety-margin", "0.01"]

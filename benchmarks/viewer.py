@@ -18,9 +18,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from roboarm_nmp.envs.viewer import app, demo
-from roboarm_nmp.envs.viewer.drawing import Drawing
-from roboarm_nmp.envs.viewer.simulation import PolicyArm, Simulation, task_episodes
+from roboarm_nmp.viewer import app, demo
+from roboarm_nmp.viewer.drawing import Drawing
+from roboarm_nmp.viewer.simulation import PolicyArm, Simulation, task_episodes
 
 FRAMES, PORT = 200, 8190
 CORES = sorted(os.sched_getaffinity(0))

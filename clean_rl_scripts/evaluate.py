@@ -46,12 +46,12 @@ from typing import Literal
 
 from PIL import Image
 
-from roboarm_nmp.envs.policies.baselines import OMPL_PLANNERS, TIME_LIMIT, TRIES
 from roboarm_nmp.envs.tasks import task_with_robot
-from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.evaluation_report import report
-from roboarm_nmp.envs.utils.files import check_writable, write_atomically
-from roboarm_nmp.envs.utils.signals import end_with_one_line
+from roboarm_nmp.evaluation.report import report
+from roboarm_nmp.policies.baselines import OMPL_PLANNERS, TIME_LIMIT, TRIES
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.files import check_writable, write_atomically
+from roboarm_nmp.utils.signals import end_with_one_line
 
 
 @dataclass
@@ -139,7 +139,7 @@ def main(arguments=None):
             check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
         from roboarm_nmp.envs.perception.noise import SensorNoise
-        from roboarm_nmp.envs.training.evaluation import evaluate, first_episode_image
+        from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_image
 
         noise = SensorNoise.parse(args.sensor_noise) if args.sensor_noise else None
         options = vars(args) | {"safety_filter": _safety_filter(args), "sensor_noise": noise}
@@ -175,8 +175,8 @@ def _check_baseline_flags(args):
 
 def _safety_filter(args):
     """The flags' safety filter as for `evaluate`. Raises ValueError: there is none to change."""
-    from roboarm_nmp.envs.policies.registry import find_policy, own_safety_filter
-    from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+    from roboarm_nmp.policies.registry import find_policy, own_safety_filter
+    from roboarm_nmp.policies.safety_filter import SafetyFilter
 
     flags_given = {
         "--no-escape": not args.escape,

@@ -32,11 +32,11 @@ from pathlib import Path
 
 import tyro
 
-from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers, check, parse
-from roboarm_nmp.envs.utils import names
-from roboarm_nmp.envs.utils.files import check_folder, write_atomically
-from roboarm_nmp.envs.utils.signals import Terminated, end_with_one_line, exit_interrupted
-from roboarm_nmp.envs.utils.workers import check_ray
+from roboarm_nmp.utils import names
+from roboarm_nmp.utils.files import check_folder, write_atomically
+from roboarm_nmp.utils.flags import CORES, PositiveInt, Seed, Workers, check, parse
+from roboarm_nmp.utils.signals import Terminated, end_with_one_line, exit_interrupted
+from roboarm_nmp.utils.workers import check_ray
 
 try:
     import optuna

@@ -18,16 +18,16 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs.datasets.episodes import demo_transitions
-from roboarm_nmp.envs.networks.kinematics import JacobianTranspose
-from roboarm_nmp.envs.networks.poses import pose_difference
-from roboarm_nmp.envs.training import cuda_graphs, flags, protocol, runs
-from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.datasets.episodes import demo_transitions
+from roboarm_nmp.training import cuda_graphs, protocol, runs
+from roboarm_nmp.training.network_parts import JacobianTranspose, pose_difference
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.progress import progress_bar
 
 
 @dataclass
 class Args(protocol.PolicyFlags, protocol.EnvFlags):
-    # More flags are in `envs/training/protocol.py` (task, MDP) and `envs/training/runs.py` (run).
+    # More flags: `roboarm_nmp.training.protocol` (task, MDP), `roboarm_nmp.training.runs` (run).
     num_envs: flags.Environments = 4
     """environments stepped together; every one of their steps counts"""
     total_timesteps: flags.PositiveInt = 1_000_000

@@ -19,16 +19,17 @@ from pathlib import Path
 import numpy as np
 
 from roboarm_nmp import envs
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.demo_generation.planning import Planner, PlanningError
-from roboarm_nmp.envs.datasets.demonstrations import demo_path, write_demos
-from roboarm_nmp.envs.datasets.journal import Journal, journal_of
-from roboarm_nmp.envs.datasets.queries import query_path, validate
+from roboarm_nmp.datasets.demonstrations import demo_path, write_demos
+from roboarm_nmp.datasets.journal import Journal, journal_of
+from roboarm_nmp.datasets.queries import query_path, validate
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
 from roboarm_nmp.envs.tasks import task_with_robot
-from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import (
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner, PlanningError
+from roboarm_nmp.utils import flags, workers
+from roboarm_nmp.utils.files import check_writable
+from roboarm_nmp.utils.flags import (
     CORES,
     NonNegativeFloat,
     NonNegativeInt,
@@ -36,11 +37,9 @@ from roboarm_nmp.envs.training.flags import (
     Seed,
     Workers,
 )
-from roboarm_nmp.envs.utils import workers
-from roboarm_nmp.envs.utils.files import check_writable
-from roboarm_nmp.envs.utils.progress import progress_bar, write_line
-from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import end_with_one_line
+from roboarm_nmp.utils.progress import progress_bar, write_line
+from roboarm_nmp.utils.random_streams import Stream
+from roboarm_nmp.utils.signals import end_with_one_line
 
 MAX_QUERIES = 100  # tried for one demonstration
 ATTEMPTS = 3  # plans tried on a query of the Panda
@@ -75,8 +74,8 @@ class Args:
     allow_collisions: bool = False
     """Accept demonstrations with contact that reach the goal (the paper's rule)."""
     output: Path | None = None
-    """File to write. The default is `envs/demos/<task>.h5`, or `<name>_demos.h5` beside a scene
-    file, or `<task>@<robot>_demos.h5` beside a robot's file."""
+    """File to write. The default is `src/roboarm_nmp/datasets/demos/<task>.h5`, or
+    `<name>_demos.h5` beside a scene file, or `<task>@<robot>_demos.h5` beside a robot's file."""
     overwrite: bool = False
     """Replace the output, if it exists."""
     ray_address: str | None = None

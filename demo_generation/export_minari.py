@@ -32,14 +32,14 @@ import gymnasium
 import numpy as np
 
 from roboarm_nmp import envs
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
-from roboarm_nmp.envs.datasets.episodes import demo_episode
+from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.datasets.episodes import demo_episode
 from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
 from roboarm_nmp.envs.tasks import has_name, split_robot, task_with_robot
-from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.utils.progress import progress_bar
-from roboarm_nmp.envs.utils.signals import end_with_one_line
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.progress import progress_bar
+from roboarm_nmp.utils.signals import end_with_one_line
 
 PREFIX = ".exporting-"  # of incomplete folders; Minari ignores hidden ones
 
@@ -84,7 +84,7 @@ def episode(demo, env):
     """A demonstration as the environment would have recorded it, up to reaching the goal.
 
     Args:
-        demo: an `envs.datasets.demonstrations.Demo`.
+        demo: an `datasets.demonstrations.Demo`.
         env: a `RoboArmEnv` with relative actions and no velocities.
 
     Returns:
@@ -163,7 +163,7 @@ def export(
     """Write `Demos` into Minari's local storage; returns the dataset's id and number of steps.
 
     Args:
-        demos: an `envs.datasets.demonstrations.Demos`.
+        demos: an `datasets.demonstrations.Demos`.
         goal_type: `ee`, `config`, `combined` or `pose`.
         dataset_id: a name with a version, `namespace/name-v0`; None for the default.
         exact: follow the plans again, see above.

@@ -1,4 +1,4 @@
-"""Make the query files of tasks, `envs/data/<task>.h5`: random feasible starts and goals.
+"""Make the query files of tasks (`datasets/data/<task>.h5`): random feasible starts and goals.
 
     roboarm queries --task wall
     roboarm queries --task random_boxes_hard --solvable
@@ -37,23 +37,22 @@ import numpy as np
 import tyro
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.format import ORIGINAL, AnimatedScenes, scene_seeds
+from roboarm_nmp.datasets.journal import Journal, journal_of
+from roboarm_nmp.datasets.problems import load_problems
+from roboarm_nmp.datasets.queries import query_path, write_queries
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
-from roboarm_nmp.demo_generation.planning import Planner
-from roboarm_nmp.envs.datasets.format import ORIGINAL, AnimatedScenes, scene_seeds
-from roboarm_nmp.envs.datasets.journal import Journal, journal_of
-from roboarm_nmp.envs.datasets.problems import load_problems
-from roboarm_nmp.envs.datasets.queries import query_path, write_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
 from roboarm_nmp.envs.tasks import is_for_any_robot, task_with_robot
-from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers
-from roboarm_nmp.envs.utils import workers
-from roboarm_nmp.envs.utils.files import check_writable
-from roboarm_nmp.envs.utils.progress import progress_bar, write_line
-from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import end_with_one_line
 from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
+from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.utils import flags, workers
+from roboarm_nmp.utils.files import check_writable
+from roboarm_nmp.utils.flags import CORES, PositiveInt, Seed, Workers
+from roboarm_nmp.utils.progress import progress_bar, write_line
+from roboarm_nmp.utils.random_streams import Stream
+from roboarm_nmp.utils.signals import end_with_one_line
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
 HOLD_STEPS = 24
@@ -94,8 +93,9 @@ class Args:
     """File or folder of problems, such as MotionBenchMaker's (docs/customise/problems.md), to add
     as the split `original`; goes with one task."""
     output: Path | None = None
-    """File to write; goes with one task. The default is `envs/data/<task>.h5`, or, for a scene
-    file, `<name>_queries.h5` beside it, or, for a robot's file, `<task>@<robot>_queries.h5`."""
+    """File to write; goes with one task. The default is `src/roboarm_nmp/datasets/data/<task>.h5`,
+    or, for a scene file, `<name>_queries.h5` beside it, or, for a robot's file,
+    `<task>@<robot>_queries.h5`."""
     overwrite: bool = False
     """Replace files that exist."""
 
@@ -213,7 +213,7 @@ def make_queries(
         ValueError: unknown task; the journal belongs to other queries, or is in use.
         RuntimeError: no query can be found, also because the goal region has no room; or workers
             keep dying.
-        DatasetError, OSError: as `envs.datasets.queries.write_queries` does.
+        DatasetError, OSError: as `datasets.queries.write_queries` does.
         Whatever is raised, what is in the journal is safe.
     """
     query_path(task)  # rejects an unknown task

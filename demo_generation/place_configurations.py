@@ -7,8 +7,8 @@ ends, on_ways = place_configurations(scene, places, rng, 20)
 import numpy as np
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.policies.approach_path import approach_path
 from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
+from roboarm_nmp.planning.approach_path import approach_path
 
 MARGIN, NEAR = 0.003, 0.015  # m: of all configurations, and of most of them at most
 FAR_SHARE = 0.25  # of those farther than NEAR, so many are kept

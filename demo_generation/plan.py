@@ -23,15 +23,15 @@ from typing import Literal
 import numpy as np
 
 from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS
-from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import (
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.files import check_writable
+from roboarm_nmp.utils.flags import (
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     Seed,
 )
-from roboarm_nmp.envs.utils.files import check_writable
-from roboarm_nmp.envs.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line
 
 CLOUD_FLAGS = (
     *("units", "frame", "intrinsics", "recorded_at", "arm_distance", "table", "workspace"),
@@ -156,7 +156,7 @@ def _observed_scene(args, robot):
 
 def _goal(args, robot, start):
     """The goal as an argument of `Planner.plan`: `goal` (n,), rad, or `goal_pose` (7,)."""
-    from roboarm_nmp.envs.policies.pose_goals import goal_configuration
+    from roboarm_nmp.policies.pose_goals import goal_configuration
 
     if args.goal is not None:
         return {"goal": _configuration("--goal", args.goal, robot)}
@@ -188,8 +188,8 @@ def _planned(args, scene, start, goal):
 
     Raises PlanningError: there is none.
     """
-    from roboarm_nmp.demo_generation.planning import Planner
     from roboarm_nmp.envs.arm_env import RoboArmEnv
+    from roboarm_nmp.planning.planner import Planner
 
     planner = Planner(RoboArmEnv(scene))
     began = time.perf_counter()
@@ -200,10 +200,10 @@ def _planned(args, scene, start, goal):
 def _rolled_out(args, checker, start, goal=None, goal_pose=None):
     """The `Trajectory` of a policy from start to goal. Raises ValueError: it cannot act here."""
     from roboarm_nmp import envs
-    from roboarm_nmp.envs.datasets.queries import Query
-    from roboarm_nmp.envs.policies.pose_goals import goal_configuration
-    from roboarm_nmp.envs.policies.registry import find_policy, make_policy, own_safety_filter
-    from roboarm_nmp.envs.policies.rollout import rollout
+    from roboarm_nmp.datasets.queries import Query
+    from roboarm_nmp.evaluation.rollout import rollout
+    from roboarm_nmp.policies.pose_goals import goal_configuration
+    from roboarm_nmp.policies.registry import find_policy, make_policy, own_safety_filter
 
     policy, options = find_policy(args.policy)
     if args.cloud is not None:
@@ -231,7 +231,7 @@ def _retimed(path, checker):
     A path that is inside the ball around a point, as its ends may be, or in contact, as a policy's
     may be, is timed without a check, exactly along the path, and a line says so.
     """
-    from roboarm_nmp.envs.time_parameterisation import time_parameterise
+    from roboarm_nmp.motions.time_parameterisation import time_parameterise
 
     began = time.perf_counter()
     try:
@@ -247,7 +247,7 @@ def _retimed(path, checker):
 def _describe(configurations, checker):
     """Print the length of a motion (m, n), rad, and its minimum clearance from the scene."""
     from roboarm_nmp.envs.collision.checker import FLOOR, NOTHING, POINT, TABLE
-    from roboarm_nmp.envs.metrics import path_length
+    from roboarm_nmp.motions.metrics import path_length
 
     robot, names = checker.robot, {TABLE: "the table", FLOOR: "the floor", POINT: "a point"}
     joints = path_length(configurations)
@@ -273,14 +273,14 @@ def main(args):
             raise ValueError("one of --goal and --goal-pose is needed")
         # Here, because --help need not wait for Numba.
         from roboarm_nmp.envs.collision.checker import CollisionChecker
-        from roboarm_nmp.envs.datasets.trajectories import (
+        from roboarm_nmp.envs.robots.files import load_robot
+        from roboarm_nmp.envs.robots.panda import PANDA
+        from roboarm_nmp.motions.trajectories import (
             check_ending,
             save_joint_path,
             save_trajectory,
             timed,
         )
-        from roboarm_nmp.envs.robots.files import load_robot
-        from roboarm_nmp.envs.robots.panda import PANDA
 
         if args.output is not None:
             check_ending(args.output)

@@ -20,10 +20,10 @@ Of an arm with j joints and l links that may collide:
 
 import numpy as np
 
+from roboarm_nmp.datasets.episodes import observed
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
-from roboarm_nmp.envs.datasets.episodes import observed
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
-from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.utils.random_streams import Stream
 
 AHEAD = 0.1  # normalised: an example's direction is to the point of its path so far ahead
 PER_PATH = 4  # examples of each chosen path, which share the link distances at its goal
@@ -33,7 +33,7 @@ class RoadmapExamples:
     """Makes examples. Equal arguments give equal examples.
 
     Args:
-        paths: `envs.datasets.roadmap_paths.RoadmapPaths`.
+        paths: `datasets.roadmap_paths.RoadmapPaths`.
         geometry_source: from a scene to what computes `link_distances`, of
             `envs.perception.geometry_source.find_geometry_source`.
         seed: of `draw`, >= 0.

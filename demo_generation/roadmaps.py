@@ -2,7 +2,7 @@
 
     roboarm roadmaps --task random_boxes_hard --scenes 6000 --output roadmaps
 
-collects paths of many scenes, for `envs.datasets.roadmap_paths.load_roadmap_paths`. In Python:
+collects paths of many scenes, for `datasets.roadmap_paths.load_roadmap_paths`. In Python:
 
     from roboarm_nmp.demo_generation.roadmaps import Roadmap
 
@@ -35,23 +35,23 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets import shards
+from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from roboarm_nmp.demo_generation.place_configurations import place_configurations
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
-from roboarm_nmp.envs.datasets import shards
-from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import task_with_robot
-from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
-from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import end_with_one_line
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
+from roboarm_nmp.utils.random_streams import Stream
+from roboarm_nmp.utils.signals import end_with_one_line
 
 # L2, normalised, between checked states of a motion before a path wants to take it.
 COARSE = 8 * RESOLUTION
 # Near a configuration that is closer to an obstacle than the margin, the margin is its distance. It
 # grows by this much (m) per unit of normalised distance from it.
 MARGIN_GROWTH = 0.05
-# Least margin (m) of nodes, that of plans (`demo_generation.planning.MARGIN`).
+# Least margin (m) of nodes, that of plans (`planning.planner.MARGIN`).
 NODE_MARGIN = 0.003
 # A motion costs up to 1 + NARROW times its length, where one of its ends has no room at all.
 NARROW = 2.0
@@ -572,7 +572,7 @@ def collect(args, progress=True):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
     if not args.margin >= NODE_MARGIN:
         raise ValueError(f"--margin must be at least {NODE_MARGIN} m")
-    package = Path(envs.__file__).parent.resolve()
+    package = Path(envs.__file__).parents[1].resolve()
     if package in (args.output.resolve(), *args.output.resolve().parents):
         raise ValueError(
             f"{args.output} is in {package}, which has the repository's own files only"

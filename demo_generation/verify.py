@@ -1,6 +1,6 @@
 """Verify demonstration files: follow every plan again in the simulator; repair what fails.
 
-    roboarm verify envs/demos/double_walls.h5 --repair
+    roboarm verify src/roboarm_nmp/datasets/demos/double_walls.h5 --repair
 
 Paper: appendix "Software package description" ("verification, and correction"). A demonstration
 is good if following its plan repeats the stored execution exactly, reaches the goal and has no
@@ -16,17 +16,16 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from roboarm_nmp.datasets.demonstrations import demo_path, load_demos, write_demos
+from roboarm_nmp.datasets.format import DatasetError, locate
 from roboarm_nmp.demo_generation.collect import demonstrate, make_planner
-from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.envs.arm_env import RoboArmEnv
-from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos, write_demos
-from roboarm_nmp.envs.datasets.format import DatasetError, locate
 from roboarm_nmp.envs.tasks import is_task, task_with_robot
-from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import CORES, Workers
-from roboarm_nmp.envs.utils import workers
-from roboarm_nmp.envs.utils.progress import progress_bar, write_line
-from roboarm_nmp.envs.utils.signals import end_with_one_line, exit_interrupted
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.utils import flags, workers
+from roboarm_nmp.utils.flags import CORES, Workers
+from roboarm_nmp.utils.progress import progress_bar, write_line
+from roboarm_nmp.utils.signals import end_with_one_line, exit_interrupted
 
 VERDICTS = ("good", "changed", "missed", "collided", "refused")
 REPAIR_ATTEMPTS = 10

@@ -4,7 +4,7 @@
     python docs/make_algorithm_pages.py
 
 A table stands between the marks `<!-- table: NAME -->` and `<!-- end -->` of a page; a test
-compares the two. The numbers are those of `envs/policies/pretrained`,
+compares the two. The numbers are those of `src/roboarm_nmp/policies/pretrained`,
 `envs/perception/pretrained` and `benchmarks/results`.
 """
 
@@ -23,7 +23,7 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES, FIGURES = ROOT / "docs" / "algorithms", ROOT / "docs" / "figures"
-RUNS, ENCODERS = ROOT / "envs/policies/pretrained", ROOT / "envs/perception/pretrained"
+RUNS, ENCODERS = ROOT / "src/roboarm_nmp/policies/pretrained", ROOT / "envs/perception/pretrained"
 RESULTS = ROOT / "benchmarks" / "results"
 TASKS = ("no_obstacles", "wall", "double_walls_wide_gap", "double_walls", "boxes")
 HARD = "random_boxes_hard"

@@ -15,12 +15,12 @@ from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
-from roboarm_nmp.envs.datasets.queries import Query, load_queries
+from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
-from roboarm_nmp.envs.show import render_query
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
+from roboarm_nmp.viewer.show import render_query
 
 SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls

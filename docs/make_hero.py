@@ -16,10 +16,10 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 from tqdm import tqdm
 
-from roboarm_nmp.envs.utils.files import write_atomically
-from roboarm_nmp.envs.viewer import app, demo
-from roboarm_nmp.envs.viewer.drawing import Drawing
-from roboarm_nmp.envs.viewer.simulation import PolicyArm, Simulation, task_episodes
+from roboarm_nmp.utils.files import write_atomically
+from roboarm_nmp.viewer import app, demo
+from roboarm_nmp.viewer.drawing import Drawing
+from roboarm_nmp.viewer.simulation import PolicyArm, Simulation, task_episodes
 
 OUTPUT = Path(__file__).parent / "figures" / "hero.gif"
 PORT, SIZE = 8191, (760, 400)

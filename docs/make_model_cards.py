@@ -6,9 +6,9 @@ python docs/make_model_cards.py
 from pathlib import Path
 
 from roboarm_nmp.envs.perception.encoders import pretrained_encoders
-from roboarm_nmp.envs.policies.cards import encoder_card, observes, policy_card
-from roboarm_nmp.envs.policies.registry import pretrained_policies
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.policies.cards import encoder_card, observes, policy_card
+from roboarm_nmp.policies.registry import pretrained_policies
+from roboarm_nmp.utils.files import write_atomically
 
 PAGE = Path(__file__).parent / "reference" / "pretrained.md"
 GOALS = {

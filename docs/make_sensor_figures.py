@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.perception.sensors import (
     NOTHING,
     OUTPUTS,
@@ -22,7 +22,7 @@ from roboarm_nmp.envs.perception.sensors import (
     SensorWorld,
     cardinal,
 )
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 FOLDER = Path(__file__).parent / "figures"
 COLOURS = np.array([[210, 50, 40], [240, 140, 40], [245, 210, 60], [255, 255, 255]], np.uint8)

@@ -13,7 +13,6 @@ from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.robots.robot import rotation_angle, signed
 from roboarm_nmp.envs.scenes.primitives import Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import (
     HOLD_STEPS,
     MAX_EDGE,
@@ -21,6 +20,7 @@ from roboarm_nmp.envs.world import (
     image_array,
     why_no_window,
 )
+from roboarm_nmp.utils.bullet import pybullet as p
 
 GOAL_TYPES = "ee", "config", "combined", "pose"
 ACTION_MODES = ("relative", "subgoal")

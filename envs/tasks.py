@@ -25,7 +25,7 @@ from roboarm_nmp.envs.scenes.moving_boxes import (
 )
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
-from roboarm_nmp.envs.utils.names import suggest
+from roboarm_nmp.utils.names import suggest
 
 SCENE_FILES = WORLD_FILES  # this project's and those of other programs
 

@@ -22,7 +22,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     hull_faces,
     pose_at,
 )
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 # A configuration is "held" if the controller keeps the arm there without contact for this many
 # environment steps, and the arm drifts no further than this (normalised).

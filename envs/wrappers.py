@@ -260,7 +260,7 @@ class LinkDistancesWrapper(_ObservingWrapper):
         append: whether `observation` contains `link_distances`, too, flat, before an encoded scene.
         goal_link_distances: whether observations contain `goal_link_distances`, if the goal type
             is `config` or `combined`.
-        fine_geometry_source: another one for approach paths (`envs.policies.approach_path`).
+        fine_geometry_source: another one for approach paths (`planning.approach_path`).
     """
 
     def __init__(

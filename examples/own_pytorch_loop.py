@@ -14,8 +14,8 @@ from torch import nn
 from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
 import roboarm_nmp
-from roboarm_nmp.envs.datasets.demonstrations import load_demos
-from roboarm_nmp.envs.datasets.episodes import demo_episode
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.episodes import demo_episode
 
 
 class DemoSteps(Dataset):

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 import roboarm_nmp
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.demo_generation.planning import Planner
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.datasets.trajectories import save_joint_path, timed
+from roboarm_nmp.motions.trajectories import save_joint_path, timed
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner
 
 
 def main():

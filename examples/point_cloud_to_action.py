@@ -15,13 +15,13 @@ import argparse
 import numpy as np
 
 import roboarm_nmp
+from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.queries import Query
 from roboarm_nmp.envs.perception.cloud_files import load_cloud
 from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
-from roboarm_nmp.envs.policies.registry import find_policy, make_policy
-from roboarm_nmp.envs.policies.rollout import rollout
 from roboarm_nmp.envs.scenes.primitives import ObservedScene
+from roboarm_nmp.evaluation.rollout import rollout
+from roboarm_nmp.policies.registry import find_policy, make_policy
 
 POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
 # Joint angles, rad: from the arm's left to its right.

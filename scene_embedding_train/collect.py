@@ -18,14 +18,14 @@ from typing import Literal
 import numpy as np
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets import shards
-from roboarm_nmp.envs.datasets.observations import Observations, observe, open_shard, shard_bytes
+from roboarm_nmp.datasets import shards
+from roboarm_nmp.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.tasks import task_with_robot
-from roboarm_nmp.envs.training import flags
-from roboarm_nmp.envs.training.flags import CORES, PositiveInt, Seed, Workers
-from roboarm_nmp.envs.utils.random_streams import Stream
-from roboarm_nmp.envs.utils.signals import end_with_one_line
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.flags import CORES, PositiveInt, Seed, Workers
+from roboarm_nmp.utils.random_streams import Stream
+from roboarm_nmp.utils.signals import end_with_one_line
 
 
 @dataclass

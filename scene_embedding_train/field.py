@@ -30,9 +30,7 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.training.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
-from roboarm_nmp.envs.training.runs import Run, check_finite, parse_args, seed_torch
+from roboarm_nmp.networks.exported_networks import save_network
 from roboarm_nmp.scene_embedding_train.clouds import (
     example_clouds,
     load_obstacle_points,
@@ -52,6 +50,8 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     load_observations,
     write_result,
 )
+from roboarm_nmp.training.runs import Run, check_finite, parse_args, seed_torch
+from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 # The field is around the robot's axis, m.
 REACH, HEIGHT = 1.0, 1.5
@@ -62,7 +62,7 @@ SECTORS = 8
 
 
 @dataclass
-class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
+class Args(EncoderFlags):  # whose flags are in `training_data.py` and `roboarm_nmp.training.runs`
     # The algorithm
     total_updates: PositiveInt = 20_000
     """batches of the whole run"""

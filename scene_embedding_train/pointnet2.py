@@ -27,10 +27,8 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.envs.networks.exported_networks import save_network
 from roboarm_nmp.envs.perception.sensors import NOTHING
-from roboarm_nmp.envs.training.flags import PositiveFloat, PositiveInt, Width
-from roboarm_nmp.envs.training.runs import Run, check_finite, parse_args, seed_torch
+from roboarm_nmp.networks.exported_networks import save_network
 from roboarm_nmp.scene_embedding_train import training_data
 from roboarm_nmp.scene_embedding_train.clouds import (
     IGNORED,
@@ -45,11 +43,13 @@ from roboarm_nmp.scene_embedding_train.clouds import (
     scene_cloud,
     thin_out,
 )
+from roboarm_nmp.training.runs import Run, check_finite, parse_args, seed_torch
+from roboarm_nmp.utils.flags import PositiveFloat, PositiveInt, Width
 
 
 @dataclass
 class Args(training_data.EncoderFlags):
-    # More flags are in `training_data.py` and `envs/training/runs.py`.
+    # More flags are in `training_data.py` and `src/roboarm_nmp/training/runs.py`.
 
     # The algorithm
     total_updates: PositiveInt = 10_000

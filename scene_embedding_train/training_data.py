@@ -11,17 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.observations import Observations
-from roboarm_nmp.envs.datasets.shards import shard_path
-from roboarm_nmp.envs.networks.exported_networks import robot_metadata
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.observations import Observations
+from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.envs.perception.sensors import sensors_to_json
 from roboarm_nmp.envs.robots.files import RobotError, load_robot
+from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.training.flags import PositiveInt, Share
-from roboarm_nmp.envs.training.runs import RunFlags, script_name
-from roboarm_nmp.envs.utils.files import new_contents
-from roboarm_nmp.envs.utils.progress import progress_bar
+from roboarm_nmp.training.runs import RunFlags, script_name
+from roboarm_nmp.utils.files import new_contents
+from roboarm_nmp.utils.flags import PositiveInt, Share
+from roboarm_nmp.utils.progress import progress_bar
 
 
 @dataclass

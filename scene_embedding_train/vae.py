@@ -17,9 +17,7 @@ import numpy as np
 import torch
 import torch.nn as nn
 
-from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.training.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
-from roboarm_nmp.envs.training.runs import Run, parse_args, seed_torch
+from roboarm_nmp.networks.exported_networks import save_network
 from roboarm_nmp.scene_embedding_train.images import (
     average_down,
     batch_of,
@@ -36,10 +34,12 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     load_observations,
     write_result,
 )
+from roboarm_nmp.training.runs import Run, parse_args, seed_torch
+from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 
 @dataclass
-class Args(EncoderFlags):  # whose flags are in `training_data.py` and `envs/training/runs.py`
+class Args(EncoderFlags):  # whose flags are in `training_data.py` and `roboarm_nmp.training.runs`
     # The algorithm
     total_updates: PositiveInt = 20_000
     """batches of the whole run"""

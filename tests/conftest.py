@@ -11,8 +11,8 @@ import pytest
 import torch
 from trainers import GPU
 
-from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
-from roboarm_nmp.envs.training import protocol
+from roboarm_nmp.datasets.demonstrations import load_demos, write_demos
+from roboarm_nmp.training import protocol
 
 # As many threads as a trainer has in a process of its own, whatever benchmarks set when they are
 # imported: results are compared bit for bit.

@@ -29,7 +29,7 @@ def run(*arguments):
 @pytest.mark.parametrize("name", ["collect", "queries"])
 def test_planning_without_ompl_is_refused_in_one_line(name, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ompl", None)
-    monkeypatch.delitem(sys.modules, "roboarm_nmp.demo_generation.planning", raising=False)
+    monkeypatch.delitem(sys.modules, "roboarm_nmp.planning.planner", raising=False)
     monkeypatch.setattr(sys, "argv", sys.argv)
     assert command.main([name, "--task", "wall"]) == 1
     message = capsys.readouterr().err

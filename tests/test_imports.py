@@ -1,86 +1,135 @@
-"""Arrows between modules point one way: no import cycle, no upward import."""
+"""Imports between modules point one way: no circle, no upward import, none hidden from a reader."""
 
 import ast
 import graphlib
 
-from paths import ROOT
+import pytest
+from paths import LIBRARY, ROOT
 
 from roboarm_nmp.__main__ import TRAINERS
 
 PACKAGE = "roboarm_nmp"
-FOLDERS = ("envs", "demo_generation", "clean_rl_scripts", "bc_script", "scene_embedding_train")
-# From the bottom to the top. A module may import from its own row and from the rows before it.
-LEVELS = [
-    ("envs.utils",),
-    ("envs.robots",),
-    ("envs.scenes", "envs.networks", "envs.subgoals"),
-    ("envs.world", "envs.collision", "envs.tasks"),
-    ("envs.arm_env", "envs.perception", "envs.wrappers"),
-    ("envs",),  # `make`
-    ("envs.datasets", "envs.policies"),
-    ("envs.metrics", "envs.time_parameterisation"),
-    ("envs.training",),
-    ("envs.show", "envs.robot_check", "envs.import_problems", "envs.retime"),
-    ("envs.viewer",),
-    ("demo_generation",),
+# From the bottom to the top. A module may import from its own package and from the rows before it.
+ROWS = [
+    ("utils",),
+    ("networks",),
+    ("envs",),
+    ("datasets", "planning"),
+    ("policies", "motions"),
+    ("evaluation",),
+    ("__init__",),  # make, evaluate
+    ("training", "viewer", "demo_generation"),
     ("clean_rl_scripts", "bc_script", "scene_embedding_train"),
+    ("benchmarks", "__main__"),
 ]
+# The environment's own files and packages, likewise.
+ENV_ROWS = [
+    ("robots",),
+    ("scenes", "subgoals"),
+    ("world", "collision", "tasks"),
+    ("arm_env", "perception"),
+    ("wrappers",),
+    ("__init__",),  # `make`
+]
+MOST_ROOMS, MOST_FLOORS, MOST_PAIRS = 17, 9, 75
 
 
 def modules():
-    """Names of all modules, without `roboarm_nmp.`, and their files."""
-    files = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
-    found = {}
+    """The names of all modules, without `roboarm_nmp.`, and their files."""
+    files = [*LIBRARY.glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]
+    for folder in LIBRARY.iterdir():
+        if folder.is_dir():
+            files += folder.resolve().rglob("*.py")
+    names = {}
     for path in files:
-        parts = path.relative_to(ROOT).with_suffix("").parts
-        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return found
+        base = LIBRARY if LIBRARY in path.parents else ROOT
+        parts = path.relative_to(base).with_suffix("").parts
+        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return names
 
 
 def imports(path, known):
-    """Names of the project's modules that a file imports, in functions too."""
-    found = set()
+    """The names of the project's modules that a file imports, in functions too."""
+    names = set()
     for node in ast.walk(ast.parse(path.read_text())):
-        names = []
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: a relative import"
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        for name in names:
-            top, _, name = name.partition(".")
-            if top == PACKAGE:  # the longest part of the name that is a module
-                while name not in known:
-                    name = name.rpartition(".")[0]
-                found.add(name)
-    return found
-
-
-def level_of(module):
-    """The row of `LEVELS` with the module, or with the package that it is in."""
-    rows = {name: row for row, names in enumerate(LEVELS) for name in names}
-    if module in rows:
-        return rows[module]
-    parent = module.rpartition(".")[0]
-    assert parent not in ("", "envs"), f"{module} has no level: add it to LEVELS"
-    return level_of(parent)
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    modules = set()
+    for name in names:
+        top, _, name = name.partition(".")
+        if top == PACKAGE:  # the longest part of the name that is a module
+            while name and name not in known:
+                name = name.rpartition(".")[0]
+            modules.add(name)
+    return modules
 
 
 GRAPH = {name: imports(path, modules()) for name, path in modules().items()}
+"""Of every module, which of the others it imports. The package itself is "" here."""
 
 
-def test_there_is_no_import_cycle():
-    graphlib.TopologicalSorter(GRAPH).prepare()  # or it raises CycleError
+def room(module):
+    """The package that a module is in, or its own name at the top."""
+    return module.partition(".")[0] or "__init__"
 
 
-def test_no_module_imports_from_a_higher_level():
-    upward = [
-        f"{name} imports {other}"
-        for name, others in GRAPH.items()
-        for other in others
-        if level_of(other) > level_of(name)
-    ]
-    assert not upward, upward
+def env_room(module):
+    """Of a module in `envs`, the package or file there."""
+    return (module.split(".") + ["__init__"])[1]
+
+
+def arrows(graph, place):
+    """Pairs of places between which there are imports, and an example of each."""
+    pairs = {}
+    for module, others in graph.items():
+        for other in others:
+            if place(module) != place(other):
+                pairs.setdefault((place(module), place(other)), f"{module} -> {other}")
+    return pairs
+
+
+def floors(pairs):
+    """The number of places in the longest chain of imports; raises CycleError on a circle."""
+    below = {}
+    for upper, lower in pairs:
+        below.setdefault(upper, set()).add(lower)
+    height = {}
+    for name in graphlib.TopologicalSorter(below).static_order():
+        height[name] = 1 + max((height[lower] for lower in below.get(name, ())), default=0)
+    return max(height.values())
+
+
+def upward(pairs, rows):
+    """The examples of pairs that point up, or sideways within a row."""
+    row_of = {name: row for row, names in enumerate(rows) for name in names}
+    return [example for (upper, lower), example in pairs.items() if row_of[lower] >= row_of[upper]]
+
+
+def test_files_import_each_other_without_a_circle():
+    graphlib.TopologicalSorter(GRAPH).prepare()  # raises CycleError on a circle
+
+
+def test_house_is_small_and_no_arrow_points_up(capsys):
+    pairs = arrows(GRAPH, room)
+    rooms = {room(module) for module in GRAPH}
+    with capsys.disabled():
+        print(f"\n{len(rooms)} packages and files, {floors(pairs)} floors, {len(pairs)} pairs")
+    assert not upward(pairs, ROWS)
+    assert len(rooms) <= MOST_ROOMS
+    assert floors(pairs) <= MOST_FLOORS
+    assert len(pairs) <= MOST_PAIRS
+
+
+def test_no_arrow_within_the_environment_points_up():
+    inside = {
+        module: {other for other in others if room(other) == "envs"}
+        for module, others in GRAPH.items()
+        if room(module) == "envs"
+    }
+    assert not upward(arrows(inside, env_room), ENV_ROWS)
 
 
 def test_trainers_do_not_import_each_other():
@@ -90,8 +139,22 @@ def test_trainers_do_not_import_each_other():
     assert not any(between.values()), between
 
 
+@pytest.mark.parametrize("name", sorted(modules()))
+def test_module_hides_no_import(name):
+    """`import_module("roboarm_nmp…")` is seen neither by an editor nor by these tests."""
+    for node in ast.walk(ast.parse(modules()[name].read_text())):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
+            ("import_module", "__import__")
+        ):
+            loaded = node.args[0]
+            is_other = isinstance(loaded, ast.Constant) and not loaded.value.startswith(PACKAGE)
+            assert is_other, f"line {node.lineno}: {ast.unparse(node)}"
+
+
 def test_no_module_is_imported_by_an_ambiguous_name():
     """`import envs` would find whichever folder of that name comes first."""
+    folders = {path.name for path in LIBRARY.iterdir() if path.is_symlink()}
+    assert len(folders) == 5
     for path in ROOT.rglob("*.py"):
         if any(part.startswith(".") or part == "build" for part in path.relative_to(ROOT).parts):
             continue
@@ -102,4 +165,4 @@ def test_no_module_is_imported_by_an_ambiguous_name():
                 tops = [(node.module or "").split(".")[0]]
             else:
                 continue
-            assert not set(tops) & set(FOLDERS), f"{path}:{node.lineno}"
+            assert not set(tops) & folders, f"{path}:{node.lineno}"

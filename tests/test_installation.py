@@ -108,19 +108,20 @@ def test_trainer_of_the_checkout_runs_from_any_folder(project):
 
 def test_wheel_is_complete_and_not_replaced_by_a_package_named_envs(project, tmp_path):
     source, site = tmp_path / "source", tmp_path / "site"
-    listed = ["git", "ls-files", "-z", "--", "*.py", "*.toml", "*.md", "*.h5", "*.pt", "*.json"]
+    endings = ("*.py", "*.toml", "*.md", "*.h5", "*.pt", "*.json", "*.typed", "src/roboarm_nmp/*")
+    listed = ["git", "ls-files", "-z", "--", *endings]
     files = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for file in filter(None, files.split("\0")):
         if not file.startswith(("tests/", "docs/", "benchmarks/")):
             (source / file).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / file, source / file)
+            shutil.copy(ROOT / file, source / file, follow_symlinks=False)
     options = ["--no-deps", "--no-build-isolation", "--quiet", "--target", site]
     run("-m", "pip", "install", *options, source, cwd=tmp_path)
     (site / "envs").mkdir()
     (site / "envs" / "__init__.py").write_text("")  # as `pip install envs` brings it
     output = run("use.py", cwd=project, PYTHONPATH=str(site))
     assert f"works from {site}" in output
-    code = "import roboarm_nmp.envs.policies.registry as r; print(len(r.pretrained_policies()))"
+    code = "import roboarm_nmp.policies.registry as r; print(len(r.pretrained_policies()))"
     assert int(run("-c", code, cwd=project, PYTHONPATH=str(site))) > 10
     arguments = [
         "evaluate",

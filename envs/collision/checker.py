@@ -237,7 +237,7 @@ class CollisionChecker:
     ):
         """A path by RRT-Connect, within about `max_checks` checks, in milliseconds.
 
-        The same arguments and generator give the same path. `demo_generation.planning` plans more
+        The same arguments and generator give the same path. `planning.planner` plans more
         thoroughly; this is for planning again in each step.
 
         Args:

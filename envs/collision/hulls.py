@@ -29,7 +29,7 @@ from roboarm_nmp.envs.collision.kernels import (
 )
 from roboarm_nmp.envs.robots.robot import matrix, temporary_file
 from roboarm_nmp.envs.scenes.primitives import ConvexHull, Cylinder, Sphere, to_array
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 MAX_MARGIN = 0.5
 """m. Margins and radii of points must be smaller."""

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from roboarm_nmp.envs.utils.numba_cache import compiled, uncounted
+from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 BULLET_MARGIN = 0.001
 """m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
@@ -1189,7 +1189,7 @@ def project(
     max_recovery,
     projection_sweeps,
 ):
-    """Change actions (m, n) in place: `envs.policies.safety_filter.SafetyFilter.__call__`.
+    """Change actions (m, n) in place: `policies.safety_filter.SafetyFilter.__call__`.
 
     Each sweep projects an action onto one link's half-space after the other.
     `link_distances`: (m, l, 1 + n); `margins`: m, (m, l); `rates`: m per step, (m, l).

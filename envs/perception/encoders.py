@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from roboarm_nmp.envs.networks.exported_networks import NetworkError, check_robot, load_network
 from roboarm_nmp.envs.perception.point_clouds import (
     NUM_POINTS,
     POINT_CLOUD,
@@ -29,10 +28,12 @@ from roboarm_nmp.envs.perception.point_clouds import (
     remember_points,
 )
 from roboarm_nmp.envs.perception.sensors import PointCloud, observe_scene, sensors_from_json
+from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.scenes.primitives import ROW, Scene, padded_rows
-from roboarm_nmp.envs.utils.files import cache_folder, write_atomically
-from roboarm_nmp.envs.utils.names import suggest
-from roboarm_nmp.envs.utils.progress import progress_bar, write_line
+from roboarm_nmp.networks.exported_networks import NetworkError, load_network
+from roboarm_nmp.utils.files import cache_folder, write_atomically
+from roboarm_nmp.utils.names import suggest
+from roboarm_nmp.utils.progress import progress_bar, write_line
 
 ORACLE = "oracle"
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -135,7 +136,7 @@ class SceneEncoder:
         """Raise NetworkError if the encoder was trained for another `Robot`."""
 
     def encode_demos(self, demos):
-        """z_E of all scenes of `envs.datasets.demonstrations.Demos`: float32 (n, size).
+        """z_E of all scenes of `datasets.demonstrations.Demos`: float32 (n, size).
 
         Later calls of the encoder with these scenes return the same numbers.
 

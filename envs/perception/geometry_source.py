@@ -24,7 +24,7 @@ from roboarm_nmp.envs.perception.point_clouds import (
 )
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene
-from roboarm_nmp.envs.utils.names import suggest
+from roboarm_nmp.utils.names import suggest
 
 GROUND_TRUTH = "ground_truth"
 CACHED_CHECKERS = 64  # about 60 kB each

@@ -17,8 +17,8 @@ import numpy as np
 from roboarm_nmp.envs.collision.kernels import AXES, EYE, edge_pixels, pixels_with_neighbours
 from roboarm_nmp.envs.perception.ray_casting import NOTHING
 from roboarm_nmp.envs.scenes.primitives import is_number
-from roboarm_nmp.envs.utils.names import suggest
-from roboarm_nmp.envs.utils.random_streams import Stream
+from roboarm_nmp.utils.names import suggest
+from roboarm_nmp.utils.random_streams import Stream
 
 EDGE = 0.05
 """m. Neighbouring pixels whose depths differ by more are at an edge, where pixels may fly."""

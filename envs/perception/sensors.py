@@ -27,8 +27,8 @@ from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes
 )
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, is_number
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
+from roboarm_nmp.utils.bullet import pybullet as p
 
 CLASSES = ("robot", "table and floor", "obstacle", "nothing")
 ROBOT_COLOUR = (0.90, 0.45, 0.15, 1)

@@ -15,7 +15,7 @@ import numpy as np
 
 from roboarm_nmp.envs.robots.robot import Link, matrix
 from roboarm_nmp.envs.robots.urdf import LIGHT, link_placement, steps
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 COLOUR = "0.85 0.55 0.2 1"
 MAX_ATTACHED = 100

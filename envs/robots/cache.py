@@ -1,6 +1,6 @@
 """A cache on disk of what takes seconds to find out about an arm from a URDF.
 
-It is in the user's cache folder (`envs.utils.files.cache_folder`). A damaged file is written anew.
+It is in the user's cache folder (`utils.files.cache_folder`). A damaged file is written anew.
 """
 
 import contextlib
@@ -9,7 +9,7 @@ import importlib.metadata
 import json
 import re
 
-from roboarm_nmp.envs.utils.files import cache_folder, write_atomically
+from roboarm_nmp.utils.files import cache_folder, write_atomically
 
 
 def cached(name, robot, settings, compute):

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 # One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
 # controller; docs/guide/environment.md has the measured tracking error.

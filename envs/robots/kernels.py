@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from roboarm_nmp.envs.utils.numba_cache import compiled
+from roboarm_nmp.utils.numba_cache import compiled
 
 JOINT, PRISMATIC, MIDDLE, SCALE, POSITION, ROTATION, CHAIN_COLUMNS = 0, 1, 2, 3, 4, 7, 16
 # An error of 1 rad counts like one of this many metres, about the size of a hand.

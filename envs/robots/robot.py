@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 MAX_HELD = 10.0  # rad or m, of a held joint

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from roboarm_nmp.envs.robots.untrusted import RobotError, read_xml
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 SAMPLES = 20_000
 # Of the samples: a pair that collides in more of them always collides.

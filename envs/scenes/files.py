@@ -90,7 +90,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     check_obstacle,
     unit_quaternion,
 )
-from roboarm_nmp.envs.utils.files import write_atomically
+from roboarm_nmp.utils.files import write_atomically
 
 _MAX_DEPTH = 12  # a scene needs 10
 # Values of a file with aliases, each repeated value counted. (A small file could be gigabytes.)

@@ -10,10 +10,10 @@ from torch.distributions import Categorical, Independent, MixtureSameFamily, Nor
 from trainers import PATHS, load, panda_env, refusal, run_here, run_script
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
-from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.training.protocol import stack
+from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.training.protocol import stack
 
 bc = load("bc")
 

@@ -17,17 +17,17 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from trainers import PATHS, command, load, refusal, run_here, run_script
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
+from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
-from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
-from roboarm_nmp.envs.datasets.shards import shard_path
-from roboarm_nmp.envs.networks.exported_networks import load_network
 from roboarm_nmp.envs.perception.encoders import PRETRAINED
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
-from roboarm_nmp.envs.policies.registry import PolicyError, find_policy, make_policy
-from roboarm_nmp.envs.policies.safety_filter import VERSION, SafetyFilter
-from roboarm_nmp.envs.training import protocol, runs
-from roboarm_nmp.envs.training.evaluation import evaluate
+from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.policies.registry import PolicyError, find_policy, make_policy
+from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
+from roboarm_nmp.training import protocol, runs
 
 dagger = load("dagger")
 HARD = "random_boxes_hard"

@@ -11,8 +11,8 @@ import pytest
 import torch
 from paths import ROOT
 
+from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.demonstrations import load_demos
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere

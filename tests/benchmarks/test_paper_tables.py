@@ -18,7 +18,7 @@ from PIL import Image
 from trainers import succeeds_here
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.networks.exported_networks import load_network
 
 CELLS = {cell.name: cell for cell in paper_tables.read_cells()}
 

@@ -7,7 +7,7 @@ import time
 import pytest
 from paths import ROOT
 
-from roboarm_nmp.envs.training import runs
+from roboarm_nmp.training import runs
 
 sys.path.append(str(ROOT / "benchmarks"))
 import time_to_success  # noqa: E402

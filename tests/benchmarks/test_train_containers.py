@@ -9,10 +9,10 @@ import torch
 from paths import ROOT
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.roadmap_paths import shard_bytes
+from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
-from roboarm_nmp.envs.datasets.roadmap_paths import shard_bytes
-from roboarm_nmp.envs.datasets.shards import shard_path
-from roboarm_nmp.envs.policies.registry import find_policy, own_safety_filter
+from roboarm_nmp.policies.registry import find_policy, own_safety_filter
 
 sys.path.append(str(ROOT / "benchmarks"))
 import train_containers as script  # noqa: E402

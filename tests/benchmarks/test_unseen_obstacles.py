@@ -8,11 +8,11 @@ import torch
 import unseen_obstacles as unseen
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.roadmap_paths import shard_bytes
-from roboarm_nmp.envs.datasets.shards import shard_path
-from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
-from roboarm_nmp.envs.policies.safety_filter import VERSION
+from roboarm_nmp.datasets.roadmap_paths import shard_bytes
+from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.envs.tasks import STATIC_TASKS
+from roboarm_nmp.networks.exported_networks import load_network, save_network
+from roboarm_nmp.policies.safety_filter import VERSION
 
 
 def result(success, collision_free, number=200):

@@ -11,7 +11,7 @@ import torch
 from one_type import OneType
 from trainers import PATHS, TRAINERS, command, run_here
 
-from roboarm_nmp.envs.training import protocol
+from roboarm_nmp.training import protocol
 
 ONCE = "--total-timesteps 60 --horizon 30 --eval-every 30 --learning-starts 15 --num-envs 3"
 ONCE_BC = "--total-updates 2 --eval-every 2"

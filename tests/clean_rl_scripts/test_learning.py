@@ -5,10 +5,10 @@ import pytest
 from trainers import load, panda_env, run_script
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.queries import Query
-from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.training import protocol
+from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.training import protocol
 
 READY = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)  # rad
 FLAGS = "--goal-type ee --total-timesteps 2000 --learning-starts 300 --horizon 30 --gamma 0.9"

@@ -10,14 +10,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from trainers import ONE_EVALUATION, PATHS, load, panda_env, run_here, run_script
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.demonstrations import Demos, load_demos
+from roboarm_nmp.datasets.episodes import demo_transitions
+from roboarm_nmp.datasets.format import QueryScenes
 from roboarm_nmp.demo_generation import collect
-from roboarm_nmp.envs.datasets.demonstrations import Demos, load_demos
-from roboarm_nmp.envs.datasets.episodes import demo_transitions
-from roboarm_nmp.envs.datasets.format import QueryScenes
-from roboarm_nmp.envs.networks.kinematics import JacobianTranspose
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.training import cuda_graphs, protocol
-from roboarm_nmp.envs.training.protocol import stack
+from roboarm_nmp.training import cuda_graphs, protocol
+from roboarm_nmp.training.network_parts import JacobianTranspose
+from roboarm_nmp.training.protocol import stack
 
 sac = load("sac_her_mp")
 

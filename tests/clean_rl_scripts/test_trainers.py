@@ -24,11 +24,11 @@ from trainers import (
 )
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.demonstrations import demo_path
-from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.datasets.demonstrations import demo_path
 from roboarm_nmp.envs.perception.encoders import SceneEncoder
-from roboarm_nmp.envs.training import protocol, runs
-from roboarm_nmp.envs.training.evaluation import evaluate
+from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.training import protocol, runs
 
 
 @pytest.fixture(params=TRAINERS)

@@ -11,14 +11,14 @@ from trainers import PATHS, load, panda_env, refusal, run_here, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import evaluate as evaluate_command
+from roboarm_nmp.datasets.demonstrations import demo_path
+from roboarm_nmp.datasets.queries import query_path
 from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
-from roboarm_nmp.envs.datasets.demonstrations import demo_path
-from roboarm_nmp.envs.datasets.queries import query_path
-from roboarm_nmp.envs.networks.exported_networks import load_network
-from roboarm_nmp.envs.policies.export import save_policy
-from roboarm_nmp.envs.policies.registry import PolicyError, find_policy, make_policy
 from roboarm_nmp.envs.robots.files import load_robot
-from roboarm_nmp.envs.training.evaluation import EvaluationError, evaluate
+from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
+from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.policies.export import save_policy
+from roboarm_nmp.policies.registry import PolicyError, find_policy, make_policy
 
 EXAMPLE = ROOT / "examples" / "robots" / "xarm6.yaml"
 PANDAS = "sac-ee-wall-p1-s1"  # a pretrained policy

@@ -23,16 +23,16 @@ import pytest
 from paths import ROOT
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.demonstrations import load_demos, write_demos
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.journal import VERSION, line_of
 from roboarm_nmp.demo_generation import collect
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.demo_generation.verify import VERDICTS, Verifier, verify
-from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.journal import VERSION, line_of
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json
-from roboarm_nmp.envs.utils import workers
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.utils import workers
 
 TASK, NUM = "double_walls", 16
 

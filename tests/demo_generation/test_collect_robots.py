@@ -9,15 +9,15 @@ import pytest
 from paths import ROOT
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.datasets.queries import load_queries, query_path, validate
 from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
-from roboarm_nmp.demo_generation.planning import Planner, PlanningError
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.demo_generation.verify import verify
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos
-from roboarm_nmp.envs.datasets.queries import load_queries, query_path, validate
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.tasks import task_with_robot
+from roboarm_nmp.planning.planner import Planner, PlanningError
 
 ROBOTS = ROOT / "examples" / "robots"
 

@@ -14,9 +14,9 @@ pytest.importorskip("minari")
 import minari  # noqa: E402
 
 from roboarm_nmp import envs  # noqa: E402
+from roboarm_nmp.datasets.demonstrations import demo_path, load_demos, write_demos  # noqa: E402
+from roboarm_nmp.datasets.format import QueryScenes  # noqa: E402
 from roboarm_nmp.demo_generation import collect, export_minari  # noqa: E402
-from roboarm_nmp.envs.datasets.demonstrations import demo_path, load_demos, write_demos  # noqa: E402
-from roboarm_nmp.envs.datasets.format import QueryScenes  # noqa: E402
 from roboarm_nmp.envs.robots.files import load_robot  # noqa: E402
 from roboarm_nmp.envs.robots.panda import PANDA  # noqa: E402
 from roboarm_nmp.envs.scenes.files import save_scene  # noqa: E402

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.demo_generation import plan
-from roboarm_nmp.demo_generation.following import follow
 from roboarm_nmp.envs import make
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.datasets.trajectories import load_joint_path, load_trajectory
 from roboarm_nmp.envs.perception.sensors import PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.training import flags
+from roboarm_nmp.motions.trajectories import load_joint_path, load_trajectory
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.utils import flags
 
 POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
 

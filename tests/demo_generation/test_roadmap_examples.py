@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
+from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
-from roboarm_nmp.envs.datasets.shards import shard_path
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 
 HARD = "random_boxes_hard"

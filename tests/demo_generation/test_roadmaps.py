@@ -6,20 +6,19 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from paths import ROOT
+from paths import LIBRARY, ROOT
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
+from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.demo_generation.place_configurations import place_configurations
 from roboarm_nmp.demo_generation.roadmaps import Args, Roadmap, collect
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
-from roboarm_nmp.envs.datasets.shards import shard_path
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, to_array
 
@@ -356,7 +355,7 @@ def test_corrupt_shard_is_rejected_by_name(collected, tmp_path):
     [
         ({"seed": 1}, "made by another command"),
         ({"task": "pole_shelves"}, "for testing only"),
-        ({"output": Path(envs.__file__).parent / "demos" / "new"}, "repository"),
+        ({"output": LIBRARY / "datasets" / "demos" / "new"}, "repository"),
         ({"scenes": 0}, "--scenes"),
         ({"num_nodes": 20}, "--num-nodes"),
         ({"seed": 2**32}, "--seed"),
@@ -368,7 +367,7 @@ def test_bad_flag_is_rejected(collected, changes, message):
     with pytest.raises(ValueError, match=message):
         collect(replace(Args(collected, **SMALL), **changes), progress=False)
     assert files(collected) == before
-    assert not (Path(envs.__file__).parent / "demos" / "new").exists()
+    assert not (LIBRARY / "datasets" / "demos" / "new").exists()
 
 
 def test_task_with_one_scene_has_other_paths_each_time(tmp_path):

@@ -10,12 +10,12 @@ from paths import ROOT
 
 import roboarm_nmp
 from roboarm_nmp.clean_rl_scripts import evaluate
-from roboarm_nmp.envs.networks.exported_networks import load_network
-from roboarm_nmp.envs.policies.export import save_policy
-from roboarm_nmp.envs.policies.registry import PolicyError
-from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.policies.export import save_policy
+from roboarm_nmp.policies.registry import PolicyError
+from roboarm_nmp.policies.safety_filter import SafetyFilter
+from roboarm_nmp.utils.bullet import pybullet as p
 
 PAGE = (ROOT / "docs/reference/api.md").read_text()
 SNIPPETS = re.findall(r"^```python\n(.*?)^```", PAGE, re.S | re.M)

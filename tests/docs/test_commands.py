@@ -20,7 +20,7 @@ import tyro
 from paths import ROOT
 
 from roboarm_nmp import TASKS, __main__
-from roboarm_nmp.envs.policies.registry import find_policy
+from roboarm_nmp.policies.registry import find_policy
 
 OTHER_TASKS = {"mixed_scenes", "containers", "roadmaps"}  # to train on; a folder, for the viewer
 OPTIONAL = {"panda_gym", "optuna", "ray", "viser"}  # imported before arguments are parsed

@@ -10,12 +10,12 @@ from problem_files import write_folder
 from trainers import PATHS, load
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.problems import load_problems
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.demo_generation import plan
-from roboarm_nmp.envs.datasets.problems import load_problems
-from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.training import flags
 from roboarm_nmp.scene_embedding_train import collect
+from roboarm_nmp.utils import flags
 
 
 def blocks(name):

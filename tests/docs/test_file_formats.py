@@ -6,7 +6,7 @@ import numpy as np
 from paths import ROOT
 
 import roboarm_nmp
-from roboarm_nmp.envs.datasets.format import (
+from roboarm_nmp.datasets.format import (
     DEMO_ARRAYS,
     HULL_ARRAYS,
     MOTION_ARRAYS,
@@ -14,9 +14,9 @@ from roboarm_nmp.envs.datasets.format import (
     SCENE_ARRAYS,
     TOUCH_ARRAYS,
 )
-from roboarm_nmp.envs.datasets.problems import ARRAYS as PROBLEM_ARRAYS
-from roboarm_nmp.envs.networks import operations
+from roboarm_nmp.datasets.problems import ARRAYS as PROBLEM_ARRAYS
 from roboarm_nmp.envs.scenes.files import load_scene
+from roboarm_nmp.networks import operations
 
 PAGE = (ROOT / "docs/reference/file_formats.md").read_text()
 

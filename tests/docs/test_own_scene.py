@@ -20,13 +20,13 @@ from paths import ROOT
 from PIL import Image
 
 from roboarm_nmp import __main__, envs
+from roboarm_nmp.datasets.demonstrations import load_demos, write_demos
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.demo_generation import collect
-from roboarm_nmp.envs import show
-from roboarm_nmp.envs.datasets.demonstrations import load_demos, write_demos
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, Box, Cylinder, Scene, Sphere
+from roboarm_nmp.viewer import show
 
 SCRIPTS = ROOT / "clean_rl_scripts"
 sys.path.append(str(SCRIPTS))

@@ -16,11 +16,11 @@ from gymnasium.utils.env_checker import check_env
 from paths import ROOT
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.queries import load_queries
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, from_array, to_array
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 HOME = np.array([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], dtype=np.float32)
 NEAR_HOME = HOME + np.float32(0.1)

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
-from roboarm_nmp.demo_generation.planning import Planner
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.envs.wrappers import SensorWrapper
+from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.utils.bullet import pybullet as p
 
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 HOME = np.array([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], dtype=np.float32)

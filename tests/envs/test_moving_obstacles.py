@@ -13,8 +13,8 @@ from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.wrappers import LinkDistancesWrapper
+from roboarm_nmp.utils.bullet import pybullet as p
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], np.float32)  # the hand ahead
 GOAL = np.array([1.2, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], np.float32)

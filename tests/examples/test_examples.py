@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from paths import ROOT
 
-from roboarm_nmp.envs import show
-from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.datasets.trajectories import load_joint_path
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.motions.trajectories import load_joint_path
+from roboarm_nmp.viewer import show
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 

@@ -14,12 +14,12 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainers import GPU, error_here, run_here
 
-from roboarm_nmp.envs.datasets.observations import Observations
-from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.sensors import PointCloud
-from roboarm_nmp.envs.training.runs import Run
+from roboarm_nmp.networks.exported_networks import load_network
 from roboarm_nmp.scene_embedding_train import clouds, images
+from roboarm_nmp.training.runs import Run
 
 
 @pytest.fixture(scope="module", params=SCRIPTS)

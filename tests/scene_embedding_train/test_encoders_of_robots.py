@@ -7,11 +7,11 @@ from encoder_trainers import command
 from paths import ROOT
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.observations import Observations
-from roboarm_nmp.envs.networks.exported_networks import load_network
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal
 from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.networks.exported_networks import load_network
 from roboarm_nmp.scene_embedding_train import collect
 
 XARM6 = ROOT / "examples" / "robots" / "xarm6.yaml"

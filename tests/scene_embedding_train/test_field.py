@@ -7,7 +7,7 @@ import torch
 from encoder_trainers import check_learning, check_step, load, obstacle_rows, one_update
 from one_type import OneType
 
-from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES
 from roboarm_nmp.scene_embedding_train import clouds
 from roboarm_nmp.scene_embedding_train.obstacles import distances, load_obstacles

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.scene_embedding_train import images
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from encoder_trainers import OBSTACLES, obstacle_rows
 
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.scene_embedding_train import obstacles
+from roboarm_nmp.utils.bullet import pybullet as p
 
 
 def test_distances_equal_those_of_pybullet():

@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 
-from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.sensors import OBSTACLE
 from roboarm_nmp.scene_embedding_train import clouds, images
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from encoder_trainers import check_learning, check_step, load, one_update
 
-from roboarm_nmp.envs.datasets.observations import Observations
+from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.scene_embedding_train import images
 
 vqvae = load("vqvae")

@@ -11,10 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from paths import ROOT
+from paths import LIBRARY, ROOT
 
 import roboarm_nmp
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.collision import checker as collision
 from roboarm_nmp.envs.collision.checker import (
     ARM,
@@ -25,10 +26,9 @@ from roboarm_nmp.envs.collision.checker import (
     CollisionChecker,
 )
 from roboarm_nmp.envs.collision.kernels import BULLET_MARGIN
-from roboarm_nmp.envs.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 # Stretched out, upwards and to the front, and far from itself.
 LINKS = PANDA.collision_links
@@ -541,11 +541,7 @@ def test_another_process_agrees():
 def test_read_only_installation_compiles_in_each_process(tmp_path):
     """Neither the package nor the home folder can hold a cache."""
     package = tmp_path / "roboarm_nmp"
-    package.mkdir()
-    shutil.copy(ROOT / "__init__.py", package)
-    shutil.copytree(
-        ROOT / "envs", package / "envs", ignore=shutil.ignore_patterns("*.h5", "*.pt", "__py*")
-    )
+    shutil.copytree(LIBRARY, package, ignore=shutil.ignore_patterns("*.h5", "*.pt", "__py*"))
     for name in ("roboarm_nmp/envs/collision/__pycache__", "home"):
         (tmp_path / name).write_text("")  # root may write to any folder, but not to a file
     code = """

@@ -10,8 +10,6 @@ from paths import ROOT
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.networks.operations import NetworkError
 from roboarm_nmp.envs.perception.encoders import (
     DECODED_CELL,
     DECODED_HIGH,
@@ -27,7 +25,9 @@ from roboarm_nmp.envs.perception.geometry_source import (
 )
 from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal, sensors_to_json
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
-from roboarm_nmp.envs.training.evaluation import EvaluationError, evaluate
+from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
+from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.operations import NetworkError
 
 BALL = (0.45, 0.1, 0.6, 0.15)  # decoded from every z_E, whatever the scene: position and radius, m
 POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"

@@ -14,10 +14,8 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.datasets.demonstrations import load_demos
-from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.networks.exported_networks import save_network
-from roboarm_nmp.envs.networks.operations import NetworkError
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.perception import encoders
 from roboarm_nmp.envs.perception.encoders import (
     MAX_OBSTACLES,
@@ -33,6 +31,8 @@ from roboarm_nmp.envs.perception.point_clouds import farthest_points, observed_p
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, sensors_to_json
 from roboarm_nmp.envs.scenes.primitives import Scene, Sphere, from_array
 from roboarm_nmp.envs.wrappers import SceneEncodingWrapper
+from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.operations import NetworkError
 
 FRONT = (1.6, 0.0, 0.8)
 SENSORS = {"front": Camera(FRONT, size=(8, 8)), "cloud": PointCloud(FRONT, num_samples=400)}

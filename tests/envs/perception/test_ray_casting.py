@@ -22,7 +22,7 @@ from roboarm_nmp.envs.perception.sensors import (
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere, convex_hull
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 HOME = np.array([0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8])
 EDGE = 60

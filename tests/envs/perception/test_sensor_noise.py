@@ -21,8 +21,8 @@ from roboarm_nmp.envs.perception.sensors import (
 )
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
-from roboarm_nmp.envs.training.evaluation import EvaluationError, evaluate
 from roboarm_nmp.envs.wrappers import SensorWrapper
+from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
 
 HOME = np.array([0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8])
 WALL = Box((-0.5, 0.0, 0.5), (0.1, 8.0, 8.0))

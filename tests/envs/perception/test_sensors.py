@@ -26,8 +26,8 @@ from roboarm_nmp.envs.perception.sensors import (
     sensors_to_json,
 )
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.wrappers import SensorWrapper
+from roboarm_nmp.utils.bullet import pybullet as p
 
 HOME = np.array([0.0, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8])
 BALL = Sphere((0.4, 0.5, 0.9), 0.1)

@@ -8,18 +8,14 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.demo_generation.planning import Planner
+from roboarm_nmp.datasets.problem_formats import Problem
+from roboarm_nmp.datasets.problems import load_problems, write_problems
+from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import ARM, CollisionChecker
-from roboarm_nmp.envs.datasets.problem_formats import Problem
-from roboarm_nmp.envs.datasets.problems import load_problems, write_problems
-from roboarm_nmp.envs.datasets.queries import Query
-from roboarm_nmp.envs.networks.exported_networks import check_robot
 from roboarm_nmp.envs.perception.point_clouds import obstacle_points, prepare_cloud
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
-from roboarm_nmp.envs.policies.rollout import Episode
-from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
+from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
 from roboarm_nmp.envs.scenes.motions import Oscillation
@@ -34,8 +30,12 @@ from roboarm_nmp.envs.scenes.primitives import (
     scene_to_json,
 )
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
+from roboarm_nmp.evaluation.rollout import Episode
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.policies.safety_filter import SafetyFilter
+from roboarm_nmp.utils.bullet import pybullet as p
 
 TURN = (0.3, -0.1, 0.4, np.sqrt(0.74))
 BOARD = Attached(Box((0.0, 0.0, 0.05), (0.06, 0.1, 0.2), TURN))

@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
-from roboarm_nmp.envs.networks.exported_networks import check_robot
+from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, scene_from_json, scene_to_json
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
+from roboarm_nmp.utils.bullet import pybullet as p
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 OPEN = PANDA.with_held(dict.fromkeys(FINGERS, 0.065))  # wider than the URDF's limit, 0.04

@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.networks.kinematics import JacobianTranspose
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.inverse_kinematics import MAX_ANGLE, MAX_DISTANCE, inverse_kinematics
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot, quaternions, rotation_angle
 from roboarm_nmp.envs.scenes.primitives import Scene
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
+from roboarm_nmp.training.network_parts import JacobianTranspose
+from roboarm_nmp.utils.bullet import pybullet as p
 
 # A turning joint, a sliding one, one that mimics the first, and a turned tool, all askew.
 LINK = (

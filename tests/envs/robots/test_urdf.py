@@ -19,9 +19,9 @@ from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.urdf import RobotError
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
-from roboarm_nmp.envs.time_parameterisation import time_parameterise
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
+from roboarm_nmp.motions.time_parameterisation import time_parameterise
+from roboarm_nmp.utils.bullet import pybullet as p
 
 INERTIAL = (
     '<inertial><origin xyz="0.02 0 0.1" rpy="0.3 0.2 0.1"/><mass value="1"/>'

@@ -18,12 +18,12 @@ from problem_files import (
     write_file,
 )
 
+from roboarm_nmp.datasets import observations, roadmap_paths
+from roboarm_nmp.datasets.format import DatasetError, QueryScenes, read_scenes, scene_arrays
+from roboarm_nmp.datasets.problems import load_problems, write_problems
+from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.datasets import observations, roadmap_paths
-from roboarm_nmp.envs.datasets.format import DatasetError, QueryScenes, read_scenes, scene_arrays
-from roboarm_nmp.envs.datasets.problems import load_problems, write_problems
-from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, Camera, observe_scene
@@ -48,7 +48,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     to_array,
 )
 from roboarm_nmp.envs.tasks import TASKS
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.utils.bullet import pybullet as p
 
 WEDGE = ConvexHull(
     (0.5, 0.1, 0.3),
@@ -431,8 +431,8 @@ def test_problems_keep_the_hulls_of_their_meshes(tmp_path):
 
 def test_viewer_draws_moves_and_selects_a_hull():
     viser = pytest.importorskip("viser")
-    from roboarm_nmp.envs.viewer.drawing import SELECTED_COLOUR, Drawing
-    from roboarm_nmp.envs.viewer.simulation import PolicyArm, Simulation, task_episodes
+    from roboarm_nmp.viewer.drawing import SELECTED_COLOUR, Drawing
+    from roboarm_nmp.viewer.simulation import PolicyArm, Simulation, task_episodes
 
     simulation = Simulation(task_episodes("no_obstacles"))
     simulation.add(PolicyArm("no_obstacles", "go-to-goal"))

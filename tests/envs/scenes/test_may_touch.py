@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from roboarm_nmp.demo_generation.following import follow
-from roboarm_nmp.demo_generation.planning import Planner
+from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.moving import free_over_time
 from roboarm_nmp.envs.collision.timed_checker import TimedChecker
-from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
@@ -31,6 +29,8 @@ from roboarm_nmp.envs.scenes.primitives import (
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.envs.world import World
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner
 
 START = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)
 GOAL = np.array([0.3, 0.3, 0.1, -1.9, 0.1, 2.1, 0.8], np.float32)

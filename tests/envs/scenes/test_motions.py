@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from roboarm_nmp.envs.datasets.format import DatasetError, read_scenes, scene_arrays
+from roboarm_nmp.datasets.format import DatasetError, read_scenes, scene_arrays
 from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
 from roboarm_nmp.envs.scenes.motions import (
     MAX_SPEED,

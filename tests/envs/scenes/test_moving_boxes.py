@@ -8,16 +8,16 @@ import pytest
 
 import roboarm_nmp
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.format import OutOfDateError
+from roboarm_nmp.datasets.queries import load_queries, query_path
 from roboarm_nmp.demo_generation.make_queries import make_queries
-from roboarm_nmp.envs import arm_env, show
+from roboarm_nmp.envs import arm_env
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.moving import free_over_time
-from roboarm_nmp.envs.datasets.format import OutOfDateError
-from roboarm_nmp.envs.datasets.queries import load_queries, query_path
 from roboarm_nmp.envs.scenes import moving_boxes
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.tasks import TASKS
-from roboarm_nmp.envs.viewer import simulation
+from roboarm_nmp.viewer import show, simulation
 
 MOVING = [name for name, task in TASKS.items() if hasattr(task.scene, "animate")]
 KINDS = {"moving": Oscillation, "appearing": Presence, "blocked": Waypoints, "chased": Waypoints}

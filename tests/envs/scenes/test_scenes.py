@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets import format as dataset_format
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.demo_generation import collect, make_queries, verify
-from roboarm_nmp.demo_generation.planning import Planner, PlanningError
 from roboarm_nmp.envs.arm_env import RoboArmEnv
-from roboarm_nmp.envs.datasets import format as dataset_format
-from roboarm_nmp.envs.datasets.demonstrations import load_demos
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import (
@@ -28,7 +27,8 @@ from roboarm_nmp.envs.scenes.primitives import (
 )
 from roboarm_nmp.envs.scenes.random_boxes import GRID, KEEP_CLEAR, SHOULDER
 from roboarm_nmp.envs.tasks import TASKS
-from roboarm_nmp.envs.utils.bullet import pybullet as p
+from roboarm_nmp.planning.planner import Planner, PlanningError
+from roboarm_nmp.utils.bullet import pybullet as p
 
 HARD = "random_boxes_hard"
 

@@ -15,11 +15,11 @@ from roboarm_nmp.envs import arm_env
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception import sensors
 from roboarm_nmp.envs.perception.sensors import SensorWorld
-from roboarm_nmp.envs.policies.safety_filter import SafetyFilter
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes import primitives as scenes
-from roboarm_nmp.envs.utils.bullet import pybullet as p
 from roboarm_nmp.envs.world import World
+from roboarm_nmp.policies.safety_filter import SafetyFilter
+from roboarm_nmp.utils.bullet import pybullet as p
 
 NUMBERS = (0, 1, -1, 2, 3, 0.5, -0.5, 1e-6, 20, 1e4, 2**31, 2**63, 10**400, 1e300, 1e-320)
 ODD = (

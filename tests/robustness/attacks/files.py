@@ -11,19 +11,19 @@ import torch
 
 from attacks.children import RAN, REFUSED
 from attacks.networks import Mixed, inputs
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.journal import Journal, journal_of
+from roboarm_nmp.datasets.observations import Observations
+from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
-from roboarm_nmp.envs.datasets.demonstrations import load_demos
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.journal import Journal, journal_of
-from roboarm_nmp.envs.datasets.observations import Observations
-from roboarm_nmp.envs.datasets.queries import load_queries
-from roboarm_nmp.envs.datasets.roadmap_paths import load_roadmap_paths
-from roboarm_nmp.envs.networks.exported_networks import load_network, save_network
-from roboarm_nmp.envs.networks.operations import NetworkError
 from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.tasks import get_task
-from roboarm_nmp.envs.training import runs
+from roboarm_nmp.networks.exported_networks import load_network, save_network
+from roboarm_nmp.networks.operations import NetworkError
 from roboarm_nmp.scene_embedding_train import collect as observe
+from roboarm_nmp.training import runs
 
 UNCHANGED, CHANGED = "read, as it was", "silent change"
 TEXTS = ("scene", "args")  # any change of these may be a user's

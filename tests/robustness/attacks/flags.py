@@ -66,7 +66,7 @@ TINY = {
     "demo_generation.export_minari": "--file demos_of_wall.h5 --overwrite",
     "scene_embedding_train.collect": "--num 1 --image-size 16 --num-samples 100 --workers 1"
     " --output seen",
-    "envs.show": "wall --output a.png --size 32 32",
+    "viewer.show": "wall --output a.png --size 32 32",
     "clean_rl_scripts.sweep": "trainer.py --search x=1..3 --trials 1 --folder sweep",
     "benchmarks.paper_tables": "--list --runs-dir runs",
 }

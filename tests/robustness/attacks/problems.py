@@ -8,9 +8,9 @@ import numpy as np
 import problem_files
 
 from attacks.children import RAN, REFUSED
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.problems import load_problems, write_problems
-from roboarm_nmp.envs.import_problems import import_problems, summary
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.import_problems import import_problems, summary
+from roboarm_nmp.datasets.problems import load_problems, write_problems
 from roboarm_nmp.envs.scenes.documents import DocumentError
 from roboarm_nmp.envs.scenes.files import SceneFileError
 from roboarm_nmp.envs.scenes.formats import load_world

@@ -7,14 +7,14 @@ import numpy as np
 from attacks.children import RAN, REFUSED
 from attacks.clouds import damaged
 from attacks.problems import hostile
-from roboarm_nmp.envs.datasets.format import DatasetError
-from roboarm_nmp.envs.datasets.trajectories import (
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.motions.trajectories import (
     JointTrajectory,
     load_trajectory,
     save_joint_path,
     save_trajectory,
 )
-from roboarm_nmp.envs.robots.panda import PANDA
 
 MEGABYTES = 1000
 ENDINGS = ("csv", "npz", "json", "yaml")

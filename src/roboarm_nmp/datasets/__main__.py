@@ -1,0 +1,112 @@
+"""The command `roboarm data`: validates files of queries, describes files of demonstrations.
+
+roboarm data validate src/roboarm_nmp/datasets/data/wall.h5 --simulate
+roboarm data describe wall boxes
+roboarm data describe no_obstacles --robot ur5.yaml
+"""
+
+import argparse
+import sys
+
+from roboarm_nmp.datasets.demonstrations import demo_path, describe, load_demos
+from roboarm_nmp.datasets.format import locate
+from roboarm_nmp.datasets.queries import query_path, validate
+from roboarm_nmp.envs.tasks import get_task, is_task, task_with_robot
+from roboarm_nmp.utils.signals import end_with_one_line
+
+
+def main(arguments=None):
+    """Run the command. Returns the exit code: 0, or 1 if a file is bad."""
+    parser = argparse.ArgumentParser(
+        prog="roboarm data",
+        description="Files of the tasks: queries and demonstrations.",
+        epilog="examples: roboarm data validate wall --simulate; roboarm data describe wall boxes",
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    command = commands.add_parser(
+        "validate",
+        help="check query files",
+        description="Check query files. Each good file gives a line on stdout, each bad one a line "
+        "on stderr that names the error. The exit code is 1 if any is bad. (For demonstrations: "
+        "roboarm verify.)",
+    )
+    _add_files(command)
+    command.add_argument(
+        "--simulate",
+        action="store_true",
+        help="also check in the simulator that every start and goal is feasible (about 140 queries "
+        "a second)",
+    )
+    command = commands.add_parser(
+        "describe",
+        help="statistics of demonstration files",
+        description="Print statistics of demonstration files, one column per file.",
+    )
+    _add_files(command)
+    options = parser.parse_args(arguments)
+    if options.task is not None:
+        try:
+            options.task = task_with_robot(options.task, options.robot)
+            get_task(options.task)
+        except ValueError as error:
+            print(f"error: --task: {error}", file=sys.stderr)
+            return 1
+    return {"validate": _validate, "describe": _describe}[options.command](options)
+
+
+def _add_files(command):
+    command.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
+    command.add_argument(
+        "--task", help="the task the files must be for; files of arms other than the Panda need it"
+    )
+    command.add_argument(
+        "--robot",
+        metavar="FILE",
+        help="another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md), as TASK@FILE",
+    )
+
+
+def _locate(file, path_of_task, options):
+    """(path, task it must be for) of a file, or of a task with the robot of `--robot`."""
+    if is_task(file):
+        file = task_with_robot(file, options.robot)
+    elif options.robot is not None and options.task is None:
+        raise ValueError(f"{file}: --robot of a file needs its --task")
+    path, task = locate(file, path_of_task)
+    return path, options.task or task
+
+
+def _validate(options):
+    bad = False
+    for file in options.files:
+        try:
+            path, task = _locate(file, query_path, options)
+            queries = validate(path, task, options.simulate, progress=True)
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)
+            bad = True
+        else:
+            test, validation = queries["test"], queries["validation"]
+            counts = f"{len(test)} test and {len(validation)} validation queries"
+            print(f"{path}: good, {counts} for {test.task}, seed {test.seed}")
+    return int(bad)
+
+
+def _describe(options):
+    try:
+        columns = [
+            describe(load_demos(*_locate(file, demo_path, options))) for file in options.files
+        ]
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(" | ".join(["", *options.files]))
+    for name in columns[0]:
+        values = [column.get(name, 0) for column in columns]
+        print(" | ".join([name, *(f"{v:.4g}" if isinstance(v, float) else str(v) for v in values)]))
+    return 0
+
+
+if __name__ == "__main__":
+    end_with_one_line("no file has changed")
+    sys.exit(main())

@@ -1,0 +1,169 @@
+"""Demonstrations as episodes of a goal type: as an environment would have recorded them.
+
+A demonstration (`datasets.demonstrations.Demo`) is a motion between two configurations. Its
+observations, its achieved goals and the step that reaches the goal depend on the goal type: `ee`,
+`config`, `combined` or `pose`. Trainers and the Minari export use these episodes.
+"""
+
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.envs.subgoals import MAX_STEP
+
+
+class Episode(NamedTuple):
+    """One episode of T steps, float32.
+
+    `observation` (T + 1, o), `achieved_goal` (T + 1, g), `desired_goal` (g,), `action` (T, n), and
+    `reached` (T + 1,), bool: whether that observation reaches the goal.
+    """
+
+    observation: np.ndarray
+    achieved_goal: np.ndarray
+    desired_goal: np.ndarray
+    action: np.ndarray
+    reached: np.ndarray
+
+
+def end_effector_of(goal_type, configuration, robot):
+    """What `observation` has of the end effector: its position (..., 3), or for `pose` (..., 7).
+
+    `configuration`: joint angles (..., n), rad.
+    """
+    if goal_type == "pose":
+        return robot.end_effector_pose(configuration)
+    return robot.forward_kinematics(configuration)
+
+
+def goal_of(goal_type, state, end_effector):
+    """The goal that an arm achieves: (..., 3) for `ee`, (..., n) `config`, (..., n + 3) `combined`.
+
+    And (..., 7) for `pose`. `state` (..., n) is its normalised configuration, `end_effector` as of
+    `end_effector_of`.
+    """
+    if goal_type in ("ee", "pose"):
+        return end_effector
+    if goal_type == "config":
+        return state
+    return np.concatenate([state, end_effector], axis=-1)
+
+
+def observed(states, goal, goal_type, robot):
+    """Observations at `states`, without velocities, in an episode with `goal`.
+
+    Args:
+        states: normalised configurations (m, n).
+        goal: joint angles (..., n), rad.
+        goal_type: `ee`, `config`, `combined` or `pose`.
+        robot: the `Robot`, with n joints.
+
+    Returns:
+        float32 `observation` (m, n + 3), for `pose` (m, n + 7), `achieved_goal` (m, g),
+        `desired_goal` (..., g).
+    """
+    end_effectors = end_effector_of(goal_type, robot.denormalise(states), robot)
+    goal = goal_of(goal_type, robot.normalise(goal), end_effector_of(goal_type, goal, robot))
+    arrays = np.hstack([states, end_effectors]), goal_of(goal_type, states, end_effectors), goal
+    return tuple(array.astype(np.float32) for array in arrays)
+
+
+def demo_episode(demo, env):
+    """A `Demo` as `env` would have recorded it, up to reaching its goal: an `Episode`.
+
+    Args:
+        demo: a `Demo`.
+        env: an environment of `envs.make` without velocities. Its goal type, action mode, goal
+            tolerances, encoder and appended link distances are those of the episode.
+    """
+    observation, achieved_goal, desired_goal = observed(
+        demo.states, demo.goal, env.goal_type, env.robot
+    )
+    action = demo.actions
+    if env.action_mode == "subgoal":
+        action = demo.states[:-1] + demo.actions
+    if getattr(env, "appends_link_distances", False):
+        near = env.link_distances_at(demo.states, demo.scene)
+        observation = np.hstack([observation, near.reshape(len(near), -1)])
+    encoder = getattr(env, "encoder", None)
+    if encoder is not None:
+        latent = np.tile(encoder(demo.scene), (len(observation), 1))
+        observation = np.hstack([observation, latent])
+    reached = env.compute_terminated(achieved_goal, desired_goal, {})
+    length = int(np.argmax(reached[1:])) + 1 if reached[1:].any() else len(action)
+    until = slice(length + 1)
+    return Episode(
+        observation[until], achieved_goal[until], desired_goal, action[:length], reached[until]
+    )
+
+
+def transition(before, action, after, collision):
+    """A replay buffer's entry: `action` led from the observation `before` (a dict) to `after`."""
+    return {
+        "observation": before["observation"],
+        "action": action,
+        "next_observation": after["observation"],
+        "next_achieved_goal": after["achieved_goal"],
+        "desired_goal": before["desired_goal"],
+        "collision": collision,
+    }
+
+
+def demo_transitions(demo, env):
+    """The episode of `demo_episode` as a list of such transitions."""
+    episode = demo_episode(demo, env)
+    observations = [
+        {"observation": one, "achieved_goal": achieved, "desired_goal": episode.desired_goal}
+        for one, achieved in zip(episode.observation, episode.achieved_goal, strict=True)
+    ]
+    steps = zip(observations[:-1], episode.action, observations[1:], strict=True)
+    return [transition(before, action, after, False) for before, action, after in steps]
+
+
+class DemoQueriesWrapper(gym.Wrapper):
+    """Episodes on the queries of demonstrations: `reset` draws one of them, `demo` is that `Demo`.
+
+    Args:
+        env: an environment of `envs.make`.
+        demos: the `Demos`.
+    """
+
+    def __init__(self, env, demos):
+        super().__init__(env)
+        self.demos, self.demo = demos, None
+
+    def reset(self, *, seed=None, options=None):
+        """As `RoboArmEnv.reset`."""
+        if seed is not None:
+            self.env.reset(seed=seed)
+        self.demo = self.demos[int(self.np_random.integers(len(self.demos)))]
+        return self.env.reset_specific(self.demo.start, self.demo.goal, self.demo.scene)
+
+
+def load_demos_for(env, file, task):
+    """The `Demos` of a file or task, if they can be episodes of `env`.
+
+    Args:
+        env: an environment of `envs.make`.
+        file: a task's name, or the path of a scene file or a demonstration file.
+        task: the task that they must be for.
+
+    Raises:
+        DatasetError: they cannot be episodes of `env`; or as `load_demos`.
+    """
+    if env.velocities or env.max_step < MAX_STEP:
+        raise DatasetError(
+            f"demonstrations have no velocities, and steps up to {MAX_STEP}: unlike the environment"
+        )
+    observes = getattr(env, "encoder", None) or getattr(env, "appends_link_distances", False)
+    if observes and not env.scene.is_static:
+        raise DatasetError(
+            "demonstrations among moving obstacles have no observations of the scene"
+        )
+    demos = load_demos(file, task)
+    if env.stop_on_collision and demos.collided.any():
+        raise DatasetError("--stop-on-collision, but some of these demonstrations have contacts")
+    return demos

@@ -1,0 +1,316 @@
+"""Readers of problems in other programs' formats; `datasets.problems` says which.
+
+Each reader yields a `Problem`, or a `Rejected` with the reason, for every problem of a file.
+"""
+
+import functools
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.urdf import link_placement
+from roboarm_nmp.envs.scenes import documents
+from roboarm_nmp.envs.scenes.documents import (
+    DocumentError,
+    Mistake,
+    get,
+    is_nothing,
+    load_document,
+    mapping,
+    number,
+    numbers,
+    sequence,
+    shorten,
+)
+from roboarm_nmp.envs.scenes.formats import (
+    check_frame,
+    check_frames,
+    checked_scene,
+    compose_poses,
+    curobo_obstacles,
+    is_world,
+    moveit_scene,
+    vamp_obstacles,
+    with_attached_objects,
+)
+from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, unit_quaternion
+
+MAX_PROBLEMS, MAX_GOALS, MAX_OBSTACLES = 100_000, 1_000, 1_000_000
+"""Limits of a file's problems, of a problem's goals, and of all obstacles of a file."""
+# Where the Panda's fingers are, m, in sets that do not say it: those of VAMP and robometrics.
+VAMP_OPENING, ROBOMETRICS_OPENING = 0.065, 0.025
+MAX_ANGLE = 1e4  # rad or m, of a joint
+
+
+class Problem(NamedTuple):
+    """A motion planning problem.
+
+    Attributes:
+        name: of the set and of the problem in it.
+        start: float64 (n,), joint angles, rad.
+        goals: float64 (k, n), rad: any of them will do; k is 0 where the goal is a pose only.
+        goal_pose: float64 (7,), or None: position (m) and quaternion (xyzw) of the end effector in
+            the world.
+        scene: the `Scene`, whose robot has its held joints, such as the gripper's, in place.
+    """
+
+    name: str
+    start: np.ndarray
+    goals: np.ndarray
+    goal_pose: np.ndarray | None
+    scene: Scene
+
+
+class Rejected(NamedTuple):
+    """A problem that cannot be used: its name, and the reason."""
+
+    name: str
+    reason: str
+
+
+def read_file(path, robot):
+    """Yield a `Problem` or a `Rejected` for each problem of a YAML or JSON file.
+
+    Raises DocumentError: the file is of no known format.
+    """
+    root = load_document(path)
+    try:
+        fields = mapping(root, "a file of problems")
+        if is_world(root) or "obstacles" in fields:
+            raise Mistake(root, "a world without starts and goals, which can be a task: --task")
+        if "problems" in fields:
+            entries, reader = list(_vamp_entries(fields, Path(path).stem)), _vamp_problem
+        else:
+            entries = list(_robometrics_entries(fields))
+            reader = functools.partial(_robometrics_problem, folder=Path(path).parent)
+        if not entries:
+            raise Mistake(root, "no problems")
+        if len(entries) > MAX_PROBLEMS:
+            raise Mistake(root, f"{len(entries):,} problems, at most {MAX_PROBLEMS:,}")
+    except Mistake as mistake:
+        raise DocumentError(f"{path}:{mistake.line}: {mistake.reason}") from mistake
+    obstacles = 0
+    for name, node in entries:
+        try:
+            problem = reader(name, node, robot)
+        except Mistake as mistake:
+            yield Rejected(name, f"{path}:{mistake.line}: {mistake.reason}")
+            continue
+        obstacles += len(problem.scene.obstacles)
+        if obstacles > MAX_OBSTACLES:
+            raise DocumentError(f"{path}: more than {MAX_OBSTACLES:,} obstacles in all")
+        yield problem
+
+
+# --- MotionBenchMaker and MoveIt: pairs of files
+
+
+def request_files(folder):
+    """The pairs of a folder: dict from a number, as text, to (scene file, request file) or None."""
+    found = {}
+    for kind in (0, 1):
+        for path in sorted(Path(folder).glob(("scene*.y*ml", "request*.y*ml")[kind])):
+            digits = re.fullmatch(r"(?:scene|request)_?(\d{1,9})", path.stem)
+            if digits and path.suffix in (".yaml", ".yml"):
+                found.setdefault(digits[1], [None, None])[kind] = path
+    return dict(sorted(found.items()))
+
+
+def read_folder(folder, robot):
+    """Yield a `Problem` or a `Rejected` for each `scene####.yaml` with its `request####.yaml`.
+
+    Raises DocumentError: there is none in the folder.
+    """
+    folder = Path(folder)
+    pairs = request_files(folder)
+    if not any(request for _, request in pairs.values()):
+        raise DocumentError(f"{folder}: no request####.yaml with a scene####.yaml in this folder")
+    for digits, (scene, request) in pairs.items():
+        name = f"{folder.resolve().name}/{digits}"
+        if scene is None or request is None:
+            missing = "scene" if scene is None else "request"
+            yield Rejected(name, f"{scene or request}: there is no {missing}{digits}.yaml")
+            continue
+        try:
+            path = request
+            start, goals, robot_of = _request(load_document(request), robot)
+            path = scene
+            found = moveit_scene(load_document(scene), robot_of)
+        except Mistake as mistake:
+            yield Rejected(name, f"{path}:{mistake.line}: {mistake.reason}")
+        except DocumentError as error:
+            yield Rejected(name, str(error))
+        else:
+            yield Problem(name, start, goals, None, found)
+
+
+def _request(root, robot):
+    """Start (n,), goals (k, n), and the robot with its held joints, of a MotionPlanRequest."""
+    fields = mapping(root, "a motion plan request")
+    for key in ("path_constraints", "trajectory_constraints"):
+        if not _is_empty(fields.get(key)):
+            raise Mistake(fields[key], f"{key} are not supported")
+    check_frames(fields, robot)
+    state = mapping(get(root, "start_state", "a request"), "start_state")
+    joints = get(fields["start_state"], "joint_state", "start_state")
+    names = sequence(get(joints, "name", "joint_state"), "name", 1000)
+    values = sequence(get(joints, "position", "joint_state"), "position", 1000)
+    if len(names) != len(values):
+        raise Mistake(joints, f"{len(names)} joints have {len(values)} positions")
+    positions = {}
+    for name, value in zip(names, values, strict=True):
+        joint = documents.text(name, "the name of a joint")
+        positions[joint] = number(value, f"the position of {joint[:40]}", MAX_ANGLE)
+    start, robot = _configuration(joints, positions, robot, "the start")
+    robot = with_attached_objects(state, robot)
+    constraints = get(root, "goal_constraints", "a request")
+    goals = []
+    for one in sequence(constraints, "goal_constraints", MAX_GOALS):
+        goal = mapping(one, "a goal")
+        for key in ("position_constraints", "orientation_constraints", "visibility_constraints"):
+            if not is_nothing(goal.get(key)):
+                raise Mistake(goal[key], f"{key} are not supported: only joint_constraints")
+        angles = {}
+        for joint in sequence(get(one, "joint_constraints", "a goal"), "joint_constraints", 1000):
+            name = documents.text(get(joint, "joint_name", "a joint constraint"), "joint_name")
+            value = get(joint, "position", "a joint constraint")
+            angles[name] = number(value, f"the position of {name[:40]}", MAX_ANGLE)
+        goals.append(_configuration(one, angles, robot, "the goal", with_held=False)[0])
+    if not goals:
+        raise Mistake(constraints, "no goal")
+    return start, np.array(goals), robot
+
+
+def _is_empty(node):
+    """Whether a message has no contents, at any depth: empty texts, lists and numbers 0."""
+    if node is None or isinstance(node.value, str):
+        return node is None or node.value in ("", "0", "0.0", "null", "~", "false")
+    inner = node.value.values() if isinstance(node.value, dict) else node.value
+    return all(map(_is_empty, inner))
+
+
+def _configuration(node, positions, robot, what, with_held=True):
+    """Joint angles (n,) from a dict of names, and the robot with its held joints as there."""
+    missing = [name for name in robot.joint_names if name not in positions]
+    if missing:
+        raise Mistake(node, f"{what} lacks {', '.join(missing)}")
+    held = {name: at for name, at in positions.items() if name not in robot.joint_names}
+    if unknown := sorted(name for name in held if name not in robot.held):
+        raise Mistake(node, f"{robot.name} has no joint {shorten(unknown[0])}")
+    angles = np.array([positions[name] for name in robot.joint_names])
+    return angles, _held(node, robot, held) if with_held else robot
+
+
+def _held(node, robot, positions):
+    try:
+        return robot.with_held(positions)
+    except ValueError as error:
+        raise Mistake(node, str(error)) from error
+
+
+# --- robometrics
+
+
+def _robometrics_entries(fields):
+    """The (name, node) of the problems: lists of them by the names of their scenes."""
+    for scene, problems in fields.items():
+        for index, node in enumerate(sequence(problems, "problems", MAX_PROBLEMS)):
+            yield f"{scene[:60]}/{index}", node
+
+
+def _robometrics_problem(name, node, robot, folder):
+    fields = mapping(node, "a problem")
+    robot = _with_opening(node, robot, ROBOMETRICS_OPENING)
+    if "world_frame" in fields:
+        check_frame(fields["world_frame"], robot)
+    start = _angles(get(node, "start", "a problem"), "start", robot)
+    goals = []
+    if "goal_ik" in fields:
+        goals = sequence(fields["goal_ik"], "goal_ik", MAX_GOALS)
+        goals = [_angles(goal, "a goal of goal_ik", robot) for goal in goals]
+    pose = None
+    if not is_nothing(fields.get("goal_pose")):
+        pose = _goal_pose(fields["goal_pose"], robot)
+    elif not goals:
+        raise Mistake(node, "a problem needs goal_ik or goal_pose")
+    obstacles = curobo_obstacles(get(node, "obstacles", "a problem"), folder)
+    goals = np.reshape(goals, (-1, robot.num_joints))
+    return Problem(name, start, goals, pose, checked_scene(node, obstacles, robot))
+
+
+def _goal_pose(node, robot):
+    """The end effector's pose where a link, such as the hand, has the pose of a file: (7,)."""
+    frame = documents.text(get(node, "frame", "goal_pose"), "frame")
+    position = numbers(get(node, "position_xyz", "goal_pose"), "position_xyz", 3, MAX_LENGTH)
+    turn = get(node, "quaternion_wxyz", "goal_pose")
+    w, x, y, z = numbers(turn, "quaternion_wxyz", 4, MAX_LENGTH)
+    try:
+        quaternion = unit_quaternion((x, y, z, w))
+        joint, rotation, at = link_placement(robot, frame)
+    except ValueError as error:
+        raise Mistake(node, str(error)) from error
+    end = robot.bullet_names[1][robot.end_effector_link]
+    end_joint, end_rotation, end_at = link_placement(robot, end)
+    if joint != end_joint:
+        raise Mistake(node, f"the frame {shorten(frame)} does not move with the end effector")
+    end_at = end_at + end_rotation @ np.array(robot.end_effector_offset)
+    inner = rotation.T @ (end_at - at), _quaternion(rotation.T @ end_rotation)
+    return np.concatenate(compose_poses(position, quaternion, *inner))
+
+
+def _quaternion(rotation):
+    """The quaternion (xyzw) of a rotation matrix (3, 3): by Bar-Itzhack's method (2000)."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    square = np.array(
+        [
+            [a - e - i, b + d, c + g, h - f],
+            [b + d, e - a - i, f + h, c - g],
+            [c + g, f + h, i - a - e, d - b],
+            [h - f, c - g, d - b, a + e + i],
+        ]
+    )
+    quaternion = np.linalg.eigh(square)[1][:, -1]
+    return quaternion if quaternion[3] >= 0 else -quaternion
+
+
+# --- VAMP
+
+
+def _vamp_entries(fields, stem):
+    """The (name, node) of the problems: a list, or lists by the names of their sets."""
+    problems = fields["problems"]
+    sets = problems.value if isinstance(problems.value, dict) else {stem: problems}
+    for name, nodes in sets.items():
+        for index, node in enumerate(sequence(nodes, "problems", MAX_PROBLEMS)):
+            number_of = mapping(node, "a problem").get("index")
+            number_of = None if number_of is None else documents.text(number_of, "index")
+            yield f"{name[:60]}/{(number_of or str(index))[:20]}", node
+
+
+def _vamp_problem(name, node, robot):
+    fields = mapping(node, "a problem")
+    robot = _with_opening(node, robot, VAMP_OPENING)
+    if "fingers" in fields:
+        fingers = numbers(fields["fingers"], "fingers", len(robot.held_indices), MAX_ANGLE)
+        robot = _held(node, robot, dict(zip(robot.held, fingers, strict=True)))
+    start = _angles(get(node, "start", "a problem"), "start", robot)
+    goals = get(node, "goals", "a problem")
+    found = [_angles(goal, "a goal", robot) for goal in sequence(goals, "goals", MAX_GOALS)]
+    if not found:
+        raise Mistake(goals, "no goal")
+    obstacles = vamp_obstacles(fields.get("obstacles", node))
+    return Problem(name, start, np.array(found), None, checked_scene(node, obstacles, robot))
+
+
+def _angles(node, what, robot):
+    return np.array(numbers(node, what, robot.num_joints, MAX_ANGLE))
+
+
+def _with_opening(node, robot, opening):
+    """The Panda with its fingers at an opening (m); other arms as they are."""
+    if robot.arm != PANDA:
+        return robot
+    return _held(node, robot, dict.fromkeys(robot.held, opening))

@@ -1,0 +1,1 @@
+"""Evaluation: one episode loop and one evaluation for everybody."""

@@ -1,0 +1,1 @@
+"""Motions: trajectories and their formats, time parameterisation, metrics."""

@@ -1,0 +1,1 @@
+"""Planning: OMPL's planners among exact collision checks, following plans, approach paths."""

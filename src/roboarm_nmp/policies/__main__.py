@@ -1,0 +1,107 @@
+"""The command `roboarm policies`: the pretrained policies and scene encoders.
+
+roboarm policies
+roboarm policies sac-ee-wall-p1-s1
+"""
+
+import argparse
+import json
+import sys
+
+from roboarm_nmp.policies.registry import PolicyError, pretrained_policies
+
+
+def main(arguments=None):
+    """Run the command. Returns the exit code: 0, or 2 for a policy that does not exist."""
+    parser = argparse.ArgumentParser(
+        prog="roboarm policies",
+        description="List the pretrained policies and scene encoders, or show one policy. Success "
+        "is measured on test queries of the policy's task, with the policy's own safety filter.",
+        epilog="example: roboarm policies sac-ee-wall-p1-s1",
+    )
+    parser.add_argument("name", nargs="?", metavar="NAME", help="show the card of this policy")
+    parser.add_argument(
+        "--json", action="store_true", help="print JSON, with all flags of training"
+    )
+    options = parser.parse_args(arguments)
+    # Here, so that --help need not wait for PyTorch.
+    from roboarm_nmp.envs.perception.encoders import pretrained_encoders
+    from roboarm_nmp.policies.cards import encoder_card, policy_card
+
+    if options.name is not None:
+        try:
+            card = policy_card(options.name)
+        except PolicyError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+        print(json.dumps(card, indent=2) if options.json else _card(card))
+        return 0
+    policies = [policy_card(name) for name in pretrained_policies()]
+    encoders = [encoder_card(name) for name in pretrained_encoders()]
+    if options.json:
+        print(json.dumps({"policies": policies, "encoders": encoders}, indent=2))
+    else:
+        print(_policies(policies), _encoders(encoders), sep="\n\n")
+    return 0
+
+
+def _policies(cards):
+    from roboarm_nmp.policies.cards import observes
+
+    rows = [
+        ["policy", "task", "goal", "observes of the scene", "safety filter"]
+        + ["success", "collision-free", "queries"]
+    ]
+    for card in cards:
+        rates = f"{card['success_rate']:.3f}", f"{card['collision_free_success_rate']:.3f}"
+        row = [card["name"], card["task"], card["goal_type"], observes(card), _filter(card)]
+        rows.append([*row, *rates, f"{card['num_queries']:,}"])
+    return _aligned(rows, numbers=3)
+
+
+def _encoders(cards):
+    rows = [["encoder", "receives", "trained on", "decoder", "scenes"]]
+    for card in cards:
+        receives = f"{card['receives']} of {card['sensors']} sensors"
+        decoder = "yes" if card["has_decoder"] else "no"
+        rows.append([card["name"], receives, card["task"], decoder, f"{card['scenes']:,}"])
+    return _aligned(rows, numbers=1)
+
+
+def _filter(card):
+    return f"margin {card['safety_filter']['margin']:g} m" if card["safety_filter"] else "none"
+
+
+def _aligned(rows, numbers):
+    """Rows of strings as text in columns; the last `numbers` columns end at their right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    first = len(widths) - numbers
+    return "\n".join(
+        "  ".join(
+            text.ljust(width) if i < first else text.rjust(width)
+            for i, (text, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )
+
+
+def _card(card):
+    from roboarm_nmp.policies.cards import observes
+
+    low, high = card["success_rate_interval"]
+    rows = {
+        "task": card["task"],
+        "goal": card["goal_type"],
+        "observes of the scene": observes(card),
+        "safety filter": _filter(card),
+        "success": f"{card['success_rate']:.4f} (95% interval {low:.4f} to {high:.4f})",
+        "collision-free success": f"{card['collision_free_success_rate']:.4f}",
+        "test queries": f"{card['num_queries']:,}",
+        "trained by": f"{card['trainer']}, {card['steps']:,} {card['unit']}, {card['date']}",
+        "evaluate it": f"roboarm evaluate --policy {card['name']}",
+    }
+    return "\n".join([card["name"], *(f"  {name:<24}{text}" for name, text in rows.items())])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

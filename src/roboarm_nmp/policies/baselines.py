@@ -1,0 +1,224 @@
+"""Non-learning baselines, by name.
+
+- go-to-goal: straight to the goal configuration, whatever is in the way (paper, section 5.1);
+- random: a random action at every step;
+- via-points: straight to the goal configuration if that motion is free of collisions; otherwise
+  through the first of some random configurations for which the motion is free; without such a
+  configuration, straight to the goal;
+- planner: follows a plan of OMPL's RRT-Connect, which may search for a limited time;
+- replanning: follows a plan, watches it, and plans again whenever it is blocked
+  (`policies.replanning`);
+- space-time: follows a plan that was made with the future motions of obstacles, the reference where
+  obstacles move (`planning.space_time`).
+
+Of a goal pose, the goal configuration is one that inverse kinematics finds, the nearest one to the
+start; `via-points` and `planner` need one without collisions.
+
+`via-points`, `planner` and `replanning` check collisions with the obstacles of a geometry source
+(`envs.perception.geometry_source`); with the ground truth they are privileged. Where obstacles
+move, the first two plan around obstacles as they are at the start, and `replanning` around those of
+the present step. `space-time` always has the ground truth, the future included.
+"""
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.policies.pose_goals import goal_configuration, observed_at_start
+
+SPACE_TIME = "space-time"
+OMPL_PLANNERS = ("planner", SPACE_TIME)
+"""The baselines that need OMPL, which is imported only when one of them is used."""
+PLANNERS = ("via-points", *OMPL_PLANNERS)
+"""The baselines that look for a motion before they move."""
+REPLANNING = "replanning"
+CHECKING = (*PLANNERS, REPLANNING)
+"""The baselines that need a geometry source."""
+BASELINES = ("go-to-goal", "random", *CHECKING)
+TRIES = 16  # of `via-points`, by default
+TIME_LIMIT = 5.0  # s, of `planner`, by default
+
+
+class EpisodePolicy(NamedTuple):
+    """A policy in one episode.
+
+    act: act(observation) -> action (n,); None: the policy gives up.
+    plan_found: whether it found a motion; None if it does not look for one.
+    """
+
+    act: Callable | None
+    plan_found: bool | None = None
+
+
+def make_baseline(name, env, seed, tries, time_limit, geometry_source):
+    """A baseline in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
+
+    Args:
+        name: one of `BASELINES`.
+        env, seed, tries, time_limit, geometry_source: see `policies.registry.make_policy`.
+
+    Raises:
+        ValueError: the environment's actions are not displacements, there is no such geometry
+            source, or `planner` lacks OMPL.
+    """
+    robot = env.robot
+    if name == "random":
+        joints = robot.num_joints
+        return lambda number, query: EpisodePolicy(
+            _random(np.random.default_rng([seed, number]), joints)
+        )
+    if env.action_mode != "relative":
+        raise ValueError(f"{name} gives displacements, not actions of mode {env.action_mode!r}")
+    if name == "go-to-goal":
+        observes_goal = env.goal_type in ("config", "combined")
+        return lambda number, query: EpisodePolicy(
+            _go_to_goal(_goal(env, query), robot, observes_goal)
+        )
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+
+    source = find_geometry_source(geometry_source, robot)
+    if name == SPACE_TIME:
+        if geometry_source != "ground_truth":
+            raise ValueError(f"space-time plans with the ground truth, not {geometry_source}")
+        return _space_time(env, seed, time_limit)
+    if name == "via-points":
+        return _via_points(env, seed, tries, source)
+    if name == REPLANNING:
+        return make_replanning(env, seed, source)
+    return _planner(env, seed, time_limit, source)
+
+
+def check_ompl(name):
+    """Raise ValueError unless OMPL, which the baseline `name` needs, can be imported."""
+    try:
+        import ompl  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"the policy {name} needs OMPL: {error}") from error
+
+
+def _goal(env, query, checker=None):
+    """The goal's configuration (n,), rad; None if the goal is a pose, and there is none."""
+    if env.goal_type != "pose":
+        return query.goal
+    pose = env.robot.end_effector_pose(query.goal)
+    return goal_configuration(env.robot, pose, query.start, checker)
+
+
+def _go_to_goal(goal, robot, observes_goal=False):
+    if goal is None:
+        return None
+    target = robot.normalise(goal)
+
+    def act(observation):
+        state, to = observation["observation"][: len(target)], target
+        if observes_goal:
+            observed = observation["desired_goal"][: len(target)]
+            # It is another one where an approach path begins (`planning.approach_path`).
+            to = target if np.abs(observed - target).max() < 1e-5 else observed
+        return to - state
+
+    return act
+
+
+def _random(rng, num_joints):
+    return lambda observation: rng.uniform(-1.0, 1.0, num_joints)
+
+
+def _via_points(env, seed, tries, geometry_source):
+    robot = env.robot
+
+    # Without a margin, which would reject more than it saves: with 3 mm, collision-free success was
+    # 2 to 5 points lower on `wall`, `double_walls` and `boxes`.
+    def begin(number, query):
+        checker = geometry_source(observed_at_start(env, query))
+        configuration = _goal(env, query, checker)
+        if configuration is None:
+            return EpisodePolicy(None, plan_found=False)
+        # float32 may round a limit to just beyond it.
+        start, goal = np.clip(robot.normalise([query.start, configuration]), -1.0, 1.0)
+        if checker.is_motion_free(start, goal):
+            return EpisodePolicy(_go_to_goal(configuration, robot), plan_found=True)
+        for via in np.random.default_rng([seed, number]).uniform(
+            -1.0, 1.0, (tries, robot.num_joints)
+        ):
+            if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
+                path = robot.denormalise(np.stack([start, via, goal]))
+                return EpisodePolicy(_follow(path, robot), plan_found=True)
+        return EpisodePolicy(_go_to_goal(configuration, robot), plan_found=False)
+
+    return begin
+
+
+def make_replanning(env, seed, geometry_source):
+    """As `make_baseline` of `replanning`; `geometry_source`: a function from a scene."""
+    from roboarm_nmp.envs.wrappers import observed_scene
+    from roboarm_nmp.policies.replanning import Replanning
+
+    # Compile here what is compiled at its first call: an action's time is for planning.
+    state = np.zeros(env.robot.num_joints)
+    checker = geometry_source(env.unwrapped.current_scene)
+    checker.find_path(state, state, np.random.default_rng(0), max_checks=1)
+
+    def current_checker():
+        return geometry_source(observed_scene(env))
+
+    def begin(number, query):
+        goal = _goal(env, query, geometry_source(observed_at_start(env, query)))
+        if goal is None:
+            return EpisodePolicy(None)
+        rng = np.random.default_rng([seed, number])
+        return EpisodePolicy(Replanning(env.robot, goal, current_checker, rng))
+
+    return begin
+
+
+def _planner(env, seed, time_limit, geometry_source):
+    from roboarm_nmp.planning.planner import Planner, PlanningError
+
+    scene = None  # that of the query, as it is observed
+    planner = Planner(env, geometry_source=geometry_source)
+
+    def begin(number, query):
+        nonlocal planner, scene
+        if (observed := observed_at_start(env, query)) is not query.scene:
+            # A planner has one checker per scene, but this one is of a single episode.
+            scene = observed
+            planner = Planner(env, geometry_source=lambda _: geometry_source(scene))
+        options, given = {"seed": [seed, number], "time_limit": time_limit}, query
+        if env.goal_type == "pose":
+            options["goal_pose"] = env.robot.end_effector_pose(query.goal)
+            given = query._replace(goal=None)
+        try:
+            path = planner.plan(*given, **options)
+        except PlanningError:
+            return EpisodePolicy(None, plan_found=False)
+        return EpisodePolicy(_follow(path, env.robot), plan_found=True)
+
+    return begin
+
+
+def _space_time(env, seed, time_limit):
+    from roboarm_nmp.planning.planner import PlanningError
+    from roboarm_nmp.planning.space_time import SpaceTimePlanner
+
+    planner = SpaceTimePlanner(env.unwrapped)
+
+    def begin(number, query):
+        try:
+            path = planner.plan(*query, seed=[seed, number], time_limit=time_limit)
+        except PlanningError:
+            return EpisodePolicy(None, plan_found=False)
+        return EpisodePolicy(_follow(path, env.robot), plan_found=True)
+
+    return begin
+
+
+def _follow(path, robot):
+    """One sub-goal per step along a path (k, n), rad; at its end the goal, repeatedly."""
+    targets = subgoals(path, robot)[1:]
+    left = itertools.chain(targets, itertools.repeat(targets[-1]))
+    return lambda observation: next(left) - observation["observation"][: robot.num_joints]

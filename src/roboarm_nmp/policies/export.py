@@ -1,0 +1,68 @@
+"""Saving a policy of one's own, as a file that `roboarm evaluate` runs without its script.
+
+    save_policy("policy.pt", module, "wall", goal_type="ee")
+
+The file's format, and what its network may compute: `networks.exported_networks`. For a policy
+of Stable-Baselines3 see docs/reference/api.md. A function needs no file: `roboarm_nmp.evaluate`.
+"""
+
+import copy
+
+import torch
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.robots.metadata import robot_metadata
+from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.operations import NetworkError
+from roboarm_nmp.policies.registry import ENV_ARGUMENTS, PolicyError
+
+
+def save_policy(path, module, task, safety_filter=None, **env_arguments):
+    """Write a module as a policy file.
+
+    Args:
+        path: the file to write, e.g. `policy.pt`; its folder must exist.
+        module: `nn.Module`. Its `forward` receives the observation by name (`observation`,
+            `achieved_goal`, `desired_goal` and what else the environment observes), float32
+            (N, ...), and returns deterministic actions, float32 (N, n), in [-1, 1]. It may not
+            branch on values or draw random numbers.
+        task: name of the task it was trained on, or path of a scene file; or `TASK@ROBOT`.
+        safety_filter: an `policies.safety_filter.SafetyFilter` that belongs to the policy.
+        env_arguments: the arguments of `roboarm_nmp.make` it was trained with: those of
+            `policies.registry.ENV_ARGUMENTS`. Others define success, and are not stored.
+
+    Raises:
+        PolicyError: it cannot be exported, its actions have another shape or type, or an argument
+            is not one of `ENV_ARGUMENTS`. An old file stays as it is.
+        ValueError: `task` or `env_arguments` are not accepted by `roboarm_nmp.make`.
+        OSError: the file cannot be written.
+    """
+    unknown = sorted(set(env_arguments) - set(ENV_ARGUMENTS))
+    if unknown:
+        raise PolicyError(
+            f"{', '.join(unknown)}: not among the arguments that a policy stores, which are "
+            f"{', '.join(ENV_ARGUMENTS)}"
+        )
+    env = envs.make(task, **env_arguments)
+    goal_type, robot = env.goal_type, env.unwrapped.robot
+    observations = [env.reset(seed=seed)[0] for seed in (0, 1)]
+    env.close()
+    example = {
+        name: torch.stack([torch.from_numpy(one[name]) for one in observations])
+        for name in observations[0]
+    }
+    metadata = {"kind": "policy", "task": str(task), "env": {"goal_type": goal_type}}
+    metadata["env"] |= env_arguments
+    metadata |= robot_metadata(robot)
+    if safety_filter is not None:
+        metadata["safety_filter"] = safety_filter.to_metadata()
+    with torch.no_grad():
+        action = copy.deepcopy(module).cpu().eval()(**example)
+    shape = (len(observations), robot.num_joints)
+    if not isinstance(action, torch.Tensor) or action.shape != shape:
+        got = tuple(action.shape) if isinstance(action, torch.Tensor) else type(action).__name__
+        raise PolicyError(f"{path}: actions for {shape[0]} observations must be {shape}, got {got}")
+    try:
+        save_network(path, module, example, metadata)
+    except NetworkError as error:
+        raise PolicyError(str(error)) from error

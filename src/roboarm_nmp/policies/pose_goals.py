@@ -1,0 +1,94 @@
+"""Goal poses for policies whose goals are configurations, by inverse kinematics.
+
+Such a policy heads for a configuration that has the pose: the one nearest to the start, with as
+much clearance as `CLEARANCES` says, if there is one.
+"""
+
+import numpy as np
+
+from roboarm_nmp.datasets.episodes import goal_of
+
+# m, in the geometry source of the environment's link distances: the first that any solution has.
+CLEARANCES = (0.02, 0.01, 0.0)
+
+
+def goal_configuration(robot, pose, start, checker=None):
+    """A configuration that has a pose, float32 (n,), rad; None if none was found.
+
+    Args:
+        robot: a `Robot` with n joints.
+        pose: (7,), as of `Robot.end_effector_pose`.
+        start: joint angles (n,), rad.
+        checker: a `CollisionChecker`, in which the configuration is free; None for no checks.
+    """
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
+
+    found = inverse_kinematics(robot, pose, checker=checker, near=start)
+    if not len(found):
+        return None
+    if checker is not None:
+        states = robot.normalise(found)
+        for clearance in CLEARANCES:
+            wide = checker.is_free(states, margin=clearance)
+            if wide.any():
+                found = found[wide]
+                break
+    return found[0].astype(np.float32)
+
+
+def observed_at_start(env, query):
+    """The scene of a `Query` as it is observed at the start of an episode in an environment."""
+    try:
+        observe = env.get_wrapper_attr("observed_at_start")
+    except AttributeError:  # no `envs.wrappers.ObservedSceneWrapper`
+        return query.scene.at(0.0)
+    return observe(query.scene, query.start)
+
+
+class ConfigurationGoals:
+    """Observations in an environment of goal poses, as a policy for configurations expects them.
+
+    Args:
+        env: a `RoboArmEnv` with the goal type `pose`, possibly wrapped.
+        goal_type: the policy's, `config` or `combined`.
+    """
+
+    def __init__(self, env, goal_type):
+        self.env, self.goal_type, self.robot = env, goal_type, env.unwrapped.robot
+        self._has_distances = "link_distances" in env.observation_space.spaces
+        self._more = {}
+
+    def begin(self, query):
+        """Choose the goal of an episode, for an `datasets.queries.Query` with a goal's pose.
+
+        Returns whether there is one.
+        """
+        checker, scene = None, observed_at_start(self.env, query)
+        if self._has_distances:
+            checker = self.env.get_wrapper_attr("geometry_source")(scene)
+        pose = self.robot.end_effector_pose(query.goal)
+        goal = goal_configuration(self.robot, pose, query.start, checker)
+        if goal is not None:
+            self._set(self.robot.normalise(goal), pose[:3], scene)
+        return goal is not None
+
+    def begin_anywhere(self):
+        """Choose any goal, to see what the policy would observe."""
+        goal = np.zeros(self.robot.num_joints)
+        self._set(goal, np.zeros(3), self.env.unwrapped.current_scene)
+
+    def _set(self, state, position, scene):
+        self._more = {"desired_goal": goal_of(self.goal_type, state, position).astype(np.float32)}
+        if self._has_distances:
+            at = self.env.get_wrapper_attr("link_distances_at")
+            self._more["goal_link_distances"] = at(np.clip(state, -1.0, 1.0), scene)
+
+    def __call__(self, observation):
+        """An observation of the environment as one of the policy."""
+        joints, inner = self.robot.num_joints, observation["observation"]
+        end = self.env.unwrapped.observation_space["observation"].shape[0]  # of the quaternion
+        position = inner[end - 7 : end - 4]
+        achieved = goal_of(self.goal_type, inner[:joints], position)
+        more = {"observation": np.delete(inner, np.s_[end - 4 : end]), "achieved_goal": achieved}
+        return {**observation, **more, **self._more}

@@ -1,0 +1,325 @@
+"""Policies by name: non-learning baselines, and trained policies from their files.
+
+    policy, arguments = find_policy("via-points")        # or a file, a folder, a pretrained name
+    env = roboarm_nmp.make("wall", **arguments)
+    begin = make_policy(policy, env)
+    act, plan_found = begin(0, load_queries("wall")[0])  # once, at the start of an episode
+    action = act(observation)                            # at every step
+
+A safety filter may be put around any policy (`policies.safety_filter`); a trained policy may
+include one. Baselines: `policies.baselines`. Whole episodes: `evaluation.rollout`.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from roboarm_nmp.policies.baselines import (
+    BASELINES,
+    OMPL_PLANNERS,
+    REPLANNING,
+    TIME_LIMIT,
+    TRIES,
+    EpisodePolicy,
+    check_ompl,
+    make_baseline,
+    make_replanning,
+)
+from roboarm_nmp.policies.pose_goals import ConfigurationGoals
+from roboarm_nmp.utils.names import suggest
+
+# The arguments of an environment that a policy's metadata may contain. Tolerances and horizon are
+# not among them: they define what a success is.
+ENV_ARGUMENTS = (
+    *("goal_type", "action_mode", "max_step", "velocities"),
+    *("encoder", "num_points", "geometry_source", "link_distances", "append_link_distances"),
+)
+FOR_POSES = ("config", "combined")
+"""Goal types of policies that also take goal poses, by inverse kinematics."""
+PRETRAINED = Path(__file__).parent / "pretrained"
+MAX_RECURRENT_SIZE = 65_536  # numbers
+
+
+class PolicyError(ValueError):
+    """A policy that cannot be found or used; the message says why."""
+
+
+def pretrained_policies():
+    """The trained policies that come with the project: dict of name -> path."""
+    return {path.stem: path for path in sorted(PRETRAINED.glob("*.pt"))}
+
+
+def policy_file(name):
+    """The path of a trained policy: of a file, a run's folder, or a name of `pretrained_policies`.
+
+    Raises PolicyError if it is none of these.
+    """
+    path = Path(name)
+    if path.is_dir():
+        path = path / "policy.pt"
+    if path.exists():
+        return path
+    pretrained = pretrained_policies()
+    if str(name) not in pretrained:
+        otherwise = f"expected {', '.join(BASELINES)}, a policy network, a folder with a policy.pt "
+        otherwise += "in it, or a name that `roboarm policies` lists"
+        hint = suggest(name, [*BASELINES, *pretrained], otherwise)
+        raise PolicyError(f"no such policy: {path}: {hint}")
+    return pretrained[str(name)]
+
+
+def find_policy(name):
+    """The policy as `make_policy` takes it, and the arguments of `envs.make` it was trained with.
+
+    Args:
+        name: one of `BASELINES`, which have no arguments, or a name or path as for `policy_file`.
+
+    Raises:
+        PolicyError: there is no such policy, its file is not one, or OMPL is missing, which
+            `planner` and `space-time` need.
+    """
+    if name in OMPL_PLANNERS:
+        try:
+            check_ompl(name)
+        except ValueError as error:
+            raise PolicyError(str(error)) from error
+    if name in BASELINES:
+        return name, {}
+    path = policy_file(name)
+    return path, _load(path)[1]
+
+
+def own_safety_filter(policy):
+    """The `policies.safety_filter.SafetyFilter` that a policy includes; None without one.
+
+    `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
+    """
+    return None if callable(policy) or policy in BASELINES else _load(policy)[2]
+
+
+def filter_around(policy, safety_filter, replan=False):
+    """A safety filter as it acts around a policy: a policy that replans needs no escapes."""
+    replan = replan or (not callable(policy) and policy == REPLANNING)
+    if safety_filter and replan:
+        return replace(safety_filter, escape=False)
+    return safety_filter
+
+
+def own_task(policy):
+    """The task that a trained policy was trained on, a name or path; None for other policies.
+
+    `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
+    """
+    if callable(policy) or policy in BASELINES:
+        return None
+    task = _load(policy)[0].metadata.get("task")
+    return task if isinstance(task, str) else None
+
+
+def recurrent_size(policy):
+    """The size of a trained policy's recurrent state; 0 for none.
+
+    Args:
+        policy: an exported network, whose metadata may have `recurrent_size`, or a module that may
+            have that attribute. How it is called: `networks.exported_networks`.
+
+    Raises:
+        PolicyError: it is no integer from 0 to `MAX_RECURRENT_SIZE`.
+    """
+    metadata = getattr(policy, "metadata", None)
+    if metadata is None:
+        size = getattr(policy, "recurrent_size", 0)
+    else:
+        size = metadata.get("recurrent_size", 0)
+    if type(size) is not int or not 0 <= size <= MAX_RECURRENT_SIZE:
+        raise PolicyError(
+            f"a policy's recurrent state has 0 to {MAX_RECURRENT_SIZE:,} numbers, not {size!r}"
+        )
+    return size
+
+
+def make_policy(
+    policy,
+    env,
+    seed=0,
+    tries=TRIES,
+    time_limit=TIME_LIMIT,
+    geometry_source="ground_truth",
+    safety_filter=None,
+    replan=False,
+):
+    """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
+
+    It is called once per episode, before the environment's reset to the query: `planner` moves the
+    arm.
+
+    In an environment with the goal type `pose`, the goal is the pose of the query's goal. Baselines
+    and policies for configurations then head for a configuration that inverse kinematics finds.
+
+    Args:
+        policy: one of `BASELINES`, the path of a policy network, or a function from an observation
+            to an action (n,).
+        env: the `RoboArmEnv` it will act in.
+        seed: of random numbers, >= 0; each query has its own generator.
+        tries: random configurations that `via-points` tries per query.
+        time_limit: seconds that `planner` may search per query.
+        geometry_source: where `via-points`, `planner` and `replanning` take the obstacles from:
+            `ground_truth`, `point_cloud` or an encoder's name (`envs.perception.geometry_source`).
+        safety_filter: an `policies.safety_filter.SafetyFilter` around the policy; None for the
+            one that a trained policy includes, if any; False for none. The environment must have
+            `link_distances`, whose geometry source is the filter's.
+        replan: whenever the policy is stuck, follow a plan for a while
+            (`policies.replanning.ReplanWhenStuck`); a safety filter then makes no escapes.
+
+    Raises:
+        PolicyError: the policy cannot act in this environment.
+    """
+    as_observed = None
+    if callable(policy):
+        begin = _same(policy)
+    elif policy in BASELINES:
+        try:
+            begin = make_baseline(policy, env, seed, tries, time_limit, geometry_source)
+        except ValueError as error:
+            raise PolicyError(str(error)) from error
+    else:
+        begin, as_observed = _trained(policy, env)
+    if safety_filter is None:
+        safety_filter = own_safety_filter(policy)
+    if replan:
+        begin = _replanned(begin, env, seed, geometry_source)
+    if safety_filter:
+        begin = _filtered(begin, env, seed, filter_around(policy, safety_filter, replan))
+    return begin if as_observed is None else _translated(begin, as_observed)
+
+
+def _same(act):
+    return lambda number, query: EpisodePolicy(act)
+
+
+def _filtered(begin, env, seed, safety_filter):
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.policies.safety_filter import check_env
+
+    try:
+        check_env(env)
+    except ValueError as error:
+        raise PolicyError(str(error)) from error
+
+    def begin_filtered(number, query):
+        act, plan_found = begin(number, query)
+        rng = np.random.default_rng([seed, number])
+        return EpisodePolicy(act and safety_filter.filter_policy(act, env, rng), plan_found)
+
+    return begin_filtered
+
+
+def _replanned(begin, env, seed, geometry_source):
+    from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+    from roboarm_nmp.policies.replanning import ReplanWhenStuck
+
+    if env.action_mode != "relative":
+        raise PolicyError(f"plans give displacements, not actions of mode {env.action_mode!r}")
+    if env.goal_type == "pose":
+        raise PolicyError("replan needs goals that are configurations, not poses")
+    try:
+        source = find_geometry_source(geometry_source, env.robot)
+    except ValueError as error:
+        raise PolicyError(str(error)) from error
+    begin_replanning = make_replanning(env, seed, source)
+
+    def begin_replanned(number, query):
+        act, plan_found = begin(number, query)
+        replanning, goal = begin_replanning(number, query).act, env.robot.normalise(query.goal)
+        return EpisodePolicy(act and ReplanWhenStuck(act, replanning, goal), plan_found)
+
+    return begin_replanned
+
+
+def _translated(begin, goals):
+    """A policy for configurations in an environment of goal poses, by its `ConfigurationGoals`."""
+
+    def begin_translated(number, query):
+        if not goals.begin(query):
+            return EpisodePolicy(None, plan_found=False)
+        act, plan_found = begin(number, query)
+        return EpisodePolicy(lambda observation: act(goals(observation)), plan_found)
+
+    return begin_translated
+
+
+# --- Trained policies. PyTorch is imported only here: it takes seconds.
+
+
+def _load(path):
+    """A policy network, the arguments of the environment it was trained in, its safety filter."""
+    from roboarm_nmp.networks.exported_networks import load_network
+    from roboarm_nmp.networks.operations import NetworkError
+    from roboarm_nmp.policies.safety_filter import SafetyFilter
+
+    try:
+        network = load_network(path)
+        safety_filter = SafetyFilter.from_metadata(network.metadata)
+        recurrent_size(network)  # or it raises
+    except NetworkError as error:
+        raise PolicyError(str(error)) from error
+    except ValueError as error:
+        raise PolicyError(f"{path}: {error}") from error
+    trained = network.metadata.get("env")
+    if network.metadata.get("kind") != "policy" or not isinstance(trained, dict):
+        raise PolicyError(f"{path}: a network, but not a policy")
+    if "goal_type" not in trained:
+        raise PolicyError(f"{path}: does not say which goal type it was trained with")
+    arguments = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
+    return network, arguments, safety_filter
+
+
+def _trained(path, env):
+    """`make_policy` of a policy network, and its `ConfigurationGoals`, None if it needs none."""
+    import torch
+
+    from roboarm_nmp.envs.robots.metadata import check_robot
+    from roboarm_nmp.networks.operations import NetworkError
+
+    network, trained, _ = _load(path)
+    robot = env.unwrapped.robot
+    try:
+        check_robot(path, network.metadata, robot)
+    except NetworkError as error:
+        raise PolicyError(str(error)) from error
+    mode = trained.get("action_mode", "relative")
+    if mode != env.action_mode:
+        raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
+    size = recurrent_size(network)
+
+    def begin(number, query):
+        recurrent_state = np.zeros(size, np.float32)
+
+        # One observation at a time: in a batch its last bits would depend on the batch's size, for
+        # a gain of a tenth of the time at most.
+        def act(observation):
+            nonlocal recurrent_state
+            given = observation | {"recurrent_state": recurrent_state} if size else observation
+            inputs = {name: torch.from_numpy(given[name])[None] for name in network.inputs}
+            if not size:
+                return network.predict_one(inputs, robot.num_joints)
+            action, recurrent_state = network.predict_one(inputs, (robot.num_joints, size))
+            return action
+
+        return EpisodePolicy(act)
+
+    example = {name: np.zeros(one.shape, np.float32) for name, one in env.observation_space.items()}
+    as_observed = None
+    if env.goal_type == "pose" and trained["goal_type"] in FOR_POSES:
+        as_observed = ConfigurationGoals(env, trained["goal_type"])
+        as_observed.begin_anywhere()
+        example = as_observed(example)
+    unknown = set(network.inputs) - {*example, *(["recurrent_state"] if size else [])}
+    if unknown:
+        raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
+    try:
+        begin(0, None).act(example)
+    except NetworkError as error:
+        raise PolicyError(str(error)) from error
+    return begin, as_observed

@@ -1,0 +1,100 @@
+"""Parts of policies' networks: an arm's kinematics and differences of poses as inputs."""
+
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+
+from roboarm_nmp.envs.robots.inverse_kinematics import kinematic_chain
+from roboarm_nmp.envs.robots.kernels import JOINT, MIDDLE, POSITION, PRISMATIC, ROTATION, SCALE
+
+# With a row vector x, cos x ALONG + sin x ACROSS + x FIXED is x in a frame that is turned about z.
+ALONG, FIXED = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 1.0])
+ACROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+class JacobianTranspose(nn.Module):
+    """The end effector's Jacobian, transposed, times a vector.
+
+    That is the direction in which the joints move the end effector fastest along the vector.
+
+    Position and vector are transformed from the base to the frame of one joint after the other,
+    whose axis is z. The turn of a joint is a sum of three constant matrices, two of them times the
+    cosine and the sine of its angle. So from joint to joint there is a layer of three parts.
+
+    Args:
+        robot: an `envs.robots.robot.Robot`.
+        rotates: the vector has an angular part.
+    """
+
+    def __init__(self, robot, rotates=False):
+        super().__init__()
+        self.size = 9 if rotates else 6  # position, vector, angular part
+        vectors, chain = np.eye(self.size // 3), kinematic_chain(robot)
+        moving = chain[chain[:, JOINT] >= 0]
+        parts, slides, weights, biases = (0 * ALONG, 0 * ACROSS, ALONG + FIXED), False, [], []
+        turn, origin = np.eye(3), np.zeros(3)
+        for row in chain:
+            # x in the frame of the joint before is x turn - origin in this one.
+            rotation = row[ROTATION:].reshape(3, 3)
+            turn, origin = turn @ rotation, (origin + row[POSITION:ROTATION]) @ rotation
+            if row[JOINT] < 0:
+                continue
+            bias = np.zeros((3, self.size))
+            bias[0, :3] = -turn[2] * slides  # times the value of the joint before
+            bias[2, :3] = -origin
+            weights.append(np.hstack([np.kron(vectors, part @ turn) for part in parts]).T)
+            biases.append(bias.ravel())
+            slides = row[PRISMATIC] > 0
+            parts = (0 * ALONG, 0 * ACROSS, ALONG + FIXED) if slides else (ALONG, ACROSS, FIXED)
+            turn, origin = np.eye(3), np.zeros(3)
+        per_state = moving[:, SCALE, None] * (moving[:, JOINT, None] == np.arange(robot.num_joints))
+        numbers = {"weights": weights, "biases": biases, "middle": moving[:, MIDDLE]}
+        numbers["per_state"] = per_state  # of joints' values, those of mimicking joints, too
+        for name, values in numbers.items():
+            self.register_buffer(name, torch.tensor(np.array(values), dtype=torch.float32))
+        self.register_buffer("is_prismatic", torch.tensor(moving[:, PRISMATIC] > 0))
+
+    def forward(self, state, position, vector):
+        """(N, n), (N, 3), (N, 3 or 6) -> (N, n): per unit of the normalised configuration.
+
+        Position (m) and vector are in the world's axes.
+        """
+        values = F.linear(state, self.per_state, self.middle)
+        first = torch.where(self.is_prismatic, values, torch.cos(values)).split(1, 1)
+        second = torch.sin(values).split(1, 1)
+        x = torch.cat([position, vector], 1)
+        x = F.linear(x, self.weights[0], self.biases[0])[:, 2 * self.size :]
+        frames = [x]
+        for i in range(1, len(self.weights)):
+            along, across, fixed = F.linear(x, self.weights[i], self.biases[i]).split(self.size, 1)
+            x = first[i - 1] * along + (second[i - 1] * across + fixed)
+            frames.append(x)
+        frames = torch.stack(frames, 1)
+        px, py, _, vx, vy, vz = frames[:, :, :6].unbind(2)
+        turning = px * vy - py * vx
+        if self.size == 9:
+            turning = turning + frames[:, :, 8]
+        return torch.where(self.is_prismatic, vz, turning) @ self.per_state
+
+
+def pose_difference(pose, goal):
+    """What is left from poses to goals: (N, 7), (N, 7) -> (N, 6).
+
+    Poses are positions (m) and quaternions (xyzw) of norm 1. The difference is that of the
+    positions (m), and the vector part of the rotation between them, in the world's axes: its axis
+    times the sine of half the angle. A quaternion and its negative give the same.
+    """
+    here, there = pose[:, 3:], goal[:, 3:]
+    x, y, z, w = here[:, 0:1], here[:, 1:2], here[:, 2:3], here[:, 3:4]
+    a, b, c, d = there[:, 0:1], there[:, 1:2], there[:, 2:3], there[:, 3:4]
+    vector = torch.cat(
+        [
+            w * a - d * x + c * y - b * z,
+            w * b - d * y + a * z - c * x,
+            w * c - d * z + b * x - a * y,
+        ],
+        dim=1,
+    )
+    is_longer = (here * there).sum(dim=1, keepdim=True) < 0.0  # than half a turn
+    return torch.cat([goal[:, :3] - pose[:, :3], torch.where(is_longer, -vector, vector)], dim=1)

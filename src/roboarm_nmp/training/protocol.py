@@ -1,0 +1,471 @@
+"""The benchmark's protocol, for trainers of policies.
+
+The policy of a run that is the best on validation queries is saved, `policy.pt`. At the end of the
+run it is tested on test queries: `result.json`. (An evaluation on all queries, with more numbers:
+`evaluation.evaluate`.)
+
+Functions that take flags are for scripts: on a mistake of the user, they end the program with a
+message.
+"""
+
+import collections
+import sys
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, load_demos_for
+from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.envs.arm_env import HORIZON, STANDARD_RULES, deviations
+from roboarm_nmp.envs.robots.metadata import robot_metadata
+from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.tasks import task_name, task_with_robot
+from roboarm_nmp.evaluation.rollout import Episode, render_strip
+from roboarm_nmp.networks.exported_networks import (
+    load_network,
+    save_network,
+)
+from roboarm_nmp.policies.registry import policy_file, recurrent_size
+from roboarm_nmp.training.collection import TrainingEnvs
+from roboarm_nmp.training.cuda_graphs import to_device
+from roboarm_nmp.training.runs import Run, RunFlags, check_finite, script_name
+from roboarm_nmp.utils.flags import (
+    CORES,
+    Horizon,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+)
+from roboarm_nmp.utils.progress import progress_bar
+
+NUM_ENVS = 8  # at most, that an evaluation runs together; the first of them renders
+IMAGE_SIZE = (240, 180)
+# The rules of every test. The step length, a rule too, may be the policy's own.
+RULES = [name for name in STANDARD_RULES if name != "max_step"]
+
+
+@dataclass
+class PolicyFlags(RunFlags):
+    """The flags of every trainer of a policy: its run, task, updates and evaluations."""
+
+    task: str = "no_obstacles"
+    """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
+    robot: Path | None = None
+    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
+    compile: bool = True
+    """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
+    eval_queries: PositiveInt = 200
+    """validation queries per evaluation"""
+    test_queries: NonNegativeInt = 1_000
+    """test queries for the best policy at the end (0: no test)"""
+
+    def __post_init__(self):
+        # The task names the robot from here on: in files, messages and the run's flags.
+        self.task, self.robot = task_with_robot(self.task, self.robot), None
+
+
+@dataclass
+class EnvFlags:
+    """The arguments of `envs.make` among a trainer's flags: the paper's MDP, and observations."""
+
+    goal_type: Literal["ee", "config", "combined", "pose"] = "ee"
+    """what the goal is: end-effector position, configuration, both, or end-effector pose"""
+    action_mode: Literal["relative", "subgoal"] = "relative"
+    """action: a displacement of the normalised configuration, or the next one itself"""
+    max_step: PositiveFloat = MAX_STEP
+    """longest displacement per step (L2, normalised configuration)"""
+    horizon: Horizon = HORIZON
+    """steps after which an episode is truncated"""
+    stop_on_collision: bool = False
+    """end an episode at the first contact"""
+    velocities: bool = False
+    """joint velocities in the observation"""
+    encoder: str | None = None
+    """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
+    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/guide/perception.md),
+    `point_cloud` for observed points, or `oracle` for the ground-truth obstacles; by default
+    nothing"""
+    link_distances: str | None = None
+    """append the signed distance of each link from the nearest obstacle and its gradient to the
+    observation; the obstacles are those of a geometry source: `ground_truth`, `point_cloud`, or an
+    encoder with a decoder (`field`, or a path), which also gives the points of `point_cloud`"""
+
+
+def env_arguments_of(args):
+    """The `EnvFlags` in a trainer's flags as a dict, for `envs.make`."""
+    arguments = {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
+    has_distances = args.link_distances is not None
+    arguments |= {"geometry_source": args.link_distances, "link_distances": has_distances}
+    return arguments | {"append_link_distances": has_distances}
+
+
+def load_task(args):
+    """The first validation queries and test queries, as many as the flags say, of `args.task`.
+
+    Raises:
+        SystemExit: unknown task, a task for testing only, or its query file cannot be used.
+    """
+    try:
+        if not envs.get_task(args.task).trainable:
+            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
+        return tuple(
+            _first(load_queries(args.task, split), f"--{flag}-queries", number)
+            for split, flag, number in (
+                ("validation", "eval", args.eval_queries),
+                ("test", "test", args.test_queries),
+            )
+        )
+    except ValueError as error:
+        sys.exit(f"--task: {error}")
+
+
+def copy_weights(policy, module):
+    """Give a module the weights of a policy of the same sizes, a name or path: `--initial-policy`.
+
+    Ends the program with a message where that cannot be.
+    """
+    try:
+        given, own = load_network(policy_file(policy)).parameters(), list(module.parameters())
+        if [weights.shape for weights in given] != [weights.shape for weights in own]:
+            raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
+    except ValueError as error:
+        sys.exit(f"--initial-policy: {error}")
+    with torch.no_grad():
+        for weights, initial in zip(own, given, strict=True):
+            weights.copy_(initial)
+
+
+def _first(queries, flag, number):
+    if number > len(queries):
+        print(f"{flag} {number}: there are {len(queries)}, all of them are used", file=sys.stderr)
+    return queries[:number]
+
+
+def make_envs(task, number, **kwargs):
+    """A list of environments of a task; `kwargs` as for `envs.make`.
+
+    Raises:
+        SystemExit: an argument is rejected.
+    """
+    try:
+        return [envs.make(task, **kwargs) for _ in range(number)]
+    except ValueError as error:
+        names = {"encoder": "--encoder", "geometry_source": "--link-distances"}
+        given = [flag for name, flag in names.items() if kwargs.get(name) is not None]
+        flags = " or ".join(given)
+        sys.exit(f"{flags}: {error}" if given else str(error))
+
+
+def make_eval_envs(task, num_queries, **kwargs):
+    """The environments for evaluations on `num_queries` queries; arguments as for `make_envs`.
+
+    At least two, which `PolicyRun.save_policy` needs.
+    """
+    rendering = make_envs(task, 1, render_mode="rgb_array", render_size=IMAGE_SIZE, **kwargs)
+    return rendering + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
+
+
+def make_training_envs(args, demo_prob=None, demos=None, bc_weight=0.0):
+    """`args.num_envs` environments, with random queries or those of demonstrations (`demo_prob`).
+
+    Args:
+        args: the flags, with `EnvFlags` among them.
+        demo_prob: value of the flag --demo-prob, if the trainer has it.
+        demos: value of the flag --demos, a file; by default the task's own.
+        bc_weight: value of the flag --bc-weight, which needs demonstrations.
+
+    Returns:
+        The `training.collection.TrainingEnvs`.
+
+    Raises:
+        SystemExit: an argument is rejected, or the demonstrations do not fit.
+    """
+    if demo_prob is None and (demos is not None or bc_weight > 0):
+        flag = "--demos" if demos is not None else "--bc-weight"
+        sys.exit(f"{flag} goes with --demo-prob")
+    made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
+    # A GPU waits for its environments; on a CPU they take less time than the updates.
+    processes = min(args.num_envs, CORES) if torch.device(args.device).type == "cuda" else 0
+    if demo_prob is None:
+        return TrainingEnvs(made, processes=processes)
+    try:
+        demos = load_demos_for(made[0], demos or args.task, args.task)
+    except ValueError as error:
+        sys.exit(f"--demo-prob: {error}")
+    return TrainingEnvs([DemoQueriesWrapper(env, demos) for env in made], demo_prob, processes)
+
+
+def stack(observations, device):
+    """List of observation dicts -> dict of float32 tensors (N, ...)."""
+    return {
+        name: to_device(np.stack([o[name] for o in observations]), device)
+        for name in observations[0]
+    }
+
+
+def evaluate(policy, envs, queries, device, safety_filter=None, seed=0, description=None):
+    """Run a deterministic policy on every query, each env one at a time; mean results.
+
+    Args:
+        policy: from `observation`, `achieved_goal`, `desired_goal` and what else is observed,
+            tensors (N, ...), to actions (N, n); a module or an exported network. A recurrent one
+            (`policies.registry.recurrent_size`) also receives its state, and returns the next.
+        envs: the environments to do it in.
+        queries: `datasets.queries.Queries`, or a list of `Query`.
+        device: of the policy.
+        safety_filter: an `policies.safety_filter.SafetyFilter` around the policy, or None.
+        seed: of the filter's escapes from local minima, >= 0.
+        description: of a progress bar that disappears at the end; None for no bar.
+
+    Returns:
+        A dict of floats: `success_rate`, `collision_free_success_rate`, `collision_rate`, and
+        `episode_length` in steps.
+
+    Raises:
+        FloatingPointError: the policy's actions or its recurrent state are not finite.
+    """
+    rollouts = _rollouts(policy, envs, queries, device, safety_filter, seed)
+    bar = {"unit": "query", "transient": True, "disable": description is None}
+    results = [
+        (trajectory.success, trajectory.collides, len(trajectory))
+        for trajectory in progress_bar(rollouts, description, len(queries), **bar)
+    ]
+    success, collides, steps = np.array(results, dtype=np.float64).T
+    return {
+        "success_rate": float(success.mean()),
+        "collision_free_success_rate": float((success * (1 - collides)).mean()),
+        "collision_rate": float(collides.mean()),
+        "episode_length": float(steps.mean()),
+    }
+
+
+class _Running:
+    """One of the episodes whose actions one call of the policy predicts.
+
+    Args:
+        episode: the `Episode`.
+        size: of the policy's recurrent state.
+        safety_filter, rng: the filter around the policy, or None, and its random numbers.
+    """
+
+    def __init__(self, episode, size, safety_filter, rng):
+        self.episode, self.recurrent_state = episode, np.zeros(size, np.float32)
+        self._act = self._predicted
+        if safety_filter is not None:
+            self._act = safety_filter.filter_policy(self._predicted, episode.env, rng)
+
+    def _predicted(self, observation):
+        # During an escape the filter does not call this: the recurrent state stays as it is.
+        action, self.recurrent_state = self._prediction
+        return action
+
+    def step(self, action, recurrent_state):
+        """One step with the policy's prediction for the current observation."""
+        self._prediction = action, recurrent_state
+        self.episode.step(self._act(self.episode.observation))
+
+
+@torch.no_grad()
+def _rollouts(policy, envs, queries, device, safety_filter, seed=0):
+    """Yield the `Trajectory` of every query, in any order; arguments as for `evaluate`."""
+    waiting, size = iter(range(len(queries))), recurrent_size(policy)
+
+    def begin(idle):
+        for env, i in zip(idle, waiting, strict=False):  # as long as there are queries
+            rng = np.random.default_rng([seed, i])
+            yield _Running(Episode(env, queries[i]), size, safety_filter, rng)
+
+    running = list(begin(envs))
+    while running:
+        observations = [one.episode.observation for one in running]
+        states = [one.recurrent_state for one in running]
+        actions, states = _actions(policy, observations, states, device)
+        for one, action, state in zip(running, actions, states, strict=True):
+            one.step(action, state)
+        ended = [one.episode for one in running if one.episode.ended]
+        for episode in ended:
+            yield episode.trajectory()
+        running = [one for one in running if not one.episode.ended]
+        running += begin(episode.env for episode in ended)
+
+
+def _actions(policy, observations, states, device):
+    """Actions (m, n) for m observations, and the policy's m recurrent states after them."""
+    if not len(states[0]):
+        actions = policy(**stack(observations, device)).cpu().numpy()
+    else:
+        given = [
+            o | {"recurrent_state": state} for o, state in zip(observations, states, strict=True)
+        ]
+        actions, states = (x.cpu().numpy() for x in policy(**stack(given, device)))
+        check_finite("the policy's recurrent state", states)
+    check_finite("the policy's actions", actions)
+    return actions, states
+
+
+def rollout_image(policy, env, query, device, safety_filter=None, frames=8):
+    """An image strip (height, frames * width, 3), uint8, of the policy on one query.
+
+    `env`: one that renders.
+    """
+    [trajectory] = _rollouts(policy, [env], [query], device, safety_filter)
+    steps = [*range(0, len(trajectory), 10), len(trajectory)]
+    chosen = np.linspace(0, len(steps) - 1, frames).round().astype(int)
+    return render_strip(env, query, trajectory.actions, [steps[i] for i in chosen])
+
+
+class PolicyRun(Run):
+    """A run that trains a policy, and validates, saves and tests it under the benchmark's protocol.
+
+    Args:
+        args: the flags, `task`, `goal_type` and `seed` among them.
+        state: dict from names to the parts of the run, as for `runs.Run`.
+        device: of the run.
+        env_arguments: dict of `envs.make`'s arguments, which `policy.pt` is evaluated with.
+        eval_envs: of `make_eval_envs`, with these arguments.
+        validation: validation queries.
+        safety_filter: an `policies.safety_filter.SafetyFilter` that is part of the policy, or
+            None.
+    """
+
+    def __init__(
+        self, args, state, device, env_arguments, eval_envs, validation, safety_filter=None
+    ):
+        super().__init__(args, task_name(args.task), state, device)
+        self.env_arguments, self.eval_envs = env_arguments, eval_envs
+        self.validation, self.safety_filter = validation, safety_filter
+        self._recent = collections.deque(maxlen=100)  # outcomes of training episodes
+
+    def log_episode(self, episode, demos_injected):
+        """Log a `FinishedEpisode`, and with --demo-prob how many demonstrations were added."""
+        self._recent.append(episode.info["is_success"])
+        values = {"episodic_return": episode.episode_return}
+        values |= {"episodic_length": episode.info["elapsed_steps"]}
+        if self.args.demo_prob is not None:
+            values["demos_injected"] = demos_injected
+        values["success"] = np.mean(self._recent)
+        step = self.step + episode.number + 1  # every environment's step counts
+        self.log({f"charts/{name}": value for name, value in values.items()}, step)
+
+    def validate(self, policy):
+        """Evaluate a policy on the validation queries, and log results and images of the first.
+
+        With a safety filter, the policy is evaluated without it, too: `eval/..._without_filter`.
+
+        Args:
+            policy: as for `evaluate`.
+
+        Returns:
+            Whether no policy of the run was better so far. False if a signal has interrupted the
+            evaluation: the resumed run repeats it (`repeat_evaluation`).
+        """
+        queries, envs, device = self.validation, self.eval_envs, self.device
+        bar = {"description": "validation"}
+        self._progress["unfinished_evaluation"] = True
+        if self.interrupted:
+            return False
+        try:
+            with self.interruptible():
+                result = evaluate(policy, envs, queries, device, self.safety_filter, **bar)
+                self.log({f"eval/{name}": value for name, value in result.items()})
+                if self.safety_filter is not None:
+                    bar = {"description": "validation without filter"}
+                    bare = evaluate(policy, envs, queries, device, **bar)
+                    self.log({f"eval/{name}_without_filter": v for name, v in bare.items()})
+                image = rollout_image(policy, envs[0], queries[0], device, self.safety_filter)
+                self.log_image("eval/rollout", image)
+        except KeyboardInterrupt:
+            return False
+        del self._progress["unfinished_evaluation"]
+        is_best = self.is_best(result["success_rate"])
+        values = {"validation success": result["success_rate"], "best": self.best_score}
+        self.show(**{name: f"{value:.3f}" for name, value in values.items()})
+        return is_best
+
+    def repeat_evaluation(self, policy):
+        """At the start of a resumed run: the evaluation that a signal ended, if there was one."""
+        if "unfinished_evaluation" in self._progress:
+            if self.validate(policy):
+                self.save_policy(policy)
+            self.checkpoint()
+
+    def save_policy(self, policy):
+        """Write `policy.pt` for `evaluate.py` and others.
+
+        Args:
+            policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else
+                is observed; with a `recurrent_size`, its `recurrent_state`, too.
+        """
+        args = self.args
+        metadata = {"kind": "policy", "task": args.task, "env": self.env_arguments}
+        metadata |= robot_metadata(self.eval_envs[0].unwrapped.robot)
+        if self.safety_filter is not None:
+            metadata["safety_filter"] = self.safety_filter.to_metadata()
+        metadata |= {"script": script_name(), "seed": args.seed, "step": self.step}
+        example = stack([env.reset(seed=0)[0] for env in self.eval_envs[:2]], self.device)
+        if size := recurrent_size(policy):
+            metadata["recurrent_size"] = size
+            number = len(example["observation"])
+            example["recurrent_state"] = torch.zeros(number, size, device=self.device)
+        save_network(self.folder / "policy.pt", policy, example, metadata)
+
+    def final_test(self, queries):
+        """Test `policy.pt` on test queries: `result.json`, and a line on the console. Ends the run.
+
+        Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed,
+        for comparable results. File and line contain the rules of the training, if they are others,
+        the step length, if it is not the standard one (`deviations`), and whether the policy
+        observes ground-truth obstacles (`privileged`). Without queries there is no test, and file
+        and line have no results of one.
+        """
+        self.close()
+        args = self.args
+        result, text = self._test(queries) if len(queries) else ({}, "no test, --test-queries 0")
+        result |= {"task": args.task, "robot": self.eval_envs[0].unwrapped.robot.name}
+        result |= {"goal_type": args.goal_type, "num_queries": len(queries)}
+        result |= {"policy": str(self.folder / "policy.pt"), "policy_step": self.best_step}
+        result |= {"validation_success_rate": self.best_score, "steps": self.step}
+        self.write_result(result | {"seconds": round(self.seconds)})
+        print(
+            f"{args.task}, goal {args.goal_type}, {text}; validation success {self.best_score:.3f} "
+            f"at {self.best_step}; {self.step} steps in {self.seconds:.0f} s. "
+            f"{self.folder / 'result.json'}"
+        )
+
+    def _test(self, queries):
+        """The results of a test as a dict, and the most important ones in words."""
+        # Here, because Numba takes a while to import, which --help would wait for.
+        from roboarm_nmp.evaluation.evaluate import is_privileged
+        from roboarm_nmp.policies.safety_filter import SafetyFilter
+
+        policy = load_network(self.folder / "policy.pt").to(self.device)
+        own = {name: value for name, value in self.env_arguments.items() if name not in RULES}
+        test_envs = make_eval_envs(self.args.task, len(queries), **own)
+        safety_filter = SafetyFilter.from_metadata(policy.metadata)
+        bar = {"description": "test"}
+        result = evaluate(policy, test_envs, queries, self.device, safety_filter, **bar)
+        success, collision_free = result["success_rate"], result["collision_free_success_rate"]
+        rules = {name: getattr(test_envs[0], name) for name in RULES}
+        trained = rules | {n: self.env_arguments[n] for n in RULES if n in self.env_arguments}
+        result |= {"rules": rules, "rules_in_training": trained, "deviations": deviations(own)}
+        result |= {"privileged": is_privileged(own)}
+        if rules != trained:
+            print(
+                f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:"
+            )
+        for name, value in result["deviations"].items():
+            print(f"not comparable: {name} is {value}, not {STANDARD_RULES[name]}")
+        privileged = ", privileged" if result["privileged"] else ""
+        return result, (
+            f"{len(queries)} test queries{privileged}: success {success:.3f}, collision-free "
+            f"success {collision_free:.3f}"
+        )
+
+
+def _words(rules):
+    contacts = "ended by a contact" if rules["stop_on_collision"] else "contacts allowed"
+    return f"{rules['horizon']} steps, {contacts}"

@@ -1,0 +1,104 @@
+"""The decorator `compiled`: Numba's `njit` with a cache on disk that survives damaged files.
+
+The cache is in the user's cache folder (`utils.files.cache_folder`), or in `NUMBA_CACHE_DIR`.
+Numba trusts its cache. A truncated file raises `EOFError` in every process from then on, and a
+file with a few wrong bytes can crash the process. Here each entry has a checksum. A damaged file is
+named on stderr, ignored, and replaced by a new compilation.
+"""
+
+import contextlib
+import fcntl
+import functools
+import hashlib
+import pickle
+import sys
+from pathlib import Path
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.serialize import dumps
+
+from roboarm_nmp.utils.files import cache_folder
+from roboarm_nmp.utils.progress import write_line
+
+
+def uncounted(function):
+    """`compiled`, for functions that make no arrays: it does not count references to them.
+
+    Counting takes a fifth of the time of short functions that are called millions of times.
+    """
+    return compiled(function, _nrt=False)
+
+
+def compiled(function, **options):
+    """Numba's `njit`, cached on disk where a folder for that can be written to."""
+    dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
+    given = numba.config.CACHE_DIR
+    # (RuntimeError: no folder can be written to. OSError: there is no home folder.)
+    with contextlib.suppress(RuntimeError, OSError):
+        try:  # Numba's own setting, for this function only
+            numba.config.CACHE_DIR = given or str(cache_folder() / "numba")
+            dispatcher._cache = _CheckedCache(function)
+        finally:
+            numba.config.CACHE_DIR = given
+    return dispatcher
+
+
+@functools.cache
+def _announce_compilation(folder):
+    """Print a line when this process compiles first, unless another is compiling.
+
+    The lock on a file in the cache's folder is held to the end of this process.
+    """
+    global _lock
+    with contextlib.suppress(OSError):
+        _lock = open(Path(folder, "compiling"), "wb")  # noqa: SIM115
+        fcntl.flock(_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        write_line("compiling collision checks and kinematics (once, about 30 s)")
+
+
+class _CheckedResult(CompileResultCacheImpl):
+    """A compiled function as bytes and their checksum."""
+
+    def reduce(self, result):
+        payload = dumps(super().reduce(result))
+        return hashlib.sha256(payload).digest(), payload
+
+    def rebuild(self, target_context, data):
+        checksum, payload = data
+        if hashlib.sha256(payload).digest() != checksum:
+            raise ValueError("wrong checksum")
+        return super().rebuild(target_context, pickle.loads(payload))
+
+
+class _CheckedCache(FunctionCache):
+    """The cache of one function: an index file, and a data file for each signature."""
+
+    _impl_class = _CheckedResult
+
+    def load_overload(self, sig, target_context):
+        try:
+            found = super().load_overload(sig, target_context)
+            if found is None:
+                _announce_compilation(self.cache_path)
+            return found
+        except Exception:  # unpickling wrong bytes raises exceptions of many types
+            path = self._damaged_path(sig, target_context)
+            print(f"{path}: damaged, the function is compiled again", file=sys.stderr)
+            with contextlib.suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig, data):
+        try:
+            super().save_overload(sig, data)
+        except Exception as error:  # a full disk, or a folder where a file should be
+            print(f"{self.cache_path}: {self._name} is not cached: {error}", file=sys.stderr)
+
+    def _damaged_path(self, sig, target_context):
+        file = self._cache_file
+        try:
+            name = file._load_index()[self._index_key(sig, target_context.codegen())]
+        except Exception:
+            return file._index_path
+        return file._data_path(name)

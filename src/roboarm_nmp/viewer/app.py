@@ -1,0 +1,729 @@
+"""Watch policies in the browser, and move the goal and the obstacles while the arm moves.
+
+    roboarm view wall
+    roboarm view wall --policy sac-ee-wall-p1-s1 go-to-goal
+    roboarm view my_scene.yaml
+    roboarm view random_boxes_hard --robot ur5.yaml
+    roboarm view wall --demos
+    roboarm view wall --trajectory motion.yaml
+    roboarm view roadmaps
+    roboarm view wall --policy planner --record replay.html
+
+Several policies stand side by side, each with its own copy of the scene. The page offers queries,
+play and pause, speed, what is drawn, and edits. Dragging the goal or an obstacle changes to a
+kinematic simulation, without forces, in which every arm goes on from where it is; Restart runs the
+edited query in the physics. `--record` writes a replay, one HTML file that plays without a server.
+
+The page is only for this machine, unless `--host` says otherwise. Ctrl-C ends the command.
+"""
+
+import contextlib
+import io
+import logging
+import math
+import queue
+import socket
+import sys
+import threading
+import time
+import webbrowser
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import tyro
+
+from roboarm_nmp import envs
+from roboarm_nmp.envs.robots.panda import PANDA, scale_of
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Sphere
+from roboarm_nmp.envs.world import SUBSTEPS, TIME_STEP
+from roboarm_nmp.policies.baselines import BASELINES
+from roboarm_nmp.policies.registry import policy_file, pretrained_policies
+from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.files import check_writable, write_atomically
+from roboarm_nmp.utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, Seed
+from roboarm_nmp.utils.signals import end_with_one_line
+
+PORT = 8080
+Port = Annotated[
+    int, flags.Range(1, 65535, "in [1, 65535]"), tyro.conf.arg(metavar="INT IN [1, 65535]")
+]
+STEPS_PER_SECOND = 1 / (TIME_STEP * SUBSTEPS)  # of simulated time
+PAUSE = 2.0  # s, between the end of all episodes and the next
+STATUS_SECONDS = 0.25  # between two updates of the table
+IDLE_SECONDS = 0.5
+MAX_QUERY = 1_000_000  # of random queries, which have no end
+NEEDS_VISER = "the viewer needs viser: pip install viser"
+PHYSICS = "Physics, as in an evaluation."
+KINEMATIC = (
+    "**Kinematic simulation**, because goal or scene were edited: no forces, and obstacles do not "
+    "stop the arm. *Restart* runs the edited query in the physics."
+)
+NEW_OBSTACLES = {  # in front of the Panda; for other arms in proportion to their reach
+    "box": Box((0.5, 0.0, 0.5), (0.15, 0.15, 0.15)),
+    "cylinder": Cylinder((0.5, 0.0, 0.5), 0.06, 0.3),
+    "sphere": Sphere((0.5, 0.0, 0.5), 0.1),
+}
+POINT_CLOUD_PLANNER = "planner (point cloud)"  # in the page's list of policies
+NO_OBSTACLE = "none"
+
+
+class ViewError(ValueError):
+    """Something that cannot be viewed; the message says why."""
+
+
+@dataclass
+class Args:
+    task: tyro.conf.Positional[str]
+    """the task's name, the path of a scene file (.yaml), or a folder of roadmap paths"""
+    robot: Path | None = None
+    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
+    policy: tuple[str, ...] = ()
+    """the policies, side by side: `go-to-goal`, `random`, `via-points`, `planner`, a policy
+    network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy; without
+    one, `go-to-goal`, or the recorded motion alone"""
+    demos: bool = False
+    """show the task's demonstrations; --query is then the number of a demonstration"""
+    trajectory: Path | None = None
+    """play this file (.csv, .npz, .json, .yaml; docs/guide/trajectories.md) in the scene of
+    --query"""
+    query: NonNegativeInt = 0
+    """number of the first query, from 0"""
+    split: Literal["test", "validation", "original"] = "test"
+    """which of the task's queries; without a query file, random queries are shown"""
+    goal_type: Literal["ee", "config", "combined", "pose"] | None = None
+    """what the goal is; by default the policy's own, otherwise `ee`"""
+    geometry_source: str | None = None
+    """where `planner`, `via-points`, the safety filter and the policy's observations take the
+    obstacles from: `ground_truth`, `point_cloud`, or an encoder with a decoder; by default the
+    policy's own, otherwise `ground_truth`"""
+    safety_margin: NonNegativeFloat | None = None
+    """put a safety filter with this margin (m) around the policies; 0 for no filter; by default the
+    filter that a policy includes, if any"""
+    seed: Seed = 0
+    """of random queries, and of `random`, `via-points`, `planner` and escapes"""
+    time_limit: PositiveFloat = 2.0
+    """seconds that `planner` may search"""
+    speed: PositiveFloat = 1.0
+    """of the simulated time, at first"""
+    record: Path | None = None
+    """write a replay of the query into this HTML file, instead of opening the page"""
+    host: str = "127.0.0.1"
+    """address to listen at; 0.0.0.0 for all of this machine's"""
+    port: Port = PORT
+    """port to listen at"""
+    open: bool = True
+    """open the page in the browser"""
+
+
+class _Choice(NamedTuple):
+    """A policy as the page's list has it."""
+
+    label: str
+    policy: str
+    geometry_source: str | None
+
+
+# --- The page
+
+
+class _Page:
+    """The page's controls, and the loop that runs simulation and drawing.
+
+    viser calls callbacks in its own threads. They only put work into a queue, and the loop does it:
+    simulation and drawing belong to one thread.
+    """
+
+    def __init__(self, server, simulation, args, choices, loader):
+        from roboarm_nmp.viewer.drawing import Drawing  # it imports Numba
+
+        self.server, self.simulation, self.args = server, simulation, args
+        self.choices, self._load = choices, loader
+        self._work, self._drags = queue.SimpleQueue(), {}
+        self._dragging, self.selected = set(), None
+        self.playing, self.speed, self._message = True, args.speed, ""
+        self._ended_at, self._shown_at, self._frames, self._rate = None, 0.0, [], 0.0
+        self.drawing = Drawing(server, simulation)
+        self.drawing.on_click = lambda index: self.do(self._select_obstacle, index)
+        self._add_controls()
+
+    # --- Work from other threads
+
+    def do(self, function, *arguments):
+        """Have the loop call a function."""
+        self._work.put((function, arguments))
+
+    def _drag(self, what, function, *arguments):
+        """Have the loop call a function; a later call for the same object replaces this one."""
+        self._drags[what] = function, arguments
+        self._work.put((None, ()))
+
+    def run(self):
+        """The loop. It ends with KeyboardInterrupt."""
+        due, changed = time.monotonic(), True
+        while True:
+            changed |= self._do_work(0.0 if changed else max(0.0, due - time.monotonic()))
+            now = time.monotonic()
+            if self.playing and not self.simulation.ended:
+                self._ended_at = None
+                if now >= due:
+                    due = max(due + 1 / (STEPS_PER_SECOND * self.speed), now)
+                    self.simulation.step()
+                    self._count_frame(now)
+                    changed = True
+            else:
+                due = now + IDLE_SECONDS
+                changed |= self._after_the_end(now)
+            if changed:
+                with self.server.atomic():
+                    self.drawing.update()
+                    self._update_controls()
+                changed = False
+            if now > self._shown_at + STATUS_SECONDS:
+                self._shown_at = now
+                self._update_status()
+
+    def _do_work(self, timeout):
+        """Do what other threads have asked for; wait for the first of it. Returns whether any."""
+        worked, until = False, time.monotonic() + timeout
+        while True:
+            left = until - time.monotonic()
+            try:
+                function, arguments = (
+                    self._work.get(timeout=max(left, 0.0))
+                    if left > 0
+                    else (self._work.get_nowait())
+                )
+            except queue.Empty:
+                break
+            worked, until = True, 0.0
+            if function is not None:
+                self._try(function, *arguments)
+        while self._drags:
+            _, (function, arguments) = self._drags.popitem()
+            self._try(function, *arguments)
+        return worked
+
+    def _try(self, function, *arguments):
+        try:
+            self._message = ""
+            function(*arguments)
+        except (OSError, ValueError) as error:
+            self._message = str(error)
+
+    def _count_frame(self, now):
+        self._frames = [one for one in self._frames if one > now - 1.0] + [now]
+        span = now - self._frames[0]
+        self._rate = (len(self._frames) - 1) / span if span > 0 else 0.0
+
+    def _after_the_end(self, now):
+        """What happens once all episodes are over. Returns whether the drawing changes."""
+        simulation = self.simulation
+        if not (self.playing and simulation.ended) or simulation.edited:
+            return False
+        self._ended_at = self._ended_at or now
+        if now < self._ended_at + PAUSE or self._at_end.value == "stop":
+            return False
+        self._ended_at = None
+        if self._at_end.value == "repeat":
+            simulation.restart()
+        else:
+            self._select(simulation.split, simulation.number + 1, wrap=True)
+        return True
+
+    # --- Controls
+
+    def _add_controls(self):
+        gui, simulation = self.server.gui, self.simulation
+        self._status = gui.add_markdown("")
+        with gui.add_folder("Run"):
+            self._play = gui.add_button("Pause")
+            self._play.on_click(lambda event: self.do(self._toggle))
+            gui.add_button("Step").on_click(lambda event: self.do(self._step))
+            gui.add_button("Restart").on_click(lambda event: self.do(self._restart))
+            self._speed = gui.add_slider(
+                "speed", min=0.1, max=4.0, step=0.1, initial_value=min(4.0, max(0.1, self.speed))
+            )
+            self._speed.on_update(lambda event: self.do(self._set_speed))
+            self._at_end = gui.add_dropdown("at the end", ("repeat", "next query", "stop"))
+        with gui.add_folder("Query"):
+            split, count = simulation.split, simulation.episodes.count(simulation.split)
+            self._split = gui.add_dropdown("split", simulation.episodes.splits, initial_value=split)
+            self._number = gui.add_number(
+                "number",
+                simulation.number,
+                min=0,
+                max=MAX_QUERY if count is None else count - 1,
+                step=1,
+            )
+            self._split.on_update(lambda event: self._chosen(event))
+            self._number.on_update(lambda event: self._chosen(event))
+            buttons = gui.add_button_group(" ", ("previous", "next"))
+            buttons.on_click(lambda event: self.do(self._move_on, event.target.value))
+        with gui.add_folder("Arms"):
+            self._policies = []
+            for index, arm in enumerate(simulation.arms):
+                if arm.name == simulation.episodes.recording:
+                    continue
+                labels = [choice.label for choice in self.choices]
+                menu = gui.add_dropdown(f"arm {index + 1}", labels, initial_value=arm.name)
+                menu.on_update(lambda event, index=index: self._policy_chosen(event, index))
+                self._policies.append((index, menu))
+            self._seed = gui.add_number("seed", self.args.seed, min=0, max=2**32 - 1, step=1)
+            self._seed.on_update(lambda event: self._seed_chosen(event))
+        with gui.add_folder("Show"):
+            names = {
+                "start": "start",
+                "goal": "goal",
+                "observed": "observed points",
+                "decoded": "decoded points",
+                "distances": "link distances",
+                "correction": "filter corrections",
+                "trace": "path of the end effector",
+            }
+            for option in self.drawing.OPTIONS:
+                if option == "decoded" and simulation.robot.arm != PANDA:
+                    continue  # pretrained encoders are the Panda's
+                box = gui.add_checkbox(names[option], option in self.drawing.show)
+                box.on_update(lambda event, o=option: self.do(self._show, o, event.target.value))
+        with gui.add_folder("Edit"):
+            position = tuple(simulation.robot.forward_kinematics(simulation.query.goal))
+            self._goal = gui.add_vector3("goal (m)", position, step=0.01)
+            self._goal.on_update(lambda event: self._goal_typed(event))
+            self._obstacle = gui.add_dropdown("obstacle", self._obstacle_names())
+            self._obstacle.on_update(lambda event: self._obstacle_chosen(event))
+            add = gui.add_button_group("add", tuple(NEW_OBSTACLES))
+            add.on_click(lambda event: self.do(self._add_obstacle, event.target.value))
+            delete = gui.add_button("Delete the obstacle")
+            delete.on_click(lambda event: self.do(self._delete))
+            self._file = gui.add_text("file", "my_scene.yaml")
+            gui.add_button("Save the scene").on_click(lambda event: self.do(self._save))
+        scene = self.server.scene
+        self._turns = self.args.goal_type == "pose"
+        options = {"scale": 0.2, "disable_rotations": not self._turns, "depth_test": False}
+        self._goal_gizmo = scene.add_transform_controls("/goal_gizmo", position=position, **options)
+        self._goal_gizmo.on_update(self._goal_dragged)
+        self._obstacle_gizmo = scene.add_transform_controls(
+            "/obstacle_gizmo", scale=0.25, depth_test=False, visible=False
+        )
+        self._obstacle_gizmo.on_update(self._obstacle_dragged)
+
+    def _obstacle_names(self):
+        kinds = enumerate(self.simulation.query.scene.obstacles)
+        return (NO_OBSTACLE, *(f"{i}: {type(one).__name__.lower()}" for i, one in kinds))
+
+    def _update_controls(self):
+        """Set controls and gizmos that are not being used to the simulation's values."""
+        simulation = self.simulation
+        position = simulation.robot.forward_kinematics(simulation.query.goal)
+        if "goal" not in self._dragging:
+            _set(self._goal_gizmo, "position", position)
+            if self._turns:
+                x, y, z, w = simulation.robot.end_effector_pose(simulation.query.goal)[3:]
+                _set(self._goal_gizmo, "wxyz", np.array((w, x, y, z)))
+        _set(self._goal, "value", tuple(float(x) for x in np.round(position, 4)))
+        names = self._obstacle_names()
+        if self._obstacle.options != names:
+            self._obstacle.options = names
+        if self.selected is not None and self.selected >= len(names) - 1:
+            self._select_obstacle(None)
+        _set(self._obstacle, "value", names[0 if self.selected is None else self.selected + 1])
+        _set(self._obstacle_gizmo, "visible", self.selected is not None)
+        if self.selected is not None and "obstacle" not in self._dragging:
+            obstacle = simulation.query.scene.obstacles[self.selected]
+            x, y, z, w = getattr(obstacle, "orientation", (0.0, 0.0, 0.0, 1.0))
+            _set(self._obstacle_gizmo, "position", np.array(obstacle.position))
+            _set(self._obstacle_gizmo, "wxyz", np.array((w, x, y, z)))
+        _set(self._number, "value", simulation.number)
+        _set(self._play, "label", "Pause" if self.playing else "Play")
+
+    def _update_status(self):
+        from roboarm_nmp.viewer.drawing import outcome
+
+        simulation = self.simulation
+        task, split, number = simulation.episodes.task, simulation.split, simulation.number
+        lines = [f"**{task}**, {split} query {number}"]
+        for arm in simulation.arms:
+            mark = "✓" if arm.success else "✗" if arm.ended and not arm.problem else "▶"
+            cells = [f"{mark} **{arm.name}**", outcome(arm)]
+            if arm.ms_per_action is not None:
+                cells.append(f"{arm.ms_per_action:.1f} ms per action")
+            if arm.escaping:
+                cells.append("an escape from a local minimum, or an approach path")
+            elif arm.correction is not None:
+                cells.append(f"correction by the filter {arm.correction:.3f}")
+            lines.append(f"{cells[0]}: {'; '.join(cells[1:])}.")
+        kinematic = any(arm.kinematic for arm in simulation.arms) and simulation.edited
+        lines.append(KINEMATIC if kinematic else PHYSICS)
+        if self.playing and not simulation.ended:
+            lines[-1] += f" {self._rate:.0f} frames per second."
+        if self._message:
+            lines.append(f"**{self._message}**")
+        _set(self._status, "content", "\n\n".join(lines))
+
+    # --- What controls do. Callbacks run in viser's threads, the rest in the loop.
+
+    def _toggle(self):
+        self.playing = not self.playing
+        if self.playing and self.simulation.ended:
+            self.simulation.restart()
+
+    def _step(self):
+        self.playing = False
+        self.simulation.step()
+
+    def _restart(self):
+        self.simulation.restart()
+
+    def begin_together(self):
+        """Once an arm is made: all begin again, unless there were edits in the meantime."""
+        if not self.simulation.edited:
+            self.simulation.restart()
+
+    def _set_speed(self):
+        self.speed = self._speed.value
+
+    def _show(self, option, shown):
+        (self.drawing.show.add if shown else self.drawing.show.discard)(option)
+
+    def _chosen(self, event):
+        if event.client is not None:  # not set by this program
+            self.do(lambda: self._select(self._split.value, int(self._number.value)))
+
+    def _move_on(self, which):
+        move = 1 if which == "next" else -1
+        self._select(self.simulation.split, self.simulation.number + move, wrap=True)
+
+    def _select(self, split, number, wrap=False):
+        count = self.simulation.episodes.count(split)
+        if count is not None:
+            number = number % count if wrap else min(number, count - 1)
+            self._number.max = count - 1
+        self.selected = self.drawing.selected = None
+        self.simulation.select(split, max(number, 0))
+
+    def _policy_chosen(self, event, index):
+        if event.client is None:
+            return
+        choice = next(one for one in self.choices if one.label == event.target.value)
+        self._load(self, index, choice, int(self._seed.value))
+
+    def _seed_chosen(self, event):
+        if event.client is None:
+            return
+        for index, menu in self._policies:
+            choice = next(one for one in self.choices if one.label == menu.value)
+            self._load(self, index, choice, int(self._seed.value))
+
+    def _goal_typed(self, event):
+        if event.client is not None:
+            self._drag("goal", self.simulation.move_goal, np.array(event.target.value))
+
+    def _goal_dragged(self, event):
+        self._follow("goal", event.phase)
+        position = np.array(event.target.position)
+        if self._turns:
+            pose = np.r_[position, np.roll(event.target.wxyz, -1)]
+            self._drag("goal", self.simulation.turn_goal, pose)
+        else:
+            self._drag("goal", self.simulation.move_goal, position)
+
+    def _obstacle_dragged(self, event):
+        self._follow("obstacle", event.phase)
+        pose = tuple(map(float, event.target.position)), tuple(map(float, event.target.wxyz))
+        self._drag("obstacle", self._move_obstacle, self.selected, *pose)
+
+    def _follow(self, what, phase):
+        (self._dragging.discard if phase == "end" else self._dragging.add)(what)
+
+    def _move_obstacle(self, index, position, wxyz):
+        if index is None or index >= len(self.simulation.query.scene.obstacles):
+            return
+        changes = {"position": position}
+        obstacle = self.simulation.query.scene.obstacles[index]
+        if hasattr(obstacle, "orientation"):
+            w, x, y, z = (number / math.hypot(*wxyz) for number in wxyz)
+            changes["orientation"] = (x, y, z, w)
+        self.simulation.replace_obstacle(index, replace(obstacle, **changes))
+
+    def _obstacle_chosen(self, event):
+        if event.client is not None:
+            name = event.target.value
+            index = None if name == NO_OBSTACLE else int(name.partition(":")[0])
+            self.do(self._select_obstacle, index)
+
+    def _select_obstacle(self, index):
+        self.selected = self.drawing.selected = index
+
+    def _add_obstacle(self, kind):
+        self.simulation.add_obstacle(new_obstacle(kind, self.simulation.robot))
+        self._select_obstacle(len(self.simulation.query.scene.obstacles) - 1)
+
+    def _delete(self):
+        if self.selected is None:
+            raise ViewError("choose an obstacle: click it, or use the list")
+        index = self.selected
+        self._select_obstacle(None)
+        self.simulation.remove_obstacle(index)
+
+    def _save(self):
+        path = self.simulation.save_scene(self._file.value)
+        self._message = f"The scene was saved as {path}."
+        print(f"{path}: written", flush=True)
+
+
+def new_obstacle(kind, robot):
+    """An obstacle in front of a robot's base; its lengths are in proportion to the reach."""
+    obstacle, scale = NEW_OBSTACLES[kind], scale_of(robot)
+    sizes = {
+        name: tuple(scale * x for x in size) if isinstance(size, tuple) else scale * size
+        for name, size in vars(obstacle).items()
+        if name in ("size", "radius", "length")
+    }
+    position = (b + scale * x for b, x in zip(robot.base_position, obstacle.position, strict=True))
+    return replace(obstacle, position=tuple(position), **sizes)
+
+
+def _set(handle, name, value):
+    """Set a property of a handle where it differs: each setting is a message to the page."""
+    if not np.array_equal(getattr(handle, name), value):
+        setattr(handle, name, value)
+
+
+# --- The command
+
+
+def _check(args):
+    """Raises ValueError for arguments that cannot be used, before any work."""
+    flags.check(args)
+    for flag in ("demos", "robot", "trajectory"):
+        if getattr(args, flag) and Path(args.task).is_dir():
+            raise ViewError(f"--{flag} goes with a task, not with a folder of roadmap paths")
+    if args.demos and args.trajectory is not None:
+        raise ViewError("--demos and --trajectory are both recordings: give one of them")
+    args.task = envs.tasks.task_with_robot(args.task, args.robot)
+    if not Path(args.task).is_dir():
+        envs.get_task(args.task)
+    for policy in args.policy:
+        if policy not in BASELINES:
+            policy_file(policy)  # or it raises
+    if args.record is not None:
+        if args.record.suffix.lower() != ".html":
+            raise ViewError(f"--record must end in .html, got {args.record}")
+        check_writable(args.record)
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise ViewError(f"{NEEDS_VISER} ({error})") from error
+    if args.record is None:
+        _check_port(args.host, args.port)
+
+
+def _check_port(host, port):
+    """Raises ViewError unless a server can listen there: viser would choose another port."""
+    try:
+        with socket.create_server((host, port)):
+            pass
+    except OSError as error:
+        reason = error.strerror or error
+        raise ViewError(
+            f"cannot listen at {host}, port {port} ({reason}): choose another with --port"
+        ) from error
+
+
+def _server(host, port):
+    """A viser server, which says nothing."""
+    import viser
+
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host, port, label="RoboArm-NMP", verbose=False)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+    server.gui.main_panel.dock_right()
+    return server
+
+
+def _stop(server):
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def _simulation(args):
+    """The `Simulation` of the arguments, without policies, on its first query."""
+    from roboarm_nmp.viewer import simulation as core
+
+    if Path(args.task).is_dir():
+        episodes = core.roadmap_episodes(args.task)
+    elif args.demos:
+        episodes = core.demonstration_episodes(args.task)
+    elif args.trajectory is not None:
+        episodes = core.trajectory_episodes(args.task, args.trajectory)
+    else:
+        episodes = core.task_episodes(args.task, args.seed)
+    simulation = core.Simulation(episodes)
+    if episodes.recording is not None:
+        simulation.add(core.RecordedArm(episodes))
+    split = args.split if args.split in episodes.splits else episodes.splits[0]
+    simulation.select(split, args.query)
+    return simulation
+
+
+def _choices(args, simulation):
+    """The policies of the arguments, and all that the page's list offers: lists of `_Choice`."""
+    names = args.policy or (() if simulation.episodes.recording else ("go-to-goal",))
+    given = [_Choice(name, name, args.geometry_source) for name in names]
+    offered = {choice.label: choice for choice in given}
+    pretrained = pretrained_policies() if simulation.robot.arm == PANDA else ()
+    for name in (*BASELINES, *pretrained):
+        offered.setdefault(name, _Choice(name, name, args.geometry_source))
+    offered[POINT_CLOUD_PLANNER] = _Choice(POINT_CLOUD_PLANNER, "planner", "point_cloud")
+    return given, list(offered.values())
+
+
+def _arm(args, task, choice, seed):
+    """The `PolicyArm` of a choice."""
+    from roboarm_nmp.policies.safety_filter import SafetyFilter
+    from roboarm_nmp.viewer.simulation import PolicyArm
+
+    safety_filter = None
+    if args.safety_margin is not None:
+        safety_filter = SafetyFilter(args.safety_margin) if args.safety_margin else False
+    arm = PolicyArm(
+        task,
+        choice.policy,
+        args.goal_type,
+        choice.geometry_source,
+        safety_filter,
+        seed,
+        args.time_limit,
+    )
+    arm.name = choice.label
+    return arm
+
+
+def _view(args):
+    """Serve the page until Ctrl-C."""
+    simulation = _simulation(args)
+    server = _server(args.host, args.port)
+    try:
+        _serve(server, simulation, args)
+    finally:
+        _stop(server)
+
+
+def _serve(server, simulation, args):
+    from roboarm_nmp.viewer.simulation import WaitingArm
+
+    task = simulation.episodes.task
+    given, offered = _choices(args, simulation)
+    for choice in given:
+        simulation.add(WaitingArm(choice.label))
+    lock = threading.Lock()  # arms are made one after another
+
+    def load(page, index, choice, seed, restart=False):
+        """Make an arm in another thread, so that the page keeps moving; then exchange it."""
+        page.do(simulation.replace, index, WaitingArm(choice.label))
+
+        def work():
+            with lock:
+                try:
+                    arm = _arm(args, task, choice, seed)
+                    arm.compile()
+                except ValueError as error:
+                    print(f"{choice.label}: {error}", file=sys.stderr, flush=True)
+                    page.do(simulation.replace, index, WaitingArm(choice.label, str(error)))
+                else:
+                    page.do(simulation.replace, index, arm)
+                    if restart:
+                        page.do(page.begin_together)
+
+        threading.Thread(target=work, daemon=True).start()
+
+    page = _Page(server, simulation, args, offered, load)
+    _place_camera(server, simulation)
+    url = f"http://{args.host}:{args.port}"
+    server.on_client_disconnect(
+        lambda client: print(f"a page was closed or lost; {url} opens it again", flush=True)
+    )
+    print(f"{url}  (Ctrl-C ends)", flush=True)
+    if args.open and not _open(url):
+        print(f"no browser could be opened: open {url} yourself", flush=True)
+    first = len(simulation.arms) - len(given)
+    for index in sorted(range(len(given)), key=lambda i: given[i].policy not in BASELINES):
+        load(page, first + index, given[index], args.seed, restart=True)
+    page.run()
+
+
+def _open(url):
+    try:
+        return webbrowser.open(url)
+    except (OSError, webbrowser.Error):
+        return False
+
+
+def camera(arms, robot=PANDA):
+    """Where the camera of a page with so many arms is at first, m; its target; its field (rad)."""
+    from roboarm_nmp.viewer.drawing import SPACING
+
+    middle, base = SPACING * (arms - 1) / 2, np.array(robot.base_position)
+    eye, target = (1.4 + arms, middle + 0.6, 0.9 + 0.3 * arms), (0.0, middle, 0.4)
+    eye, target = (base + scale_of(robot) * np.array(point) for point in (eye, target))
+    return eye, target, math.radians(50)
+
+
+def _place_camera(server, simulation):
+    first = server.initial_camera
+    first.position, first.look_at, first.fov = camera(len(simulation.arms), simulation.robot)
+
+
+def _record(args):
+    """Write a replay of the query, one HTML file."""
+    from roboarm_nmp.viewer.drawing import COARSE_MESH_CELL, Drawing, outcome
+
+    simulation = _simulation(args)
+    given, _ = _choices(args, simulation)
+    for choice in given:
+        simulation.add(_arm(args, simulation.episodes.task, choice, args.seed))
+    server = _server("127.0.0.1", args.port)
+    try:
+        drawing = Drawing(server, simulation, COARSE_MESH_CELL)
+        _place_camera(server, simulation)
+        drawing.update()
+        recording = server.get_scene_serializer()
+        while not simulation.ended:
+            recording.insert_sleep(1 / (STEPS_PER_SECOND * args.speed))
+            simulation.step()
+            drawing.update()
+        recording.insert_sleep(PAUSE)
+        contents = recording.as_html().encode()
+        write_atomically(args.record, contents)
+    finally:
+        _stop(server)
+    print(f"{args.record}: written, {len(contents) / 1000:.0f} kB")
+    for arm in simulation.arms:
+        print(f"  {arm.name}: {outcome(arm)}")
+
+
+def view(args, prog="roboarm view"):
+    """Run the viewer. Returns the exit code: 0, or 2 where nothing can be viewed."""
+    end_with_one_line("the same command starts again")
+    try:
+        _check(args)
+        if args.record is not None:
+            _record(args)
+        else:
+            _view(args)
+    except (OSError, ValueError) as error:
+        print(f"{prog}: {error}".replace("\n", " "), file=sys.stderr)
+        return 2
+    return 0
+
+
+def main(arguments=None):
+    """The command. Returns the exit code: 0, or 2 where nothing can be viewed."""
+    return view(flags.parse(Args, arguments, others="viewer"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,414 @@
+"""Drawing a `Simulation` with viser: arms side by side, scene, goal, points, distances, contacts.
+
+Every arm has its own copy of the scene, `SPACING` beside the last one. The arm's links are nested
+frames, of which only the joints move.
+"""
+
+import numpy as np
+
+from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, find_geometry_source
+from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
+from roboarm_nmp.envs.perception.sensors import SceneObservation
+from roboarm_nmp.envs.robots.panda import scale_of
+from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, Cylinder, hull_faces, obstacle_at
+from roboarm_nmp.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, arm_joints, link_meshes
+
+# m, for the Panda; for other arms in proportion to their reach.
+SPACING, LABEL_HEIGHT = 2.2, 1.35  # between the bases of two arms; of the arms' names
+ORIENTATION_STEPS = 2**14  # quaternions are rounded, so that recordings stay small
+POSITION_STEPS = 2**13  # per m, likewise
+DECODED_BY = "field"  # the encoder whose decoded points are shown where an arm uses none
+
+# Colours (red, green, blue).
+FLOOR_COLOUR, TABLE_COLOUR = (205, 205, 205), (196, 178, 150)
+OBSTACLE_COLOUR, SELECTED_COLOUR = (96, 132, 172), (240, 170, 60)
+TOUCHABLE_COLOUR = (150, 120, 170)
+START_COLOUR, GOAL_COLOUR, CONTACT_COLOUR = (150, 150, 165), (60, 190, 90), (230, 30, 30)
+OBSERVED_COLOUR, DECODED_COLOUR = (255, 140, 0), (150, 60, 200)
+WANTED_COLOUR, FILTERED_COLOUR = (130, 130, 130), (20, 110, 230)
+TRACE_COLOUR = (235, 150, 40)
+NEAR, FAR = 0.05, 0.3  # m: link distances are red up to the first, and not drawn beyond the second
+ARROW_LENGTH = 0.25  # m, of the end effector's motion in a step of the longest length
+
+
+def _wxyz(orientation):
+    """A quaternion (x, y, z, w) in viser's order."""
+    x, y, z, w = orientation
+    return (w, x, y, z)
+
+
+class ArmDrawing:
+    """An arm as nested frames.
+
+    Args:
+        scene: viser's `SceneApi`.
+        robot: the `Robot`.
+        name: of its node.
+        cell: m, see `MESH_CELL`.
+        colour, opacity: of a ghost; None for the arm's own colours.
+    """
+
+    def __init__(self, scene, robot, name, cell=MESH_CELL, colour=None, opacity=None):
+        self._root = scene.add_frame(
+            name,
+            show_axes=False,
+            position=robot.base_position,
+            wxyz=_wxyz(robot.base_orientation),
+        )
+        self._meshes, self._red, self._joints, nodes = {}, frozenset(), [], {-1: name}
+        for joint in arm_joints(robot):
+            node = f"{nodes[joint.parent]}/joint{joint.link}"
+            scene.add_frame(node, show_axes=False, position=joint.position, wxyz=joint.wxyz)
+            if not joint.is_fixed:
+                node = f"{node}/moved"
+                self._joints.append((joint, scene.add_frame(node, show_axes=False)))
+            nodes[joint.link] = node
+        still = colour is not None  # the bases of ghosts are where the arm's is
+        for link, meshes in link_meshes(robot, cell * scale_of(robot)).items():
+            self._meshes[link] = []
+            for i, (own, vertices, faces) in enumerate(() if still and link == -1 else meshes):
+                shown = own if colour is None else colour
+                handle = scene.add_mesh_simple(
+                    f"{nodes[link]}/mesh{i}",
+                    vertices,
+                    faces,
+                    color=shown,
+                    opacity=opacity,
+                    cast_shadow=opacity is None,
+                    receive_shadow=opacity is None,
+                )
+                self._meshes[link].append((handle, shown))
+
+    @property
+    def visible(self):
+        """Whether it is drawn."""
+        return self._root.visible
+
+    @visible.setter
+    def visible(self, visible):
+        if self._root.visible != visible:
+            self._root.visible = visible
+
+    def set(self, configuration):
+        """Draw it at joint angles (n,), rad."""
+        for joint, handle in self._joints:
+            position, wxyz = joint.pose(configuration)
+            for name, value, steps in (
+                ("position", position, POSITION_STEPS),
+                ("wxyz", wxyz, ORIENTATION_STEPS),
+            ):
+                value = np.round(np.array(value) * steps) / steps
+                if not np.array_equal(getattr(handle, name), value):
+                    setattr(handle, name, value)
+
+    def colour(self, links):
+        """Draw the links of these indices in red, the others in their own colours."""
+        for link in links ^ self._red:
+            for handle, own in self._meshes.get(link, ()):
+                handle.color = CONTACT_COLOUR if link in links else own
+        self._red = frozenset(links)
+
+    def colour_all(self, colour):
+        """Draw all links in one colour."""
+        for meshes in self._meshes.values():
+            for handle, _ in meshes:
+                if tuple(handle.color) != tuple(colour):
+                    handle.color = colour
+
+
+class _Place:
+    """The handles of one arm and of the scene around it."""
+
+    def __init__(self, scene, robot, index, cell):
+        scale = scale_of(robot)
+        self.name, self.offset = f"/arm{index}", np.array([0.0, SPACING * scale * index, 0.0])
+        scene.add_frame(self.name, show_axes=False, position=self.offset)
+        self.arm = ArmDrawing(scene, robot, f"{self.name}/robot", cell)
+        ghost = COARSE_MESH_CELL
+        self.start = ArmDrawing(scene, robot, f"{self.name}/start", ghost, START_COLOUR, 0.3)
+        self.goal = ArmDrawing(scene, robot, f"{self.name}/goal", ghost, GOAL_COLOUR, 0.4)
+        self.ball = scene.add_icosphere(f"{self.name}/ball", radius=0.02, color=GOAL_COLOUR)
+        self.axes = scene.add_frame(f"{self.name}/axes", axes_length=0.08, axes_radius=0.003)
+        x, y, z = robot.base_position
+        self.label = scene.add_label(
+            f"{self.name}/label",
+            "",
+            position=(x, y, z + LABEL_HEIGHT * scale),
+            anchor="bottom-center",
+        )
+        self.scene, self.bodies, self.shapes = None, [], {}
+
+
+class Drawing:
+    """Draws a `Simulation` in the scene of a viser server.
+
+    Args:
+        server: a `viser.ViserServer`.
+        simulation: the `Simulation`.
+        cell: m, see `MESH_CELL`.
+
+    Attributes:
+        show: set of what is drawn besides arm and scene: `start`, `goal`, `observed`, `decoded`,
+            `distances`, `correction`, `trace`.
+        selected: index of the obstacle drawn in another colour; None for none.
+        on_click: function of an obstacle's index; None: obstacles cannot be clicked.
+    """
+
+    OPTIONS = ("start", "goal", "observed", "decoded", "distances", "correction", "trace")
+
+    def __init__(self, server, simulation, cell=MESH_CELL):
+        self.simulation, self._scene, self._cell = simulation, server.scene, cell
+        self.show, self.selected, self.on_click = {"start", "goal", "correction"}, None, None
+        self._places = []
+        # An environment map would be a third of a recording.
+        self._scene.configure_environment_map(None)
+        self._scene.add_light_hemisphere(
+            "/sky", sky_color=(255, 255, 255), ground_color=(190, 190, 190), intensity=0.9
+        )
+
+    def offset(self, index):
+        """Where the base of an arm is drawn, m, (3,)."""
+        return self._places[index].offset
+
+    def update(self):
+        """Draw the simulation as it is now."""
+        simulation = self.simulation
+        for index, arm in enumerate(simulation.arms):
+            if index == len(self._places):
+                self._places.append(_Place(self._scene, simulation.robot, index, self._cell))
+                self._add_floor()
+            place = self._places[index]
+            self._draw_scene(place, simulation.query.scene, arm.time)
+            self._draw_arm(place, arm)
+            self._draw_overlays(place, arm)
+
+    def _add_floor(self):
+        """A floor under all arms."""
+        floor = self.simulation.query.scene.floor
+        middle = self._places[-1].offset[1] / 2
+        self._scene.add_grid(
+            "/floor",
+            width=8.0,
+            height=8.0 + 2 * middle,
+            position=(0.0, middle, -0.6 if floor is None else floor),
+            cell_color=(225, 225, 225),
+            section_color=(200, 200, 200),
+            plane_color=(245, 245, 245),
+            plane_opacity=1.0,
+            shadow_opacity=0.3,
+        )
+
+    # --- The scene
+
+    def _draw_scene(self, place, scene, time):
+        shown = scene, self.selected, 0.0 if scene.is_static else time
+        if place.scene is not None and place.scene[0] is scene and place.scene[1:] == shown[1:]:
+            return
+        # None for an obstacle that is absent, so that the others keep their numbers.
+        bodies = [
+            (obstacle_at(body, time), TOUCHABLE_COLOUR if body.may_touch else OBSTACLE_COLOUR)
+            for body in scene.obstacles
+        ]
+        if self.selected is not None and self.selected < len(bodies):
+            bodies[self.selected] = bodies[self.selected][0], SELECTED_COLOUR
+        bodies.append((scene.table, TABLE_COLOUR))
+        for i, (body, colour) in enumerate(bodies[: len(place.bodies)]):
+            self._update_body(place, i, body, colour)
+        for _, handle in place.bodies[len(bodies) :]:
+            if handle is not None:
+                handle.remove()
+        del place.bodies[len(bodies) :]
+        for i in range(len(place.bodies), len(bodies)):
+            place.bodies.append(self._add_body(place, i, *bodies[i]))
+        place.scene = shown
+
+    def _update_body(self, place, i, body, colour):
+        """Move a body, where it has the same shape as before; otherwise make it anew."""
+        (before, before_colour), handle = place.bodies[i]
+        if (body, colour) == (before, before_colour):
+            return
+        same = before is not None and body is not None and _shape(before) == _shape(body)
+        if not same:
+            if handle is not None:
+                handle.remove()
+            place.bodies[i] = self._add_body(place, i, body, colour)
+            return
+        if body != before:
+            handle.position = body.position
+            handle.wxyz = _wxyz(getattr(body, "orientation", (0.0, 0.0, 0.0, 1.0)))
+        if colour != before_colour:
+            handle.color = colour
+        place.bodies[i] = (body, colour), handle
+
+    def _add_body(self, place, i, body, colour):
+        if body is None:
+            return (body, colour), None
+        name, options = f"{place.name}/body{i}", {"color": colour, "position": body.position}
+        if isinstance(body, Box):
+            wxyz = _wxyz(body.orientation)
+            handle = self._scene.add_box(name, dimensions=body.size, wxyz=wxyz, **options)
+        elif isinstance(body, Cylinder):
+            size = {"radius": body.radius, "height": body.length}
+            wxyz = _wxyz(body.orientation)
+            handle = self._scene.add_cylinder(name, **size, wxyz=wxyz, **options)
+        elif isinstance(body, ConvexHull):
+            mesh = np.array(body.vertices, np.float32), hull_faces(body.vertices).astype(np.uint32)
+            wxyz = _wxyz(body.orientation)
+            handle = self._scene.add_mesh_simple(
+                name, *mesh, flat_shading=True, wxyz=wxyz, **options
+            )
+        else:
+            handle = self._scene.add_icosphere(name, radius=body.radius, **options)
+        if self.on_click is not None and colour != TABLE_COLOUR:
+            handle.on_click(lambda event: self.on_click(i))
+        return (body, colour), handle
+
+    # --- The arm
+
+    def _draw_arm(self, place, arm):
+        query, robot = self.simulation.query, self.simulation.robot
+        place.arm.set(robot.denormalise(arm.state))
+        place.arm.colour(arm.contacts.links)
+        place.start.visible = "start" in self.show
+        place.start.set(query.start)
+        place.goal.visible = place.ball.visible = place.axes.visible = "goal" in self.show
+        place.goal.set(query.goal)
+        pose = robot.end_effector_pose(query.goal)
+        place.ball.position = place.axes.position = pose[:3]
+        place.axes.wxyz = _wxyz(pose[3:])
+        text = f"{arm.name}{_label(arm)}"  # seldom another: a browser takes long to draw text
+        if place.label.text != text:
+            place.label.text = text
+
+    # --- Overlays: redrawn while they are shown
+
+    def _draw_overlays(self, place, arm):
+        robot = self.simulation.robot
+        observed = _observed if self.simulation.query.scene.is_static else self._observed_now
+        self._points(place, "observed", OBSERVED_COLOUR, arm, observed)
+        self._points(place, "decoded", DECODED_COLOUR, arm, _decoded)
+        self._lines(place, "distances", 0.004, lambda: _distance_lines(arm, self.simulation))
+        self._lines(place, "correction", 0.012, lambda: _arrows(arm, robot), arrows=True)
+        self._lines(place, "trace", 0.006, lambda: _trace(arm, robot))
+        self._contacts(place, arm)
+
+    def _observed_now(self, scene, arm):
+        """Of moving obstacles, with the arm where it is."""
+        configuration = self.simulation.robot.denormalise(arm.state)
+        return observed_points(SceneObservation.of(scene, configuration))
+
+    def _points(self, place, name, colour, arm, find):
+        scene = self.simulation.query.scene.at(arm.time)
+        drawn, handle = place.shapes.get(name, (None, None))
+        if name not in self.show:
+            if handle is not None:
+                handle.visible = False
+            return
+        if drawn is scene:
+            handle.visible = True
+            return
+        points = find(scene, arm)
+        handle = self._scene.add_point_cloud(
+            f"{place.name}/{name}", points, colour, point_size=0.012, point_shape="circle"
+        )
+        place.shapes[name] = scene, handle
+
+    def _lines(self, place, name, thickness, find, arrows=False):
+        handle = place.shapes.get(name)
+        points, colours = find() if name in self.show else (np.zeros((0, 2, 3)), None)
+        if not len(points):
+            if handle is not None:
+                handle.remove()
+                del place.shapes[name]
+            return
+        node, points = f"{place.name}/{name}", np.round(points, 4).astype(np.float32)
+        if arrows:
+            sizes = {"shaft_radius": 0.008, "head_radius": 0.02, "head_length": 0.04}
+            place.shapes[name] = self._scene.add_arrows(node, points, colours, **sizes)
+        elif handle is None or len(handle.points) != len(points):
+            place.shapes[name] = self._scene.add_line_segments(
+                node, points, colours, thickness=thickness
+            )
+        else:
+            handle.points, handle.colors = points, colours
+
+    def _contacts(self, place, arm):
+        points, handle = arm.contacts.points.astype(np.float32), place.shapes.get("contacts")
+        if handle is None and len(points):
+            options = {"point_size": 0.03, "point_shape": "circle", "precision": "float32"}
+            place.shapes["contacts"] = self._scene.add_point_cloud(
+                f"{place.name}/contacts", points, CONTACT_COLOUR, **options
+            )
+        elif handle is not None:
+            handle.visible = len(points) > 0
+            if len(points):
+                handle.points = points
+
+
+def outcome(arm):
+    """The state of an arm's episode in a few words."""
+    if arm.problem is not None and arm.ended:
+        return arm.problem
+    contact = f"{arm.contact_steps} steps in contact" if arm.contact_steps else "no contact"
+    if arm.success:
+        return f"goal reached in {arm.steps} steps, {contact}"
+    if arm.ended:
+        return f"goal not reached in {arm.steps} steps, {contact}"
+    return f"step {arm.steps}, {'CONTACT' if arm.in_contact else contact}"
+
+
+def _label(arm):
+    contact = ", with contact" if arm.contact_steps else ""
+    if arm.problem is not None and arm.ended:
+        return f": {arm.problem}"
+    if arm.ended:
+        return f": goal {'' if arm.success else 'not '}reached{contact or ', no contact'}"
+    return contact
+
+
+def _shape(body):
+    return type(body), {k: v for k, v in vars(body).items() if k not in ("position", "orientation")}
+
+
+def _observed(scene, arm):
+    return observed_points(scene)
+
+
+def _decoded(scene, arm):
+    from roboarm_nmp.envs.perception.encoders import encoder_with_decoder  # PyTorch takes seconds
+
+    known = arm.geometry_source in (None, GROUND_TRUTH, POINT_CLOUD)
+    return encoder_with_decoder(DECODED_BY if known else arm.geometry_source).decoded_points(scene)
+
+
+def _distance_lines(arm, simulation):
+    """Lines (n, 2, 3), m, from each link to the nearest geometry, and their colours (n, 2, 3)."""
+    scene = simulation.query.scene.at(arm.time)
+    checker = find_geometry_source(arm.geometry_source or GROUND_TRUTH)(scene)
+    found = checker.signed_distances(np.clip(arm.state, -1.0, 1.0), False, within=FAR)
+    near = np.isfinite(found.distance)
+    distance, witness = found.distance[near], found.witness[near]
+    points = np.stack([witness, witness - distance[:, None] * found.normal[near]], axis=1)
+    share = np.clip((distance - NEAR) / (FAR - NEAR), 0.0, 1.0)[:, None]
+    colours = (1 - share) * CONTACT_COLOUR + share * np.array(GOAL_COLOUR)
+    return points, np.repeat(colours[:, None], 2, axis=1).astype(np.uint8)
+
+
+def _arrows(arm, robot):
+    """The end effector's motion as the policy wants it, and as the safety filter corrects it."""
+    if arm.correction is None or arm.correction < 1e-3 or arm.ended or len(arm.trace) < 2:
+        return np.zeros((0, 2, 3)), None
+    before = arm.trace[-2]
+    states = np.clip(np.stack([before, before + arm.wanted, before + arm.action]), -1.0, 1.0)
+    start, *ends = robot.forward_kinematics(robot.denormalise(states))
+    scale = ARROW_LENGTH / 0.03
+    points = np.array([[start, start + scale * (end - start)] for end in ends])
+    return points, np.array([WANTED_COLOUR, FILTERED_COLOUR], np.uint8)
+
+
+def _trace(arm, robot):
+    """The path of the end effector so far."""
+    if len(arm.trace) < 2:
+        return np.zeros((0, 2, 3)), None
+    positions = robot.forward_kinematics(robot.denormalise(np.array(arm.trace)))
+    return np.stack([positions[:-1], positions[1:]], axis=1), np.array(TRACE_COLOUR, np.uint8)

@@ -1,0 +1,248 @@
+"""Describe a robot, and verify its description against PyBullet.
+
+    roboarm robot check ur5.yaml
+    roboarm robot check ur5.yaml --image ur5.png
+
+Prints joints, limits, links and the pairs of links that may collide. Then it compares forward
+kinematics and compiled collision checks with PyBullet, and measures how well the arm follows
+commands and holds configurations. The exit code is 1 if one of them is out of its tolerance.
+
+The image has three random feasible configurations, end-effector positions behind the arm (orange),
+and the table of the pairs of links that may collide.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import tyro
+from PIL import Image, ImageDraw, ImageFont
+
+from roboarm_nmp.datasets.queries import Query
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.robots.control import calibrate
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.tasks import get_task, with_robot
+from roboarm_nmp.envs.world import World
+from roboarm_nmp.utils.bullet import pybullet as p
+from roboarm_nmp.utils.files import check_writable
+from roboarm_nmp.utils.flags import PositiveInt, Seed, check
+from roboarm_nmp.viewer.show import render_configurations
+
+SCENES_TASK = "random_boxes_hard"  # of the collision checks that are compared
+PER_SCENE = 100
+HELD_POSES = 200
+# Tolerances.
+MAX_POSITION_ERROR = 1e-4  # m
+MAX_DISAGREEMENT, MAX_DEPTH = 0.001, 0.002  # share of configurations; m
+MIN_EXECUTED, MIN_HELD = 0.7, 0.9  # shares
+POSE_SIZE, WORKSPACE_SIZE, NUM_POSES, NUM_POSITIONS = (360, 300), (540, 450), 3, 6_000
+BEAD = 0.006  # share of the reach: half the edge of a position's cube
+MOTION_LIMITS = {"velocity": 10, "acceleration": 14, "jerk": 10}  # columns and their widths
+MAY_COLLIDE, NEVER = (235, 120, 40), (232, 232, 232)
+
+
+@dataclass
+class Args:
+    robot: tyro.conf.Positional[str]
+    """`panda`, or a robot's file (.urdf, .yaml)"""
+    configurations: PositiveInt = 10_000
+    """configurations at which collision checks are compared"""
+    image: Path | None = None
+    """file of the image (.png); by default the name of the robot's file and _check.png"""
+    seed: Seed = 0
+    """of the configurations"""
+
+
+class Agreement(NamedTuple):
+    """Compiled collision checks beside PyBullet's.
+
+    number: of configurations. free: share that is free. disagreements: number of different answers.
+    depth: m, of the deepest contact or the largest clearance among them.
+    """
+
+    number: int
+    free: float
+    disagreements: int
+    depth: float
+
+
+def position_error(robot, rng, number=500):
+    """Largest distance (m) of forward kinematics from PyBullet's end effector."""
+    world = World(Scene(table=None, floor=None, robot=robot), drawn=False)
+    worst = 0.0
+    for configuration in rng.uniform(robot.lower, robot.upper, (number, robot.num_joints)):
+        robot.set_configuration(world.client, world.body, configuration.tolist())
+        error = world.read_arm()[2] - robot.forward_kinematics(configuration)
+        worst = max(worst, float(np.linalg.norm(error)))
+    world.close()
+    return worst
+
+
+def compare_checks(robot, rng, number, scenes=None):
+    """The `Agreement` at random configurations in random scenes.
+
+    Args:
+        robot: the `Robot`.
+        rng: a NumPy Generator.
+        number: of configurations, `PER_SCENE` in each scene.
+        scenes: a distribution of scenes with this robot; by default random boxes.
+    """
+    from roboarm_nmp.envs.collision.checker import CollisionChecker  # Numba takes long to import
+
+    scenes = scenes or with_robot(get_task(SCENES_TASK).scene, robot)
+    world, checked, free, wrong, depth = World(scenes.base, drawn=False), 0, 0, 0, 0.0
+    while checked < number:
+        scene = scenes.sample(rng)
+        world.set_scene(scene)
+        checker = CollisionChecker(scene)
+        states = rng.uniform(-1.0, 1.0, (min(PER_SCENE, number - checked), robot.num_joints))
+        for state, is_free in zip(states, checker.is_free(states), strict=True):
+            expected = not world.in_collision(robot.denormalise(state).tolist())
+            free += expected
+            if expected != is_free:
+                wrong += 1
+                depth = max(depth, abs(float(checker.signed_distances(state).distance.min())))
+        checked += len(states)
+    world.close()
+    return Agreement(checked, free / checked, wrong, depth)
+
+
+def held_share(robot, rng, number=HELD_POSES):
+    """Share of the contact-free configurations, without obstacles, that the controller holds."""
+    world, held, tried = World(Scene(robot=robot), drawn=False), 0, 0
+    while tried < number:
+        configuration = rng.uniform(robot.lower, robot.upper)
+        if not world.in_collision(configuration.tolist()):
+            tried += 1
+            held += world.is_feasible(configuration)
+    world.close()
+    return held / number
+
+
+def describe(robot):
+    """The description of a robot: text of several lines."""
+    lines = [
+        f"{robot.name}: {robot.num_joints} joints, reach {robot.reach:.2f} m, {robot.urdf}",
+        f"{'joint':<28}{'lower':>9}{'upper':>9}"
+        + "".join(f"{name:>{width}}" for name, width in MOTION_LIMITS.items())
+        + f"{'effort':>9}",
+    ]
+    for i, name in enumerate(robot.joint_names):
+        line = f"{name:<28}{robot.lower[i]:>9.3f}{robot.upper[i]:>9.3f}"
+        for limit, width in MOTION_LIMITS.items():
+            values = getattr(robot, limit)
+            line += f"{'unknown':>{width}}" if values is None else f"{values[i]:>{width}.2f}"
+        lines.append(f"{line}{robot.effort[i]:>9.0f}")
+    if robot.datasheet_lower is not None:
+        pairs = zip(robot.datasheet_lower, robot.datasheet_upper, strict=True)
+        lines.append(f"datasheet: {', '.join(f'{low:.3f} to {high:.3f}' for low, high in pairs)}")
+    _, names = robot.bullet_names
+    still = [names[link.index] for link in robot.links if link.frame < 0]
+    offset = ", ".join(f"{x:g}" for x in robot.end_effector_offset)
+    lines += [
+        f"links that move and may collide: {', '.join(names[i] for i in robot.collision_links)}",
+        f"links that do not move: {', '.join(still) or 'none'}",
+        f"end effector: ({offset}) m in {names[robot.end_effector_link]}",
+        f"pairs of links that may collide ({len(robot.self_collision_pairs)}):",
+    ]
+    for a in sorted({pair[0] for pair in robot.self_collision_pairs}):
+        others = [names[pair[1]] for pair in robot.self_collision_pairs if pair[0] == a]
+        lines.append(f"  {names[a]:<26}{', '.join(others)}")
+    return "\n".join(lines)
+
+
+def draw(robot, rng):
+    """An image of the robot: configurations, workspace, and pairs of links that may collide."""
+    env = RoboArmEnv(Scene(robot=robot))
+    poses = [env.sample_feasible(rng) for _ in range(NUM_POSES)]
+    query = Query(poses[0], poses[1], env.scene)
+    images = list(render_configurations(env, query, poses, POSE_SIZE))
+    around = _behind(robot, rng)
+    bead = p.createVisualShape(
+        p.GEOM_BOX,
+        halfExtents=[BEAD * robot.reach] * 3,
+        rgbaColor=(0.9, 0.4, 0.1, 1),
+        physicsClientId=env.client,
+    )
+    p.createMultiBody(
+        baseVisualShapeIndex=bead, batchPositions=around.tolist(), physicsClientId=env.client
+    )
+    images += render_configurations(env, query, poses[:1], WORKSPACE_SIZE, around, "side")
+    env.close()
+    images.append(draw_pairs(robot, WORKSPACE_SIZE))
+    rows = np.concatenate(images[:NUM_POSES], axis=1), np.concatenate(images[NUM_POSES:], axis=1)
+    return Image.fromarray(np.concatenate(rows))
+
+
+def _behind(robot, rng):
+    """End-effector positions (m) of random configurations, those on the arm's left."""
+    configurations = rng.uniform(robot.lower, robot.upper, (NUM_POSITIONS, robot.num_joints))
+    positions = robot.forward_kinematics(configurations)
+    return positions[positions[:, 1] > robot.base_position[1]]
+
+
+def draw_pairs(robot, size):
+    """An image of the links as rows and columns: uint8 (height, width, 3)."""
+    _, names = robot.bullet_names
+    links = sorted(link.index for link in robot.links)
+    image, font = Image.new("RGB", size, "white"), ImageFont.load_default(12)
+    painter, left = ImageDraw.Draw(image), size[0] // 3
+    cell = min((size[0] - left) // len(links), (size[1] - 40) // len(links))
+    painter.text((10, 8), "pairs of links that may collide (orange)", "black", font)
+    for row, a in enumerate(links):
+        top = 32 + row * cell
+        painter.text((left - 6, top + cell // 2), names[a][-30:], "black", font, anchor="rm")
+        for column, b in enumerate(links):
+            corner = left + column * cell, top
+            pair = tuple(sorted((a, b)))
+            colour = MAY_COLLIDE if pair in robot.self_collision_pairs else NEVER
+            painter.rectangle((*corner, corner[0] + cell - 2, top + cell - 2), colour)
+    return np.asarray(image)
+
+
+def main(args):
+    """Print the description and the verification. Returns whether all is within tolerance."""
+    robot = load_robot(args.robot)
+    image = args.image or Path(f"{Path(args.robot).stem}_check.png")
+    if image.suffix.lower() != ".png":
+        raise ValueError(f"--image must end in .png, got {image}")
+    check_writable(image)
+    print(describe(robot))
+    rng = np.random.default_rng(args.seed)
+    error = position_error(robot, rng)
+    found = compare_checks(robot, rng, args.configurations)
+    executed = calibrate(robot, gains=robot.gains[:1])[1]
+    held = held_share(robot, rng)
+    share = found.disagreements / found.number
+    results = [
+        (f"forward kinematics: at most {error * 1000:.4f} mm from PyBullet's",
+         error <= MAX_POSITION_ERROR),
+        (f"collision checks: {found.disagreements} of {found.number:,} differ from PyBullet's, by "
+         f"up to {found.depth * 1000:.2f} mm ({found.free:.0%} of the configurations are free)",
+         share <= MAX_DISAGREEMENT and found.depth <= MAX_DEPTH),
+        (f"controller: {executed:.2f} of a commanded step is executed (gain {robot.gains[0]:g})",
+         executed >= MIN_EXECUTED),
+        (f"controller: {held:.1%} of contact-free configurations are held", held >= MIN_HELD),
+    ]  # fmt: skip
+    for text, is_good in results:
+        print(f"{'ok ' if is_good else 'BAD'} {text}")
+    draw(robot, rng).save(image)
+    print(f"{image}: written, poses, workspace and pairs of links")
+    return all(is_good for _, is_good in results)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] != ["check"]:
+        print("usage: roboarm robot check FILE [--help]")
+        sys.exit(0 if sys.argv[1:2] in (["-h"], ["--help"]) else 2)
+    args = tyro.cli(Args, args=sys.argv[2:], prog="roboarm robot check", description=__doc__)
+    try:
+        check(args)
+        sys.exit(0 if main(args) else 1)
+    except (OSError, RuntimeError, ValueError) as error:
+        print(f"error: {error}".replace("\n", " "), file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,687 @@
+"""Query files: exact, reproducible, written atomically; errors of bad files name them."""
+
+import dataclasses
+import json
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import h5py
+import numpy as np
+import pybullet_data
+import pytest
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets import format as dataset_format
+from roboarm_nmp.datasets.format import SPLITS, DatasetError
+from roboarm_nmp.datasets.queries import (
+    Queries,
+    load_queries,
+    query_path,
+    validate,
+    write_queries,
+)
+from roboarm_nmp.demo_generation import make_queries
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.utils.bullet import pybullet as p
+
+
+def random_splits(seed=0, test=30, validation=10):
+    """Queries inside the joint limits, feasible or not."""
+    rng = np.random.default_rng(seed)
+    return {
+        split: tuple(
+            (PANDA.lower + (PANDA.upper - PANDA.lower) * rng.uniform(0.01, 0.99, (n, 7))).astype(
+                np.float32
+            )
+            for _ in range(2)
+        )
+        for split, n in (("test", test), ("validation", validation))
+    }
+
+
+def write(path, splits=None, task="wall"):
+    write_queries(path, task, 3, splits or random_splits(), "made by a test", {"hold_steps": 24})
+    return path
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write(tmp_path / "queries.h5")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A small file made by the generator in this process."""
+    path = tmp_path_factory.mktemp("made") / "wall.h5"
+    make_queries.make_queries(path, "wall", 0, 30, 10, progress=False)
+    return path
+
+
+# --- Reading and writing
+
+
+def test_round_trip_is_exact(tmp_path):
+    splits = random_splits()
+    path = write(tmp_path / "queries.h5", splits)
+    for split, (start, goal) in splits.items():
+        queries = load_queries(path, split)
+        assert (queries.task, queries.split, queries.seed) == ("wall", split, 3)
+        assert len(queries) == len(start)
+        for array, expected in (
+            (queries.start, start),
+            (queries.goal, goal),
+            (queries.goal_position, PANDA.forward_kinematics(goal).astype(np.float32)),
+        ):
+            assert array.dtype == np.float32
+            np.testing.assert_array_equal(array, expected)
+    assert set(validate(path, "wall")) == {"test", "validation"}
+
+
+def test_queries_are_indexed_like_a_list(path):
+    queries = load_queries(path)
+    few = queries[5:8]
+    assert isinstance(few, Queries) and len(few) == 3
+    np.testing.assert_array_equal(few.goal_position, queries.goal_position[5:8])
+    start, goal, scene = queries[6]
+    np.testing.assert_array_equal(start, few.start[1])
+    np.testing.assert_array_equal(goal, few.goal[1])
+    assert scene == few[1].scene == envs.TASKS["wall"].scene
+    assert len(list(queries)) == len(queries)
+    assert len(queries[np.array([1, 4])]) == 2
+
+
+def test_same_contents_same_bytes(tmp_path):
+    first = write(tmp_path / "first.h5").read_bytes()
+    time.sleep(1.1)  # HDF5's time stamps are whole seconds
+    assert write(tmp_path / "second.h5").read_bytes() == first
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_file_made_again_has_the_same_bytes(made, tmp_path, workers):
+    again = tmp_path / "again.h5"
+    make_queries.make_queries(again, "wall", 0, 30, 10, num_workers=workers, progress=False)
+    assert again.read_bytes() == made.read_bytes()
+
+
+def test_interrupted_command_continues_to_the_same_bytes(made, tmp_path, monkeypatch):
+    again, done = tmp_path / "again.h5", []
+
+    def die(journal, entry):
+        if len(done) == 17:
+            raise OSError("the disk is full")
+        done.append(entry["index"])
+        append(journal, entry)
+
+    append = make_queries.Journal.append
+    monkeypatch.setattr(make_queries.Journal, "append", die)
+    with pytest.raises(OSError, match="disk is full"):
+        make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
+    with pytest.raises(ValueError, match="seed 0, not 1"):
+        make_queries.make_queries(again, "wall", 1, 30, 10, progress=False)
+    monkeypatch.undo()
+    sampled = []
+    monkeypatch.setattr(
+        make_queries.Journal,
+        "append",
+        lambda journal, entry: sampled.append(entry["index"]) or append(journal, entry),
+    )
+    make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
+    assert len(sampled) == 40 - 17 and not set(sampled) & set(done)
+    assert again.read_bytes() == made.read_bytes()
+    assert list(tmp_path.iterdir()) == [again]
+
+
+def test_query_does_not_depend_on_the_others(made):
+    queries = load_queries(made)
+    sampler = make_queries.Sampler("wall", solvable=False)
+    for index in (29, 3):
+        query = sampler((0, "test", index))
+        np.testing.assert_array_equal(queries.start[index], query["start"])
+        np.testing.assert_array_equal(queries.goal[index], query["goal"])
+    sampler.env.close()
+
+
+def test_made_queries_are_feasible_and_not_those_of_a_reset(made):
+    everything = validate(made, "wall", simulate=True)
+    env = envs.make("wall")
+    env.reset(seed=0)
+    for queries in everything.values():
+        assert not (queries.start == env.start_configuration).all(axis=1).any()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda start, goal: (start.astype(np.float64), goal), "float32"),
+        (lambda start, goal: (start[:, :6], goal), r"\(n, 7\)"),
+        (lambda start, goal: (start[:-1], goal), "rows"),
+        (lambda start, goal: (start[:0], goal[:0]), "n > 0"),
+        (lambda start, goal: (start * np.float32(np.nan), goal), "not finite"),
+        (lambda start, goal: (start + np.float32(10), goal), "joint limits"),
+    ],
+)
+def test_bad_arrays_are_not_written(path, change, complaint):
+    before = path.read_bytes()
+    splits = random_splits()
+    splits["validation"] = change(*splits["validation"])
+    with pytest.raises(DatasetError, match=complaint):
+        write(path, splits)
+    assert path.read_bytes() == before
+
+
+def test_splits_must_be_disjoint(path):
+    splits = random_splits()
+    splits["validation"] = tuple(array[4:6] for array in splits["test"])
+    with pytest.raises(DatasetError, match="2 queries are in both splits"):
+        write(path, splits)
+
+
+def test_bad_arguments_are_rejected(path):
+    with pytest.raises(ValueError, match="unknown task 'wal'"):
+        write(path, task="wal")
+    with pytest.raises(ValueError, match="unknown task 'wal'"):
+        query_path("wal")
+    with pytest.raises(ValueError, match="unknown split 'train': one of test, validation"):
+        load_queries(path, "train")
+
+
+# --- Bad files
+
+
+def missing(path):
+    path.unlink()
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def text(path):
+    path.write_text("start,goal\n0,1\n")
+
+
+def foreign(path):
+    with h5py.File(path, "w") as file:
+        file["start"] = np.zeros((3, 7))
+
+
+def flip_stored_bytes(path):
+    with h5py.File(path) as file:
+        chunk = file["test/goal"].id.get_chunk_info(0)
+    contents = bytearray(path.read_bytes())
+    middle = chunk.byte_offset + chunk.size // 2
+    for i in range(middle, middle + 4):
+        contents[i] ^= 0xFF
+    path.write_bytes(contents)
+
+
+def change_one_number(path):
+    with h5py.File(path, "r+") as file:
+        file["validation/start"][2, 3] -= np.float32(1e-6)
+
+
+def change_the_seed(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["seed"] = 4
+
+
+def newer_schema(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = 2
+
+
+def without_an_array(path):
+    with h5py.File(path, "r+") as file:
+        del file["validation/goal"]
+
+
+def without_an_attribute(path):
+    with h5py.File(path, "r+") as file:
+        del file.attrs["scene"]
+
+
+def replace_array(path, array):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        file["test/goal"] = array
+
+
+def wrong_dtype(path):
+    replace_array(path, np.zeros((30, 7)))
+
+
+def wrong_shape(path):
+    replace_array(path, np.zeros((29, 7), np.float32))
+
+
+def soft_link(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        file["test/goal"] = h5py.SoftLink("/test/start")
+
+
+def external_link(path):
+    with h5py.File(path, "r+") as file:
+        del file["test"]
+        file["test"] = h5py.ExternalLink("/etc/passwd", "/test")
+
+
+def elsewhere(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        shape, where = (30, 7), [("/dev/zero", 0, h5py.h5f.UNLIMITED)]
+        file.create_dataset("test/goal", shape, np.float32, external=where)
+
+
+def never_written(path):
+    with h5py.File(path, "r+") as file:
+        for name in ("start", "goal"):
+            del file[f"test/{name}"]
+            file.create_dataset(f"test/{name}", (5 * 10**6, 7), np.float32)
+
+
+def promised(path):
+    with h5py.File(path, "r+") as file:
+        del file["test/goal"]
+        file.create_dataset("test/goal", (10**12, 7), np.float32, chunks=(1000, 7))
+
+
+BAD = [
+    (soft_link, "/test/goal is a link, which is never followed"),
+    (external_link, "/test is a link, which is never followed"),
+    (elsewhere, "/test/goal is not an array in this file"),
+    (never_written, "was never written"),
+    (promised, "too many"),
+    (missing, "no such file"),
+    (truncate, "truncated"),
+    (empty, "not an HDF5 file"),
+    (text, "not an HDF5 file"),
+    (foreign, "not a query file"),
+    (flip_stored_bytes, "corrupt"),
+    (change_one_number, "checksum"),
+    (change_the_seed, "checksum"),
+    (newer_schema, "schema version 2, this code reads 1"),
+    (without_an_array, "array validation/goal is missing"),
+    (without_an_attribute, "attribute scene"),
+    (wrong_dtype, "test/goal must be float32, is float64"),
+    (wrong_shape, "test/goal has 29 rows"),
+]
+
+
+@pytest.mark.parametrize(("damage", "complaint"), BAD, ids=[damage.__name__ for damage, _ in BAD])
+def test_bad_file_is_rejected_by_name(path, damage, complaint):
+    damage(path)
+    for read in (load_queries, validate):
+        with pytest.raises(DatasetError) as caught:
+            read(path)
+        assert str(path) in str(caught.value) and complaint in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_flipped_byte_changes_nothing_or_is_rejected(path):
+    contents = path.read_bytes()
+    expected = load_queries(path)
+    rng = np.random.default_rng(0)
+    rejected = 0
+    for position in rng.integers(len(contents), size=300):
+        damaged = bytearray(contents)
+        damaged[position] ^= int(rng.integers(1, 256))
+        path.write_bytes(damaged)
+        try:
+            queries = load_queries(path)
+        except DatasetError as error:
+            assert str(path) in str(error)
+            rejected += 1
+        else:  # a byte that HDF5 does not use
+            np.testing.assert_array_equal(queries.start, expected.start)
+            np.testing.assert_array_equal(queries.goal, expected.goal)
+    assert rejected > 0
+
+
+def test_file_for_another_task_is_rejected(path, monkeypatch):
+    with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'"):
+        validate(path, "no_obstacles")
+    monkeypatch.setattr("roboarm_nmp.datasets.queries.query_path", lambda task: path)
+    assert load_queries("wall").task == "wall"
+    with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'"):
+        load_queries("no_obstacles")
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene((Box((0.5, 0.0, 0.3), (0.5, 0.05, 0.61)),)),
+        Scene(),
+        dataclasses.replace(envs.TASKS["wall"].scene, table=None),
+        dataclasses.replace(envs.TASKS["wall"].scene, floor=-0.61),
+    ],
+)
+def test_file_for_an_old_scene_is_rejected(path, monkeypatch, scene):
+    task = dataclasses.replace(envs.TASKS["wall"], scene=scene)
+    monkeypatch.setitem(envs.TASKS, "wall", task)
+    with pytest.raises(DatasetError, match="out of date.*made by a test") as caught:
+        load_queries(path)
+    assert str(path) in str(caught.value)
+
+
+def test_simulation_finds_infeasible_queries(made, tmp_path):
+    folded = np.zeros(7, np.float32)  # inside the limits; elbow and wrist straight and folded
+    folded[3], folded[5] = -3.1, 3.8
+    env = envs.make("wall")
+    assert not env.is_feasible(folded)
+    env.close()
+    queries = validate(made)
+    splits = {split: (queries[split].start, queries[split].goal) for split in queries}
+    splits["validation"][1][7] = folded
+    path = write(tmp_path / "infeasible.h5", splits)
+    validate(path)
+    with pytest.raises(DatasetError, match=r"infeasible.h5: validation/goal\[7\] is not feasible"):
+        validate(path, simulate=True)
+
+
+def test_simulation_finds_wrong_positions(path):
+    with h5py.File(path, "r+") as file:
+        file["test/goal_position"][4, 0] += np.float32(0.001)
+        attributes = {
+            name: dataset_format.attribute(file, name) for name in dataset_format._ATTRIBUTES
+        }
+        names = dataset_format.array_formats(dataset_format.QUERY_SCHEMA, file)
+        arrays = {name: file[name][()] for name in names}
+        file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
+    validate(path)
+    with pytest.raises(DatasetError, match=r"test/goal_position\[4\]"):
+        validate(path, simulate=True)
+
+
+# --- Killed writers
+
+
+KILLED_IN_THE_MIDDLE = """
+    import os, sys, time
+    import numpy as np
+    from roboarm_nmp.datasets.queries import write_queries
+
+    def wait(descriptor):
+        print("in the middle", flush=True)
+        time.sleep(60)
+
+    os.fsync = wait  # after the bytes, before they are on the disk under the file's name
+    queries = np.full((5, 7), -0.05, np.float32), np.full((5, 7), -0.06, np.float32)
+    splits = {"test": queries, "validation": queries[::-1]}
+    write_queries(sys.argv[1], "wall", 0, splits, "", {})
+"""
+
+WRITES_AGAIN_AND_AGAIN = """
+    import sys
+    import numpy as np
+    from roboarm_nmp.envs.robots.panda import PANDA
+    from roboarm_nmp.datasets.queries import write_queries
+
+    rng = np.random.default_rng(1)
+    test, validation = (
+        [rng.uniform(0.9 * PANDA.lower, 0.9 * PANDA.upper, (n, 7)).astype(np.float32)] * 2
+        for n in (3000, 10)
+    )
+    for seed in range(10, 10_000):
+        splits = {"test": test, "validation": validation}
+        write_queries(sys.argv[1], "wall", seed, splits, "", {})
+        print("in the middle", flush=True)
+"""
+
+
+def start_writer(script, path):
+    """The process of `script`, after it has printed its first line."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script), path],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert any(line.startswith("in the middle") for line in process.stdout)
+    return process
+
+
+def test_writer_killed_in_the_middle_leaves_the_old_file(path):
+    before = path.read_bytes()
+    process = start_writer(KILLED_IN_THE_MIDDLE, path)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    process.stdout.close()
+    assert path.read_bytes() == before
+    write(path)  # in spite of leftovers of the killed writer
+    assert path.read_bytes() == before
+
+
+def test_writer_killed_anywhere_leaves_a_whole_file(path):
+    for delay in (0.0, 0.01, 0.023, 0.041):
+        process = start_writer(WRITES_AGAIN_AND_AGAIN, path)
+        time.sleep(delay)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        assert len(load_queries(path)) == 3000
+        process.stdout.close()
+
+
+def test_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(path, random_splits(1))
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+# --- Commands
+
+
+def command(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True
+    )
+
+
+def test_validate_command(made, path):
+    good = command("roboarm_nmp.datasets", "validate", made, "--task", "wall", "--simulate")
+    assert good.returncode == 0
+    assert "30 test and 10 validation queries for wall, seed 0" in good.stdout
+    truncate(path)
+    bad = command("roboarm_nmp.datasets", "validate", path, made)
+    assert bad.returncode == 1
+    errors = [line for line in bad.stderr.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1 and str(path) in errors[0] and "truncated" in errors[0]
+    assert "Traceback" not in bad.stderr
+    assert str(made) in bad.stdout
+
+
+def test_make_queries_command_repeats_itself(tmp_path):
+    path = tmp_path / "wall.h5"
+    arguments = "--task wall --seed 5 --num-test 12 --num-validation 3"
+    made_by = f"roboarm queries {arguments}"
+    result = command(
+        "roboarm_nmp.demo_generation.make_queries", *arguments.split(), "--output", path
+    )
+    assert result.returncode == 0, result.stderr
+    with h5py.File(path) as file:
+        assert file.attrs["made_by"].decode() == made_by
+        assert json.loads(file.attrs["parameters"].decode())["hold_steps"] == 24
+    first = path.read_bytes()
+    again = ["roboarm_nmp", *made_by.split()[1:], "--output", path, "--workers", 1]
+    refused = command(*again)
+    assert refused.returncode == 1 and path.read_bytes() == first
+    assert refused.stderr.splitlines()[-1] == f"error: {path} exists; --overwrite replaces it"
+    path.write_bytes(b"old")
+    assert command(*again, "--overwrite").returncode == 0
+    assert path.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path):
+    path, region = tmp_path / "in_the_shelf.h5", (0.4, 0.65, -0.4, 0.4, 0.24, 0.46)
+    make_queries.make_queries(path, "three_shelves", 0, 6, 2, progress=False, goal_region=region)
+    splits = validate(path, "three_shelves", simulate=True)
+    low, high = np.array(region[::2]), np.array(region[1::2])
+    for queries in splits.values():
+        goals = PANDA.forward_kinematics(queries.goal)
+        assert (low <= goals).all() and (goals <= high).all()
+        starts = PANDA.forward_kinematics(queries.start)
+        assert not ((low <= starts) & (starts <= high)).all()  # only goals are restricted
+    with h5py.File(path) as file:
+        assert json.loads(file.attrs["parameters"])["goal_region"] == list(region)
+        assert "--goal-region 0.4 0.65 -0.4 0.4 0.24 0.46" in file.attrs["made_by"].decode()
+
+
+def test_queries_inside_the_limits_of_the_datasheet_are_a_share_of_all(tmp_path):
+    path = tmp_path / "queries.h5"
+    rejected = make_queries.make_queries(
+        path, "no_obstacles", 0, 12, 2, progress=False, limits="datasheet"
+    )
+    queries = load_queries(path, "test", "no_obstacles")
+    ends = np.concatenate([queries.start, queries.goal])
+    assert PANDA.is_within(ends, "datasheet").all() and rejected["outside"] > 0
+    with h5py.File(path) as file:
+        assert json.loads(file.attrs["parameters"])["limits"] == "datasheet"
+        assert b"--limits datasheet" in file.attrs["made_by"]
+
+
+def test_goal_region_without_room_is_an_error_that_counts(tmp_path, monkeypatch):
+    monkeypatch.setattr(make_queries, "MAX_GOALS", 20_000)
+    inside_a_wall = (0.3, 0.9, -0.015, 0.015, 0.1, 0.7)
+    args = make_queries.Args(
+        ("wall",), goal_region=inside_a_wall, output=tmp_path / "no.h5", workers=1
+    )
+    sampler = make_queries.Sampler("wall", False, goal_region=inside_a_wall)
+    goals = np.random.default_rng(1).uniform(PANDA.lower, PANDA.upper, (20_000, 7))
+    positions = PANDA.forward_kinematics(goals)
+    inside = (np.abs(positions - (0.6, 0, 0.4)) <= (0.3, 0.015, 0.3)).all(axis=1).sum()
+    with pytest.raises(RuntimeError) as error:
+        sampler((0, "test", 0))
+    text = str(error.value)
+    counted = re.search(r"of 20,000 random configurations, (\d+) \(", text)
+    assert inside > 20 and int(counted[1]) == pytest.approx(inside, rel=0.5)
+    assert text.endswith("0 of these are feasible goals")
+
+    def in_this_process(make_worker, arguments, jobs, *_, **__):
+        yield from map(make_worker(*arguments), jobs)
+
+    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
+    with pytest.raises(SystemExit, match="error: --goal-region: of 20,000"):
+        make_queries.main(args)
+    assert not list(tmp_path.iterdir())
+
+
+def test_terminated_make_queries_command_continues(made, tmp_path):
+    path = tmp_path / "wall.h5"
+    arguments = ["roboarm_nmp", "queries", "--task", "wall", "--num-test", 30]
+    arguments += ["--num-validation", 10, "--workers", 1, "--output", path]
+    process = subprocess.Popen(
+        [sys.executable, "-m", *map(str, arguments)], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    deadline, journal = time.monotonic() + 100, make_queries.journal_of(path)
+    while not journal.exists() or journal.read_bytes().count(b"\n") < 3:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    process.terminate()
+    _, stderr = process.communicate()
+    assert process.returncode == 143 and "Traceback" not in stderr
+    assert stderr.splitlines()[-1] == "terminated; the same command continues from here"
+    assert not path.exists() and journal.exists()
+    assert command(*arguments).returncode == 0
+    again, expected = load_queries(path), load_queries(made)
+    np.testing.assert_array_equal(again.start, expected.start)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--task", "wall", "wal"], "unknown task 'wal'"),
+        (["--task", "mixed_scenes"], "mixed_scenes are scenes for training"),
+        (["--task", "wall", "--output", "no/such/folder/wall.h5"], "cannot write no/such/folder"),
+        (["--task", "wall", "--output", "envs"], "envs is a directory"),
+        (["--task", "all", "--output", "some.h5"], "one task"),
+        (["--task", "wall", "--workers", "0"], "--workers must be in [1, 256]"),
+        (["--task", "wall", "--seed", "-1"], "--seed must be in [0, 2^32)"),
+        (["--task", "wall"], "wall.h5 exists; --overwrite replaces it"),
+        (["--task", "wall", "--goal-region", "1", "2", "3"], "--goal-region takes XMIN XMAX YMIN"),
+        (
+            ["--task", "wall", "--goal-region", "1", "0", "0", "1", "0", "1"],
+            "each minimum below its maximum, got 1.0 0.0 0.0",
+        ),
+    ],
+)
+def test_make_queries_rejects_bad_flags_before_any_work(arguments, complaint):
+    result = command("roboarm_nmp.demo_generation.make_queries", *arguments)
+    assert result.returncode == 1
+    assert complaint in result.stderr
+    assert "queries/s" not in result.stderr and "Traceback" not in result.stderr
+
+
+# --- Files of the project
+
+
+@pytest.mark.parametrize("task", envs.TASKS)
+def test_queries_of_the_project_are_feasible_and_have_their_positions(task):
+    env = envs.make(task)
+    client = p.connect(p.DIRECT)
+    robot = p.loadURDF(
+        pybullet_data.getDataPath() + "/franka_panda/panda.urdf",
+        useFixedBase=True,
+        physicsClientId=client,
+    )
+    for split in SPLITS:
+        queries = load_queries(task, split)
+        assert len(queries) == {"test": 10_000, "validation": 200}[split]
+        chosen = np.random.default_rng(0).choice(len(queries), 20, replace=False)
+        for start, goal, scene in queries[chosen]:
+            env.set_scene(scene)
+            assert env.is_feasible(start)
+            assert not scene.is_static or env.is_feasible(goal)
+        for goal, position in zip(queries.goal[chosen], queries.goal_position[chosen], strict=True):
+            for joint, angle in enumerate(goal):
+                p.resetJointState(robot, joint, angle, physicsClientId=client)
+            link = p.getLinkState(robot, 11, computeForwardKinematics=1, physicsClientId=client)
+            np.testing.assert_allclose(position, link[4], rtol=0, atol=1e-6)
+    p.disconnect(physicsClientId=client)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "fewest", "most"),
+    [
+        ("random_boxes_easy", 2, 4),
+        ("random_boxes_medium", 3, 6),
+        ("random_boxes_hard", 4, 8),
+    ],
+)
+def test_random_scenes_of_the_project_have_every_number_of_obstacles(task, fewest, most):
+    queries = load_queries(task)
+    with h5py.File(query_path(task)) as file:
+        parameters = json.loads(file.attrs["parameters"].decode())
+        counts = file["test/obstacle_count"][()]
+        scene = file["test/scene"][()]
+    assert parameters["solve_attempts"] > 0  # the planner has solved all of them
+    # Five queries in each of 2,000 scenes, all counts equally often.
+    np.testing.assert_array_equal(scene, np.arange(10_000) // 5)
+    assert len({queries[i].scene for i in range(0, 10_000, 5)}) == 2000
+    shares = np.bincount(counts, minlength=9) / 2000
+    expected = np.zeros(9)
+    expected[fewest : most + 1] = 1 / (most + 1 - fewest)
+    np.testing.assert_allclose(shares, expected, atol=0.04)
+    validation = {query.scene for query in load_queries(task, "validation")}
+    assert len(validation) == 40 and not validation & {queries[i].scene for i in range(10_000)}

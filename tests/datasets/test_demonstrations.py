@@ -1,0 +1,607 @@
+"""Demonstration files: round trip, replay; errors of bad files name them."""
+
+import dataclasses
+import math
+import time
+
+import h5py
+import numpy as np
+import pytest
+from paths import LIBRARY
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets import demonstrations
+from roboarm_nmp.datasets import format as dataset_format
+from roboarm_nmp.datasets.demonstrations import (
+    QUANTUM,
+    demo_path,
+    describe,
+    load_demos,
+    write_demos,
+)
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.queries import load_queries, write_queries
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.envs.subgoals import MAX_STEP, SUBGOAL_SPACING, subgoals
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Plans on `wall`, their executions, and the seeds of the plans."""
+    env = envs.make("wall")
+    planner, rng = Planner(env), np.random.default_rng(11)
+    seeds = [3, 2**32 - 1, 5, 6, 7]
+    plans = [planner.plan(*env.sample_query(rng), seed=seed) for seed in seeds]
+    executions = [follow(env, plan) for plan in plans]
+    env.close()
+    return plans, executions, seeds
+
+
+def columns(executions, seeds):
+    return {
+        "plan_seed": seeds,
+        "digest": [execution.digest for execution in executions],
+        "collided": [execution.collided for execution in executions],
+    }
+
+
+@pytest.fixture
+def path(tmp_path, made):
+    return write(tmp_path / "demos.h5", made)
+
+
+def write(path, made, task="wall", parameters=None):
+    plans, executions, seeds = made
+    states = [execution.states for execution in executions]
+    write_demos(
+        path,
+        task,
+        4,
+        plans,
+        states,
+        columns(executions, seeds),
+        "made by a test",
+        {"options": {"attempts": 3}} if parameters is None else parameters,
+    )
+    return path
+
+
+def hand_made():
+    """Arguments of `write_demos`: random plans on `no_obstacles`, executions far from them."""
+    rng = np.random.default_rng(0)
+
+    def configurations(rows):
+        return rng.uniform(-0.9, 0.9, (rows, 7))
+
+    return {
+        "task": "no_obstacles",
+        "seed": 0,
+        "plans": [PANDA.denormalise(configurations(n)).astype(np.float32) for n in (2, 3, 4)],
+        "executions": [configurations(rows).astype(np.float32) for rows in (3, 2, 4)],
+        "columns": {"plan_seed": [1, 2, 3], "digest": [4, 5, 6], "collided": [0, 1, 0]},
+        "made_by": "made by a test",
+        "parameters": {},
+    }
+
+
+# --- Reading and writing
+
+
+def test_round_trip_is_exact_up_to_rounding(path, made):
+    plans, executions, seeds = made
+    demos = load_demos(path)
+    assert (demos.task, demos.seed, demos.made_by) == ("wall", 4, "made by a test")
+    assert demos.parameters["options"] == {"attempts": 3}
+    assert len(demos) == len(list(demos)) == 5
+    for i, (demo, plan, execution) in enumerate(zip(demos, plans, executions, strict=True)):
+        assert demo.plan.dtype == demo.states.dtype == demo.actions.dtype == np.float32
+        assert demo.plan.tobytes() == plan.tobytes()
+        assert demo.start.tobytes() == demos.start[i].tobytes() == plan[0].tobytes()
+        assert demo.goal.tobytes() == demos.goal[i].tobytes() == plan[-1].tobytes()
+        np.testing.assert_allclose(
+            demo.states, execution.states, rtol=0, atol=QUANTUM / 2 + 1e-6
+        )  # fails for other shapes, too
+        assert demo.digest == demos.digest[i] == execution.digest
+        assert demos.plan_seed[i] == seeds[i]
+        assert bool(demos.collided[i]) == execution.collided
+        rows = slice(demos.offsets[i], demos.offsets[i + 1])
+        np.testing.assert_array_equal(demos.states[rows], demo.states)
+        np.testing.assert_array_equal(demos.actions[rows][:-1], demo.actions)
+        rows = slice(demos.plan_offsets[i], demos.plan_offsets[i + 1])
+        np.testing.assert_array_equal(demos.plan[rows], plan)
+    assert demos.offsets[0] == 0 and demos.offsets[-1] == len(demos.states) == len(demos.actions)
+
+
+def test_executions_far_from_their_plans_are_stored(tmp_path):
+    arguments = hand_made()
+    write_demos(tmp_path / "demos.h5", **arguments)
+    demos = load_demos(tmp_path / "demos.h5")
+    assert demos.offsets.tolist() == [0, 3, 5, 9]
+    assert demos.plan_offsets.tolist() == [0, 2, 5, 9]
+    np.testing.assert_allclose(
+        demos.states, np.concatenate(arguments["executions"]), rtol=0, atol=QUANTUM / 2 + 1e-6
+    )
+    assert demos.digest.tolist() == [4, 5, 6] and demos.plan_seed.tolist() == [1, 2, 3]
+    assert demos.collided.tolist() == [False, True, False]
+
+
+def test_demonstrations_are_indexed_like_queries(path):
+    demos, queries = load_demos(path), load_queries("wall")
+    assert queries[-1].start.tolist() == queries[len(queries) - 1].start.tolist()
+    assert demos[-1].digest == demos[4].digest and demos[np.int64(1)].digest == demos[1].digest
+    for index in (slice(1, 4), slice(None, None, -2), [4, 0], np.arange(5) > 2, slice(0, 0)):
+        chosen = np.arange(5)[index]
+        fewer = demos[index]
+        assert len(fewer) == len(queries[: len(chosen)]) == len(chosen)
+        for one, i in zip(fewer, chosen, strict=True):
+            for name in ("start", "goal", "plan", "states", "actions", "digest"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(demos[i], name))
+            assert one.scene == demos[i].scene
+    assert describe(demos[:2])["steps"] == np.mean([len(demos[i].actions) for i in (0, 1)])
+    for data, number in ((demos, 5), (demos, -6), (queries, len(queries))):
+        with pytest.raises(IndexError):
+            data[number]
+    with pytest.raises(IndexError, match="demonstration 5 of 5"):
+        demos[5]
+
+
+def test_configurations_of_a_demonstration_are_radians_like_those_of_queries(path):
+    demo = load_demos(path)[0]
+    middle, half = (PANDA.upper + PANDA.lower) / 2, (PANDA.upper - PANDA.lower) / 2
+    np.testing.assert_allclose(demo.configurations, middle + half * demo.states, atol=1e-6)
+    # As start and goal, up to the resolution of the stored states and the arrival's tolerance.
+    np.testing.assert_allclose(demo.configurations[0], demo.start, atol=1e-3)
+    np.testing.assert_allclose(demo.configurations[-1], demo.goal, atol=0.1)
+
+
+def naive_subgoals(plan):
+    """Sub-goals (normalised) by the book: each straight piece in the fewest equal steps."""
+    corners = (2 * plan.astype(np.float64) - PANDA.upper - PANDA.lower) / (
+        PANDA.upper - PANDA.lower
+    )
+    points = [corners[0]]
+    for here, there in zip(corners[:-1], corners[1:], strict=True):
+        pieces = 1
+        while np.linalg.norm(there - here) / pieces > 0.95 * 0.03:
+            pieces += 1
+        points += [here + (there - here) * k / pieces for k in range(1, pieces + 1)]
+    return np.array(points)
+
+
+def test_actions_lead_to_the_next_subgoal_and_are_clipped(path):
+    demos = load_demos(path)
+    clipped = 0
+    for i, demo in enumerate(demos):
+        points = naive_subgoals(demo.plan)
+        for t, action in enumerate(demo.actions):
+            wanted = points[min(t + 1, len(points) - 1)] - demo.states[t]
+            size = np.sqrt((wanted**2).sum())
+            if size > 0.03:
+                wanted = wanted * 0.03 / size
+                clipped += 1
+            np.testing.assert_allclose(action, wanted, rtol=0, atol=1e-6)
+        assert not demos.actions[demos.offsets[i + 1] - 1].any()
+    assert np.linalg.norm(demos.actions, axis=1).max() <= 0.03 + 1e-6
+    assert 0 < clipped < 0.5 * len(demos.actions)
+
+
+def test_subgoals_are_close_and_contain_the_waypoints(made):
+    plans, executions, _ = made
+    for plan in plans:
+        points = subgoals(plan, PANDA)
+        assert points.dtype == np.float64
+        np.testing.assert_allclose(points, naive_subgoals(plan), rtol=0, atol=1e-12)
+        assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() <= SUBGOAL_SPACING + 1e-12
+        waypoints = PANDA.normalise(plan.astype(np.float64))
+        for waypoint in waypoints:
+            assert np.abs(points - waypoint).max(1).min() < 1e-12
+        np.testing.assert_allclose(points[[0, -1]], waypoints[[0, -1]], rtol=0, atol=1e-12)
+    assert SUBGOAL_SPACING < MAX_STEP == 0.03
+    assert subgoals(plans[0][[0, 0]], PANDA).shape == (2, 7)  # standing still
+
+
+@pytest.mark.parametrize("steps", [2, 5])
+def test_subgoals_speed_up_and_slow_down_between_waypoints(steps):
+    robot = dataclasses.replace(PANDA, acceleration_steps=steps)
+    state = np.zeros(7)
+    for length in (1e-4, 0.01, 0.1, 1.0):
+        path = robot.denormalise([state, state + length / math.sqrt(7), state])
+        points = subgoals(path, robot)
+        there = len(points) // 2
+        np.testing.assert_allclose(points[there], state + length / math.sqrt(7), atol=1e-12)
+        np.testing.assert_allclose(points, points[::-1], atol=1e-12)  # braking mirrors speeding up
+        moved = np.linalg.norm(np.diff(points, axis=0), axis=1)[:there]
+        assert moved.max() <= SUBGOAL_SPACING + 1e-12
+        speeds = np.concatenate([[0.0], moved, [0.0]])
+        assert np.abs(np.diff(speeds)).max() <= SUBGOAL_SPACING / steps + 1e-12
+        # One step less would not do.
+        less = [min(i + 1, there - 1 - i, steps) for i in range(there - 1)]
+        assert sum(less) * SUBGOAL_SPACING / steps < length
+
+
+def test_same_contents_same_bytes(path, made, tmp_path):
+    time.sleep(1.1)  # HDF5's time stamps are whole seconds
+    assert write(tmp_path / "again.h5", made).read_bytes() == path.read_bytes()
+
+
+def test_statistics_equal_those_by_hand(tmp_path):
+    arguments = hand_made()
+    arguments["parameters"] = {"counts": {"queries_given_up": 1, "attempts": 5, "collided": 2}}
+    write_demos(tmp_path / "demos.h5", **arguments)
+    numbers = describe(load_demos(tmp_path / "demos.h5"))
+    half = (PANDA.upper - PANDA.lower) / 2
+    lengths, ratios = [], []
+    for states, plan in zip(arguments["executions"], arguments["plans"], strict=True):
+        moves = np.diff(states.astype(np.float64), axis=0)
+        lengths.append(sum(np.linalg.norm(move * half) for move in moves))
+        straight = np.linalg.norm((plan[-1] - plan[0].astype(np.float64)) / half)
+        ratios.append(sum(np.linalg.norm(move) for move in moves) / straight)
+    expected = {
+        "demonstrations": 3,
+        "steps": (2 + 1 + 3) / 3,
+        "steps_95": 2.9,
+        "path_length": np.mean(lengths),
+        "length_ratio": np.mean(ratios),
+        "waypoints": (2 + 3 + 4) / 3,
+        "with_contacts": 1,
+        "solved": 3 / 4,
+        "queries_given_up": 1,
+        "attempts": 5,
+        "collided": 2,
+    }
+    assert numbers == pytest.approx(expected, rel=1e-3)
+
+
+# --- Replayed
+
+
+@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+def test_actions_lead_to_the_goal(path, goal_type):
+    env, reached = envs.make("wall", goal_type=goal_type), 0
+    for demo in load_demos(path):
+        env.reset_specific(demo.start, demo.goal)
+        closest = np.inf
+        for action in demo.actions:
+            _, _, terminated, _, info = env.step(action)
+            distance = info["config_distance" if goal_type == "config" else "ee_distance"]
+            closest = min(closest, distance)
+            if terminated:
+                break
+        reached += info["is_success"]
+        assert not info["collision_so_far"]
+        # Rounding errors of states accumulate over the actions: some may end just outside.
+        assert closest <= 1.5 * (0.05 if goal_type == "config" else 0.02)
+    assert reached >= 4  # of 5
+    env.close()
+
+
+def test_following_the_plan_gives_the_digest(path):
+    env = envs.make("wall")
+    for demo in load_demos(path):
+        execution = follow(env, demo.plan)
+        assert execution.reached and not execution.collided
+        assert execution.digest == demo.digest
+        ends = PANDA.normalise(np.stack([demo.start, demo.goal]))
+        assert np.linalg.norm(demo.states[0] - ends[0]) <= QUANTUM * np.sqrt(7)
+        assert np.linalg.norm(demo.states[-1] - ends[1]) <= 0.05
+    env.close()
+
+
+def test_plan_through_an_obstacle_collides(made):
+    env = envs.make("wall")
+    outcomes = []
+    for start, goal, _ in load_queries("wall")[4:8]:  # straight through the wall
+        execution = follow(env, np.stack([start, goal]))
+        assert execution.collided
+        outcomes.append(execution.reached)
+    assert not all(outcomes)  # most get stuck
+    env.close()
+
+
+# --- Rejected when writing
+
+
+def with_row(array, row, value):
+    array = array.copy()
+    array[row] = value
+    return array
+
+
+def the_same_query_twice(arguments):
+    arguments["plans"][2][[0, -1]] = arguments["plans"][0][[0, -1]]
+
+
+def a_query_of(split):
+    def change(arguments):
+        start, goal, _ = load_queries("no_obstacles", split)[17]
+        arguments["plans"][1][0], arguments["plans"][1][-1] = start, goal
+
+    return change
+
+
+def not_a_number_in_a_plan(arguments):
+    arguments["plans"][2][1, 3] = np.nan
+
+
+def a_plan_outside_the_limits(arguments):
+    arguments["plans"][2][1, 3] = 0.1
+
+
+def not_a_number_in_an_execution(arguments):
+    arguments["executions"][1][1, 0] = np.nan
+
+
+def an_execution_of_one_row(arguments):
+    arguments["executions"][1] = arguments["executions"][1][:1]
+
+
+def a_plan_of_one_row(arguments):
+    arguments["plans"][1] = arguments["plans"][1][:1]
+
+
+def an_execution_too_few(arguments):
+    arguments["executions"].pop()
+
+
+def a_digest_too_few(arguments):
+    arguments["columns"]["digest"].pop()
+
+
+def executions_of_another_width(arguments):
+    arguments["executions"] = [states[:, :6] for states in arguments["executions"]]
+
+
+def nothing(arguments):
+    for values in (arguments["plans"], arguments["executions"], *arguments["columns"].values()):
+        values.clear()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (the_same_query_twice, "1 queries are in it twice"),
+        (a_query_of("test"), "1 queries are test queries of no_obstacles"),
+        (a_query_of("validation"), "1 queries are validation queries of no_obstacles"),
+        (not_a_number_in_a_plan, "plan has numbers that are not finite"),
+        (a_plan_outside_the_limits, r"plan\[6\] is outside the joint limits"),
+        (not_a_number_in_an_execution, "not finite"),
+        (an_execution_of_one_row, "at least two"),
+        (a_plan_of_one_row, "at least two"),
+        (an_execution_too_few, None),
+        (a_digest_too_few, "digest has 2 rows, not 3"),
+        (executions_of_another_width, None),
+        (nothing, None),
+    ],
+)
+def test_bad_demonstrations_are_not_written(path, change, complaint):
+    before = path.read_bytes()
+    arguments = hand_made()
+    change(arguments)
+    with pytest.raises(DatasetError, match=complaint) as caught:
+        write_demos(path, **arguments)
+    assert str(path) in str(caught.value)
+    assert path.read_bytes() == before
+
+
+def test_unknown_task_is_rejected(path):
+    with pytest.raises(ValueError, match="unknown task 'wal'"):
+        write_demos(path, **hand_made() | {"task": "wal"})
+    with pytest.raises(ValueError, match="unknown task 'wal'"):
+        demo_path("wal")
+    with pytest.raises(DatasetError, match="wal: no such file or task"):
+        load_demos("wal")
+
+
+def test_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_demos(path, **hand_made())
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+# --- Bad files
+
+
+def missing(path):
+    path.unlink()
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+
+
+def text(path):
+    path.write_text("plan,state\n0,1\n")
+
+
+def foreign(path):
+    with h5py.File(path, "w") as file:
+        file["plan"] = np.zeros((3, 7))
+
+
+def a_query_file(path):
+    ends = [np.full((2, 7), angle, np.float32) for angle in (-0.05, -0.06)]
+    write_queries(path, "wall", 0, {"test": ends, "validation": ends[::-1]}, "", {})
+
+
+def flip_a_byte_in_the_middle(path):
+    with h5py.File(path) as file:
+        chunk = file["residual"].id.get_chunk_info(0)
+    contents = bytearray(path.read_bytes())
+    contents[chunk.byte_offset + chunk.size // 2] ^= 0xFF
+    path.write_bytes(contents)
+
+
+def change_one_number(path):
+    with h5py.File(path, "r+") as file:
+        file["residual"][2, 3] += 1
+
+
+def change_a_seed(path):
+    with h5py.File(path, "r+") as file:
+        file["plan_seed"][2] += 1
+
+
+def newer_schema(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = 2
+
+
+def without_an_array(path):
+    with h5py.File(path, "r+") as file:
+        del file["digest"]
+
+
+def without_parameters(path):
+    with h5py.File(path, "r+") as file:
+        del file.attrs["parameters"]
+
+
+def replace_array(path, name, array):
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file[name] = array
+
+
+def wrong_dtype(path):
+    replace_array(path, "length", np.zeros(5, np.int64))
+
+
+def wrong_shape(path):
+    replace_array(path, "digest", np.zeros(4, np.uint32))
+
+
+def sign_again(path):
+    """Give a changed file the checksum it should have."""
+    with h5py.File(path, "r+") as file:
+        attributes = {
+            name: dataset_format.attribute(file, name) for name in dataset_format._ATTRIBUTES
+        }
+        arrays = {name: file[name][()] for name in dataset_format.DEMO_ARRAYS}
+        file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
+
+
+def a_row_too_many(path):
+    with h5py.File(path, "r+") as file:
+        file["length"][1] += 1
+    sign_again(path)
+
+
+def other_parameters(parameters):
+    def damage(path):
+        with h5py.File(path, "r+") as file:
+            file.attrs["parameters"] = np.bytes_(parameters.encode())
+        sign_again(path)
+
+    damage.__name__ = f"parameters {parameters}"
+    return damage
+
+
+BAD = [
+    (other_parameters("{}"), "parameters: lag is not 7 finite numbers"),
+    (other_parameters('{"lag": [0, 0, 0, 0, 0, 0, NaN]}'), "lag is not 7 finite numbers"),
+    (other_parameters('{"lag": "seven"}'), "lag is not 7 finite numbers"),
+    (other_parameters('{"lag": [0, 0, 0, 0, 0, 0, 0], "quantum": NaN}'), "quantum is not 1"),
+    (other_parameters("[]"), "parameters is not a dict"),
+    (other_parameters("{"), "corrupt"),
+    (missing, "no such file"),
+    (truncate, "truncated"),
+    (text, "not an HDF5 file"),
+    (foreign, "not a demonstration file"),
+    (a_query_file, "not a demonstration file (schema 'roboarm-nmp queries'"),
+    (flip_a_byte_in_the_middle, "corrupt"),
+    (change_one_number, "checksum"),
+    (change_a_seed, "checksum"),
+    (newer_schema, "schema version 2, this code reads 1"),
+    (without_an_array, "array digest is missing"),
+    (without_parameters, "attribute parameters"),
+    (wrong_dtype, "length must be uint32, is int64"),
+    (wrong_shape, "digest has 4 rows, not 5"),
+    (a_row_too_many, "the lengths do not add up"),
+]
+
+
+@pytest.mark.parametrize(("damage", "complaint"), BAD, ids=[damage.__name__ for damage, _ in BAD])
+def test_bad_file_is_rejected_by_name(path, damage, complaint):
+    damage(path)
+    with pytest.raises(DatasetError) as caught:
+        load_demos(path)
+    assert str(path) in str(caught.value) and complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_flipped_byte_changes_nothing_or_is_rejected(path):
+    contents = path.read_bytes()
+    expected = load_demos(path)
+    rng = np.random.default_rng(0)
+    rejected = 0
+    for position in rng.integers(len(contents), size=150):
+        damaged = bytearray(contents)
+        damaged[position] ^= int(rng.integers(1, 256))
+        path.write_bytes(damaged)
+        try:
+            demos = load_demos(path)
+        except DatasetError as error:
+            assert str(path) in str(error)
+            rejected += 1
+        else:  # a byte that HDF5 does not use
+            np.testing.assert_array_equal(demos.states, expected.states)
+            np.testing.assert_array_equal(demos.plan, expected.plan)
+    assert rejected > 0
+
+
+def test_demonstration_file_is_not_a_query_file(path):
+    with pytest.raises(DatasetError, match="not a query file") as caught:
+        load_queries(path)
+    assert str(path) in str(caught.value)
+
+
+def test_file_for_another_task_is_rejected(path, monkeypatch):
+    monkeypatch.setattr(demonstrations, "demo_path", lambda task: path)
+    assert load_demos("wall").task == "wall"
+    with pytest.raises(DatasetError, match="for the task 'wall', not 'no_obstacles'") as caught:
+        load_demos("no_obstacles")
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene((Box((0.5, 0.0, 0.3), (0.5, 0.05, 0.61)),)),
+        dataclasses.replace(envs.TASKS["wall"].scene, table=None),
+        dataclasses.replace(envs.TASKS["wall"].scene, floor=-0.61),
+    ],
+)
+def test_file_for_an_old_scene_is_rejected(path, monkeypatch, scene):
+    task = dataclasses.replace(envs.TASKS["wall"], scene=scene)
+    monkeypatch.setitem(envs.TASKS, "wall", task)
+    with pytest.raises(DatasetError, match="out of date.*made by a test") as caught:
+        load_demos(path)
+    assert str(path) in str(caught.value)
+
+
+# --- Files of the project
+
+
+FILES = sorted((LIBRARY / "datasets" / "demos").glob("*.h5"))
+
+
+@pytest.mark.parametrize("file", FILES, ids=[file.stem for file in FILES])
+def test_demonstrations_of_the_project_repeat(file):
+    demos = load_demos(file.stem)
+    assert len(demos) == 10_000 and not demos.collided.any()
+    env = envs.make(file.stem)
+    for i in np.random.default_rng(0).choice(len(demos), 8, replace=False):
+        execution = follow(env, demos[i].plan, demos[i].scene)
+        assert execution.reached and not execution.collided
+        np.testing.assert_allclose(execution.states, demos[i].states, rtol=0, atol=demos.quantum)
+    env.close()

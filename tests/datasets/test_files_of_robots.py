@@ -1,0 +1,233 @@
+"""Query, demonstration, path and roadmap files of another arm than the Panda: xArm6, 6 joints."""
+
+import shutil
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from roboarm_nmp.datasets import roadmap_paths
+from roboarm_nmp.datasets.__main__ import main
+from roboarm_nmp.datasets.demonstrations import demo_path, describe, load_demos, write_demos
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.queries import (
+    load_queries,
+    query_path,
+    validate,
+    write_queries,
+)
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.files import save_scene
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.envs.tasks import get_task, is_task, split_robot, task_name, task_with_robot
+from roboarm_nmp.motions.trajectories import load_joint_path, save_joint_path, timed
+
+XARM6 = ROOT / "examples" / "robots" / "xarm6.yaml"
+IIWA = ROOT / "examples" / "robots" / "iiwa.yaml"
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """The file of an xArm6 in a folder of its own. (Each file takes seconds to load.)"""
+    return shutil.copy(XARM6, tmp_path_factory.mktemp("robots") / "xarm6.yaml")
+
+
+def random_configurations(robot, rng, number):
+    return robot.denormalise(rng.uniform(-0.9, 0.9, (number, robot.num_joints))).astype(np.float32)
+
+
+def write_some_queries(path, task):
+    """Queries inside the limits, feasible or not, in two scenes each."""
+    scene, rng = get_task(task).scene, np.random.default_rng(0)
+    splits = {}
+    for split in ("test", "validation"):
+        ends = (random_configurations(get_task(task).base_scene.robot, rng, 4) for _ in range(2))
+        scenes = () if isinstance(scene, Scene) else ([scene.sample(rng), scene.sample(rng)] * 2,)
+        splits[split] = *ends, *scenes
+    write_queries(path, task, 3, splits, "made by a test", {})
+    return splits
+
+
+def write_some_demos(path, task):
+    robot, rng = get_task(task).base_scene.robot, np.random.default_rng(1)
+    plans = [random_configurations(robot, rng, number) for number in (2, 3, 4)]
+    states = [
+        rng.uniform(-0.9, 0.9, (rows, robot.num_joints)).astype(np.float32) for rows in (3, 2, 4)
+    ]
+    columns = {"plan_seed": [1, 2, 3], "digest": [4, 5, 6], "collided": [0, 1, 0]}
+    write_demos(path, task, 0, plans, states, columns, "made by a test", {})
+    return plans, states
+
+
+def test_files_of_a_robot_are_beside_its_file(file, tmp_path):
+    task = f"random_boxes_hard@{file}"
+    assert query_path(task) == file.parent / "random_boxes_hard@xarm6_queries.h5"
+    assert demo_path(task) == file.parent / "random_boxes_hard@xarm6_demos.h5"
+    assert query_path("random_boxes_hard@panda") == query_path("random_boxes_hard")
+    scene = tmp_path / "shelf.yaml"
+    save_scene(Scene((Box((0.6, 0.0, 0.5), (0.1, 0.1, 0.1)),)), scene)
+    assert query_path(f"{scene}@{file}") == tmp_path / "shelf@xarm6_queries.h5"
+
+
+def test_task_with_a_robot_is_the_task_at_the_robot(file):
+    assert task_with_robot("no_obstacles", None) == "no_obstacles"
+    assert task_with_robot("no_obstacles", file) == f"no_obstacles@{file}"
+    with pytest.raises(ValueError, match="the task names a robot already, no_obstacles@ur5.yaml"):
+        task_with_robot("no_obstacles@ur5.yaml", file)
+
+
+@pytest.mark.parametrize(
+    ("text", "task", "robot", "name"),
+    [
+        ("wall@arms/iiwa.yaml", "wall", "arms/iiwa.yaml", "wall@iiwa"),
+        ("a/tub.yaml@b/iiwa.urdf", "a/tub.yaml", "b/iiwa.urdf", "tub@iiwa"),
+        ("me@here/tub.yaml", "me@here/tub.yaml", None, "tub"),
+        ("me@here/tub.yaml@me@here/ur5.yaml", "me@here/tub.yaml", "me@here/ur5.yaml", "tub@ur5"),
+        ("wall@panda", "wall", None, "wall"),
+        ("wall", "wall", None, "wall"),
+    ],
+)
+def test_robot_follows_a_task_and_not_a_folder(text, task, robot, name):
+    assert split_robot(text) == (task, robot)
+    assert task_name(text) == name
+    assert is_task(text) and not is_task("wall@iiwa_queries.h5")
+
+
+def test_queries_of_six_joints_round_trip(file):
+    task = f"random_boxes_hard@{file}"
+    splits = write_some_queries(query_path(task), task)
+    robot = load_robot(file)
+    for split, (start, goal, scenes) in splits.items():
+        queries = load_queries(task, split)
+        np.testing.assert_array_equal(queries.start, start)
+        np.testing.assert_array_equal(queries.goal, goal)
+        np.testing.assert_allclose(
+            queries.goal_position, robot.forward_kinematics(goal), rtol=0, atol=1e-6
+        )
+        assert [query.scene for query in queries] == scenes
+        assert queries[0].scene.robot == robot and queries.task == "random_boxes_hard@xarm6"
+    by_path = load_queries(query_path(task), task=task)
+    np.testing.assert_array_equal(by_path.start, splits["test"][0])
+
+
+def test_demonstrations_of_six_joints_round_trip(file):
+    task = f"no_obstacles@{file}"
+    plans, states = write_some_demos(demo_path(task), task)
+    demos, robot = load_demos(task), load_robot(file)
+    for demo, plan, executed in zip(demos, plans, states, strict=True):
+        assert demo.plan.tobytes() == plan.tobytes()
+        np.testing.assert_allclose(demo.states, executed, rtol=0, atol=demos.quantum / 2 + 1e-6)
+        np.testing.assert_allclose(demo.configurations, robot.denormalise(demo.states))
+        assert demo.actions.shape == (len(executed) - 1, 6)
+    half = (robot.upper - robot.lower) / 2
+    lengths = [np.linalg.norm(np.diff(one, axis=0) * half, axis=1).sum() for one in states]
+    assert describe(demos)["path_length"] == pytest.approx(np.mean(lengths), rel=1e-3)
+
+
+def test_other_widths_and_limits_are_those_of_the_robot(file, tmp_path):
+    task, path = f"no_obstacles@{file}", tmp_path / "queries.h5"
+    rng, robot = np.random.default_rng(0), load_robot(file)
+    good = tuple(random_configurations(robot, rng, 3) for _ in range(2))
+    for bad, message in (
+        (tuple(random_configurations(PANDA, rng, 3) for _ in range(2)), r"shape \(n, 6\)"),
+        ((good[0] + np.float32(7.0), good[1]), "outside the joint limits"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            write_queries(path, task, 0, {"test": bad, "validation": good}, "", {})
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("load", [load_queries, validate, load_demos])
+def test_file_of_another_robot_is_rejected(load, file, tmp_path):
+    task, path = f"no_obstacles@{file}", tmp_path / "file.h5"
+    (write_some_demos if load is load_demos else write_some_queries)(path, task)
+    robot = load_robot(file)
+    named = rf"file.h5: made for the robot 'xarm6' \({robot.fingerprint[:12]}\), not for "
+    with pytest.raises(DatasetError, match=f"{named}'panda' .*: name the robot's file, as TASK@"):
+        load(path)
+    load(path, task=task)
+    with pytest.raises(DatasetError, match="for the task 'no_obstacles@xarm6', not 'no_obstacles'"):
+        load(path, task="no_obstacles")
+    # A file of the same name describes another arm.
+    changed = tmp_path / "changed" / "xarm6.yaml"
+    changed.parent.mkdir()
+    changed.write_text(XARM6.read_text() + "base_position: [0, 0, 0.1]\n")
+    with pytest.raises(DatasetError, match=f"{named}'xarm6' .*make the file again"):
+        load(path, task=f"no_obstacles@{changed}")
+    shutil.copy(IIWA, changed)
+    with pytest.raises(DatasetError, match=f"{named}'iiwa'"):
+        load(path, task=f"no_obstacles@{changed}")
+
+
+def test_file_of_the_panda_is_rejected_for_another_robot(file, tmp_path):
+    write_some_queries(tmp_path / "queries.h5", "no_obstacles")
+    contents = (tmp_path / "queries.h5").read_bytes()
+    assert PANDA.fingerprint[:12].encode() not in contents and b"robot" not in contents
+    with pytest.raises(DatasetError, match="for the task 'no_obstacles', not 'no_obstacles@xarm6'"):
+        load_queries(tmp_path / "queries.h5", task=f"no_obstacles@{file}")
+    scene = tmp_path / "empty.yaml"
+    save_scene(Scene(), scene)
+    write_some_queries(query_path(scene), scene)
+    scene.write_text(f"robot: {file}\n" + scene.read_text())
+    with pytest.raises(DatasetError, match="made for the robot 'panda' .*, not for 'xarm6'"):
+        load_queries(scene)
+
+
+def test_missing_file_names_the_command_that_makes_it(file):
+    task, flags = f"random_boxes_easy@{file}", f"--task random_boxes_easy --robot {file}"
+    with pytest.raises(DatasetError, match=f"no such file; make it with: roboarm queries {flags}"):
+        load_queries(task)
+    with pytest.raises(DatasetError, match=f"no such file; make it with: roboarm collect {flags}"):
+        load_demos(task)
+
+
+def test_data_command_takes_a_robot(file, capsys):
+    task = f"no_obstacles@{file}"
+    write_some_queries(query_path(task), task)
+    write_some_demos(demo_path(task), task)
+    robot = ["--robot", str(file)]
+    assert main(["validate", "no_obstacles", *robot]) == 0
+    assert main(["validate", str(query_path(task)), "--task", "no_obstacles", *robot]) == 0
+    assert main(["describe", "no_obstacles", *robot]) == 0
+    assert "demonstrations | 3" in capsys.readouterr().out
+    for arguments, message in (
+        ([str(query_path(task))], "name the robot's file, as TASK@ROBOT or --robot"),
+        ([str(query_path(task)), *robot], "--robot of a file needs its --task"),
+        ([task, *robot], "the task names a robot already"),
+        (["wall", *robot], "wall is the Panda's"),
+    ):
+        assert main(["validate", *arguments]) == 1
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["path.csv", "path.npz"])
+def test_joint_path_has_a_column_for_each_joint(name, file, tmp_path):
+    robot = load_robot(file)
+    path = robot.denormalise(np.array([[0.1] * 6, [-0.2] * 6]))
+    times, configurations = timed(path, robot)
+    np.testing.assert_allclose(configurations[[0, -1]], path, atol=1e-12)
+    save_joint_path(tmp_path / name, configurations, times)
+    for one, other in zip(
+        load_joint_path(tmp_path / name, robot), (times, configurations), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(DatasetError, match="no column q7|must be .n, 7., are"):
+        load_joint_path(tmp_path / name, PANDA)
+    save_joint_path(tmp_path / name, np.zeros((2, 7)), [0.0, 1.0])
+    with pytest.raises(DatasetError, match="a column q7, and the arm 6 joints|must be .n, 6., are"):
+        load_joint_path(tmp_path / name, robot)
+
+
+def test_roadmap_paths_belong_to_their_robot(file, tmp_path):
+    task, rng = f"random_boxes_hard@{file}", np.random.default_rng(0)
+    scenes = [get_task(task).scene.sample(rng) for _ in range(2)]
+    paths = [[rng.uniform(-1, 1, (k, 6)).astype(np.float32) for k in (2, 5)], []]
+    contents = roadmap_paths.shard_bytes(task, 0, 0, scenes, paths, "made by a test")
+    (tmp_path / "shard_00000.h5").write_bytes(contents)
+    loaded = roadmap_paths.load_roadmap_paths(tmp_path, load_robot(file))
+    assert [loaded.scenes[i] for i in range(2)] == scenes
+    for one, other in zip(loaded.of_scene(0), paths[0], strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(DatasetError, match="made for the robot 'xarm6' .*, not for 'panda'"):
+        roadmap_paths.load_roadmap_paths(tmp_path)

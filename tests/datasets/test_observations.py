@@ -1,0 +1,182 @@
+"""Collecting observations: the same files after any interruption, and exact when read back."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.datasets.observations import Observations
+from roboarm_nmp.datasets.shards import shard_path
+from roboarm_nmp.envs.perception.sensors import (
+    Camera,
+    PointCloud,
+    SensorWorld,
+    cardinal,
+    sensors_from_json,
+    sensors_to_json,
+)
+from roboarm_nmp.scene_embedding_train import collect
+from roboarm_nmp.utils import workers
+
+
+def args(output, **more):
+    small = {"num": 10, "shard_size": 4, "image_size": 32, "num_samples": 400, "workers": 1}
+    return collect.Args(task="random_boxes_hard", output=output, **small | more)
+
+
+def shards(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    collect.collect(args(folder), progress=False)
+    return folder
+
+
+def test_stored_observations_are_those_of_the_sensors(whole):
+    observations = Observations(whole)
+    assert len(observations) == 10 and observations.offsets.tolist() == [0, 4, 8, 10]
+    assert observations.task == "random_boxes_hard"
+    world, env = SensorWorld(), envs.make("random_boxes_hard")
+    for shard in range(3):
+        configurations = observations.read(shard, "configuration")
+        for row, scene in enumerate(observations.scenes(shard)):
+            env.set_scene(scene)
+            assert 4 <= len(scene.obstacles) <= 8 and env.is_feasible(configurations[row])
+            world.show(scene, configurations[row])
+            for name, sensor in observations.sensors.items():
+                observed = sensor.observe(world)
+                if isinstance(sensor, Camera):
+                    read = {"rgb": observations.read(shard, f"{name}/rgb")[row]}
+                else:
+                    depth = observations.read(shard, f"{name}/depth")[row] * (5.0 / 65_535)
+                    read = sensor.points(
+                        depth, observations.read(shard, f"{name}/segmentation")[row]
+                    )
+                for output, array in observed.items():
+                    np.testing.assert_allclose(read[output], array, atol=1e-4)
+    world.close()
+    env.close()
+
+
+def test_scenes_and_configurations_are_all_different(whole):
+    observations = Observations(whole)
+    scenes = {scene for shard in range(3) for scene in observations.scenes(shard)}
+    poses = np.concatenate([observations.read(shard, "configuration") for shard in range(3)])
+    assert len(scenes) == len(np.unique(poses, axis=0)) == 10
+
+
+def test_sensors_are_stored_exactly():
+    sensors = {**cardinal(size=(64, 48), outputs=("depth",)), "cloud": PointCloud((1, 2, 3))}
+    assert sensors_from_json(sensors_to_json(sensors)) == sensors
+
+
+def test_files_do_not_depend_on_workers_or_on_earlier_shards(whole, tmp_path):
+    collect.collect(args(tmp_path / "two", workers=2), progress=False)
+    assert shards(tmp_path / "two") == shards(whole)
+    collect.collect(args(tmp_path / "grown", num=6), progress=False)  # its last shard is short
+    collect.collect(args(tmp_path / "grown"), progress=False)
+    assert shards(tmp_path / "grown") == shards(whole)
+
+
+def test_existing_shards_are_not_made_again(whole, tmp_path, monkeypatch):
+    for name, contents in shards(whole).items():
+        (tmp_path / name).write_bytes(contents)
+    (tmp_path / "shard_00001.h5").unlink()
+    made = []
+    run = workers.run
+
+    def record(make, arguments, jobs, *more, **others):
+        made.extend(jobs)
+        return run(make, arguments, jobs, *more, **others)
+
+    monkeypatch.setattr(workers, "run", record)
+    collect.collect(args(tmp_path), progress=False)
+    assert made == [(1, 4, 8)] and shards(tmp_path) == shards(whole)
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "line"),
+    [
+        (signal.SIGKILL, -9, None),
+        (signal.SIGTERM, 143, "terminated; the same command continues from here"),
+    ],
+)
+def test_interrupted_command_continues_to_the_same_files(whole, tmp_path, number, code, line):
+    command = [sys.executable, "-m", "roboarm_nmp", "observations", "--output", str(tmp_path)]
+    command += ["--num", "10", "--shard-size", "4", "--workers", "1"]
+    command += ["--image-size", "32", "--num-samples", "400"]
+    process = subprocess.Popen(
+        command, start_new_session=True, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    until = time.time() + 100
+    while not shard_path(tmp_path, 0).exists():
+        assert time.time() < until
+        time.sleep(0.01)
+    os.killpg(process.pid, number)
+    _, stderr = process.communicate()
+    assert process.returncode == code and "Traceback" not in stderr
+    assert line is None or stderr.splitlines()[-1] == line
+    result = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path)
+    assert "10 scenes" in result.stdout
+    assert {k: v for k, v in shards(tmp_path).items() if k.endswith(".h5")} == shards(whole)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"num": 0}, "--num must be at least 1"),
+        ({"task": "three_shelves"}, "for testing only"),
+        ({"num_samples": 10}, "square number"),
+        ({"task": "nowhere"}, "unknown task"),
+    ],
+)
+def test_bad_flag_is_rejected(tmp_path, change, complaint):
+    given = args(tmp_path)
+    for name, value in change.items():
+        setattr(given, name, value)
+    with pytest.raises(ValueError, match=complaint):
+        collect.collect(given, progress=False)
+    assert not shards(tmp_path)
+
+
+def test_shards_of_another_collection_are_rejected(whole, tmp_path):
+    for name, contents in shards(whole).items():
+        (tmp_path / name).write_bytes(contents)
+    with pytest.raises(ValueError, match="another command: .*--seed 0"):
+        collect.collect(args(tmp_path, seed=1), progress=False)
+    assert shards(tmp_path) == shards(whole)
+
+
+def test_damaged_shard_is_rejected_by_name(whole, tmp_path):
+    with pytest.raises(DatasetError, match="no observations"):
+        Observations(tmp_path)
+    for name, contents in shards(whole).items():
+        (tmp_path / name).write_bytes(contents)
+    good = (tmp_path / "shard_00001.h5").read_bytes()
+    (tmp_path / "shard_00001.h5").write_bytes(good[: len(good) // 2])
+    with pytest.raises(DatasetError, match=r"shard_00001\.h5: truncated or corrupt"):
+        Observations(tmp_path)
+    (tmp_path / "shard_00001.h5").unlink()
+    with pytest.raises(DatasetError, match=r"shard_00001\.h5: no such file"):
+        Observations(tmp_path)
+    bad = bytearray(good)
+    at = good.index(Observations(whole).read(1, "configuration").tobytes())
+    bad[at + 5] ^= 16
+    (tmp_path / "shard_00001.h5").write_bytes(bad)
+    with pytest.raises(DatasetError, match=r"shard_00001\.h5: configuration is missing or corrupt"):
+        Observations(tmp_path).read(1, "configuration")
+
+
+@pytest.mark.slow
+def test_cluster_makes_the_same_files(whole, tmp_path, cluster):
+    collect.collect(args(tmp_path, ray_address=cluster.address), progress=False)
+    assert shards(tmp_path) == shards(whole)

@@ -1,0 +1,766 @@
+"""Evaluation: metrics, baselines, safety filters, ground truth, the command and its errors."""
+
+import itertools
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from paths import ROOT
+from torch import nn
+
+import roboarm_nmp
+from roboarm_nmp import envs
+from roboarm_nmp.clean_rl_scripts import evaluate as command
+from roboarm_nmp.datasets.queries import load_queries, write_queries
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.perception.noise import SensorNoise
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.files import save_scene
+from roboarm_nmp.envs.scenes.motions import Waypoints
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.envs.tasks import Task
+from roboarm_nmp.evaluation import evaluate as evaluation
+from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
+from roboarm_nmp.evaluation.report import report
+from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.policies.registry import make_policy
+from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
+
+SCRIPT = ROOT / "clean_rl_scripts" / "evaluate.py"
+HARD = "random_boxes_hard"
+POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
+
+
+@pytest.fixture(scope="module")
+def queries():
+    env, rng = envs.make("no_obstacles"), np.random.default_rng(0)
+    pairs = [env.sample_query(rng) for _ in range(40)]
+    env.close()
+    return SimpleNamespace(
+        start=np.array([pair[0] for pair in pairs]), goal=np.array([pair[1] for pair in pairs])
+    )
+
+
+@pytest.fixture(scope="module")
+def query_file(queries, tmp_path_factory):
+    path = tmp_path_factory.mktemp("queries") / "queries.h5"
+    splits = {
+        "test": (queries.start[:30], queries.goal[:30]),
+        "validation": (queries.start[30:], queries.goal[30:]),
+    }
+    write_queries(path, "no_obstacles", 0, splits, "a test", {})
+    return path
+
+
+class Straight(nn.Module):
+    """The go-to-goal policy as a network, for goals that are configurations."""
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        return torch.clamp(desired_goal - observation[:, :7], -1, 1)
+
+
+def _save(path, module=None, goal_size=7, observation_size=10, **metadata):
+    inputs = {
+        "observation": torch.zeros(1, observation_size),
+        "achieved_goal": torch.zeros(1, goal_size),
+        "desired_goal": torch.zeros(1, goal_size),
+    }
+    metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
+    save_network(path, module or Straight(), inputs, metadata)
+    return path
+
+
+def _numbers(result):
+    """The numbers that must not depend on how an evaluation is run."""
+    times = ("ms_per_action", "planning_seconds", "planning_seconds_solved")
+    return {name: value for name, value in result.items() if name not in times}
+
+
+def header_of(result):
+    """Rows of the command's header: dict of name -> text."""
+    rows = itertools.takewhile(
+        lambda line: not line.startswith("  success"), report(result).splitlines()[1:]
+    )
+    return dict(re.split(" {2,}", row.strip(), maxsplit=1) for row in rows)
+
+
+# --- Metrics
+
+
+def test_wilson_interval_equals_values_by_hand():
+    # p = 0.8, n = 10, z^2 = 3.84146: centre (0.8 + 0.192073) / 1.384146, half width
+    # 1.959964 * sqrt(0.016 + 0.0096036) / 1.384146
+    low, high = evaluation.wilson_interval(8, 10)
+    assert low == pytest.approx(0.490162, abs=1e-5)
+    assert high == pytest.approx(0.943318, abs=1e-5)
+    assert evaluation.wilson_interval(0, 10) == pytest.approx((0.0, 0.277533), abs=1e-5)
+    assert evaluation.wilson_interval(10, 10) == pytest.approx((0.722467, 1.0), abs=1e-5)
+
+
+def test_path_length_and_smoothness_equal_values_by_hand():
+    configurations = np.zeros((4, 7))
+    configurations[:, 0] = [0.0, 3.0, 3.0, 3.0]
+    configurations[:, 1] = [0.0, 4.0, 4.0, 6.0]
+    # steps (3, 4), (0, 0), (0, 2); their differences (-3, -4), (0, 2)
+    assert evaluation.path_length(configurations) == pytest.approx(5 + 0 + 2)
+    assert evaluation.smoothness(configurations) == pytest.approx((5 + 2) / 2)
+    straight = np.linspace(np.zeros(7), np.ones(7), 11)
+    assert evaluation.path_length(straight) == pytest.approx(np.sqrt(7))
+    assert evaluation.smoothness(straight) == pytest.approx(0.0, abs=1e-12)
+    assert evaluation.path_length(straight[:1]) == evaluation.smoothness(straight[:2]) == 0.0
+
+
+def test_metrics_of_an_evaluation_equal_those_of_its_episodes(queries):
+    result = evaluate("go-to-goal", "no_obstacles", queries=queries)
+    env, rows = envs.make("no_obstacles"), []
+    for start, goal in zip(queries.start, queries.goal, strict=True):
+        observation, info = env.reset_specific(start, goal)
+        path, ended = [start.astype(float)], False
+        while not ended:
+            action = PANDA.normalise(goal) - observation["observation"][:7]
+            observation, _, terminated, truncated, info = env.step(action)
+            path.append(PANDA.denormalise(observation["observation"][:7]))
+            ended = terminated or truncated
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        rows.append((info["is_success"], info["collision_so_far"], len(path) - 1, length))
+    env.close()
+    success, collides, steps, lengths = (np.array(column) for column in zip(*rows, strict=True))
+    assert result["num_queries"] == 40
+    assert result["success_rate"] == success.mean() > 0.9
+    assert result["collision_free_success_rate"] == (success & ~collides).mean()
+    assert result["collision_rate"] == collides.mean()
+    assert 0 < result["collision_free_success_rate"] < result["success_rate"]
+    assert result["mean_steps"] == pytest.approx(steps[success].mean())
+    assert result["path_length"] == pytest.approx(lengths[success].mean(), abs=1e-5)
+    assert 0 < result["smoothness"] < 0.1 and result["ms_per_action"] > 0
+    low, high = result["collision_free_success_rate_interval"]
+    assert low < result["collision_free_success_rate"] < high
+    assert json.loads(json.dumps(result)) == result
+
+
+def test_start_at_the_goal_is_a_success_of_no_steps():
+    start = np.array([[0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0]], np.float32)
+    result = evaluate(
+        "go-to-goal", "no_obstacles", queries=SimpleNamespace(start=start, goal=start)
+    )
+    assert result["success_rate"] == 1.0
+    assert result["mean_steps"] == result["path_length"] == result["smoothness"] == 0.0
+    assert result["ms_per_action"] is None
+
+
+def test_stop_on_collision_leaves_collision_free_successes_only(queries):
+    free = evaluate("go-to-goal", "no_obstacles", queries=queries)
+    stopped = evaluate("go-to-goal", "no_obstacles", queries=queries, stop_on_collision=True)
+    assert (
+        stopped["success_rate"]
+        == stopped["collision_free_success_rate"]
+        == free["collision_free_success_rate"]
+    )
+    assert stopped["collision_rate"] == free["collision_rate"]
+
+
+# --- Reproducibility
+
+
+def test_result_does_not_depend_on_the_number_of_workers(queries):
+    alone = evaluate("random", "no_obstacles", queries=queries, num_queries=12, seed=3)
+    assert alone["success_rate"] == 0 and alone["mean_steps"] is None
+    options = {"split": "validation", "num_queries": 30, "seed": 5}
+    alone = evaluate("via-points", "wall", **options)
+    shared = evaluate("via-points", "wall", **options, workers=2)
+    assert _numbers(alone) == _numbers(shared)
+
+
+def test_random_actions_depend_on_seed_and_query_only():
+    env = envs.make("no_obstacles")
+
+    def actions(seed, index):
+        act, _ = make_policy("random", env, seed)(index, None)
+        return np.array([act({}) for _ in range(5)])
+
+    assert np.array_equal(actions(1, 4), actions(1, 4))
+    assert not np.array_equal(actions(1, 4), actions(1, 5))
+    assert not np.array_equal(actions(1, 4), actions(2, 4))
+    assert np.abs(actions(1, 4)).max() <= 1
+
+
+def test_network_function_and_baseline_with_the_same_actions_agree(queries, tmp_path):
+    def straight(observation):
+        return observation["desired_goal"] - observation["observation"][:7]
+
+    few = {"queries": queries, "num_queries": 15}
+    threads = torch.get_num_threads()
+    baseline = evaluate("go-to-goal", "no_obstacles", goal_type="config", **few)
+    function = evaluate(straight, "no_obstacles", goal_type="config", **few)
+    network = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
+    folder = evaluate(str(tmp_path), "no_obstacles", **few, workers=2)
+    assert torch.get_num_threads() == threads
+    assert _numbers(network) == _numbers(folder)
+    assert function["policy"] == "straight"
+    assert network["goal_type"] == "config" and network["policy"] == str(tmp_path / "policy.pt")
+    for result in (function, network):
+        assert result["success_rate"] == baseline["success_rate"] > 0.8
+        assert result["path_length"] == pytest.approx(baseline["path_length"], rel=1e-3)
+
+
+def test_network_brings_its_environment_but_not_the_rules(queries, tmp_path):
+    class Still(Straight):
+        def forward(self, observation, achieved_goal, desired_goal):
+            return observation[:, :7] + 0 * observation[:, 14:].sum(1, keepdim=True)
+
+    env = {"goal_type": "ee", "action_mode": "subgoal", "max_step": 0.05, "velocities": True}
+    cheat = {"ee_tolerance": 10.0, "horizon": 10_000, "render_mode": "human"}
+    path = _save(tmp_path / "still.pt", Still(), 3, 17, env=env | cheat)
+    result = evaluate(path, "no_obstacles", queries=queries, num_queries=2)
+    assert result["env"] == env | {"stop_on_collision": False}
+    assert result["success_rate"] == 0.0
+
+
+# --- Baselines that look for a motion
+
+# `wall` is the box from x 0.25 to 0.95, z up to 0.775, at y = 0, 0.04 thick. Stretched out to the
+# front, left and right of it: halfway between the two the hand is at (0.57, 0, 0.25), inside it.
+LEFT = np.array([0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8], np.float32)
+RIGHT = np.array([-0.8, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8], np.float32)
+HIGHER = np.array([0.8, 0.0, 0.0, -1.8, 0.0, 2.3, 0.8], np.float32)
+
+
+def _queries(*pairs, **more):
+    start, goal = (np.array(column) for column in zip(*pairs, strict=True))
+    return SimpleNamespace(start=start, goal=goal, **more)
+
+
+def test_via_points_go_around_the_wall():
+    x, y, z = PANDA.forward_kinematics((LEFT + RIGHT) / 2)
+    assert 0.25 < x < 0.95 and abs(y) < 0.02 and 0 < z < 0.775
+    behind = _queries((LEFT, RIGHT))
+    straight = evaluate("go-to-goal", "wall", queries=behind)
+    assert straight["collision_free_success_rate"] == 0 and straight["collision_rate"] == 1
+    assert straight["free_motion_rate"] is None and straight["planning_seconds"] is None
+    result = evaluate("via-points", "wall", queries=behind, tries=200)
+    assert result["collision_free_success_rate"] == 1 and result["free_motion_rate"] == 1
+    assert result["planning_seconds"] == result["planning_seconds_solved"] > 0
+    assert (result["tries"], result["time_limit"]) == (200, None)
+
+
+def test_via_points_go_straight_if_that_is_free_or_no_motion_is_found():
+    both = _queries((LEFT, HIGHER), (LEFT, RIGHT))
+    straight = evaluate("go-to-goal", "wall", queries=both)
+    # The one random configuration of this seed is no way to the second goal.
+    result = evaluate("via-points", "wall", queries=both, tries=1)
+    assert result["free_motion_rate"] == 0.5 and result["collision_free_success_rate"] == 0.5
+    for name in ("success_rate", "collision_rate", "mean_steps", "path_length"):
+        assert result[name] == straight[name]
+    assert 0 < result["planning_seconds_solved"] != result["planning_seconds"]
+
+
+def test_planner_solves_double_walls_and_follows_its_plan():
+    queries = load_queries("double_walls", "validation")[:4]
+    straight = evaluate("go-to-goal", "double_walls", queries=queries)
+    assert straight["collision_free_success_rate"] < 0.6
+    options = {"seed": 2, "time_limit": 60.0}  # so long that it does not matter
+    result = evaluate("planner", "double_walls", queries=queries, **options)
+    assert result["collision_free_success_rate"] == 1
+    assert 0 < result["planning_seconds"] == result["planning_seconds_solved"] < 60
+    assert result["free_motion_rate"] is None and result["time_limit"] == 60.0
+    assert "ompl" in result["versions"] and "ompl" not in straight["versions"]
+
+    env, rows = envs.make("double_walls"), []
+    planner = Planner(env)
+    for index, query in enumerate(queries):
+        path = planner.plan(*query, seed=[2, index], time_limit=60.0)
+        states = PANDA.denormalise(follow(env, path).states)
+        to_goal = PANDA.forward_kinematics(states) - PANDA.forward_kinematics(query.goal)
+        steps = int(np.argmax(np.linalg.norm(to_goal, axis=1) <= env.ee_tolerance))
+        rows.append((steps, evaluation.path_length(states[: steps + 1])))
+    env.close()
+    steps, lengths = np.mean(rows, axis=0)
+    assert result["mean_steps"] == steps
+    assert result["path_length"] == pytest.approx(lengths)
+
+
+def test_safety_filter_lowers_collisions_and_escapes_raise_success(tmp_path):
+    results = {}
+    for name, flags in {
+        "bare": [],
+        "none": ["--safety-margin", "0"],
+        "filter": ["--safety-margin", "0.01", "--no-escape"],
+        "escape": ["--safety-margin", "0.01"],
+        "points": ["--safety-margin", "0.015", "--geometry-source", "point_cloud"],
+    }.items():
+        arguments = ["--policy", "go-to-goal", "--task", HARD, "--num-queries", "12"]
+        arguments += ["--split", "validation", "--goal-type", "combined"]
+        assert command.main([*arguments, *flags, "--json", str(tmp_path / "result.json")]) == 0
+        results[name] = json.loads((tmp_path / "result.json").read_text())
+    assert _numbers(results["none"]) == _numbers(results["bare"])
+    assert results["bare"]["collision_rate"] > 0.5
+    filters = {name: result["safety_filter"] for name, result in results.items()}
+    assert filters["bare"] is filters["none"] is None
+    assert filters["filter"] == {"margin": 0.01, "escape": False, "version": VERSION}
+    assert filters["escape"] == {"margin": 0.01, "escape": True, "version": VERSION}
+    assert filters["points"] == {"margin": 0.015, "escape": True, "version": VERSION}
+    for name in ("filter", "escape", "points"):
+        assert results[name]["collision_rate"] < 0.6 * results["bare"]["collision_rate"]
+    rates = {name: result["success_rate"] for name, result in results.items()}
+    assert rates["bare"] < rates["filter"] < rates["escape"]
+    assert results["points"]["seed"] == 0 and results["bare"]["seed"] is None
+
+
+def test_no_escape_changes_the_filter_that_a_policy_includes(tmp_path):
+    arguments = ["--policy", POLICY, "--task", "wall", "--num-queries", "1", "--no-escape"]
+    assert command.main([*arguments, "--json", str(tmp_path / "result.json")]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["safety_filter"] == {"margin": 0.01, "escape": False, "version": VERSION}
+
+
+def test_approach_adds_paths_to_the_filter_that_a_policy_includes(tmp_path, capsys):
+    arguments = ["--policy", POLICY, "--task", "wall", "--num-queries", "1", "--approach"]
+    assert command.main([*arguments, "--json", str(tmp_path / "result.json")]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    kept = {"margin": 0.01, "escape": True, "approach": True, "version": VERSION}
+    assert result["safety_filter"] == kept
+    assert "escapes local minima, approach paths" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("source", [None, "point_cloud"])
+def test_safety_filter_around_a_network_without_link_distances(tmp_path, source):
+    path = _save(tmp_path / "policy.pt")
+    few = {"split": "validation", "num_queries": 5}
+    bare = evaluate(path, "boxes", **few)
+    assert "link_distances" not in bare["env"] and bare["collision_rate"] > 0
+    result = evaluate(
+        path, "boxes", **few, safety_filter=SafetyFilter(margin=0.01), geometry_source=source
+    )
+    used = {"link_distances": True, "geometry_source": source or "ground_truth"}
+    assert result["env"] == bare["env"] | used
+    assert result["collision_rate"] < bare["collision_rate"]
+
+
+def test_planner_plans_from_the_observed_point_cloud():
+    truth, points = (
+        evaluate("planner", HARD, num_queries=8, split="validation", geometry_source=source)
+        for source in (None, "point_cloud")
+    )
+    assert truth["success_rate"] >= 0.75 and points["success_rate"] >= 0.75
+    assert truth["path_length"] != points["path_length"]
+
+
+# --- Ground truth
+
+FILTER = SafetyFilter(margin=0.01)
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "source", "privileged"),
+    [
+        ("go-to-goal", {}, None, False),
+        ("random", {}, None, False),
+        ("sac-ee-wall-p1-s1", {}, None, False),
+        ("bc-combined-oracle-random_boxes_hard-s1", {}, None, True),
+        (POLICY, {}, "point_cloud", False),
+        (POLICY, {"safety_filter": False}, "point_cloud", False),
+        (POLICY, {"geometry_source": "ground_truth"}, "ground_truth", True),
+        (POLICY, {"geometry_source": "field"}, "field", False),
+        ("via-points", {}, "ground_truth", True),
+        ("planner", {}, "ground_truth", True),
+        ("planner", {"geometry_source": "point_cloud"}, "point_cloud", False),
+        # A filter without a geometry source of its own takes the ground truth.
+        ("go-to-goal", {"safety_filter": FILTER}, "ground_truth", True),
+        ("sac-ee-wall-p1-s1", {"safety_filter": FILTER}, "ground_truth", True),
+        ("go-to-goal", {"safety_filter": FILTER, "geometry_source": "field"}, "field", False),
+    ],
+)
+def test_result_and_header_say_whether_ground_truth_was_used(policy, options, source, privileged):
+    result = evaluate(policy, "wall", num_queries=1, **options)
+    assert (result["geometry_source"], result["privileged"]) == (source, privileged)
+    header = header_of(result)
+    assert header["geometry source"] == (source or "none")
+    assert header.get("privileged", "no") == ("yes" if privileged else "no")
+
+
+def test_headers_of_different_evaluations_differ():
+    cases = [
+        ("go-to-goal", {}),
+        ("go-to-goal", {"goal_type": "config"}),
+        ("go-to-goal", {"safety_filter": FILTER}),
+        ("go-to-goal", {"safety_filter": SafetyFilter(FILTER.margin / 2)}),
+        ("go-to-goal", {"safety_filter": SafetyFilter(FILTER.margin, escape=False)}),
+        ("go-to-goal", {"safety_filter": FILTER, "geometry_source": "point_cloud"}),
+        ("random", {"seed": 1}),
+        ("random", {"seed": 2}),
+        ("via-points", {"tries": 1}),
+        ("via-points", {"tries": 2}),
+        ("planner", {"time_limit": 1.0}),
+        ("planner", {"time_limit": 2.5}),
+        (POLICY, {}),
+        (POLICY, {"safety_filter": False}),
+    ]
+    headers = [
+        (policy, header_of(evaluate(policy, "wall", num_queries=1, **options)))
+        for policy, options in cases
+    ]
+    assert all(headers.count(header) == 1 for header in headers)
+    (policy, last) = headers[-2]
+    assert last["encoder"] == "point_cloud, 32 points"
+    assert last["safety filter"] == "margin 0.01 m, escapes local minima"
+    assert headers[0][1]["encoder"] == headers[0][1]["safety filter"] == "none"
+    assert headers[-3][1]["time limit"] == "2.5 s per query"
+
+
+def test_header_says_once_how_the_filter_takes_moving_obstacles():
+    for lookahead, words in ((0.5, ", 0.5 s ahead"), (None, ", no velocities")):
+        safety_filter = SafetyFilter(FILTER.margin, lookahead=lookahead)
+        result = evaluate("go-to-goal", "wall", num_queries=1, safety_filter=safety_filter)
+        expected = "margin 0.01 m, escapes local minima" + words
+        assert header_of(result)["safety filter"] == expected
+
+
+def test_task_defaults_to_that_of_the_policy(tmp_path):
+    (tmp_path / "run").mkdir()
+    path = _save(tmp_path / "run" / "policy.pt", task="boxes")
+    for policy, task in (("sac-ee-wall-p1-s1", "wall"), (path, "boxes"), (path.parent, "boxes")):
+        assert evaluate(str(policy), num_queries=1)["task"] == task
+    assert evaluate(str(path), "wall", num_queries=1)["task"] == "wall"
+    for policy in ("go-to-goal", _no_motion):
+        with pytest.raises(EvaluationError, match="has no task of its own"):
+            evaluate(policy)
+
+
+def test_points_without_link_distances_are_not_privileged():
+    env = {"encoder": "point_cloud", "num_points": 8}
+    still = {"policy": _no_motion, "task": "wall", "num_queries": 1}
+    result = evaluate(**still, env=env)
+    assert (result["geometry_source"], result["privileged"]) == ("point_cloud", False)
+    result = evaluate(**still, env=env, geometry_source="field")
+    assert (result["geometry_source"], result["privileged"]) == ("field", False)
+    with pytest.raises(EvaluationError, match="geometry_source is for via-points, planner, a safe"):
+        evaluate(**still, env=env, geometry_source="ground_truth")
+
+
+def _no_motion(observation):
+    return np.zeros(7)
+
+
+def test_planner_without_time_gives_up():
+    both = _queries((LEFT, RIGHT), (RIGHT, LEFT))
+    result = evaluate("planner", "wall", queries=both, time_limit=1e-6)
+    assert result["success_rate"] == result["collision_rate"] == 0
+    assert result["mean_steps"] is None and result["ms_per_action"] is None
+    assert result["planning_seconds"] > 0 and result["planning_seconds_solved"] is None
+
+
+def test_planner_without_ompl_is_refused(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    monkeypatch.delitem(sys.modules, "roboarm_nmp.planning.planner")
+    queries = _queries((LEFT, HIGHER))
+    with pytest.raises(EvaluationError, match="the policy planner needs OMPL"):
+        evaluate("planner", "wall", queries=queries)
+    assert evaluate("via-points", "wall", queries=queries)["success_rate"] == 1
+
+
+def test_policy_with_longer_steps_is_not_comparable(query_file, tmp_path, capsys):
+    def run(policy, *flags):
+        arguments = ["--task", "no_obstacles", "--queries", query_file, "--num-queries", "3"]
+        arguments += ["--policy", policy, "--json", tmp_path / "out.json", *flags]
+        assert command.main([str(argument) for argument in arguments]) == 0
+        return json.loads((tmp_path / "out.json").read_text()), capsys.readouterr().out
+
+    usual = _save(tmp_path / "usual.pt", env={"goal_type": "config", "max_step": 0.03})
+    longer = _save(tmp_path / "longer.pt", env={"goal_type": "config", "max_step": 0.06})
+    standard, table = run(usual)
+    assert standard["deviations"] == {} and "not comparable" not in table
+    faster, table = run(longer)
+    assert faster["mean_steps"] < 0.7 * standard["mean_steps"]
+    assert faster["deviations"] == {"max_step": 0.06}
+    assert "not comparable: max_step is 0.06, not 0.03" in table
+    stopped, table = run("go-to-goal", "--stop-on-collision")
+    assert stopped["deviations"] == {"stop_on_collision": True}
+    assert "not comparable: stop_on_collision is True, not False" in table
+
+
+# --- Scenes
+
+BLOCKED = Scene((Box((0.6, 0.0, 0.3875), (0.7, 0.04, 0.775)),))
+
+
+def _write_scenes(folder, base, scenes):
+    """A scene file with queries beside it: LEFT to RIGHT in the given scenes, and two others."""
+    task, path = folder / "mine.yaml", folder / "mine_queries.h5"
+    save_scene(base, task)
+    # A little more each, since no two queries may be the same.
+    start = np.array([LEFT + np.float32(1e-6) * i for i in range(len(scenes))])
+    splits = {
+        "test": (start, np.array([RIGHT] * len(scenes)), scenes),
+        "validation": (np.array([RIGHT]), np.array([LEFT])),
+        "original": (np.array([LEFT]), np.array([HIGHER])),
+    }
+    write_queries(path, task, 0, splits, "a test", {})
+    return str(task), path
+
+
+@pytest.mark.parametrize("policy", ["go-to-goal", "via-points", "planner"])
+def test_each_query_is_in_its_own_scene(policy, tmp_path):
+    task, path = _write_scenes(tmp_path, Scene(), [Scene(), BLOCKED, Scene(), BLOCKED])
+    result = evaluate(policy, task, tries=1, time_limit=60.0)
+    assert result["collision_free_success_rate"] == (1.0 if policy == "planner" else 0.5)
+    assert result["collision_rate"] == (0.0 if policy == "planner" else 0.5)
+    assert result["free_motion_rate"] == (0.5 if policy == "via-points" else None)
+    assert (result["task"], result["num_queries"]) == (task, 4)
+    queries = load_queries(path)
+    alone = SimpleNamespace(start=queries.start, goal=queries.goal)
+    assert evaluate(policy, task, queries=alone, tries=1)["collision_free_success_rate"] == 1.0
+
+
+def test_queries_of_another_scene_file_are_refused(tmp_path):
+    task, path = _write_scenes(tmp_path, Scene(), [Scene(), BLOCKED])
+    assert evaluate("go-to-goal", task, split="original", queries=path)["mean_steps"] < 30
+    (tmp_path / "other.yaml").write_text(Path(task).read_text())
+    cases = [
+        ((str(tmp_path / "other.yaml"), path), "is for the task 'mine', not 'other'"),
+        ((str(tmp_path / "other.yaml"), load_queries(path)), "for the task 'mine', not 'other'"),
+        ((str(tmp_path / "other.yaml"), None), "other_queries.h5: no such file"),
+        ((str(tmp_path / "no.yaml"), path), "no.yaml: No such file"),
+    ]
+    for (other, queries), message in cases:
+        with pytest.raises(EvaluationError, match=message):
+            evaluate("go-to-goal", other, queries=queries)
+    save_scene(BLOCKED, task)  # after the queries were made
+    for queries in (None, path):
+        with pytest.raises(EvaluationError, match="out of date: made for another"):
+            evaluate("go-to-goal", task, queries=queries)
+
+
+def test_queries_in_random_scenes_need_scenes(monkeypatch):
+    scenes = SimpleNamespace(base=Scene(), sample=lambda rng: Scene())
+    monkeypatch.setitem(envs.TASKS, "varied", Task(scenes, "scenes that vary"))
+    pairs = [(LEFT, RIGHT), (LEFT, RIGHT)]
+    with pytest.raises(EvaluationError, match="varied has random scenes: these queries"):
+        evaluate("go-to-goal", "varied", queries=_queries(*pairs))
+    queries = _queries(*pairs, scenes=[BLOCKED, Scene()])
+    assert evaluate("go-to-goal", "varied", queries=queries)["collision_free_success_rate"] == 0.5
+
+
+# --- The command
+
+
+def test_command_runs_in_any_folder_with_workers(query_file, tmp_path):
+    arguments = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", query_file]
+    arguments += ["--num-queries", "12", "--workers", "2"]
+    arguments += ["--json", tmp_path / "out.json", "--image", tmp_path / "out.png"]
+    run = subprocess.run(
+        [sys.executable, SCRIPT, *arguments], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    assert "go-to-goal on no_obstacles: 12 test queries" in run.stdout
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert f"success {result['success_rate']:>25.4f}" in run.stdout
+    assert result["split"] == "test" and result["num_queries"] == 12
+    assert set(result["versions"]) == {"python", "pybullet", "torch", "numpy"}
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(os.listdir(tmp_path)) == ["out.json", "out.png"]
+
+
+def test_errors_of_the_command_are_one_line_before_any_work(
+    query_file, tmp_path, capsys, monkeypatch
+):
+    def never(job, progress):
+        raise AssertionError("work was done")
+
+    monkeypatch.setattr(evaluation, "_run", never)
+    policy = str(_save(tmp_path / "policy.pt"))
+    (tmp_path / "broken.pt").write_bytes(Path(policy).read_bytes()[:500])
+    encoder = str(_save(tmp_path / "encoder.pt", kind="encoder"))
+    arguments = {"goal_type": "config", "action_mode": "subgoal"}
+    subgoal = str(_save(tmp_path / "subgoal.pt", env=arguments))
+    unsaid = str(_save(tmp_path / "unsaid.pt", env={}))
+    unfit = str(_save(tmp_path / "unfit.pt", env={"goal_type": "ee"}))
+    (tmp_path / "empty").mkdir()
+    cases = [
+        ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol: did you mean go-to-goal?"),
+        ({"policy": "sac-ee-wal-p1"}, "did you mean sac-ee-wall-p1-s1?"),
+        ({"task": "wal"}, "unknown task 'wal': did you mean wall?"),
+        ({"policy": str(tmp_path / "empty")}, "no such policy"),
+        ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
+        ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
+        ({"geometry-source": "point_cloud"}, "geometry_source is for via-points, planner, a safe"),
+        ({"policy": "planner", "geometry-source": "vae"}, "vae has no decoder"),
+        (
+            {"policy": subgoal, "safety-margin": "0.01"},
+            "a safety filter needs action_mode 'relative'",
+        ),
+        (
+            {"policy": "go-to-goal", "safety-margin": "0.15"},
+            "margin must be in [0, 0.15) m, got 0.15",
+        ),
+        ({"policy": policy, "no-escape": None}, "--no-escape: the policy has no safety filter"),
+        ({"policy": policy, "approach": None}, "--approach: the policy has no safety filter"),
+        (
+            {"safety-margin": "0", "approach": None},
+            "there is no safety filter with --safety-margin",
+        ),
+        (
+            {"safety-margin": "0.01", "no-velocities": None, "lookahead": "0.2"},
+            "--lookahead needs the velocities that --no-velocities leaves out",
+        ),
+        ({"policy": "replanning", "replan": None}, "replan: replanning plans again by itself"),
+        ({"policy": "planner", "tries": "3"}, "--tries is for via-points"),
+        ({"policy": "via-points", "time-limit": "3"}, "--time-limit is for planner and space-time"),
+        ({"observe-every": "5"}, "this policy observes nothing of the scene"),
+        ({"sensor-noise": "latency=3"}, "this policy observes nothing of the scene"),
+        ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
+        ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
+        ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
+        ({"task": "moon"}, "unknown task 'moon': one of no_obstacles"),
+        (
+            {"task": "part.stl"},
+            "scene files are .yaml or .scene (docs/customise/scene.md), got part",
+        ),
+        ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),
+        ({"queries": str(tmp_path / "no.h5")}, "no.h5"),
+        ({"num-queries": "31"}, "num_queries must be 1 to 30, got 31"),
+        ({"num-queries": "0"}, "--num-queries must be at least 1, got 0"),
+        ({"split": "validation", "num-queries": "11"}, "num_queries must be 1 to 10"),
+        ({"split": "original"}, "has no original queries"),
+        ({"workers": "0"}, "--workers must be in [1, 256]"),
+        ({"tries": "0"}, "--tries must be at least 1, got 0"),
+        ({"time-limit": "0"}, "--time-limit must be above 0, and finite, got 0.0"),
+        ({"time-limit": "nan"}, "--time-limit must be above 0, and finite, got nan"),
+        ({"json": str(tmp_path)}, "is a directory, not a file"),
+        ({"json": str(tmp_path / "no such folder" / "a.json")}, "cannot write"),
+        ({"json": "a.json", "image": "a.json"}, "--json and --image are the same file"),
+        ({"image": str(tmp_path / "no such folder" / "a.png")}, "cannot write"),
+    ]
+    good = {"policy": "go-to-goal", "task": "no_obstacles", "queries": str(query_file)}
+    for change, message in cases:
+        flags = good | change
+        arguments = [part for name, value in flags.items() for part in (f"--{name}", value) if part]
+        assert command.main(arguments) == 2, change
+        output = capsys.readouterr()
+        assert output.out == "" and message in output.err
+        assert output.err.startswith("evaluate.py: ") and output.err.count("\n") == 1
+    assert command.main(["--policy", "go-to-goal"]) == 2
+    assert "go-to-goal has no task of its own: choose one (--task)" in capsys.readouterr().err
+
+
+def test_dead_workers_give_one_line(monkeypatch, capsys):
+    def die(job, progress):
+        raise BrokenProcessPool("workers died 5 times without a result")
+
+    monkeypatch.setattr(evaluation, "_run", die)
+    assert command.main(["--policy", "go-to-goal", "--task", "wall"]) == 2
+    assert capsys.readouterr().err == "evaluate.py: workers died 5 times without a result\n"
+
+
+def test_goal_type_that_does_not_exist_is_rejected():
+    with pytest.raises(SystemExit) as stop:
+        command.main(["--policy", "random", "--task", "wall", "--goal-type", "poses"])
+    assert stop.value.code == 2
+
+
+def test_device_files_are_written_to_and_never_replaced(query_file, tmp_path):
+    flags = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", str(query_file)]
+    # With buffered output, as by default.
+    run = ["env", "-u", "PYTHONUNBUFFERED", sys.executable, SCRIPT, *flags]
+    run += ["--num-queries", "1", "--json"]
+    shown = subprocess.run([*run, "/dev/stdout"], capture_output=True, text=True, check=True)
+    assert json.loads(shown.stdout[shown.stdout.index("{") :])["num_queries"] == 1
+    with open(tmp_path / "out.txt", "w") as file:  # the table, and the JSON after it
+        subprocess.run([*run, "/dev/stdout"], stdout=file, check=True)
+    text = (tmp_path / "out.txt").read_text()
+    assert "success" in text[: text.index("{")] and text.rstrip().endswith("}")
+    full = subprocess.run([*run, "/dev/full"], capture_output=True, text=True)
+    assert full.returncode == 2 and "Traceback" not in full.stderr
+    assert full.stderr.rstrip().endswith("cannot write: [Errno 28] No space left on device")
+    assert not Path("/dev/stdout").is_file() or Path("/dev/stdout").is_symlink()
+
+
+def test_refused_query_is_named(queries):
+    goal = queries.goal.copy()
+    goal[3] = 7.0
+    broken = SimpleNamespace(start=queries.start, goal=goal)
+    with pytest.raises(EvaluationError, match="query 3: goal is outside the joint"):
+        evaluate("go-to-goal", "no_obstacles", queries=broken)
+
+
+def test_action_that_is_not_finite_is_an_error(queries):
+    with pytest.raises(EvaluationError, match="query 0: an action is 7 finite numbers"):
+        evaluate(lambda observation: np.full(7, np.nan), "no_obstacles", queries=queries)
+
+
+def test_options_out_of_range_and_unknown_options_are_refused():
+    for name, value in (("workers", 0), ("tries", 0), ("time_limit", 0.0), ("time_limit", np.inf)):
+        with pytest.raises(EvaluationError, match=f"{name} must be"):
+            evaluate("go-to-goal", "wall", **{name: value})
+    with pytest.raises(TypeError, match="encoder"):
+        evaluate("go-to-goal", "wall", encoder="point_cloud")
+
+
+def test_evaluate_is_available_at_the_top_level(queries):
+    assert roboarm_nmp.evaluate is evaluate
+
+
+def test_moving_obstacles_are_evaluated_and_a_delay_is_noted(tmp_path, capsys):
+    """A box that comes to the arm's place after 1 s: who waits for 60 steps is hit by it."""
+    here = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], np.float32)
+    there = here + np.float32([1.5, 0, 0, 0, 0, 0, 0])
+    coming = Waypoints((1.0, 2.0), ((0.0, 0.0, 0.0), (0.0, 0.4, 0.0)))
+    scene = Scene((Box((0.307, -0.4, 0.5), (0.1, 0.1, 0.1), motion=coming),))
+    queries = SimpleNamespace(start=here[None], goal=there[None], scenes=[scene])
+    options = {"queries": queries, "goal_type": "config", "clearance": True}
+    found = evaluate("go-to-goal", "no_obstacles", **options)
+    assert found["collision_free_success_rate"] == 1 and found["action_delay"] == 0
+    checkers = [CollisionChecker(scene.at(t)) for t in (0.0, found["mean_steps"] / 30)]
+    states = PANDA.normalise([here, there])
+    ends = [
+        c.signed_distances(q, False).distance.min() for c, q in zip(checkers, states, strict=True)
+    ]
+    assert 0 < found["min_clearance"] <= min(ends) + 1e-6
+    late = evaluate("go-to-goal", "no_obstacles", action_delay=60, **options)
+    assert late["collision_rate"] == 1 and late["action_delay"] == 60
+    real = evaluate("go-to-goal", "no_obstacles", real_time=True, **options)
+    assert real["action_delay"] == "real_time"
+    for result, words in ((late, "60 steps"), (real, "real time"), (found, None)):
+        text = report(result)
+        assert (f"action delay            {words}" in text) == (words is not None)
+    assert "action delay" not in report(found)
+    with pytest.raises(EvaluationError, match="give one of them"):
+        evaluate("go-to-goal", "wall", action_delay=1, real_time=True)
+    for delay in (-1, 1.5):
+        with pytest.raises(EvaluationError, match="action_delay must be steps"):
+            evaluate("go-to-goal", "wall", action_delay=delay)
+
+
+def test_header_names_each_option_of_a_filter_once(queries):
+    options = {"queries": queries, "num_queries": 1, "goal_type": "combined"}
+    safety_filter = SafetyFilter(escape=False, lookahead=None)
+    text = report(evaluate("go-to-goal", "no_obstacles", safety_filter=safety_filter, **options))
+    assert "margin 0.01 m, no escape, no velocities\n" in text
+
+
+def test_time_per_action_does_not_depend_on_the_delay(queries):
+    def slow(observation):
+        time.sleep(0.01)
+        return observation["desired_goal"] - observation["observation"][:7]
+
+    few = {"queries": queries, "num_queries": 1, "goal_type": "config"}
+    for delay in (0, 8):
+        result = evaluate(slow, "no_obstacles", action_delay=delay, **few)
+        assert result["success_rate"] == 1 and result["ms_per_action"] > 10
+
+
+@pytest.mark.parametrize("given", [{"observe_every": 5}, {"sensor_noise": SensorNoise(latency=2)}])
+@pytest.mark.parametrize("policy", ["go-to-goal", "space-time"])
+def test_sensors_of_a_policy_that_observes_no_scene_are_refused(policy, given):
+    with pytest.raises(EvaluationError, match="observes nothing of the scene"):
+        evaluate(policy, "moving_boxes_easy", **given)

@@ -1,0 +1,165 @@
+"""Rollouts: a trajectory equals the episode; replays equal the rollout."""
+
+import numpy as np
+import pytest
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets.queries import Query, load_queries
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.evaluation import rollout as rollouts
+from roboarm_nmp.evaluation.rollout import Episode, render_strip, rollout
+from roboarm_nmp.policies.registry import make_policy
+
+BENT = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
+AT_THE_SIDE = np.array([1.5, 0.6, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = envs.make("wall", render_mode="rgb_array", render_size=(64, 48))
+    yield env
+    env.close()
+
+
+def straight(query):
+    goal = PANDA.normalise(query.goal)
+    return lambda observation: goal - observation["observation"][:7]
+
+
+def test_trajectory_equals_the_steps_of_the_environment(env):
+    outcomes = set()
+    for query in load_queries("wall", "validation")[:6]:
+        trajectory = rollout(env, query, straight(query))
+        observation, info = env.reset_specific(*query)
+        states, actions, contacts = [observation["observation"][:7]], [], []
+        over = info["is_success"]
+        while not over:
+            actions.append(straight(query)(observation))
+            observation, _, terminated, truncated, info = env.step(actions[-1])
+            states.append(observation["observation"][:7])
+            contacts.append(info["collision"])
+            over = terminated or truncated
+        assert len(trajectory) == info["elapsed_steps"] == len(trajectory.times)
+        assert trajectory.states.dtype == np.float32
+        assert np.array_equal(trajectory.states, states)
+        assert np.array_equal(trajectory.actions, actions)
+        assert np.array_equal(trajectory.contacts, contacts)
+        assert trajectory.success == info["is_success"]
+        assert trajectory.collides == info["collision_so_far"]
+        assert (trajectory.times >= 0).all()
+        assert np.allclose(trajectory.configurations[0], query.start, atol=1e-6)
+        outcomes.add((trajectory.success, trajectory.collides))
+    assert len(outcomes) > 1
+
+
+def test_episode_ends_as_soon_as_the_goal_is_reached(env):
+    query = Query(BENT, AT_THE_SIDE, Scene())
+    trajectory = rollout(env, query, straight(query))
+    assert trajectory.success and not trajectory.collides and len(trajectory) > 10
+    positions = PANDA.forward_kinematics(trajectory.configurations)
+    to_goal = np.linalg.norm(positions - PANDA.forward_kinematics(AT_THE_SIDE), axis=1)
+    assert to_goal[-1] <= env.ee_tolerance + 1e-6 and (to_goal[:-1] > env.ee_tolerance).all()
+
+
+def test_start_at_the_goal_and_a_policy_that_gives_up_make_no_step(env):
+    at_goal = rollout(env, Query(BENT, BENT, Scene()), straight)
+    gives_up = rollout(env, Query(BENT, AT_THE_SIDE, Scene()), None)
+    for trajectory, success in ((at_goal, True), (gives_up, False)):
+        assert len(trajectory) == 0 and trajectory.success is success and not trajectory.collides
+        assert trajectory.states.shape == (1, 7) and trajectory.actions.shape == (0, 7)
+
+
+def test_actions_are_copied(env):
+    action = np.zeros(7)
+
+    def act(observation):
+        action[:] += 1e-3
+        return action
+
+    episode = Episode(env, Query(BENT, AT_THE_SIDE, Scene()))
+    for _ in range(3):
+        episode.step(act(episode.observation))
+    assert not episode.ended
+    assert np.allclose(episode.trajectory().actions[:, 0], [1e-3, 2e-3, 3e-3])
+
+
+def test_refused_query_and_refused_action_are_errors(env):
+    outside = Query(BENT, np.full(7, 9.0, np.float32), Scene())
+    with pytest.raises(ValueError, match="goal is outside the joint limits"):
+        rollout(env, outside, straight(outside))
+    with pytest.raises(ValueError, match="an action is 7 finite numbers"):
+        rollout(env, Query(BENT, AT_THE_SIDE, Scene()), lambda observation: np.full(7, np.nan))
+
+
+def test_replay_renders_what_the_rollout_went_through():
+    env = envs.make("wall", render_mode="rgb_array", render_size=(64, 48))
+    query = load_queries("wall", "validation")[1]
+    act, plan_found = make_policy("random", env, seed=3)(0, query)
+    assert plan_found is None
+    images = []
+
+    def rendering(observation):
+        images.append(env.render())
+        return act(observation)
+
+    trajectory = rollout(env, query, rendering)
+    images.append(env.render())
+    steps = [0, 7, 7, len(trajectory)]
+    strip = render_strip(env, query, trajectory.actions, steps)
+    assert np.array_equal(strip, np.concatenate([images[step] for step in steps], axis=1))
+    assert not np.array_equal(images[0], images[-1])
+    env.close()
+
+
+def test_delayed_action_takes_effect_some_steps_later():
+    """Meanwhile the arm makes the step before it, then holds; the policy observes nothing."""
+    env, query = envs.RoboArmEnv(), Query(BENT, AT_THE_SIDE, Scene())
+    observed = []
+
+    def act(observation):
+        observed.append(observation["observation"][:7])
+        return np.full(7, len(observed), np.float32) / 1000
+
+    trajectory = rollout(env, query, act, delay=3)
+    commands = (trajectory.actions[:, 0] * 1000).round().astype(int)
+    assert commands[:12].tolist() == [0, 0, 0, 1, 0, 0, 2, 0, 0, 3, 0, 0]
+    assert np.array_equal(observed[:4], trajectory.states[:12:3])
+    assert len(trajectory) == env.horizon
+    assert len(rollout(env, query, act, delay=1).actions) == env.horizon
+
+
+def test_delay_of_one_step_is_the_action_before():
+    env, query = envs.RoboArmEnv(), Query(BENT, AT_THE_SIDE, Scene())
+    trajectory = rollout(env, query, straight(query), delay=1)
+    act, observation = straight(query), env.reset_specific(*query)[0]
+    previous = np.zeros(7)
+    for state, command in zip(trajectory.states[1:], trajectory.actions, strict=True):
+        assert np.array_equal(command, previous)
+        previous = act(observation)
+        observation, *_ = env.step(command)
+        assert np.array_equal(observation["observation"][:7], state)
+
+
+def test_held_arm_stays_where_it_is_in_mode_subgoal():
+    env, query = envs.RoboArmEnv(action_mode="subgoal"), Query(BENT, AT_THE_SIDE, Scene())
+    goal = PANDA.normalise(AT_THE_SIDE)
+    trajectory = rollout(env, query, lambda observation: goal, delay=10)
+    moved = np.linalg.norm(np.diff(trajectory.states, axis=0), axis=1)
+    moving = (moved > 5e-3).nonzero()[0]  # a step after each observation, and the lag of one
+    assert set(moving % 10) == {0, 1}
+
+
+def test_real_time_delays_by_the_time_that_an_action_takes(monkeypatch):
+    env, query, clock = envs.RoboArmEnv(), Query(BENT, AT_THE_SIDE, Scene()), [0.0]
+    monkeypatch.setattr(rollouts.time, "perf_counter", lambda: clock[0])
+
+    def act(observation):
+        clock[0] += 0.070  # s, which are three steps of 1/30 s
+        return np.full(7, 0.001, np.float32)
+
+    plain = rollout(env, query, act, "real_time")
+    assert (plain.actions[:9, 0] > 0).tolist() == [False] * 3 + [True, False, False] * 2
+    late = rollout(env, query, act, "real_time", planning_seconds=0.1)
+    assert (late.actions[:9, 0] > 0).tolist() == [False] * 6 + [True, False, False]
+    assert plain.times.sum() == pytest.approx(0.070 * np.ceil(env.horizon / 3))

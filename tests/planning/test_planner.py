@@ -1,0 +1,684 @@
+"""The planner: exact ends, no collisions, the clearance asked for, and the same path for a seed."""
+
+import copy
+import dataclasses
+import math
+import pickle
+import subprocess
+import sys
+import textwrap
+import zlib
+
+import numpy as np
+import psutil
+import pytest
+from paths import ROOT
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import rotation_angle
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.planning import planner as planning
+from roboarm_nmp.planning.planner import (
+    FIRST_TURN,
+    MARGIN,
+    MARGIN_SCHEDULE,
+    PLANNERS,
+    Planner,
+    PlanningError,
+)
+from roboarm_nmp.utils.bullet import pybullet as p
+
+# Configurations on `wall`: two without contact, and three in collision.
+READY = np.array([1.0, -0.5, 0.0, -1.8, 0.0, 1.5, 0.0], np.float32)
+TURNED = np.array([1.3, -0.2, 0.3, -1.5, 0.3, 1.8, 0.3], np.float32)
+INTO_THE_WALL = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.5, 0.0], np.float32)
+INTO_THE_TABLE = np.array([1.0, 1.2, 0.0, -1.6, 0.0, 2.0, 0.0], np.float32)
+INTO_ITSELF = np.array([1.0, -0.5, 0.0, -1.8, 0.0, -0.08, 0.0], np.float32)
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """Task -> environment."""
+    worlds = {task: envs.make(task) for task in ("no_obstacles", "wall", "double_walls")}
+    yield worlds
+    for env in worlds.values():
+        env.close()
+
+
+def interpolate(path, step):
+    """Configurations (rad) along a path, at most `step` apart in the normalised space."""
+    corners = PANDA.normalise(path.astype(np.float64))
+    points = [corners[0]]
+    for here, there in zip(corners[:-1], corners[1:], strict=True):
+        pieces = int(np.linalg.norm(there - here) / step) + 1
+        points += [here + (there - here) * i / pieces for i in range(1, pieces + 1)]
+    return PANDA.denormalise(np.array(points))
+
+
+def length(path):
+    return np.linalg.norm(np.diff(PANDA.normalise(path), axis=0), axis=1).sum()
+
+
+def is_path_of(path, start, goal):
+    assert path.dtype == np.float32 and path.ndim == 2 and path.shape[1] == 7
+    return path[0].tobytes() == start.tobytes() and path[-1].tobytes() == goal.tobytes()
+
+
+# --- Paths
+
+
+def test_paths_have_the_exact_ends_of_the_query_and_no_collision(worlds):
+    env, queries = worlds["double_walls"], load_queries("double_walls")
+    planner = Planner(env)
+    bent = 0
+    for seed, (start, goal, _) in enumerate(queries[:12], 1):
+        path = planner.plan(start, goal, seed=seed)
+        assert is_path_of(path, start, goal)
+        assert ((path >= PANDA.lower) & (path <= PANDA.upper)).all()
+        assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
+        direct = np.stack([start, goal])
+        bent += any(env.in_collision(point) for point in interpolate(direct, 0.01))
+    assert bent >= 5  # many straight lines collide
+
+
+def test_query_at_the_joint_limits_gets_a_path(worlds):
+    start, goal = READY.copy(), READY.copy()
+    start[[0, 6]] = PANDA.upper[0], PANDA.lower[6]
+    goal[[0, 3, 6]] = PANDA.lower[0], PANDA.upper[3], PANDA.upper[6]
+    assert is_path_of(Planner(worlds["no_obstacles"]).plan(start, goal, seed=1), start, goal)
+
+
+def test_query_whose_start_is_its_goal_gets_a_path(worlds):
+    assert is_path_of(Planner(worlds["no_obstacles"]).plan(READY, READY, seed=1), READY, READY)
+
+
+def test_simplification_shortens_paths(worlds):
+    start, goal, _ = load_queries("double_walls")[0]
+    simple, raw = (
+        [
+            length(Planner(worlds["double_walls"], simplify=simplify).plan(start, goal, seed=seed))
+            for seed in range(1, 9)
+        ]
+        for simplify in (1, 0)
+    )
+    assert np.mean(simple) < 0.8 * np.mean(raw)
+
+
+def test_planner_follows_a_change_of_scene(worlds):
+    env, (start, goal, _) = envs.make("no_obstacles"), load_queries("wall")[4]
+    planner = Planner(env)
+    assert any(worlds["wall"].in_collision(c) for c in interpolate(np.stack([start, goal]), 0.01))
+    planner.plan(start, goal, seed=1)
+    env.set_scene(worlds["wall"].scene)
+    path = planner.plan(start, goal, seed=1)
+    assert not any(worlds["wall"].in_collision(c) for c in interpolate(path, 0.01))
+    env.close()
+
+
+# --- Sets of goals, goal poses
+
+
+def test_path_to_a_set_ends_at_a_goal_that_is_free(worlds):
+    goals = np.stack([INTO_THE_WALL, TURNED + np.float32(0.8), TURNED, INTO_THE_TABLE])
+    planner = Planner(worlds["wall"])
+    path = planner.plan(READY, goals, seed=1)
+    assert is_path_of(path, READY, goals[2]) or is_path_of(path, READY, goals[1])
+    assert path.tobytes() == planner.plan(READY, goals, seed=1).tobytes()
+    # A set of one is that goal; whatever comes first, the nearest goal is preferred.
+    alone = planner.plan(READY, goals[2:3], seed=1)
+    assert alone.tobytes() == planner.plan(READY, TURNED, seed=1).tobytes()
+    near, far = READY + np.float32(0.02), np.array([-1.5, -0.5, 0, -1.8, 0, 1.5, 0], np.float32)
+    assert is_path_of(planner.plan(READY, np.stack([far, near]), seed=2), READY, near)
+
+
+@pytest.mark.parametrize(
+    ("goals", "complaint"),
+    [
+        (np.stack([INTO_THE_WALL, INTO_ITSELF]), "none of the 2 goals is possible: goal 0 is in c"),
+        (READY[None] + 9, "none of the 1 goals is possible: goal 0 is outside the joint limits"),
+        (np.empty((0, 7)), "a set of goals has shape"),
+        (np.zeros((2, 6)), "a set of goals has shape"),
+    ],
+)
+def test_set_without_a_possible_goal_is_rejected(worlds, goals, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        Planner(worlds["wall"]).plan(READY, goals, seed=1)
+
+
+def test_path_to_a_goal_pose_is_followed_without_contact(worlds):
+    env, reached = worlds["wall"], 0
+    planner = Planner(env)
+    for seed, query in enumerate(load_queries("wall", "validation")[:10]):
+        pose = PANDA.end_effector_pose(query.goal)
+        path = planner.plan(query.start, seed=seed, goal_pose=pose)
+        assert path[0].tobytes() == query.start.tobytes()
+        end = PANDA.end_effector_pose(path[-1])
+        assert np.linalg.norm(end[:3] - pose[:3]) <= 1e-4
+        assert rotation_angle(end[3:], pose[3:]) <= 1e-3
+        env.reset_specific(query.start, path[-1])
+        for target in subgoals(path, PANDA)[1:]:
+            info = env.step(target - env.world.read_arm()[0])[-1]
+        reached += info["ee_distance"] < 0.02 and not info["collision_so_far"]
+    assert reached >= 9
+
+
+def test_own_planner_tries_one_goal_after_the_other(worlds):
+    asked = []
+
+    def only_the_second(is_valid, start, goal, rng):
+        asked.append(goal)
+        return np.stack([start, goal]) if len(asked) == 2 else None
+
+    goals = np.stack([TURNED, READY + np.float32(0.05)])
+    path = Planner(worlds["wall"], only_the_second, simplify=0).plan(READY, goals, seed=1)
+    assert is_path_of(path, READY, TURNED)  # the farther one
+
+
+def test_pose_without_a_free_configuration_is_a_planning_error(worlds):
+    planner = Planner(worlds["wall"])
+    into_the_wall = PANDA.end_effector_pose(INTO_THE_WALL)
+    for pose in (np.r_[3.0, into_the_wall[1:]], np.r_[into_the_wall[:2], -0.5, 0, 0, 0, 1]):
+        with pytest.raises(PlanningError, match="no collision-free configuration has the goal"):
+            planner.plan(READY, seed=1, goal_pose=pose)
+
+
+def test_goal_and_goal_pose_exclude_each_other(worlds):
+    for given in ({}, {"goal": TURNED, "goal_pose": np.ones(7)}):
+        with pytest.raises(ValueError, match="either goal or goal_pose"):
+            Planner(worlds["wall"]).plan(READY, seed=1, **given)
+    with pytest.raises(ValueError, match="start is in collision"):
+        Planner(worlds["wall"]).plan(INTO_THE_WALL, seed=1, goal_pose=np.ones(7))
+
+
+# --- The same path for a seed
+
+
+def test_seed_gives_the_same_path_whatever_was_planned_before(worlds):
+    planner = Planner(worlds["double_walls"])
+    queries = load_queries("double_walls")
+    first = planner.plan(*queries[0], seed=7)
+    checks = planner.checks
+    others = [planner.plan(*queries[i], seed=7 + i) for i in (3, 1)]
+    again = planner.plan(*queries[0], seed=7)
+    assert again.tobytes() == first.tobytes() and planner.checks == checks
+    fresh = Planner(worlds["double_walls"])
+    assert fresh.plan(*queries[1], seed=8).tobytes() == others[1].tobytes()
+
+
+def test_other_seeds_give_other_paths(worlds):
+    planner, (start, goal, _) = Planner(worlds["double_walls"]), load_queries("double_walls")[0]
+    assert len({planner.plan(start, goal, seed=seed).tobytes() for seed in range(1, 6)}) == 5
+
+
+SEARCHES = """
+    import sys, zlib
+    import roboarm_nmp
+    from roboarm_nmp.planning.planner import Planner
+    from roboarm_nmp.datasets.queries import load_queries
+
+    env, queries = roboarm_nmp.make("wall"), load_queries("wall")
+    for name in sys.argv[2:]:
+        for seed in range(int(sys.argv[1])):
+            Planner(env, "RRT").plan(*queries[8], seed=50 + seed)
+        planner = Planner(env, name, max_checks=8000, simplify=0)
+        path = planner.plan(*queries[0], seed=5)
+        print("search:", name, planner.checks, zlib.crc32(path.tobytes()))
+"""
+
+
+def test_seed_gives_the_same_search_in_another_process():
+    names = [name for name in PLANNERS if "FMT" not in name]  # those take a second each
+    searches = []
+    for arguments in (["0", *names], ["1", *reversed(names)]):
+        result = subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(SEARCHES), *arguments],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+        )
+        assert result.returncode == 0, result.stderr
+        searches.append(sorted(x for x in result.stdout.splitlines() if x.startswith("search:")))
+    assert searches[0] == searches[1] and len(searches[0]) == len(names)
+
+
+def test_copy_plans_the_same_paths_in_a_world_of_its_own():
+    env, (start, goal, _) = envs.make("double_walls"), load_queries("double_walls")[0]
+    planner = Planner(env)
+    path = planner.plan(start, goal, seed=3).tobytes()
+    for other in (copy.deepcopy(planner), pickle.loads(pickle.dumps(planner))):
+        assert other.env is not env and other.env.client != env.client
+        assert other.plan(start, goal, seed=3).tobytes() == path
+        other.env.close()
+    assert planner.plan(start, goal, seed=3).tobytes() == path
+    env.close()
+
+
+# --- Planners
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_every_planner_solves_an_easy_query(worlds, name):
+    env = worlds["no_obstacles"]
+    start, goal, _ = load_queries("no_obstacles")[0]
+    # FMT and BFMT first connect a thousand samples; the "stars" use all of their limit.
+    planner = Planner(env, name, max_checks=100_000 if "FMT" in name else 3000)
+    path = planner.plan(start, goal, seed=1, time_limit=math.inf)
+    assert is_path_of(path, start, goal)
+    assert not any(env.in_collision(point) for point in interpolate(path, 0.02))
+    assert length(path) < 1.2 * length(np.stack([start, goal]))  # simplified
+
+
+def test_planners_are_those_of_ompl():
+    assert {"RRTConnect", "RRT", "RRTstar", "BITstar", "KPIECE1"} <= set(PLANNERS)
+
+
+@pytest.mark.parametrize("simplify", [1, 0])
+def test_own_planner_checks_configurations_and_gives_the_path(worlds, simplify):
+    env, asked = worlds["wall"], []
+
+    def over_the_top(is_valid, start, goal, rng):
+        top = PANDA.normalise([0.0, -0.3, 0.0, -0.2, 0.0, 1.5, 0.0])
+        asked.extend([is_valid(top), is_valid(PANDA.normalise(INTO_THE_WALL)), rng.integers(2**40)])
+        assert is_valid.checks == 2 and not is_valid.exhausted()
+        return [start, top, goal]
+
+    planner = Planner(env, over_the_top, simplify=simplify)
+    path = planner.plan(READY, TURNED, seed=3)
+    assert is_path_of(path, READY, TURNED)
+    search = int(np.random.default_rng(3).integers(1, 2**32))  # the seed of the first search
+    assert asked == [True, False, np.random.default_rng(search).integers(2**40)]
+    if simplify:
+        assert planner.checks > 2
+    else:
+        assert planner.checks == 2
+        np.testing.assert_allclose(path[1], [0.0, -0.3, 0.0, -0.2, 0.0, 1.5, 0.0], atol=1e-6)
+
+
+def test_limits_end_the_search_of_an_own_planner(worlds):
+    def never(is_valid, start, goal, rng):
+        while not is_valid.exhausted():
+            is_valid(start)
+
+    planner = Planner(worlds["no_obstacles"], never, max_checks=123)
+    expected = r"no path in 123 collision checks \(time_limit 5.0 s, max_checks 123\)"
+    with pytest.raises(PlanningError, match=expected):
+        planner.plan(READY, READY, seed=1)
+    assert planner.checks == 123
+    planner = Planner(worlds["no_obstacles"], never)
+    with pytest.raises(PlanningError, match=r"\(time_limit 0.05 s, max_checks None\)"):
+        planner.plan(READY, READY, seed=1, time_limit=0.05)
+
+
+@pytest.mark.parametrize(
+    ("answer", "complaint"),
+    [
+        (lambda start, goal: [start[:6], goal[:6]], r"shape \(2, 6\)"),
+        (lambda start, goal: [start], r"shape \(1, 7\)"),
+        (lambda start, goal: start, r"shape \(7,\)"),
+        (lambda start, goal: [goal, start], "does not start at the query's start"),
+        (
+            lambda start, goal: [start, goal + 1e-3],
+            "does not end at the query's end|does not end at the query's goal",
+        ),
+        (lambda start, goal: [start, start * 0 + 1.001, goal], r"leaves \[-1, 1\]\^7"),
+        (lambda start, goal: [start, start * np.nan, goal], r"leaves \[-1, 1\]\^7"),
+    ],
+)
+def test_bad_path_of_an_own_planner_is_rejected(worlds, answer, complaint):
+    start, goal, _ = load_queries("no_obstacles")[0]
+    planner = Planner(worlds["no_obstacles"], lambda is_valid, *query: answer(*query[:2]))
+    with pytest.raises(ValueError, match=complaint):
+        planner.plan(start, goal, seed=1)
+
+
+def test_own_planner_may_round_start_and_goal(worlds):
+    def rounded(is_valid, start, goal, rng):
+        return np.stack([start, goal]).round(6)
+
+    start, goal, _ = load_queries("no_obstacles")[0]
+    for simplify in (1, 0):
+        path = Planner(worlds["no_obstacles"], rounded, simplify=simplify).plan(start, goal, seed=1)
+        assert is_path_of(path, start, goal)
+
+
+def test_own_planner_without_a_path_is_a_planning_error(worlds):
+    with pytest.raises(PlanningError, match="no path in 0 collision checks"):
+        Planner(worlds["no_obstacles"], lambda *_: None).plan(READY, READY, seed=1)
+
+
+def test_own_planner_checks_many_configurations_at_once(worlds):
+    asked = []
+
+    def batched(is_valid, start, goal, rng):
+        points = rng.uniform(-1, 1, (50, 7))
+        free = is_valid.free(points)
+        assert is_valid.checks == 50
+        assert free.tolist() == [is_valid(point) for point in points]
+        before, free_points = is_valid.checks, points[free]
+        motions = is_valid.motions_free(start, free_points)
+        assert is_valid.checks >= before + len(free_points)
+        one_by_one = [is_valid.motion_free(tuple(start), tuple(point)) for point in free_points]
+        assert motions.tolist() == one_by_one
+        asked.extend([free.mean(), motions.mean()])
+        return [start, free_points[motions.argmax()], goal]
+
+    Planner(worlds["wall"], batched, simplify=0).plan(READY, TURNED, seed=3)
+    assert 0 < asked[0] < 1 and 0 < asked[1] < 1
+
+
+# --- Long searches
+
+# Queries of the original problems of MotionBenchMaker that need more than one search of RRT-Connect
+# with constant margins and 30,000 checks.
+HARD = {"benchmaker_bookshelf_thin": (5, 38, 88), "benchmaker_bookshelf_tall": (1, 8, 43)}
+HARD_PLANS = """
+    import sys, zlib
+    import roboarm_nmp
+    from roboarm_nmp.planning.planner import Planner
+    from roboarm_nmp.datasets.queries import load_queries
+
+    for task, numbers in eval(sys.argv[1]).items():
+        planner, queries = Planner(roboarm_nmp.make(task)), load_queries(task, "original")
+        for number in numbers:
+            path = planner.plan(*queries[number], seed=[3, number], time_limit=60.0)
+            print("plan:", task, number, planner.checks, zlib.crc32(path.tobytes()))
+"""
+
+
+def test_hard_queries_are_solved_by_the_same_paths_in_every_process():
+    plans = []
+    for task, numbers in HARD.items():
+        env, queries = envs.make(task), load_queries(task, "original")
+        planner = Planner(env)
+        for number in numbers:
+            path = planner.plan(*queries[number], seed=[3, number], time_limit=60.0)
+            assert is_path_of(path, queries[number].start, queries[number].goal)
+            assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
+            plans.append(f"plan: {task} {number} {planner.checks} {zlib.crc32(path.tobytes())}")
+        env.close()
+    script = [sys.executable, "-c", textwrap.dedent(HARD_PLANS)]
+    backwards = {task: numbers[::-1] for task, numbers in reversed(HARD.items())}
+    result = subprocess.run([*script, str(backwards)], cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    again = [line for line in result.stdout.splitlines() if line.startswith("plan:")]
+    assert again == plans[::-1]
+
+
+def test_seed_of_several_numbers_gives_a_path_of_its_own(worlds):
+    planner, (start, goal, _) = Planner(worlds["double_walls"]), load_queries("double_walls")[0]
+    paths = [planner.plan(start, goal, seed=seed).tobytes() for seed in ([4, 1], [4, 2], [1, 4], 4)]
+    assert len(set(paths)) == 4
+    assert planner.plan(start, goal, seed=np.array([4, 1])).tobytes() == paths[0]
+
+
+def test_other_planner_solves_a_query_that_rrt_connect_alone_does_not(monkeypatch):
+    """This query takes RRT-Connect half a million checks or more: docs/lab_notebook.md."""
+    env = envs.make("benchmaker_bookshelf_thin")
+    query, planner = load_queries("benchmaker_bookshelf_thin", "original")[88], Planner(env)
+    planner.plan(*query, seed=4, time_limit=60.0)
+    assert FIRST_TURN < planner.checks < 30_000
+    monkeypatch.setattr(planning, "FIRST_TURN", 10**6)
+    with pytest.raises(PlanningError, match="no path in 1[0-9]{5} collision checks"):
+        Planner(env, max_checks=100_000).plan(*query, seed=4, time_limit=60.0)
+    env.close()
+
+
+def test_path_longer_than_an_episode_is_searched_again():
+    env = envs.make("double_walls", horizon=200)
+    start, goal, _ = load_queries("double_walls")[0]
+    there = PANDA.denormalise(np.random.default_rng(0).uniform(-1, 1, (6, 7))).astype(np.float32)
+    long, longer = np.stack([start, *there, goal]), np.stack([start, *there, start, goal])
+    short = np.stack([start, goal])
+    assert length(longer) > length(long) > 200 * 0.03 > length(short)
+
+    def plan(*paths):
+        """The plan where searches find these paths, and how many paths are left over."""
+        left = list(paths)
+
+        def search(is_valid, start, goal, rng):
+            return PANDA.normalise(left.pop(0))
+
+        return Planner(env, search, simplify=0).plan(start, goal, seed=1), len(left)
+
+    for paths, best, left in (((long, short, long), short, 1), ((longer, long, longer), long, 0)):
+        path, unused = plan(*paths)
+        np.testing.assert_allclose(path, best, atol=1e-6)
+        assert unused == left
+    env.close()
+
+
+def test_max_checks_holds_for_all_searches_of_a_plan_together():
+    env = envs.make("double_walls", horizon=12)  # so short that every path is too long
+    start, goal, _ = load_queries("double_walls")[0]
+    limits = []
+
+    def search(is_valid, start, goal, rng):
+        while not is_valid.exhausted() and is_valid.checks < 40:
+            is_valid(start)
+        limits.append(is_valid.checks)
+        return None if is_valid.exhausted() else [start, goal]
+
+    planner = Planner(env, search, simplify=0, max_checks=100)
+    path = planner.plan(start, goal, seed=1)
+    assert limits == [40, 40, 20] and planner.checks == 100
+    assert is_path_of(path, start, goal)  # what the earlier searches have found
+    env.close()
+
+
+def test_margins_shrink_in_a_long_search_and_are_restored_for_its_path(worlds):
+    env, (start, goal, _) = worlds["wall"], load_queries("wall")[0]
+    points = np.random.default_rng(0).uniform(-1, 1, (20_000, 7))
+    distances = CollisionChecker(env.scene).signed_distances(points).distance.min(-1)
+    near = np.abs(distances - 0.003) < 0.006  # all points for which the margin matters
+    kept, asked = [], []
+
+    def search(is_valid, start, goal, rng):
+        for checks, _ in MARGIN_SCHEDULE:
+            while is_valid.checks < checks:
+                is_valid.free(points[:500])
+            kept.append(distances[near][is_valid.free(points[near])].min())
+        asked.append(is_valid)
+        return [start, goal]
+
+    Planner(env, search, clearance=0.0).plan(start, goal, seed=1)
+    # Simplification keeps the full margin.
+    kept.append(distances[near][asked[0].free(points[near])].min())
+    wanted = np.array([margin_scale for _, margin_scale in MARGIN_SCHEDULE] + [1.0]) * MARGIN
+    assert (kept >= wanted).all() and np.abs(kept - wanted).max() < 0.0005
+
+
+def test_geometry_source_replaces_the_obstacles_of_the_scene(worlds):
+    env, seen = worlds["wall"], []
+
+    def empty(scene):
+        seen.append(scene)
+        return CollisionChecker(Scene())
+
+    start, goal, _ = load_queries("wall")[4]
+    path = Planner(env, geometry_source=empty).plan(start, goal, seed=1)
+    assert len(path) == 2 and any(env.in_collision(point) for point in interpolate(path, 0.01))
+    assert seen and all(scene is env.scene for scene in seen)
+
+
+# --- Clearance
+
+
+@pytest.fixture(scope="module")
+def box():
+    """An environment with nothing but the box of `wall`."""
+    env = envs.RoboArmEnv(Scene(envs.TASKS["wall"].scene.obstacles, table=None, floor=None))
+    yield env
+    env.close()
+
+
+def distance(env, configuration):
+    """Of the arm from the box, m, by PyBullet's query for closest points; at most 0.2."""
+    PANDA.set_configuration(env.client, env.body, configuration)
+    (body,) = {0, 1} - {env.body}
+    points = p.getClosestPoints(env.body, body, 0.2, physicsClientId=env.client)
+    return min((point[8] for point in points), default=0.2)
+
+
+def nearest(env, path):
+    return min(distance(env, point) for point in interpolate(path, 0.01))
+
+
+def box_queries(env, number, low, high):
+    """Queries of `wall` whose nearer end is between `low` and `high` m from the box.
+
+    The straight line between them collides with it.
+    """
+    chosen = []
+    for start, goal, _ in load_queries("wall")[:400]:
+        ends = min(distance(env, end) for end in (start, goal))
+        if low < ends < high and nearest(env, np.stack([start, goal])) < 0:
+            chosen.append((start, goal))
+            if len(chosen) == number:
+                break
+    assert len(chosen) == number
+    return chosen
+
+
+def test_paths_keep_the_clearance(box):
+    wide, narrow = Planner(box, clearance=0.03), Planner(box, clearance=0.0)
+    close = []
+    for seed, (start, goal) in enumerate(box_queries(box, 6, 0.056, 0.21), 1):
+        assert nearest(box, wide.plan(start, goal, seed=seed)) > 0.029
+        close.append(nearest(box, narrow.plan(start, goal, seed=seed)))
+    assert np.median(close) < 0.02
+
+
+def test_query_that_nearly_collides_is_planned(worlds):
+    env, rng = worlds["double_walls"], np.random.default_rng(3)
+    checker = CollisionChecker(env.scene)
+    planned = 0
+    while planned < 3:
+        start = rng.uniform(PANDA.lower, PANDA.upper).astype(np.float32)
+        near = checker.signed_distances(PANDA.normalise(start)).distance.min()
+        if not env.in_collision(start) and near < 0.001:
+            goal = env.sample_feasible(rng)
+            path = Planner(env).plan(start, goal, seed=1)
+            assert is_path_of(path, start, goal)
+            assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
+            planned += 1
+
+
+def test_query_nearer_than_the_clearance_is_planned(box):
+    for start, goal in box_queries(box, 2, 0.004, 0.028):
+        path = Planner(box, clearance=0.03).plan(start, goal, seed=1)
+        assert is_path_of(path, start, goal)
+        assert nearest(box, path) > 0
+
+
+# --- Rejected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ({"planner": "RRTConect"}, "unknown planner 'RRTConect': did you mean RRTConnect"),
+        ({"planner": "PRM"}, "unknown planner 'PRM'"),
+        ({"planner": None}, "unknown planner None"),
+        ({"max_checks": 0}, "max_checks must be positive or None, got 0"),
+        ({"max_checks": -5}, "max_checks must be positive or None, got -5"),
+        ({"max_checks": math.nan}, "max_checks must be positive or None, got nan"),
+        ({"clearance": -0.01}, r"clearance must be in \[0, 0.5\) m, got -0.01"),
+        ({"clearance": 0.5}, r"clearance must be in \[0, 0.5\) m"),
+        ({"clearance": float("nan")}, r"clearance must be in \[0, 0.5\) m"),
+        ({"planner_range": -0.1}, "planner_range must be 0 or positive, got -0.1"),
+        ({"planner_range": float("nan")}, "planner_range must be 0 or positive"),
+        ({"simplify": -1}, "simplify must be a number of rounds, got -1"),
+        ({"simplify": 1.5}, "simplify must be a number of rounds, got 1.5"),
+    ],
+)
+def test_bad_constructor_argument_is_rejected(worlds, arguments, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        Planner(worlds["no_obstacles"], **arguments)
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "complaint"),
+    [
+        (INTO_THE_WALL, READY, "start is in collision: the arm with obstacle 0"),
+        (READY, INTO_THE_WALL, "goal is in collision: the arm with obstacle 0"),
+        (READY, INTO_THE_TABLE, "goal is in collision: the arm with the table"),
+        (INTO_ITSELF, READY, "start is in collision: the arm with itself"),
+        (READY + 9, READY, "start is outside the joint limits: joint 1 is 10.0000 rad"),
+        (READY, READY - 9, "goal is outside the joint limits: joint 1"),
+        (READY * np.nan, READY, "start must be finite"),
+        (READY, READY + np.float32(np.inf), "goal must be finite"),
+        (READY[:6], READY, r"start must have 7 numbers, got shape \(6,\)"),
+        (READY, READY[:3], "goal must have 7 numbers"),
+        (READY, "home", "goal must be numbers"),
+    ],
+)
+def test_bad_query_is_rejected(worlds, start, goal, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        Planner(worlds["wall"]).plan(start, goal, seed=1)
+
+
+@pytest.mark.parametrize("seed", [-1, [1, -2], None])
+def test_bad_seed_is_rejected(worlds, seed):
+    with pytest.raises(ValueError, match="seed must be|non-negative"):
+        Planner(worlds["no_obstacles"]).plan(READY, READY, seed=seed)
+
+
+@pytest.mark.parametrize("time_limit", [0.0, -1.0, math.nan])
+def test_bad_time_limit_is_rejected(worlds, time_limit):
+    with pytest.raises(ValueError, match="time_limit must be positive, got"):
+        Planner(worlds["no_obstacles"]).plan(READY, READY, seed=1, time_limit=time_limit)
+
+
+def test_search_ends_at_its_limits(worlds):
+    start, goal, _ = load_queries("double_walls")[0]
+    planner = Planner(worlds["double_walls"], max_checks=50)
+    with pytest.raises(PlanningError, match=r"\(time_limit 9.0 s, max_checks 50\)"):
+        planner.plan(start, goal, seed=1, time_limit=9.0)
+    assert 50 <= planner.checks < 200
+    planner = Planner(worlds["double_walls"])
+    with pytest.raises(PlanningError, match=r"\(time_limit 1e-06 s, max_checks None\)"):
+        planner.plan(start, goal, seed=1, time_limit=1e-6)
+
+
+# --- Memory
+
+
+def test_planning_does_not_leak_memory(worlds):
+    planner, queries = Planner(worlds["no_obstacles"]), load_queries("no_obstacles")
+    for seed in range(1, 51):
+        planner.plan(*queries[seed], seed=seed)
+    before = psutil.Process().memory_info().rss
+    for seed in range(51, 351):
+        planner.plan(*queries[seed], seed=seed)
+    assert psutil.Process().memory_info().rss - before < 20e6
+
+
+def test_plans_stay_inside_the_limits_of_the_datasheet(worlds):
+    env = worlds["double_walls"]
+    start, goal, scene = load_queries("double_walls", "validation")[2]
+    path = Planner(env).plan(start, goal, seed=1)
+    beyond = path.max(0) - np.maximum(start, goal)
+    joint, upper = beyond.argmax(), PANDA.upper.copy()
+    assert beyond[joint] > 0.1
+    upper[joint] = path[:, joint].max() - beyond[joint] / 2  # the plan leaves these limits
+    robot = dataclasses.replace(PANDA, datasheet_upper=upper, datasheet_lower=PANDA.lower)
+    env = RoboArmEnv(dataclasses.replace(scene, robot=robot))
+    inside = Planner(env, limits="datasheet").plan(start, goal, seed=1)
+    assert (
+        robot.is_within(inside, "datasheet").all() and not robot.is_within(path, "datasheet").all()
+    )
+    outside = goal.copy()
+    outside[joint] = upper[joint] + 1e-3
+    with pytest.raises(ValueError, match="goal is outside the datasheet position limits|collision"):
+        Planner(env, limits="datasheet").plan(start, outside, seed=1)
+    env.close()
+
+
+def test_unknown_limits_are_rejected(worlds):
+    with pytest.raises(ValueError, match="limits must be 'urdf' or 'datasheet', got 'wide'"):
+        Planner(worlds["wall"], limits="wide")

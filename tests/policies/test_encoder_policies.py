@@ -1,0 +1,193 @@
+"""Policies that observe an encoded scene: buffer, demonstrations, training, evaluation."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from paths import ROOT
+from trainers import PATHS, TRAINERS, load, refusal, run_here, run_script
+
+from roboarm_nmp import envs
+from roboarm_nmp.clean_rl_scripts import evaluate
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.episodes import demo_transitions, load_demos_for
+from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.envs.perception.encoders import make_encoder
+from roboarm_nmp.envs.scenes.motions import Oscillation
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+
+HARD = "random_boxes_hard"
+MOVING = Scene((Box((0.5, 0.2, 0.3), (0.1, 0.1, 0.6), motion=Oscillation((0, 0.3, 0), 1.0)),))
+oracle = make_encoder("oracle")
+SIZE = oracle.size
+
+
+@pytest.fixture
+def env():
+    env = envs.make(HARD, encoder="oracle")
+    yield env
+    env.close()
+
+
+def steps(env, length):
+    """An episode of random steps as transitions."""
+    observation, _ = env.reset()
+    transitions = []
+    for _ in range(length):
+        action = env.action_space.sample()
+        following = env.step(action)[0]
+        transitions.append(
+            {
+                "observation": observation["observation"],
+                "action": action,
+                "next_observation": following["observation"],
+                "next_achieved_goal": following["achieved_goal"],
+                "desired_goal": following["desired_goal"],
+                "collision": False,
+            }
+        )
+        observation = following
+    return transitions
+
+
+def test_buffer_samples_have_the_latent_code_of_their_scene(env):
+    sac = load("sac_her_mp")
+    env.reset(seed=0)
+    buffer = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
+    assert buffer.arrays["observation"].shape[1] < 50  # stored without latents
+    stored = {}
+    for _ in range(8):  # the oldest ones are overwritten
+        episode = steps(env, 10)
+        stored |= {t["observation"][:10].tobytes(): t for t in episode}
+        buffer.add_episode(episode)
+    copy = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
+    copy.load_state_dict(buffer.state_dict())
+    for one in (buffer, copy):
+        batch = one.sample(200)
+        assert batch["observation"].shape == (200, 10 + SIZE)
+        assert batch["observation"].dtype == np.float32
+        for row, following in zip(batch["observation"], batch["next_observation"], strict=True):
+            transition = stored[row[:10].tobytes()]
+            np.testing.assert_array_equal(row, transition["observation"])
+            np.testing.assert_array_equal(following, transition["next_observation"])
+
+
+@pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
+def test_buffer_samples_have_the_latent_codes_of_moving_obstacles(trainer):
+    env = envs.make(MOVING, encoder="oracle")
+    env.reset(seed=0)
+    buffer, stored = load(trainer).HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0)), {}
+    for _ in range(8):
+        episode = steps(env, 10)
+        stored |= {t["observation"][:10].tobytes(): t for t in episode}
+        buffer.add_episode(episode)
+    env.close()
+    assert len({t["observation"][10:].tobytes() for t in episode}) > 5
+    copy = load(trainer).HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
+    copy.load_state_dict(buffer.state_dict())
+    for one in (buffer, copy):
+        batch = one.sample(200)
+        for row, following in zip(batch["observation"], batch["next_observation"], strict=True):
+            transition = stored[row[:10].tobytes()]
+            np.testing.assert_array_equal(row, transition["observation"])
+            np.testing.assert_array_equal(following, transition["next_observation"])
+
+
+def test_demonstrations_among_moving_obstacles_cannot_have_observations_of_the_scene():
+    class Demos(list):
+        scenes, task = [MOVING], "a task"
+
+    for options in (
+        {"encoder": "oracle"},
+        {"append_link_distances": True, "link_distances": True, "geometry_source": "ground_truth"},
+    ):
+        env = envs.make(MOVING, **options)
+        with pytest.raises(DatasetError, match="among moving obstacles"):
+            load_demos_for(env, "wall", "wall")
+        env.close()
+    with pytest.raises(ValueError, match="among moving obstacles"):
+        oracle.encode_demos(Demos([None]))
+
+
+def test_demonstrations_have_the_latent_code_of_their_scene(env):
+    demos = load_demos(HARD)
+    for i in (0, 7):
+        for transition in demo_transitions(demos[i], env):
+            for name in ("observation", "next_observation"):
+                np.testing.assert_array_equal(transition[name][10:], oracle(demos[i].scene))
+
+
+def test_appended_link_distances_in_observations_buffer_and_demonstrations():
+    arguments = {"encoder": "oracle", "append_link_distances": True}
+    env = envs.make(HARD, **arguments, link_distances=True, geometry_source="ground_truth")
+    env.reset(seed=0)
+    buffer = load("sac_her_mp").HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
+    episode = steps(env, 10)
+    buffer.add_episode(episode)
+    observations = np.stack([one["observation"] for one in episode])
+    near = env.link_distances_at(observations[:, :7])
+    np.testing.assert_array_equal(observations[:, 10:90], near.reshape(10, 80))
+    np.testing.assert_array_equal(observations[0, 90:], oracle(env.unwrapped.scene))
+    rows = {row.tobytes() for row in observations}
+    assert {row.tobytes() for row in buffer.sample(100)["observation"]} == rows
+    demo = load_demos(HARD)[7]  # in another scene than the environment's
+    transitions = demo_transitions(demo, env)
+    env.reset_specific(demo.start, demo.goal, demo.scene)
+    for i, one in enumerate(transitions):
+        near = env.link_distances_at(demo.states[i]).ravel()
+        np.testing.assert_allclose(one["observation"][10:90], near, atol=1e-6)
+        np.testing.assert_array_equal(one["observation"][90:], oracle(demo.scene))
+    env.close()
+
+
+def flags(trainer, demos):
+    more = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
+    more += ["--goal-type", "combined", "--demos", demos, "--eval-queries", "1"]
+    distances = ["--link-distances", "ground_truth"]
+    return more if trainer == "bc" else [*more, "--demo-prob", "1", *distances]
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_policy_with_an_encoder_is_trained_resumed_and_evaluated(
+    trainer, tmp_path, short_episodes, few_demos
+):
+    given = flags(trainer, few_demos)
+    run = run_script(trainer, tmp_path / "whole", *given)
+    network = torch.load(run / "policy.pt", weights_only=True)
+    assert network["metadata"]["env"]["encoder"] == "oracle"
+    arguments = ["--policy", run, "--num-queries", "3", "--task", HARD]
+    arguments += ["--json", tmp_path / "result.json"]
+    assert evaluate.main(list(map(str, arguments))) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["goal_type"] == "combined" and result["privileged"]
+    assert network["metadata"]["env"].get("append_link_distances", False) == (trainer != "bc")
+    if trainer == "bc":
+        show = [sys.executable, "-m", "roboarm_nmp.viewer.show", HARD, "--policy", str(run)]
+        show += ["--size", "60", "40", "--output", str(tmp_path / "rollout.gif")]
+        subprocess.run(show, check=True, capture_output=True, cwd=ROOT)
+        assert (tmp_path / "rollout.gif").stat().st_size > 0
+        return
+    again = run_script(trainer, tmp_path / "part", *given, "--total-timesteps", "600")
+    run_here(PATHS[trainer], "--resume", again, "--total-timesteps", "1200")
+    one, other = (
+        torch.load(path / "checkpoint.pt", weights_only=True)["actor"] for path in (run, again)
+    )
+    assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_file_that_is_no_encoder_is_rejected(trainer, tmp_path, capsys):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "encoder.pt").write_text("nothing")
+    given = ("--encoder", str(tmp_path / "encoder.pt"))
+    message = refusal(trainer, capsys, tmp_path / "runs", *given)
+    assert "--encoder: " in message and "not a network file" in message
+
+
+def test_environments_of_a_process_share_one_encoder(env):
+    other = envs.make(HARD, encoder="oracle")
+    assert env.encoder is other.encoder is oracle
+    other.close()

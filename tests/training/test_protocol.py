@@ -1,0 +1,334 @@
+"""training/protocol.py: results and rules of evaluations. (Whole runs: test_trainers.py.)"""
+
+import json
+import signal
+import sys
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.networks.exported_networks import load_network, save_network
+from roboarm_nmp.policies.registry import PolicyError, make_policy
+from roboarm_nmp.policies.safety_filter import SafetyFilter
+from roboarm_nmp.training import protocol
+from roboarm_nmp.utils import flags, progress
+
+HARD = "random_boxes_hard"
+DISTANCES = {"link_distances": True, "geometry_source": "ground_truth"}
+
+
+@dataclass
+class Flags(protocol.PolicyFlags):
+    goal_type: str = "config"
+
+
+@pytest.fixture(autouse=True)
+def restored(monkeypatch):
+    """What a run sets for its process."""
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def a_run(folder, env_arguments, eval_envs, task="no_obstacles", validation=()):
+    """A `PolicyRun` without anything to train."""
+    args = Flags(task=task, runs_dir=folder / "runs")
+    return protocol.PolicyRun(args, {}, "cpu", env_arguments, eval_envs, validation)
+
+
+class Toward(torch.nn.Module):
+    """Straight to the goal configuration, in steps of `size` (L2)."""
+
+    def __init__(self, size):
+        super().__init__()
+        self.size = size
+
+    def forward(self, observation, achieved_goal, desired_goal):
+        apart = desired_goal - observation[:, :7]
+        return self.size * apart / torch.linalg.vector_norm(apart, dim=1, keepdim=True)
+
+
+@pytest.mark.parametrize("number", [1, 3, 8])
+def test_results_do_not_depend_on_the_number_of_environments(number):
+    queries = load_queries("wall", "validation")[:6]
+    policy = Toward(0.03)
+    found = protocol.evaluate(
+        policy, protocol.make_envs("wall", number, goal_type="config"), queries, "cpu"
+    )
+    env, outcomes = envs.make("wall", goal_type="config"), []
+    for query in queries:
+        observation, _ = env.reset_specific(*query)
+        over = False
+        while not over:
+            batch = {name: torch.tensor(value[None]) for name, value in observation.items()}
+            observation, _, terminated, truncated, info = env.step(policy(**batch)[0].numpy())
+            over = terminated or truncated
+        outcomes.append((info["is_success"], info["collision_so_far"], info["elapsed_steps"]))
+    assert len({outcome[:2] for outcome in outcomes}) > 1  # some collide or fail, others do not
+    success, collides, steps = np.array(outcomes).T
+    assert found == {
+        "success_rate": success.mean(),
+        "collision_free_success_rate": (success * (1 - collides)).mean(),
+        "collision_rate": collides.mean(),
+        "episode_length": steps.mean(),
+    }
+
+
+def test_safety_filter_has_its_own_state_in_every_episode():
+    queries = load_queries(HARD, "validation")[:7]
+    straight, safety_filter = Toward(0.03), SafetyFilter(0.012)
+
+    def policy(observation, achieved_goal, desired_goal, **_):
+        return straight(observation, achieved_goal, desired_goal)
+
+    several, one = (
+        protocol.make_envs(HARD, number, goal_type="config", **DISTANCES) for number in (3, 1)
+    )
+    found, outcomes = protocol.evaluate(policy, several, queries, "cpu", safety_filter), []
+    for i, query in enumerate(queries):
+
+        def act(observation):
+            return policy(**protocol.stack([observation], "cpu"))[0].numpy()
+
+        act = safety_filter.filter_policy(act, one[0], np.random.default_rng([0, i]))
+        observation, _ = one[0].reset_specific(*query)
+        over = False
+        while not over:
+            observation, _, terminated, truncated, info = one[0].step(act(observation))
+            over = terminated or truncated
+        outcomes.append((info["is_success"], info["elapsed_steps"]))
+    success, steps = np.mean(outcomes, axis=0)
+    assert found["success_rate"] == success and found["episode_length"] == steps
+    bare = protocol.evaluate(policy, several, queries, "cpu")
+    assert found["collision_rate"] < bare["collision_rate"]
+
+
+class Hesitant(torch.nn.Module):
+    """Toward the goal, alternately fast and slow: the recurrent state has the steps and moves."""
+
+    recurrent_size = 8
+
+    def forward(self, observation, achieved_goal, desired_goal, recurrent_state):
+        steps, moved = recurrent_state[:, :1], recurrent_state[:, 1:]
+        speed = 0.03 + 0.02 * torch.sin(steps) - 0.002 * torch.abs(moved)
+        action = speed * torch.tanh(10 * (desired_goal - observation[:, :7]))
+        return action, torch.cat([steps + 1, moved + action], dim=1)
+
+
+def test_recurrent_state_starts_at_zero_in_every_episode(tmp_path):
+    arguments, queries = {"goal_type": "config"}, load_queries("wall", "validation")[:5]
+    several = protocol.make_eval_envs("wall", 3, **arguments)
+    found, policy, outcomes = protocol.evaluate(Hesitant(), several, queries, "cpu"), Hesitant(), []
+    env = envs.make("wall", **arguments)
+    for query in queries:
+        observation, _ = env.reset_specific(*query)
+        over, state = False, torch.zeros(1, 8)
+        while not over:
+            action, state = policy(**protocol.stack([observation], "cpu"), recurrent_state=state)
+            observation, _, terminated, truncated, info = env.step(action[0].numpy())
+            over = terminated or truncated
+        assert state[0, 0] == info["elapsed_steps"]
+        outcomes.append((info["is_success"], info["elapsed_steps"]))
+    assert len({steps for _, steps in outcomes}) == 5
+    success, steps = np.mean(outcomes, axis=0)
+    assert found["success_rate"] == success and found["episode_length"] == steps
+
+    run = a_run(tmp_path, arguments, several, task="wall")
+    run.save_policy(policy)
+    saved = load_network(run.folder / "policy.pt")
+    assert saved.metadata["recurrent_size"] == 8 and "recurrent_state" in saved.inputs
+    assert protocol.evaluate(saved, several, queries, "cpu") == found
+    result = evaluate(run.folder, "wall", split="validation", num_queries=5)
+    assert result["success_rate"] == success
+    reached = [steps for success, steps in outcomes if success]
+    assert result["mean_steps"] == pytest.approx(np.mean(reached))
+
+
+def test_recurrent_state_stays_during_an_escape_of_the_safety_filter():
+    arguments = {"goal_type": "config", **DISTANCES}
+    queries = load_queries(HARD, "validation")[:3]
+    several, states = protocol.make_eval_envs(HARD, 3, **arguments), []
+
+    class Counting(torch.nn.Module):
+        recurrent_size = 1
+
+        def forward(self, observation, achieved_goal, desired_goal, recurrent_state, **_):
+            states.append(recurrent_state[:, 0])
+            return 0.05 * (desired_goal - observation[:, :7]), recurrent_state + 1
+
+    for query in queries:
+        states.clear()
+        result = protocol.evaluate(Counting(), several[:1], [query], "cpu", SafetyFilter())
+        if result["episode_length"] > states[-1] + 1:  # there were escapes
+            break
+    assert result["episode_length"] == len(states) > states[-1] + 1
+
+
+@pytest.mark.parametrize("size", [-1, 2.0, True, 10**9])
+def test_invalid_recurrent_size_is_rejected(size):
+    policy = SimpleNamespace(recurrent_size=size)
+    with pytest.raises(PolicyError, match="recurrent state has 0 to 65,536 numbers"):
+        protocol.evaluate(policy, [], [], "cpu")
+
+
+def test_recurrent_state_of_another_size_than_the_metadata_is_rejected(tmp_path):
+    env = envs.make("wall", goal_type="config")
+    example = protocol.stack([env.reset(seed=0)[0]] * 2, "cpu")
+    metadata = {"kind": "policy", "env": {"goal_type": "config"}}
+    path = tmp_path / "policy.pt"
+    save_network(path, Toward(0.05), example, metadata | {"recurrent_size": 8})
+    with pytest.raises(PolicyError, match="not a sequence of 2"):
+        make_policy(path, env)
+    example["recurrent_state"] = torch.zeros(2, 8)
+    sizes = ((0, "needs recurrent_state"), (7, "do not fit|failed"), (9, "do not fit|failed"))
+    for size, message in sizes:
+        save_network(path, Hesitant(), example, metadata | {"recurrent_size": size})
+        with pytest.raises(PolicyError, match=message):
+            make_policy(path, env)
+
+
+def test_image_strip_shows_the_episode_from_start_to_end():
+    query = load_queries("wall", "validation")[0]
+    [env] = protocol.make_envs("wall", 1, goal_type="config", render_mode="rgb_array")
+    strip = protocol.rollout_image(Toward(0.03), env, query, "cpu", frames=3)
+    last = env.render()  # still at the end of the episode
+    observation, _ = env.reset_specific(*query)
+    images, over = [env.render()], False
+    while not over:
+        batch = {name: torch.tensor(value[None]) for name, value in observation.items()}
+        action = Toward(0.03)(**batch)[0].numpy()
+        observation, _, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+        if info["elapsed_steps"] % 10 == 0 or over:
+            images.append(env.render())
+    images = [images[i] for i in np.linspace(0, len(images) - 1, 3).round().astype(int)]
+    assert np.array_equal(strip, np.concatenate(images, axis=1))
+    assert np.array_equal(strip[:, -last.shape[1] :], last)
+    assert not np.array_equal(images[0], images[1])
+
+
+def test_latest_of_equally_good_policies_is_the_best(tmp_path, monkeypatch):
+    rates = 0.5, 0.7, 0.6, 0.7, 0.2
+    results = ({"success_rate": rate} for rate in rates)
+    monkeypatch.setattr(protocol, "evaluate", lambda *_, **__: next(results))
+    monkeypatch.setattr(protocol, "rollout_image", lambda *_: np.zeros((2, 2, 3), np.uint8))
+    run = a_run(tmp_path, {}, [None], validation=[None])
+    run.start(5, "step")
+    found = []
+    for _ in range(5):
+        run.advance()
+        is_best = run.validate(None)
+        found.append((is_best, run.best_step, run.best_score))
+    run.close()
+    assert found == [
+        (True, 1, 0.5),
+        (True, 2, 0.7),
+        (False, 2, 0.7),
+        (True, 4, 0.7),
+        (False, 4, 0.7),
+    ]
+
+
+def result_of(tmp_path, capsys, num_queries=3, **env_arguments):
+    """`result.json` and the printed lines for a policy that needs more than 50 steps."""
+    env_arguments |= {"goal_type": "config"}
+    made = protocol.make_eval_envs("no_obstacles", 3, **env_arguments)
+    run = a_run(tmp_path, env_arguments, made)
+    run.start(10, "step")
+    run.advance(7)
+    run.is_best(0.5)
+    run.save_policy(Toward(0.01))
+    run.advance(3)
+    run._bar.start_t -= 1000.0  # as if training had taken so long
+    run.checkpoint()
+    run.final_test(load_queries("no_obstacles", "test")[:num_queries])
+    return json.loads((run.folder / "result.json").read_text()), capsys.readouterr().out
+
+
+def test_final_test_is_run_under_the_standard_rules(tmp_path, capsys):
+    standard, line = result_of(tmp_path, capsys)
+    assert standard["success_rate"] > 0.5 and standard["episode_length"] > 50
+    assert standard["rules"] == standard["rules_in_training"]
+    assert (standard["policy_step"], standard["steps"]) == (7, 10)
+    assert 1000 <= standard["seconds"] < 1100
+    assert standard["validation_success_rate"] == 0.5
+    assert "trained with" not in line and "3 test queries: success" in line
+    assert standard["deviations"] == {} and "not comparable" not in line
+    assert standard["privileged"] is False and "privileged" not in line
+    for other in ({"horizon": 50}, {"stop_on_collision": True}):
+        result, lines = result_of(tmp_path, capsys, **other)
+        assert result["rules"] == {"horizon": 400, "stop_on_collision": False}
+        assert result["rules_in_training"] == result["rules"] | other
+        assert result["success_rate"] == standard["success_rate"]
+        assert result["episode_length"] == standard["episode_length"]
+        assert "tested under the standard rules, 400 steps, contacts allowed:" in lines
+
+
+def test_run_without_test_queries_has_no_figures_of_a_test(tmp_path, capsys):
+    flags.check(Flags(test_queries=0))
+    result, lines = result_of(tmp_path, capsys, num_queries=0)
+    assert result["num_queries"] == 0 and not any("collision" in name for name in result)
+    assert "success_rate" not in result and result["validation_success_rate"] == 0.5
+    assert "no test, --test-queries 0; validation success 0.500 at 7" in lines
+
+
+def test_validations_and_the_final_test_show_their_progress(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "LOG_INTERVAL", 0)
+    queries = load_queries("no_obstacles", "validation")[:2]
+    envs_ = protocol.make_eval_envs("no_obstacles", 2, goal_type="config")
+    run = a_run(tmp_path, {"goal_type": "config"}, envs_, validation=queries)
+    run.start(10, "step")
+    run.safety_filter = SafetyFilter(0.0)
+    monkeypatch.setattr(protocol, "rollout_image", lambda *_: np.zeros((2, 2, 3), np.uint8))
+    policy, evaluate = Toward(0.03), protocol.evaluate
+
+    def without_filter(policy, envs, queries, device, safety_filter=None, **bar):
+        return evaluate(policy, envs, queries, device, **bar)
+
+    monkeypatch.setattr(protocol, "evaluate", without_filter)
+    assert run.validate(policy)
+    run.safety_filter = None
+    run.save_policy(policy)
+    run.final_test(queries)
+    lines = capsys.readouterr().err.splitlines()
+    for name in ("validation", "validation without filter", "test"):
+        assert any(line.startswith(f"{name}: 100%, 2/2, ") for line in lines), name
+
+
+def test_result_with_other_step_lengths_is_marked_as_not_comparable(tmp_path, capsys):
+    result, lines = result_of(tmp_path, capsys, max_step=0.02)
+    assert result["deviations"] == {"max_step": 0.02}
+    assert "not comparable: max_step is 0.02, not 0.03" in lines
+    assert result["rules"] == result["rules_in_training"]
+
+
+@pytest.mark.parametrize(("encoder", "privileged"), [("oracle", True), ("point_cloud", False)])
+def test_result_of_a_policy_that_observes_ground_truth_is_privileged(
+    encoder, privileged, tmp_path, capsys
+):
+    result, line = result_of(tmp_path, capsys, encoder=encoder)
+    assert result["privileged"] is privileged
+    assert ("test queries, privileged: success" in line) == privileged
+
+
+def test_training_environments_need_neither_replay_buffer_nor_demonstrations():
+    @dataclass
+    class Args(protocol.EnvFlags):
+        task: str = "wall"
+        num_envs: int = 2
+        device: str = "cpu"
+
+    made = protocol.make_training_envs(Args(goal_type="config", velocities=True))
+    assert made.begin_episodes(seed=1, step=0) == []
+    assert len(made.observations) == 2
+    for observation in made.observations:
+        assert observation["observation"].shape == (17,)
+        assert observation["desired_goal"].shape == (7,)

@@ -1,0 +1,478 @@
+"""training/runs.py: flags, checkpoints, logs, signals. (Whole runs: test_trainers.py.)"""
+
+import contextlib
+import io
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from roboarm_nmp.training import runs
+from roboarm_nmp.utils.files import new_contents
+
+
+@dataclass
+class Args(runs.RunFlags):
+    data: Path | None = None
+    files: tuple[Path, ...] = ()
+    radii: tuple[float, float] = (0.1, 0.2)
+    name: str | None = None
+    steps: int = 10
+    size: ClassVar[int] = 0
+
+
+@pytest.fixture(autouse=True)
+def restored(monkeypatch):
+    """What a run sets for its process."""
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def parse(monkeypatch):
+    def parse(*flags):
+        monkeypatch.setattr("sys.argv", ["trainer.py", *map(str, flags)])
+        return runs.parse_args(Args, may_change={"steps", "data"})
+
+    return parse
+
+
+def test_flags_are_restored_by_resume(parse, tmp_path):
+    flags = ["--runs-dir", tmp_path, "--data", "a.h5", "--files", "b.h5", "c.h5", "--name", "x"]
+    args = parse(*flags, "--radii", "0.3", "0.5")
+    run = runs.run_folder(args, "wall")
+    assert run.parent == tmp_path and run.name.startswith("wall__trainer__1__")
+    again = parse("--resume", run)
+    assert again.resume == run == runs.run_folder(again, "wall")
+    args.resume = run
+    assert again == args
+    assert isinstance(again.data, Path) and all(isinstance(file, Path) for file in again.files)
+    changed = parse("--resume", run, "--steps", "20", "--data", "d.h5")
+    assert (changed.steps, changed.data) == (20, Path("d.h5"))
+
+
+@pytest.mark.parametrize(
+    "flags, message",
+    [
+        (["--radii", "0.3", "0.4"], r"--radii is \[0.3, 0.4\] now, the run had \[0.1, 0.2\]"),
+        (["--files", "e.h5"], r"--files is \['e.h5'\] now, the run had \[\]"),
+        (["--name", "y"], "--name is 'y' now, the run had None"),
+        (["--seed", "2", "--name", "z"], "--seed is 2 now, .*; --name is 'z'"),
+    ],
+)
+def test_resuming_with_another_flag_is_rejected(parse, tmp_path, flags, message):
+    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    with pytest.raises(SystemExit, match=message):
+        parse("--resume", run, *flags)
+
+
+def test_run_without_a_newer_flag_resumes_with_its_default(parse, tmp_path):
+    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    saved = json.loads((run / "args.json").read_text())
+    del saved["radii"]
+    (run / "args.json").write_text(json.dumps(saved | {"a_flag_that_was": 3}))
+    assert parse("--resume", run).radii == (0.1, 0.2)
+    with pytest.raises(SystemExit, match="--radii"):
+        parse("--resume", run, "--radii", "0.3", "0.4")
+
+
+def test_missing_run_or_gpu_is_rejected(parse, tmp_path, monkeypatch):
+    with pytest.raises(SystemExit, match="is no run's folder"):
+        parse("--resume", tmp_path)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(SystemExit, match="PyTorch sees no CUDA device"):
+        parse("--device", "cuda")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    assert parse("--device", "cuda:1").device == "cuda:1"
+    with pytest.raises(SystemExit, match=r"--device cuda:2: PyTorch sees 2 CUDA device\(s\) here"):
+        parse("--device", "cuda:2")
+
+
+def test_resumed_run_keeps_its_choice_of_bfloat16(parse, tmp_path, monkeypatch):
+    @dataclass
+    class WithBf16(Args):
+        bf16: bool | None = None
+
+    def begin(supported, *flags):
+        monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: supported)
+        monkeypatch.setattr("sys.argv", ["trainer.py", *map(str, flags)])
+        args = runs.parse_args(WithBf16)
+        return args.bf16, runs.run_folder(args, "wall")
+
+    for number, supported in enumerate((False, True)):
+        bf16, run = begin(supported, "--runs-dir", tmp_path / str(number))
+        assert bf16 is supported
+        assert json.loads((run / "args.json").read_text())["bf16"] is supported
+        assert begin(not supported, "--resume", run)[0] is supported
+    assert begin(False, "--runs-dir", tmp_path, "--bf16", "True")[0] is True
+
+
+def parts():
+    model = torch.nn.Linear(3, 2)
+    return {
+        "model": model,
+        "optimizer": torch.optim.Adam(model.parameters(), lr=0.1, fused=True),
+        "alpha": torch.zeros(1, requires_grad=True),
+        "rng": np.random.default_rng(0),
+        "counts": {"updates": 0, "best": {}},
+    }
+
+
+def learn(parts):
+    """Steps that use every part; what came out."""
+    inputs = torch.randn(4, 3) * float(parts["rng"].random()) + parts["alpha"]
+    loss = parts["model"](inputs).square().sum()
+    parts["optimizer"].zero_grad()
+    loss.backward()
+    parts["optimizer"].step()
+    with torch.no_grad():
+        parts["alpha"] += 1
+    parts["counts"]["updates"] += 1
+    parts["counts"]["best"] = {"loss": loss.item()}
+    return loss.item()
+
+
+def test_checkpoint_restores_every_part(parse, tmp_path):
+    args = parse("--runs-dir", tmp_path)
+    run = runs.run_folder(args, "wall")
+    runs.seed_torch(args)
+    before = parts()
+    runs.load_checkpoint(args, before)  # a new run: nothing happens
+    learn(before)
+    runs.save_checkpoint(run, before, "cpu")
+    assert {path.name for path in run.iterdir()} == {"args.json", "checkpoint.pt"}
+    expected = [learn(before) for _ in range(3)]
+
+    args = parse("--resume", run)
+    after = parts()
+    runs.load_checkpoint(args, after)
+    assert after["counts"]["updates"] == 1 and after["alpha"].requires_grad
+    assert [learn(after) for _ in range(3)] == expected
+    for newer, name in (
+        ({"critic": torch.nn.Linear(1, 1)}, "critic"),
+        ({"counts": {"updates": 0, "best_step": 0}}, "best_step"),
+    ):
+        with pytest.raises(SystemExit, match=f"of another version: it has no {name}"):
+            runs.load_checkpoint(args, after | newer)
+    with pytest.raises(SystemExit, match="of another version: the layers of its model are others$"):
+        runs.load_checkpoint(args, after | {"model": torch.nn.Linear(4, 2)})
+
+
+def test_random_numbers_of_the_runs_gpu_are_restored(parse, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    states, given = {"cuda:0": torch.tensor([3]), "cuda:1": torch.tensor([7])}, []
+    monkeypatch.setattr("torch.cuda.get_rng_state", lambda device: states[str(device)])
+    monkeypatch.setattr("torch.cuda.set_rng_state", lambda *state: given.append(state))
+    run = runs.run_folder(parse("--runs-dir", tmp_path, "--device", "cuda:1"), "wall")
+    runs.save_checkpoint(run, parts(), torch.device("cuda:1"))
+    runs.load_checkpoint(parse("--resume", run), parts())
+    assert given == [(torch.tensor([7]), "cuda:1")]
+
+
+def test_files_are_found_from_another_working_directory(parse, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for name in ("a.h5", "mine.yaml"):
+        Path(name).touch()
+    flags = ["--data", "a.h5", "--name", "mine.yaml", "--files", "missing.h5", "--runs-dir", "runs"]
+    run = runs.run_folder(parse(*flags), "mine").absolute()
+    assert parse("--resume", run).name == "mine.yaml"
+    monkeypatch.chdir(tmp_path / "there")
+    args = parse("--resume", run)
+    assert args.data == tmp_path / "here" / "a.h5"
+    assert args.name == str(tmp_path / "here" / "mine.yaml")
+    assert args.files == (Path("missing.h5"),)  # its reader reports it
+
+
+def test_robot_of_a_task_is_found_from_another_working_directory(parse, tmp_path, monkeypatch):
+    for folder in ("here", "there"):
+        (tmp_path / folder).mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    Path("boxes").mkdir()  # no file of the task of this name
+    Path("ur5.urdf").touch()
+    run = runs.run_folder(parse("--name", "boxes@ur5.urdf", "--runs-dir", "runs"), "a").absolute()
+    assert parse("--resume", run).name == "boxes@ur5.urdf"
+    monkeypatch.chdir(tmp_path / "there")
+    assert parse("--resume", run).name == f"boxes@{tmp_path}/here/ur5.urdf"
+
+
+def test_leftovers_of_a_kill_are_removed(parse, tmp_path):
+    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    left = run / ".checkpoint.pt.0123abcd.tmp"
+    left.write_text("half of one")
+    with new_contents(run / "policy.pt") as being_written:
+        runs.run_folder(parse("--resume", run), "wall")
+        assert not left.exists() and being_written.exists()
+        being_written.write_text("whole")
+    assert {path.name for path in run.iterdir()} == {"args.json", "policy.pt"}
+    left.touch()
+    runs.save_checkpoint(run, parts(), "cpu")
+    assert not left.exists()
+
+
+SCRIPT = """
+import os, resource, signal, sys
+from dataclasses import dataclass
+import torch
+from roboarm_nmp.training import runs
+
+@dataclass
+class Args(runs.RunFlags):
+    pass
+
+args = runs.parse_args(Args)
+run = runs.run_folder(args, "wall")
+numbers = torch.zeros(1000)
+runs.save_checkpoint(run, {"numbers": numbers}, "cpu")
+"""
+
+
+def script(folder, code):
+    """A process that runs `SCRIPT` and `code`, when it has ended; and its run's folder."""
+    command = [sys.executable, "-c", SCRIPT + code, "--runs-dir", folder]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    return ended, min(folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        (
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900))\nsave()",
+            "error: .*: 'checkpoint.pt'",
+        ),
+        ("torch.zeros(10**15)", "error: out of memory .+"),
+        ("bytearray(10**15)", "error: out of memory"),
+        (
+            "from concurrent.futures.process import BrokenProcessPool\n"
+            "raise BrokenProcessPool('a process has died')",
+            "error: a process has died",
+        ),
+    ],
+)
+def test_errors_that_are_no_mistake_of_the_program_get_a_line(tmp_path, code, message):
+    save = "def save():\n    runs.save_checkpoint(run, {'numbers': numbers + 1}, 'cpu')\n"
+    ended, run = script(tmp_path, save + code)
+    lines = ended.stderr.strip().splitlines()
+    assert ended.returncode != 0 and "Traceback" not in ended.stderr
+    assert re.fullmatch(message, lines[-2])
+    assert lines[-1] == f"--resume {run} continues from the last checkpoint"
+    assert {path.name for path in run.iterdir()} == {"args.json", "checkpoint.pt"}
+    assert not torch.load(run / "checkpoint.pt", weights_only=True)["numbers"].any()
+
+
+def test_other_errors_keep_their_traceback(tmp_path):
+    ended, _ = script(tmp_path, "1 / 0")
+    assert "Traceback" in ended.stderr and "ZeroDivisionError" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "word"), [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted")]
+)
+def test_signal_outside_the_loop_ends_a_run_with_a_line(tmp_path, number, code, word):
+    kill = f"os.kill(os.getpid(), signal.{number})"
+    ended, run = script(tmp_path, kill)
+    assert ended.returncode == code
+    line = f"{word}; --resume {run} continues from the last checkpoint"
+    assert ended.stderr.splitlines()[-1] == line and "Traceback" not in ended.stderr
+
+
+LOOP = """
+run = runs.Run(args, "wall", {"numbers": numbers}, "cpu")
+run.start(10, "update")
+while run.step < 10:
+    run.advance()
+    numbers += 1
+    if run.step == 3:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert run.interrupted  # and this step is completed
+        %s
+    if run.interrupted:
+        run.checkpoint()
+    assert run.step <= 3
+"""
+
+
+def test_signals_in_the_loop_end_a_run_in_a_checkpoint(tmp_path):
+    # `timeout` sends it to all processes, and so does a search to its trainers.
+    ended, _ = script(tmp_path, LOOP % "os.kill(os.getpid(), signal.SIGTERM)")
+    run = sorted(tmp_path.iterdir())[-1]
+    assert ended.returncode == 143
+    line = f"terminated; checkpoint at update 3; --resume {run} continues there"
+    assert ended.stderr.splitlines()[-1] == line
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    assert state["progress"]["step"] == 3 and (state["numbers"] == 3).all()
+
+
+def test_second_signal_ends_a_run_at_once(tmp_path):
+    later = "runs.SAME_INTERRUPT = 0.0; os.kill(os.getpid(), signal.SIGTERM)"
+    ended, _ = script(tmp_path, LOOP % later)
+    run = sorted(tmp_path.iterdir())[-1]
+    assert ended.returncode == 143
+    line = f"terminated; no checkpoint yet; --resume {run} starts again"
+    assert ended.stderr.splitlines()[-1] == line
+    assert not (run / "checkpoint.pt").exists()
+
+
+def test_damaged_checkpoint_is_rejected_by_name(parse, tmp_path):
+    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    args = parse("--resume", run)
+    runs.load_checkpoint(args, parts())  # stopped before the first checkpoint
+    runs.save_checkpoint(run, parts(), "cpu")
+    content = (run / "checkpoint.pt").read_bytes()
+    (run / "checkpoint.pt").write_bytes(content[: len(content) // 2])
+    with pytest.raises(SystemExit, match="checkpoint.pt is damaged"):
+        runs.load_checkpoint(args, parts())
+    saved = torch.load(io.BytesIO(content), weights_only=True)
+    rng, unnoticed = np.random.default_rng(0), 0
+    for _ in range(100):
+        flipped = bytearray(content)
+        flipped[rng.integers(len(content))] ^= 1 << rng.integers(8)
+        (run / "checkpoint.pt").write_bytes(flipped)
+        with contextlib.suppress(SystemExit):
+            runs.load_checkpoint(args, parts())
+            unnoticed += 1  # nothing but padding or a date was hit:
+            assert str(torch.load(run / "checkpoint.pt", weights_only=True)) == str(saved)
+    assert unnoticed < 50
+
+
+def test_events_of_repeated_steps_are_hidden(parse, tmp_path):
+    args = parse("--runs-dir", tmp_path)
+    run = runs.run_folder(args, "wall")
+    for begin, end in ((0, 4), (2, 5)):  # stopped after step 4, its checkpoint was of step 2
+        with runs.summary_writer(run, args, begin) as writer:
+            for step in range(begin + 1, end + 1):
+                writer.add_scalar("loss", 10 * begin + step, step)
+        time.sleep(1.1)  # TensorBoard orders files by their names, which have the second
+    events = EventAccumulator(str(run))
+    events.Reload()
+    found = [(event.step, event.value) for event in events.Scalars("loss")]
+    assert found == [(1, 1), (2, 2), (3, 23), (4, 24), (5, 25)]
+    table = events.Tensors("hyperparameters/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "|radii|(0.1, 0.2)|" in table
+
+
+def test_track_logs_to_weights_and_biases(parse, tmp_path, monkeypatch):
+    with pytest.raises(SystemExit, match=r"--track: wandb is not installed \(pip install wandb\)"):
+        parse("--track")
+    (tmp_path / "wandb.py").write_text("calls = []\ndef init(**kw): calls.append(kw)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    args = parse("--runs-dir", tmp_path / "runs", "--data", "a.h5")
+    run = runs.run_folder(args, "wall")
+    runs.summary_writer(run, args, 0).close()
+    assert "wandb" not in sys.modules  # off by default
+
+    args = parse("--resume", run, "--track")
+    runs.summary_writer(run, args, 0).close()
+    (call,) = sys.modules.pop("wandb").calls
+    assert call["sync_tensorboard"] and call["id"] == run.name and call["resume"] == "allow"
+    assert (call["config"]["data"], call["config"]["steps"]) == ("a.h5", 10)
+    json.dumps(call)  # plain values only
+
+
+def begin(parse, tmp_path, *flags):
+    """A `Run` and its parts."""
+    args, changing = parse("--runs-dir", tmp_path, *flags), parts()
+    return runs.Run(args, "wall", changing, torch.device("cpu")), changing
+
+
+def test_run_continues_with_step_time_and_best_evaluation(parse, tmp_path, monkeypatch):
+    run, changing = begin(parse, tmp_path)
+    run.start(10, "update")
+    assert (run.step, run.best_step, run.best_score, run.best_result) == (0, 0, -math.inf, {})
+    assert run.advance() == 1 and run.is_best(0.5, {"error": 2.0})
+    assert run.advance(3) == 4 and not run.is_best(0.4)
+    expected = learn(changing)
+    run._bar.start_t -= 100.0  # as if that had taken so long
+    run.checkpoint()
+    run.close()
+    learn(changing)
+
+    resumed, again = begin(parse, tmp_path, "--resume", run.folder)
+    assert resumed.folder == run.folder and resumed.step == 4
+    assert (resumed.best_step, resumed.best_score) == (1, 0.5)
+    assert resumed.best_result == {"error": 2.0} and 100 <= resumed.seconds < 110
+    assert again["counts"]["best"]["loss"] == expected
+    resumed.start(10, "update")
+    resumed.advance()
+    resumed.checkpoint()
+    assert 100 < resumed.seconds < 115
+    resumed.close()
+
+
+def test_run_prints_its_folder_before_anything_else(parse, tmp_path, capsys):
+    run, _ = begin(parse, tmp_path)
+    assert capsys.readouterr().out == f"run folder: {run.folder}\n"
+
+
+def test_bar_shows_labelled_values_in_their_order(parse, tmp_path, capsys):
+    run, _ = begin(parse, tmp_path)
+    run.start(10, "update")
+    run.show(**{"validation success": "0.620", "best": "0.710"})
+    run.close()
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("training: 0%, 0/10, ")
+    assert line.endswith("validation success=0.620, best=0.710")
+
+
+def test_equal_score_is_the_best_and_nan_never(parse, tmp_path):
+    run, _ = begin(parse, tmp_path)
+    run.start(10, "update")
+    found = []
+    for score in (math.nan, 0.5, 0.7, 0.6, 0.7, math.nan):
+        run.advance()
+        found.append(run.is_best(score))
+    run.close()
+    assert found == [False, True, True, False, True, False]
+    assert (run.best_step, run.best_score) == (5, 0.7)
+
+
+def test_log_writes_numbers_and_means_of_tensors(parse, tmp_path):
+    run, _ = begin(parse, tmp_path)
+    run.start(10, "update")
+    run.advance(7)
+    run.log({"losses/a": torch.tensor([1.0, 4.0]), "charts/b": 3})
+    run.log({"charts/b": np.float64(5.0)}, step=6)
+    run.log_image("eval/image", np.zeros((4, 6, 3), np.uint8))
+    run.close()
+    events = EventAccumulator(str(run.folder)).Reload()
+    assert [(one.step, one.value) for one in events.Scalars("losses/a")] == [(7, 2.5)]
+    assert [(one.step, one.value) for one in events.Scalars("charts/b")] == [(7, 3.0), (6, 5.0)]
+    (image,) = events.Images("eval/image")
+    assert (image.step, image.width, image.height) == (7, 6, 4)
+
+
+def test_result_has_the_flags(parse, tmp_path):
+    run, _ = begin(parse, tmp_path, "--name", "x")
+    run.write_result({"error": 0.5})
+    result = json.loads((run.folder / "result.json").read_text())
+    assert result["error"] == 0.5 and result["args"]["name"] == "x"
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, 1), ("2", 2)])
+def test_torch_has_one_thread_or_those_of_the_environment(tmp_path, given, expected):
+    env = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    env |= {} if given is None else {"OMP_NUM_THREADS": given}
+    code = SCRIPT + "runs.seed_torch(args)\nprint(torch.get_num_threads())"
+    command = [sys.executable, "-c", code, "--runs-dir", tmp_path]
+    ended = subprocess.run(command, capture_output=True, text=True, env=env, check=True)
+    assert ended.stdout == f"{expected}\n"

@@ -1,0 +1,122 @@
+"""`roboarm view` and `roboarm demo`: their errors, each in one line, and the replay."""
+
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import webbrowser
+
+import pytest
+
+from roboarm_nmp.viewer import app, demo
+
+pytest.importorskip("viser")
+
+
+@pytest.fixture(autouse=True)
+def own_signals(monkeypatch):
+    """Signals stay as they are in the test run."""
+    monkeypatch.setattr(app, "end_with_one_line", lambda advice: None)
+
+
+@contextlib.contextmanager
+def port_in_use():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server.getsockname()[1]
+
+
+def error_of(capfd, *arguments, main=app.main):
+    """The one line on stderr of a command that ends with 2."""
+    assert main([str(argument) for argument in arguments]) == 2
+    output, errors = capfd.readouterr()
+    assert output == "" and len(errors.splitlines()) == 1, errors
+    return errors
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nothing"], "unknown task 'nothing'"),
+        (["missing.yaml"], "missing.yaml: No such file"),
+        (["wall", "--policy", "nothing"], "no such policy: nothing"),
+        (["wall", "--query", "10000"], "no test query 10000: the numbers are 0 to 9999"),
+        (["three_shelves", "--demos"], "three_shelves"),
+        (["wall", "--trajectory", "a.csv"], "a.csv: No such file"),
+        (["wall", "--trajectory", "a.csv", "--demos"], "give one of them"),
+        (["wall", "--port", "0"], "--port must be in [1, 65535], got 0"),
+        (["wall", "--speed", "0"], "--speed must be above 0"),
+        (["wall", "--record", "replay.gif"], "--record must end in .html"),
+        (["wall", "--record", "no/such/folder/replay.html"], "no/such/folder"),
+        (["wall", "--host", "192.0.2.1"], "cannot listen at 192.0.2.1, port 8080"),
+        (["wall", "--safety-margin", "0.5", "--record", "out.html"], "margin must be in"),
+    ],
+)
+def test_arguments_that_cannot_be_used_give_one_line(
+    capfd, tmp_path, monkeypatch, arguments, words
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(app, "_server", lambda *arguments: pytest.fail("a server was started"))
+    assert words in error_of(capfd, *arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_folder_that_has_no_roadmap_paths_gives_one_line(capfd, tmp_path):
+    assert str(tmp_path) in error_of(capfd, tmp_path)
+    assert "--demos" in error_of(capfd, tmp_path, "--demos")
+
+
+@pytest.mark.parametrize("main", [app.main, demo.main])
+def test_port_in_use_gives_one_line(capfd, main):
+    task = ["wall"] if main is app.main else []
+    with port_in_use() as port:
+        message = error_of(capfd, *task, "--port", port, "--no-open", main=main)
+    assert f"port {port}" in message and "--port" in message
+
+
+def test_missing_viser_gives_one_line_with_the_command_that_installs_it(capfd, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install viser" in error_of(capfd, "wall")
+
+
+@pytest.mark.parametrize("failure", [lambda url: False, webbrowser.Error("no browser")])
+def test_missing_browser_gives_one_line_with_the_address(capfd, monkeypatch, failure):
+    def fail(url):
+        if isinstance(failure, Exception):
+            raise failure
+        return failure(url)
+
+    monkeypatch.setattr(webbrowser, "open", fail)
+    monkeypatch.setattr(app._Page, "run", lambda page: None)
+    with port_in_use() as port:
+        pass
+    assert app.main(["no_obstacles", "--port", str(port)]) == 0
+    first, second = capfd.readouterr().out.splitlines()
+    assert first.startswith(f"http://127.0.0.1:{port}")
+    assert f"no browser could be opened: open http://127.0.0.1:{port} yourself" == second
+
+
+@pytest.mark.parametrize(("number", "word"), [("SIGINT", "interrupted"), ("SIGTERM", "terminated")])
+def test_signal_ends_the_command_with_one_line(number, word):
+    with port_in_use() as port:
+        pass
+    command = [sys.executable, "-m", "roboarm_nmp", "view", "no_obstacles", "--no-open"]
+    process = subprocess.Popen(
+        [*command, "--port", str(port)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline().startswith("http://127.0.0.1")
+    process.send_signal(getattr(signal, number))
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == {"SIGINT": 130, "SIGTERM": 143}[number]
+    assert errors.splitlines() == [f"{word}; the same command starts again"] and output == ""
+
+
+def test_recordings_of_demonstrations_and_of_policies_are_written(capfd, tmp_path):
+    path = tmp_path / "replay.html"
+    arguments = ["wall", "--demos", "--policy", "go-to-goal", "--query", "3", "--record", str(path)]
+    assert app.main(arguments) == 0
+    written, *arms = capfd.readouterr().out.splitlines()
+    assert written.startswith(f"{path}: written")
+    assert [arm.split(":")[0].strip() for arm in arms] == ["demonstration", "go-to-goal"]
+    contents = path.read_text()
+    assert "__VISER_EMBED_DATA__" in contents and len(contents) < 1_000_000

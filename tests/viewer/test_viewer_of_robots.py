@@ -1,0 +1,243 @@
+"""The viewer with other arms than the Panda: what is drawn, dragging the goal, saved scenes."""
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.files import load_scene
+from roboarm_nmp.envs.scenes.primitives import Attached, Box, Scene, Sphere, convex_hull
+from roboarm_nmp.utils.bullet import pybullet as p
+from roboarm_nmp.viewer import app
+from roboarm_nmp.viewer.simulation import (
+    PolicyArm,
+    Simulation,
+    inverse_kinematics,
+    task_episodes,
+)
+
+pytest.importorskip("viser")
+from roboarm_nmp.viewer.meshes import arm_joints, link_meshes  # noqa: E402
+
+trimesh = pytest.importorskip("trimesh")
+XARM6, IIWA = (ROOT / "examples" / "robots" / f"{name}.yaml" for name in ("xarm6", "iiwa"))
+INERTIAL = (
+    '<inertial><mass value="1"/>'
+    '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+def of_shapes(folder):
+    """The path of the URDF of an arm with every kind of visual shape; `turn` leads `follow`."""
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    box.export(folder / "box.stl")
+    box.export(folder / "box.obj")
+    shapes = {
+        "base": '<box size="0.2 0.1 0.1"/>',
+        "one": '<mesh filename="box.stl" scale="1 1 2"/>',
+        "two": '<cylinder radius="0.05" length="0.4"/>',
+        "three": '<mesh filename="box.obj"/>',
+        "four": '<sphere radius="0.1"/>',
+        "five": '<capsule radius="0.05" length="0.1"/>',
+    }
+    links = "".join(
+        f'<link name="{name}">{INERTIAL}<visual><origin xyz="0 0 0.1" rpy="0 0 1.5707963"/>'
+        f'<geometry>{shape}</geometry><material name="blue"/></visual>'
+        '<collision><geometry><box size="0.01 0.01 0.01"/></geometry></collision></link>'
+        for name, shape in shapes.items()
+    )
+    names, joints = list(shapes), ""
+    for i, (name, kind, more) in enumerate(
+        [
+            ("turn", "revolute", ""),
+            ("slide", "prismatic", ""),
+            ("weld", "fixed", ""),
+            ("roll", "revolute", ""),
+            ("follow", "revolute", '<mimic joint="turn" multiplier="-0.5" offset="0.2"/>'),
+        ]
+    ):
+        joints += (
+            f'<joint name="{name}" type="{kind}"><parent link="{names[i]}"/>'
+            f'<child link="{names[i + 1]}"/><origin xyz="0.1 0 0.3" rpy="0.3 -0.2 0.5"/>'
+            f'<axis xyz="0 3 1"/><limit lower="-1" upper="1" effort="50" velocity="2"/>{more}'
+            "</joint>"
+        )
+    blue = '<material name="blue"><color rgba="0 0 1 1"/></material>'
+    (folder / "arm.urdf").write_text(f'<robot name="arm">{blue}{links}{joints}</robot>')
+    return folder / "arm.urdf"
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("arm")
+    return Robot.from_urdf(of_shapes(folder), end_effector="five", base_position=(0.5, 0.0, 0.2))
+
+
+@pytest.fixture(scope="module", params=["panda", "xarm6", "iiwa", "shapes"])
+def robot(request, arm):
+    files = {"panda": "panda", "xarm6": XARM6, "iiwa": IIWA}
+    return arm if request.param == "shapes" else load_robot(files[request.param])
+
+
+def transform(position, wxyz):
+    matrix = trimesh.transformations.quaternion_matrix(wxyz)
+    matrix[:3, 3] = position
+    return matrix
+
+
+def test_links_are_drawn_where_pybullet_has_them(robot):
+    client = p.connect(p.DIRECT)
+    body = robot.load(client, drawn=False)
+    base = p.getBasePositionAndOrientation(body, client)
+    for state in np.random.default_rng(0).uniform(-1, 1, (5, robot.num_joints)):
+        configuration = robot.denormalise(state)
+        robot.set_configuration(client, body, configuration.tolist())
+        x, y, z, w = robot.base_orientation
+        drawn = {-1: transform(robot.base_position, (w, x, y, z))}
+        for joint in arm_joints(robot):
+            at = drawn[joint.parent] @ transform(joint.position, joint.wxyz)
+            drawn[joint.link] = at @ transform(*joint.pose(configuration))
+        for link in range(p.getNumJoints(body, client)):
+            state = p.getLinkState(body, link, computeForwardKinematics=1, physicsClientId=client)
+            expected = np.reshape(p.getMatrixFromQuaternion(state[5]), (3, 3))
+            np.testing.assert_allclose(drawn[link][:3, 3], state[4], atol=1e-5)
+            np.testing.assert_allclose(drawn[link][:3, :3], expected, atol=1e-5)
+    assert p.getBasePositionAndOrientation(body, client) == base
+    p.disconnect(client)
+
+
+def test_every_kind_of_visual_shape_is_drawn_at_its_origin_in_its_colour(arm):
+    expected = {  # full edges, turned by a quarter about z
+        -1: (0.1, 0.2, 0.1),
+        0: (0.2, 0.1, 0.6),
+        1: (0.1, 0.1, 0.4),
+        2: (0.2, 0.1, 0.3),
+        3: (0.2, 0.2, 0.2),
+        4: (0.1, 0.1, 0.2),
+    }
+    meshes = link_meshes(arm, 0.005)
+    assert set(meshes) == set(expected)
+    for link, edges in expected.items():
+        [(colour, vertices, faces)] = meshes[link]
+        assert colour == (0, 0, 255) and faces.max() < len(vertices)
+        np.testing.assert_allclose(np.ptp(vertices, axis=0), edges, atol=0.005)
+        np.testing.assert_allclose((vertices.max(0) + vertices.min(0)) / 2, (0, 0, 0.1), atol=1e-3)
+
+
+def test_panda_has_the_colours_of_its_mesh_files():
+    colours = [colour for parts in link_meshes(PANDA, 0.013).values() for colour, *_ in parts]
+    assert (255, 255, 255) in colours and (64, 64, 64) in colours and (10, 138, 199) in colours
+
+
+def test_link_without_visual_shapes_has_its_collision_shapes(tmp_path):
+    path = of_shapes(tmp_path)
+    text = path.read_text()
+    start, end = text.index("<visual>"), text.index("</visual>") + len("</visual>")
+    path.write_text(text[:start] + text[end:])
+    [(_, vertices, _)] = link_meshes(Robot.from_urdf(path, end_effector="five"), 0.005)[-1]
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), (0.01, 0.01, 0.01), atol=1e-4)
+
+
+def test_mesh_that_cannot_be_drawn_is_named(tmp_path):
+    path = of_shapes(tmp_path)
+    robot = Robot.from_urdf(path, end_effector="five", name="another")  # equal ones share meshes
+    (tmp_path / "box.stl").write_bytes((tmp_path / "box.stl").read_bytes()[:100])
+    with pytest.raises(ValueError, match="box.stl: the mesh cannot be drawn"):
+        link_meshes(robot, 0.005)
+
+
+def test_inverse_kinematics_moves_every_arm(robot):
+    rng, errors = np.random.default_rng(1), []
+    for state in rng.uniform(-0.7, 0.7, (20, robot.num_joints)):
+        here = robot.forward_kinematics(robot.denormalise(state))
+        near = robot.denormalise(np.clip(state + rng.uniform(-0.1, 0.1, state.shape), -1, 1))
+        found = inverse_kinematics(robot, here, near)
+        assert np.all(np.abs(robot.normalise(found)) <= 1 + 1e-9)
+        errors.append(np.linalg.norm(robot.forward_kinematics(found) - here))
+    assert np.mean(np.array(errors) < 1e-3) > 0.9
+
+
+@pytest.mark.parametrize("policy", ["go-to-goal", "planner"])
+def test_policies_move_another_arm_and_its_scene_can_be_edited_and_saved(policy, tmp_path):
+    task = f"random_boxes_hard@{XARM6}"
+    shown = Simulation(task_episodes(task))
+    shown.add(PolicyArm(task, policy))
+    shown.select("random", 0)
+    [moved], robot = shown.arms, load_robot(XARM6)
+    for _ in range(5):
+        shown.step()
+    assert moved.steps == 5 and moved.state.shape == (6,)
+    shown.add_obstacle(Sphere((0.0, 0.0, 1.5), 0.1))
+    assert moved.kinematic
+    shown.move_goal(robot.forward_kinematics(shown.query.goal) + [0.0, 0.0, -0.01])
+    shown.step()
+    path = shown.save_scene(tmp_path / "mine")
+    shown.close()
+    assert load_scene(path) == shown.query.scene and load_scene(path).robot == robot
+
+
+def test_saving_a_scene_never_replaces_a_file(tmp_path):
+    shown = Simulation(task_episodes("no_obstacles"))
+    shown.select("test", 0)
+    first = shown.save_scene(tmp_path / "mine.yaml")
+    before = first.read_bytes()
+    shown.add_obstacle(Sphere((0.0, 0.0, 1.5), 0.1))
+    names = [shown.save_scene(tmp_path / "mine.yaml").name for _ in range(2)]
+    assert names == ["mine_2.yaml", "mine_3.yaml"] and first.read_bytes() == before
+    assert load_scene(tmp_path / "mine_2.yaml") == shown.query.scene
+    shown.close()
+
+
+def test_new_obstacles_and_the_camera_are_in_proportion_to_the_reach(arm):
+    for robot in (PANDA, arm):
+        scale, base = robot.reach / PANDA.reach, np.array(robot.base_position)
+        box = app.new_obstacle("box", robot)
+        np.testing.assert_allclose(box.position, base + scale * np.array([0.5, 0.0, 0.5]))
+        np.testing.assert_allclose(box.size, scale * np.full(3, 0.15))
+        assert app.new_obstacle("sphere", robot).radius == pytest.approx(0.1 * scale)
+        Scene((box, app.new_obstacle("cylinder", robot)), robot=robot)
+        eye, target, _ = app.camera(1, robot)
+        assert np.linalg.norm(eye - target) == pytest.approx(
+            scale * np.linalg.norm((2.4, 0.6, 0.8))
+        )
+
+
+def test_replay_of_another_arm_is_written(capfd, tmp_path, monkeypatch):
+    monkeypatch.setattr(app, "end_with_one_line", lambda advice: None)
+    path = tmp_path / "replay.html"
+    arguments = ["no_obstacles", "--robot", str(XARM6), "--record", str(path)]
+    assert app.main(arguments) == 0
+    assert capfd.readouterr().out.startswith(f"{path}: written")
+    assert path.stat().st_size < 1_500_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["no_obstacles@a.yaml", "--robot", "b.yaml"], "names a robot already"),
+        (["no_obstacles", "--robot", "missing.yaml"], "missing.yaml: No such file"),
+        (["wall", "--robot", str(XARM6)], "wall is the Panda's"),
+        ([".", "--robot", str(XARM6)], "--robot goes with a task"),
+        (["no_obstacles", "--robot", str(XARM6), "--policy", "sac-ee-wall-p1-s1"], "panda"),
+    ],
+)
+def test_robots_that_cannot_be_viewed_give_one_line(capfd, monkeypatch, arguments, words, tmp_path):
+    monkeypatch.setattr(app, "end_with_one_line", lambda advice: None)
+    assert app.main([*arguments, "--record", str(tmp_path / "a.html")]) == 2
+    output, errors = capfd.readouterr()
+    assert output == "" and len(errors.splitlines()) == 1 and words in errors
+
+
+def test_attached_objects_are_drawn_where_their_links_are():
+    hull = convex_hull(np.random.default_rng(0).uniform(-0.05, 0.05, (12, 3)), (0, 0, 0.1))
+    shapes = (Sphere((0, 0, 0.1), 0.05), Box((0, 0, 0.15), (0.05, 0.1, 0.2)), hull)
+    robot = PANDA.with_attached([Attached(shape, "panda_hand") for shape in shapes])
+    links = [link.index for link in robot.links[-3:]]
+    hand = {joint.link: joint.parent for joint in arm_joints(robot)}
+    assert {hand[link] for link in links} == {8}
+    drawn = link_meshes(robot, 1e-4)
+    extents = [np.ptp(drawn[link][0][1], axis=0) for link in links]
+    np.testing.assert_allclose(extents[1], (0.05, 0.1, 0.2), atol=1e-3)
+    np.testing.assert_allclose(extents[2], np.ptp(hull.vertices, axis=0), atol=1e-3)
