@@ -145,7 +145,7 @@ def test_help_has_groups_docstrings_and_defaults(capsys, monkeypatch):
     with pytest.raises(SystemExit):
         flags.parse(Own, ["--help"], default=Own(seed=7))
     text = capsys.readouterr().out
-    assert text.startswith("src/roboarm_nmp/utils/flags.py: parsing, groups, and ranges")
+    assert text.startswith("utils/flags.py: parsing, groups, and ranges")
     assert "usage: own.py [-h]" in text
     options = " ".join(re.sub(r"[|│]", " ", text.partition("show this help")[2]).split())
     expected = [
