@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from tyro.conf import arg
 
 # The groups of `--help`, in its order, and the flags in each. Flags of other names are in OTHERS.
 OTHERS = "algorithm"
@@ -69,27 +70,33 @@ class Range(typing.NamedTuple):
     words: str
 
 
-def _number(kind, least, most, words, symbols):
-    shown = tyro.conf.arg(metavar=f"{kind.__name__.upper()} {symbols}")
-    return Annotated[kind, Range(least, most, words), shown]
-
-
 LARGEST = sys.float_info.max
-PositiveInt = _number(int, 1, 10**12, "at least 1", ">= 1")
-NonNegativeInt = _number(int, 0, 10**12, "at least 0", ">= 0")
-Seed = _number(int, 0, 2**32 - 1, "in [0, 2^32)", "IN [0, 2^32)")
-Workers = _number(int, 1, 256, "in [1, 256]", "IN [1, 256]")
-Helpers = _number(int, 0, 256, "in [0, 256]", "IN [0, 256]")  # processes beside this one
-Layers = _number(int, 1, 100, "in [1, 100]", "IN [1, 100]")
-Width = _number(int, 1, 2**16, "in [1, 65536]", "IN [1, 65536]")
-Pixels = _number(int, 1, 4096, "in [1, 4096]", "IN [1, 4096]")  # larger images are very slow
-Horizon = _number(int, 1, 10**6, "in [1, 1000000]", "IN [1, 1000000]")  # fits replay buffers
-Environments = _number(int, 1, 1000, "in [1, 1000]", "IN [1, 1000]")  # PyBullet has room for 1,024
-Share = _number(float, 0.0, 1.0, "in [0, 1]", "IN [0, 1]")
-PositiveShare = _number(float, sys.float_info.min, 1.0, "above 0, and at most 1", "IN (0, 1]")
-PositiveFloat = _number(float, sys.float_info.min, LARGEST, "above 0, and finite", "> 0")
-NonNegativeFloat = _number(float, 0.0, LARGEST, "at least 0, and finite", ">= 0")
-FiniteFloat = _number(float, -LARGEST, LARGEST, "finite", "")
+TINIEST = sys.float_info.min
+PositiveInt = Annotated[int, Range(1, 10**12, "at least 1"), arg(metavar="INT >= 1")]
+NonNegativeInt = Annotated[int, Range(0, 10**12, "at least 0"), arg(metavar="INT >= 0")]
+Seed = Annotated[int, Range(0, 2**32 - 1, "in [0, 2^32)"), arg(metavar="INT IN [0, 2^32)")]
+Workers = Annotated[int, Range(1, 256, "in [1, 256]"), arg(metavar="INT IN [1, 256]")]
+# Processes beside this one.
+Helpers = Annotated[int, Range(0, 256, "in [0, 256]"), arg(metavar="INT IN [0, 256]")]
+Layers = Annotated[int, Range(1, 100, "in [1, 100]"), arg(metavar="INT IN [1, 100]")]
+Width = Annotated[int, Range(1, 2**16, "in [1, 65536]"), arg(metavar="INT IN [1, 65536]")]
+# Larger images are very slow.
+Pixels = Annotated[int, Range(1, 4096, "in [1, 4096]"), arg(metavar="INT IN [1, 4096]")]
+# So that an episode fits into replay buffers.
+Horizon = Annotated[int, Range(1, 10**6, "in [1, 1000000]"), arg(metavar="INT IN [1, 1000000]")]
+# PyBullet has room for 1,024.
+Environments = Annotated[int, Range(1, 1000, "in [1, 1000]"), arg(metavar="INT IN [1, 1000]")]
+Share = Annotated[float, Range(0.0, 1.0, "in [0, 1]"), arg(metavar="FLOAT IN [0, 1]")]
+PositiveShare = Annotated[
+    float, Range(TINIEST, 1.0, "above 0, and at most 1"), arg(metavar="FLOAT IN (0, 1]")
+]
+PositiveFloat = Annotated[
+    float, Range(TINIEST, LARGEST, "above 0, and finite"), arg(metavar="FLOAT > 0")
+]
+NonNegativeFloat = Annotated[
+    float, Range(0.0, LARGEST, "at least 0, and finite"), arg(metavar="FLOAT >= 0")
+]
+FiniteFloat = Annotated[float, Range(-LARGEST, LARGEST, "finite"), arg(metavar="FLOAT")]
 
 
 def program():
