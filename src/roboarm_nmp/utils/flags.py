@@ -11,22 +11,22 @@
 `--help` shows the ranges, too.
 """
 
-import ast
+import contextlib
 import dataclasses
-import inspect
-import itertools
-import math
 import os
-import re
 import shutil
 import sys
 import textwrap
 import typing
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
+import docstring_parser
 import tyro
 from tyro.conf import arg
+
+T = TypeVar("T")
 
 # The groups of `--help`, in its order, and the flags in each. Flags of other names are in OTHERS.
 OTHERS = "algorithm"
@@ -63,7 +63,7 @@ CORES = min(len(os.sched_getaffinity(0)), 256)
 
 
 class Range(typing.NamedTuple):
-    """From `least` to `most`, both included."""
+    """From `least` to `most`, both included; `words` say that in messages."""
 
     least: float
     most: float
@@ -99,13 +99,18 @@ NonNegativeFloat = Annotated[
 FiniteFloat = Annotated[float, Range(-LARGEST, LARGEST, "finite"), arg(metavar="FLOAT")]
 
 
-def program():
+def program() -> str:
     """The name of the running program, for messages: `roboarm evaluate`, or a script's name."""
     main = sys.modules["__main__"]
     return getattr(main, "PROGRAM", Path(sys.argv[0]).name)  # `roboarm` sets it
 
 
-def parse(Args, arguments=None, default=None, others=OTHERS):
+def parse(
+    Args: type[T],
+    arguments: Sequence[str] | None = None,
+    default: T | None = None,
+    others: str = OTHERS,
+) -> T:
     """The flags of the command line as an instance of a dataclass.
 
     `--help` shows the docstring of the dataclass's module, and the flags in their `GROUPS`, each
@@ -113,103 +118,85 @@ def parse(Args, arguments=None, default=None, others=OTHERS):
 
     Args:
         Args: the dataclass, all fields with types that tyro parses.
-        arguments: list of strings; None for those of the process.
+        arguments: the command line's words; None for those of the process.
         default: an instance with other defaults.
         others: the group of the flags that are not in `GROUPS`.
 
     Raises:
         SystemExit: after `--help`, or for flags that cannot be parsed.
     """
-    kinds, docs = typing.get_type_hints(Args, include_extras=True), _docs(Args)
+    kinds = typing.get_type_hints(Args, include_extras=True)
+    docs = {}
+    for parent in reversed(Args.__mro__):
+        with contextlib.suppress(OSError, TypeError):  # no source: `object`, interactive sessions
+            documented = docstring_parser.parse_from_object(parent).params
+            docs.update({field.arg_name: field.description for field in documented})
     group_of = {name: group for group, names in GROUPS.items() for name in names}
     groups = {others if group == OTHERS else group: [] for group in GROUPS}
-    for field in dataclasses.fields(Args):
-        kind = Annotated[kinds[field.name], tyro.conf.arg(help=docs.get(field.name))]
-        one = dataclasses.field(default=field.default, default_factory=field.default_factory)
+    for field in dataclasses.fields(Args):  # pyright: ignore[reportArgumentType]
+        help_text = " ".join(docs.get(field.name, "").split())
+        kind = Annotated[kinds[field.name], arg(help=help_text)]
         if default is not None:
-            one = dataclasses.field(default=getattr(default, field.name))
-        groups[group_of.get(field.name, others)].append((field.name, kind, one))
-    made = [
-        (group, tyro.conf.OmitArgPrefixes[_dataclass(group, fields)])
-        for group, fields in groups.items()
-        if fields
-    ]
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & set(arguments):  # tyro would not wrap its lines
-        description = getattr(sys.modules.get(Args.__module__), "__doc__", None) or ""
-        print(_wrapped(description, min(100, shutil.get_terminal_size().columns)), end="\n\n")
-    parsed = tyro.cli(_dataclass("Flags", made), prog=program(), args=arguments, description="")
-    values = (vars(getattr(parsed, group)) for group, _ in made)
-    return Args(**{name: value for group in values for name, value in group.items()})
-
-
-def _dataclass(name, fields):
-    made = dataclasses.make_dataclass(name, fields, kw_only=True)
-    made.__doc__ = None  # otherwise its signature, which `--help` would show
-    return made
-
-
-def _wrapped(text, width):
-    """A docstring with its paragraphs and list items wrapped. Indented lines stay as they are."""
-    blocks = []
-    for block in text.strip().split("\n\n"):
-        if not block.startswith(" "):
-            items = [" ".join(item.split()) for item in re.split(r"\n(?=- )", block)]
-            block = "\n".join(
-                textwrap.fill(
-                    item,
-                    width,
-                    subsequent_indent="  " * item.startswith("- "),
-                    break_long_words=False,
-                    break_on_hyphens=False,
-                )
-                for item in items
+            value = dataclasses.field(default=getattr(default, field.name))
+        else:
+            value = dataclasses.field(default=field.default, default_factory=field.default_factory)
+        groups[group_of.get(field.name, others)].append((field.name, kind, value))
+    # tyro shows a nested dataclass as a group.
+    nested = []
+    for group, fields in groups.items():
+        if fields:
+            made = dataclasses.make_dataclass(
+                group, fields, namespace={"__doc__": ""}, kw_only=True
             )
-        blocks.append(block)
-    return "\n\n".join(blocks)
+            nested.append((group, tyro.conf.OmitArgPrefixes[made]))
+    AllFlags = dataclasses.make_dataclass("AllFlags", nested)
+
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if "-h" in arguments or "--help" in arguments:  # tyro's own description has ragged lines
+        print(_wrapped(sys.modules[Args.__module__].__doc__ or ""), end="\n\n")
+    parsed = tyro.cli(AllFlags, prog=program(), args=arguments, description="")
+    values = {}
+    for group, _ in nested:
+        values.update(vars(getattr(parsed, group)))
+    return Args(**values)
 
 
-def _docs(Args):
-    """The docstrings under a dataclass's fields, and under those of its base classes, by name."""
-    docs = {}
-    for one in reversed(Args.__mro__[:-1]):
-        try:
-            source = inspect.getsource(one)
-        except (OSError, TypeError):  # a class of an interactive session has none
-            continue
-        for field, text in itertools.pairwise(ast.parse(textwrap.dedent(source)).body[0].body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                docs[field.target.id] = " ".join(ast.literal_eval(text.value).split())
-    return docs
+def _wrapped(text: str) -> str:
+    """A docstring whose paragraphs fit the terminal; indented lines and lists stay as they are."""
+    width = min(100, shutil.get_terminal_size().columns)
+    paragraphs = text.strip().split("\n\n")
+    return "\n\n".join(
+        paragraph if paragraph.startswith((" ", "- ")) else textwrap.fill(paragraph, width)
+        for paragraph in paragraphs
+    )
 
 
-def check(args):
+def check(args: object) -> None:
     """Raise ValueError, in one line, unless every flag is within its range, and a path can exist.
 
     Args:
         args: an instance of a dataclass. None, or a word, where a flag may be that, is in range.
     """
-    hints = typing.get_type_hints(type(args), include_extras=True)
-    for field in dataclasses.fields(args):
-        limits, value = _range_of(hints[field.name]), getattr(args, field.name)
-        values = value if isinstance(value, tuple) else [value]
-        flag = f"--{field.name.replace('_', '-')}"
-        for path in (one for one in values if isinstance(one, Path)):
-            try:
-                path.exists()
-            except OSError as error:  # a name that is too long
-                raise ValueError(f"{flag}: {error.strerror}: {path}") from error
-        if limits is None or value is None or isinstance(value, str):
-            continue
-        for one in values:
-            if math.isnan(one) or not limits.least <= one <= limits.most:
-                raise ValueError(f"{flag} must be {limits.words}, got {one!r}")
+    kinds = typing.get_type_hints(type(args), include_extras=True)
+    for name, value in vars(args).items():
+        flag = f"--{name.replace('_', '-')}"
+        limits = _range_of(kinds[name])
+        for number in value if isinstance(value, tuple) else [value]:
+            if isinstance(number, Path):
+                try:
+                    number.exists()
+                except OSError as error:  # a name that is too long
+                    raise ValueError(f"{flag}: {error.strerror}: {number}") from error
+            elif limits is None or number is None or isinstance(number, str):
+                continue
+            elif not limits.least <= number <= limits.most:  # true of NaN, too
+                raise ValueError(f"{flag} must be {limits.words}, got {number!r}")
 
 
-def _range_of(kind):
+def _range_of(kind) -> Range | None:
     """The `Range` in a type, also inside a union or tuple; None without one."""
-    for one in getattr(kind, "__metadata__", ()):
-        if isinstance(one, Range):
-            return one
-    found = (_range_of(one) for one in typing.get_args(kind))
-    return next((one for one in found if one is not None), None)
+    for part in (*getattr(kind, "__metadata__", ()), *typing.get_args(kind)):
+        limits = part if isinstance(part, Range) else _range_of(part)
+        if limits is not None:
+            return limits
+    return None
