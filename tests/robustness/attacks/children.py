@@ -31,7 +31,8 @@ def outcomes(attempt, numbers, per_child, seconds=SECONDS, megabytes=MEGABYTES):
             os.close(reader)
             _attempts(attempt, batch, writer, megabytes)
         os.close(writer)
-        done, hangs = 0, False
+        done = 0
+        hangs = False
         for word in _lines(reader, seconds):
             if word is None:
                 hangs = True
@@ -65,7 +66,8 @@ def _attempts(attempt, numbers, writer, megabytes):
     try:
         with open("/proc/self/statm") as file:
             has = int(file.read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, 2 * (has + 2**20 * megabytes,))
+        limit = has + 2**20 * megabytes
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for number in numbers:
             try:

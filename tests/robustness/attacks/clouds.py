@@ -21,9 +21,18 @@ PCD = (
 )
 INTRINSICS = 20.0, 20.0, 4.0, 4.0
 # What replaces a number or a word of a header.
-ODD = (
-    *(b"0", b"-1", b"1e9", b"99999999999", b"20000000", b"4294967296", b"nan", b"", b"x", b"f8"),
-    *(b"(9, 9)", b"'|O'", b"'<U9'", b"list", b"vertex", b"face", b"DATA", b"ascii", b"\n", b"\xff"),
+ODD = (b"0", b"-1", b"1e9", b"99999999999", b"20000000", b"4294967296", b"nan", b"", b"x", b"f8")
+ODD += (
+    b"(9, 9)",
+    b"'|O'",
+    b"'<U9'",
+    b"list",
+    b"vertex",
+    b"face",
+    b"DATA",
+    b"ascii",
+    b"\n",
+    b"\xff",
 )
 
 
@@ -37,7 +46,8 @@ def compressed(points):
 
 def files():
     """Contents of the files before changes: dict from the name to bytes."""
-    arrays, depth = {"a.npy": POINTS, "f.npy": np.asfortranarray(np.float64(POINTS))}, io.BytesIO()
+    arrays = {"a.npy": POINTS, "f.npy": np.asfortranarray(np.float64(POINTS))}
+    depth = io.BytesIO()
     pixels = np.random.default_rng(1).integers(0, 2000, (9, 9)).astype(np.uint16)
     Image.fromarray(pixels).save(depth, "PNG")
     contents = {"depth.png": depth.getvalue()}

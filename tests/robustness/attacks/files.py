@@ -87,8 +87,8 @@ def content_of(kind, path):
         output = network(**inputs())
         return digest(network.metadata, output.detach().numpy())
     if kind == "queries":
-        splits = [load_queries(path, split) for split in ("test", "validation")]
-        return digest(*(array for one in splits for array in (one.start, one.goal)))
+        splits = [load_queries(path, name) for name in ("test", "validation")]
+        return digest(*(array for split in splits for array in (split.start, split.goal)))
     if kind == "demos":
         demos = load_demos(path)
         arrays = [array for demo in demos for array in (demo.plan, demo.states, demo.actions)]
@@ -111,7 +111,7 @@ def content_of(kind, path):
         parts = parts_of_a_run()
         runs.load_checkpoint(runs.RunFlags(resume=path.parent), parts)
         model, rng = parts["model"], parts["rng"].bit_generator.state
-        arrays = [one.detach().numpy() for one in model.parameters()]
+        arrays = [parameter.detach().numpy() for parameter in model.parameters()]
         return digest(*arrays, parts["optimizer"].state_dict(), parts["progress"], rng)
     return digest(json.loads(path.read_text()))
 
@@ -136,7 +136,7 @@ def attempts(seed, folder):
         messages = io.StringIO()
         try:
             with contextlib.redirect_stderr(messages):
-                found = content_of(kind, paths[kind])
+                content = content_of(kind, paths[kind])
         except (DatasetError, NetworkError):
             return REFUSED
         except SystemExit as end:
@@ -147,11 +147,11 @@ def attempts(seed, folder):
             raise
         finally:
             paths[kind].write_bytes(originals[kind])
-        if found == contents[kind]:
+        if content == contents[kind]:
             return UNCHANGED
         if kind == "journal":
             # Damaged lines are left out with a message. The end may be missing, as after a kill.
-            fits = found.items() <= contents[kind].items()
+            fits = content.items() <= contents[kind].items()
             ended = len(damaged) < len(originals[kind]) or not damaged.endswith(b"\n")
             return REFUSED if fits and (messages.getvalue() or ended) else CHANGED
         return RAN if kind in TEXTS else CHANGED

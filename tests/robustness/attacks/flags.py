@@ -10,35 +10,24 @@ import shutil
 import sys
 from pathlib import Path
 
-from paths import ROOT
-
 from attacks import children
 from attacks.children import RAN, REFUSED
 
-sys.path.append(str(ROOT))  # where `benchmarks` is
 MEGABYTES = 8000
 SECONDS = 60  # a run that is not rejected is a whole one; trials of a sweep are processes
 NUMBERS = (0, -1, -5, 1, 2, 3.5, 2**31, 2**63, 2**70, 10**30, 1e-300, 1e-320, 1e300, 0.5)
-WORDS = ("nan", "inf", "-inf", "", " ", "x", "None", "../../x", "/proc", "/dev/null", "/dev/null/x")
-WORDS += ("no/such/folder", "a" * 300, "ü\n", "1,5", "1e3", "0x10", "--", "-", "wall", "empty.h5")
+WORDS = ("nan", "inf", "", " ", "x", "None", "../../x", "/proc", "/dev/null/x", "no/such/folder")
+WORDS += ("a" * 300, "ü\n", "1,5", "1e3", "0x10", "--", "-", "wall", "empty.h5")
 PLAIN = 20  # the round of attempts without odd flags, in which every command runs
 # Flags whose large numbers only take long.
 LONG = ("total_timesteps", "total_updates", "num", "num_test", "num_validation", "scenes", "trials")
 LONG += ("paths_per_scene", "steps", "horizon", "tries", "num_nodes", "round_queries", "draws")
-LONG += (
-    "num_queries",
-    "round_labels",
-    "attempts",
-    "max_checks",
-    "simplify",
-    "time_limit",
-    "updates_per_step",
-)
+LONG += ("num_queries", "round_labels", "attempts", "max_checks", "simplify", "time_limit")
+LONG += ("updates_per_step",)
 
 RUN = "--eval-queries 1 --test-queries 1 --runs-dir runs"
 RL = f"--task wall --num-envs 1 --hidden-size 8 --batch-size 4 --learning-starts 20 {RUN}"
 RL += " --total-timesteps 60 --eval-every 60 --horizon 20"
-OUTSIDE = ("benchmarks.paper_tables",)  # of the package
 TINY = {
     "clean_rl_scripts.sac_her_mp": RL,
     "clean_rl_scripts.td3_her_mp": RL,
@@ -68,9 +57,8 @@ TINY = {
     " --output seen",
     "viewer.show": "wall --output a.png --size 32 32",
     "clean_rl_scripts.sweep": "trainer.py --search x=1..3 --trials 1 --folder sweep",
-    "benchmarks.paper_tables": "--list --runs-dir runs",
 }
-TINY = {n if n in OUTSIDE else f"roboarm_nmp.{n}": flags for n, flags in TINY.items()}
+TINY = {f"roboarm_nmp.{name}": flags for name, flags in TINY.items()}
 TRAINER = """
 import json, sys
 from dataclasses import dataclass
@@ -92,9 +80,9 @@ run.mkdir(parents=True)
 def attempts(seed, folder):
     """The attempt: a function from a number to the outcome of a command with such flags."""
     fields = {name: _fields(name) for name in TINY}
-    given = folder / "given"
-    given.mkdir()
-    _make_inputs(given)
+    inputs = folder / "inputs"
+    inputs.mkdir()
+    _make_inputs(inputs)
     os.environ["MINARI_DATASETS_PATH"] = "minari"  # of each attempt's folder
 
     def attempt(number):
@@ -104,7 +92,7 @@ def attempts(seed, folder):
         odd = [] if plain else _flags(fields[module], rng)
         here = folder / str(number)
         shutil.rmtree(here, ignore_errors=True)
-        shutil.copytree(given, here, symlinks=True)
+        shutil.copytree(inputs, here, symlinks=True)
         before = _everything(here)
         try:
             code, output = _run(module, [*TINY[module].split(), *odd], here)
@@ -115,7 +103,7 @@ def attempts(seed, folder):
             print(output)
         if "Traceback" in output:
             return f"traceback of {module}: {output.strip().splitlines()[-1][:120]}"
-        if any(not path.name.isdigit() for path in folder.iterdir() if path != given):
+        if any(not path.name.isdigit() for path in folder.iterdir() if path != inputs):
             return f"{module} left something elsewhere"
         if plain and code != 0:
             return f"{module} does not run"
@@ -145,11 +133,12 @@ def _flags(fields, rng):
         if str(fields[name].type).startswith(("bool", "<class 'bool'")):
             flags.append(rng.choice([flag, f"--no-{flag[2:]}"]))
             continue
-        values = [one for one in NUMBERS if name not in LONG or not 5 < one < 2**62]
-        value = rng.choice(
-            [*values, *(word for word in WORDS if word != "None" or name not in LONG)]
-        )
-        flags += [flag, str(value)] + [str(rng.choice(values))] * (name in ("size", "radii"))
+        values = [number for number in NUMBERS if name not in LONG or not 5 < number < 2**62]
+        words = [word for word in WORDS if word != "None" or name not in LONG]
+        value = rng.choice([*values, *words])
+        flags += [flag, str(value)]
+        if name in ("size", "radii"):
+            flags.append(str(rng.choice(values)))
     return flags
 
 

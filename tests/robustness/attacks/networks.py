@@ -13,20 +13,7 @@ from roboarm_nmp.networks.exported_networks import ExportedNetwork, save_network
 from roboarm_nmp.networks.operations import NetworkError
 
 NUMBERS = (0, 1, -1, 2, 3, 7, -7, 255, 2**15, 2**31, -(2**31), 2**40, 2**62, -(2**63), 2**63, 2**70)
-ODD = (
-    *NUMBERS,
-    0.5,
-    -1.0,
-    float("nan"),
-    float("inf"),
-    1e300,
-    True,
-    False,
-    None,
-    "mean",
-    "floor",
-    [],
-)
+ODD = (*NUMBERS, 0.5, float("nan"), float("inf"), 1e300, True, None, "mean", "floor", [])
 
 
 class Mixed(nn.Module):
@@ -115,9 +102,8 @@ def _change(arguments, rng, nodes, content):
 def _tensor(tensor, rng):
     kind = rng.randrange(5)
     if kind == 0:
-        return (
-            torch.full_like(tensor, float("nan")) if tensor.is_floating_point() else tensor + 2**40
-        )
+        is_float = tensor.is_floating_point()
+        return torch.full_like(tensor, float("nan")) if is_float else tensor + 2**40
     if kind == 1:
         return tensor.flatten()[: rng.randint(0, tensor.numel())].clone()
     if kind == 2:

@@ -16,12 +16,10 @@ from roboarm_nmp.envs.scenes.files import SceneFileError
 from roboarm_nmp.envs.scenes.formats import load_world
 
 MEGABYTES = 1000
-ODD = (
-    *("", "0", "-1", "nan", ".inf", "1e300", "-1e-300", "9" * 400, "1e5", "null", "~", "[]", "{}"),
-    *("[1, 2]", "{a: 1}", "&a [*a]", "*a", "!!python/object/apply:os.system ['touch hacked']"),
-    *("'0.1'", "true", "cone", "mesh", "box", "panda_joint1", "/dev/zero", "\u202e", "\x00", "\t"),
-    *("- " * 50, "[" * 50, "{" * 50, "? ", "<<: 1", "!!binary aGk=", "2026-11-27", "%YAML 9"),
-)
+ODD = ("", "0", "-1", "nan", ".inf", "1e300", "-1e-300", "9" * 400, "null", "~", "[]", "{}", "*a")
+ODD += ("[1, 2]", "{a: 1}", "&a [*a]", "!!python/object/apply:os.system ['touch hacked']", "'0.1'")
+ODD += ("true", "cone", "mesh", "box", "panda_joint1", "/dev/zero", "\u202e", "\x00", "\t", "? ")
+ODD += ("- " * 50, "[" * 50, "{" * 50, "<<: 1", "!!binary aGk=", "2026-11-27", "%YAML 9")
 NUMBERS = (b"0", b"-1", b"1", b"0.5", b"nan", b".inf", b"1e300", b"1e-300", b"1e3", b"-0.02", b"7")
 WORLDS = {
     "world.yaml": problem_files.MOVEIT_SCENE,
@@ -53,8 +51,8 @@ def hostile(rng, contents):
         elif kind < 0.12:
             contents = contents[: rng.randrange(len(contents))]
         elif kind < 0.45 and (numbers := list(re.finditer(rb"-?[\d.]+", contents))):
-            one = rng.choice(numbers)
-            contents = contents[: one.start()] + rng.choice(NUMBERS) + contents[one.end() :]
+            old = rng.choice(numbers)
+            contents = contents[: old.start()] + rng.choice(NUMBERS) + contents[old.end() :]
         else:
             lines = contents.decode(errors="replace").split("\n")
             at = rng.randrange(len(lines))

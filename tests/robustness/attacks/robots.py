@@ -14,19 +14,10 @@ from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.untrusted import RobotError
 from roboarm_nmp.envs.scenes.primitives import Scene
 
-ODD = (
-    *("", "0", "-1", "nan", "inf", "1e300", "1e-300", "-1e6", "1e6", "1e5 1e5 1e5", "0 0 0", "1 2"),
-    *("nan nan nan", "a", "base", "tool", "turn", "slide", "fixed", "continuous", "prismatic"),
-    *(
-        "floating",
-        "../../x.stl",
-        "/dev/zero",
-        "box.obj",
-        "ball.stl",
-        "file:///etc/passwd",
-        "\u202e",
-    ),
-)
+ODD = ("", "0", "-1", "nan", "inf", "1e300", "1e-300", "-1e6", "1e6", "1e5 1e5 1e5", "0 0 0", "1 2")
+ODD += ("nan nan nan", "a", "base", "tool", "turn", "slide", "fixed", "continuous", "prismatic")
+ODD += ("floating", "../../x.stl", "/dev/zero", "box.obj", "ball.stl", "file:///etc/passwd")
+ODD += ("\u202e",)
 INERTIAL = (
     '<inertial><origin xyz="0.02 0 0.1" rpy="0.3 0.2 0.1"/><mass value="1"/>'
     '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -93,10 +84,10 @@ def hostile(rng):
     for _ in range(rng.randint(1, 3)):
         kind, elements = rng.random(), list(root.iter())
         if kind < 0.4:
-            element = rng.choice([one for one in elements if one.attrib])
+            element = rng.choice([candidate for candidate in elements if candidate.attrib])
             element.set(rng.choice(sorted(element.attrib)), rng.choice(ODD))
         elif kind < 0.6:
-            parent = rng.choice([one for one in elements if len(one)])
+            parent = rng.choice([candidate for candidate in elements if len(candidate)])
             child = rng.choice(list(parent))
             if rng.random() < 0.5:
                 parent.remove(child)

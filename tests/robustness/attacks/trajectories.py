@@ -42,17 +42,17 @@ def attempts(seed, folder):
         path = folder / f"{number}{suffix}"
         path.write_bytes(damaged(contents, rng) if suffix == ".npz" else hostile(rng, contents))
         try:
-            found = load_trajectory(path, PANDA)
+            loaded = load_trajectory(path, PANDA)
         except DatasetError as error:
             assert str(error).startswith(f"{path}: ") and "\n" not in str(error), error
             return REFUSED
         finally:
             path.unlink()
-        for values in (found.times, found.positions, found.frames()):
+        for values in (loaded.times, loaded.positions, loaded.frames()):
             assert np.isfinite(values).all()
         again = folder / f"{number}-again.{rng.choice(ENDINGS)}"
-        save_trajectory(again, found)
-        assert len(load_trajectory(again, PANDA)) == len(found)
+        save_trajectory(again, loaded)
+        assert len(load_trajectory(again, PANDA)) == len(loaded)
         again.unlink()
         return RAN
 
