@@ -23,11 +23,10 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from markdown_tables import NOTHING, share, table, write
+from markdown_tables import NOTHING, share, table, write, write_cells
 
 from roboarm_nmp.datasets.queries import load_queries, query_path
 from roboarm_nmp.envs.tasks import STATIC_TASKS
-from roboarm_nmp.utils.files import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks/results/baselines.json"
@@ -47,6 +46,9 @@ CELLS = {
 }
 REACTIVE = "go-to-goal, filter, point_cloud"  # which that one runs
 PLANNERS = tuple(CELLS)[1:]
+KEPT = ("success_rate", "success_rate_interval", "collision_free_success_rate")
+KEPT += ("collision_free_success_rate_interval", "num_queries", "mean_steps", "path_length")
+KEPT += ("ms_per_action", "planning_seconds")
 COLUMNS = ("go-to-goal", REACTIVE, *PLANNERS)
 SHOWN = {REACTIVE: "go-to-goal with safety filter"}
 SOURCES = {
@@ -71,9 +73,10 @@ def run(results, tasks, names, num, workers):
                 command += ["--workers", str(workers), "--json", path]
                 subprocess.run(command, check=True)
                 result = json.loads(path.read_text())
+            result = {key: result[key] for key in KEPT}
             result["date"] = datetime.date.today().isoformat()
             results.setdefault(task, {})[name] = result
-            write_atomically(RESULTS, (json.dumps(results, indent=1) + "\n").encode())
+            write_cells(RESULTS, results)
 
 
 def papers_go_to_goal():

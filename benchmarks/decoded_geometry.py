@@ -1,4 +1,4 @@
-"""Geometry in a latent code: occupied cells and link distances that can be decoded from z_E.
+"""Geometry in a latent code: the occupied cells that can be decoded from z_E.
 
     python benchmarks/decoded_geometry.py                  # pretrained encoders, oracle, mean
     python benchmarks/decoded_geometry.py runs/RUN/encoder.pt --json geometry.json
@@ -15,11 +15,8 @@ queries, 2,000 that no encoder was trained on. Two scores, over all cells that a
   encoder with a decoder also of the cells with decoded obstacles, without a probe: those nearer
   than a distance that is chosen on training scenes.
 
-Policies need the distances of links from obstacles (m, clipped to 0.4). A second probe, as large,
-predicts them from z_E and the links' places, at `POSES` random configurations per scene:
-
-- links: mean error in cm for links within 10 cm of an obstacle;
-- decoded: the same of the decoded points (`envs.perception.geometry_source.decoded_checker`).
+Of an encoder with a decoder also `decoded`: the mean error in cm of the links' distances from
+decoded points, for links within 10 cm of an obstacle, at `POSES` random configurations per scene.
 """
 
 import argparse
@@ -44,7 +41,6 @@ from roboarm_nmp.envs.perception.encoders import (
     pretrained_encoders,
 )
 from roboarm_nmp.envs.perception.geometry_source import DECODED_RADIUS
-from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import ROW, to_array
 
 TASK = "random_boxes_hard"
@@ -76,21 +72,16 @@ def occupied(obstacles):
 
 
 def link_distances(scenes, seed):
-    """The links' places and distances from obstacles at random configurations.
+    """The links' distances (scenes, POSES, 10), m, from obstacles, and the random configurations.
 
-    Returns:
-        float32 (scenes, POSES, 63), place and two axes of each joint's frame; (scenes, POSES, 10),
-        m; and the normalised configurations (scenes, POSES, 7).
+    These are (scenes, POSES, 7), normalised.
     """
     states = np.random.default_rng(seed).uniform(-1.0, 1.0, (len(scenes), POSES, 7))
     distances = [
         CollisionChecker(replace(scene, table=None, floor=None)).link_distances(batch, within=FAR)
         for scene, batch in zip(tqdm(scenes, desc="distances"), states, strict=True)
     ]
-    frames = PANDA.frame_poses(PANDA.denormalise(states))
-    parts = [part for place, axes in frames for part in (place, axes[..., :, 0], axes[..., :, 2])]
-    places = np.concatenate(parts, axis=-1).astype(np.float32)
-    return places, np.stack(distances)[..., 0], states
+    return np.stack(distances)[..., 0], states
 
 
 def _rotation(quaternion):
@@ -120,7 +111,7 @@ class AnyObstacle(nn.Module):
 
 
 def probe(latents, cells, test_latents, is_set=False, seed=0, epochs=60):
-    """Train the first probe; its probabilities (n, cells) on the test scenes.
+    """Train the probe; its probabilities (n, cells) on the test scenes.
 
     A tenth of the training scenes selects the epoch.
     """
@@ -150,60 +141,6 @@ def probe(latents, cells, test_latents, is_set=False, seed=0, epochs=60):
             if error < best:
                 best, probabilities = error, torch.sigmoid(network(test_latents))
     return probabilities.numpy()
-
-
-class NearestObstacle(nn.Module):
-    """The oracle's z_E and links' places -> distances, the least of those from each obstacle."""
-
-    def __init__(self, network):
-        super().__init__()
-        self.network = network
-
-    def forward(self, inputs):
-        latents, places = inputs.split((MAX_OBSTACLES * (1 + ROW), inputs.shape[1] - 384), dim=1)
-        rows = latents.unflatten(1, (MAX_OBSTACLES, 1 + ROW))
-        rows = rows[:, : int(rows[..., 0].sum(1).max())]
-        places = places.unsqueeze(1).expand(-1, rows.shape[1], -1)
-        found = self.network(torch.cat([rows, places], dim=2))
-        return (found + FAR * (1.0 - rows[..., :1])).amin(1)
-
-
-def distance_probe(latents, data, test_latents, test_data, is_set=False, seed=0, epochs=10):
-    """Train the second probe; its mean error (m) for links within `NEAR` in the test scenes."""
-    torch.manual_seed(seed)
-    if not is_set:
-        mean, std = latents.mean(0), latents.std(0) + 1e-3
-        latents, test_latents = (latents - mean) / std, (test_latents - mean) / std
-    latents, test_latents, places, distances, test_places, test_distances = (
-        torch.as_tensor(x) for x in (latents, test_latents, *data[:2], *test_data[:2])
-    )
-    size = (1 + ROW if is_set else latents.shape[1]) + places.shape[2]
-    network = nn.Sequential(
-        nn.Linear(size, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(),
-        nn.Linear(256, distances.shape[2]),
-    )  # fmt: skip
-    if is_set:
-        network = NearestObstacle(network)
-    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
-    updates, done = epochs * -(-len(latents) * POSES // 512), 0
-    for _ in range(epochs):
-        for rows in torch.randperm(len(latents) * POSES).split(512):
-            scene, pose = rows // POSES, rows % POSES
-            truth = distances[scene, pose]
-            predicted = network(torch.cat([latents[scene], places[scene, pose]], dim=1))
-            weights = 1.0 + 4.0 * (truth < NEAR)
-            loss = (weights * (predicted - truth).abs()).sum() / weights.sum()
-            optimizer.param_groups[0]["lr"] = 1e-3 * (1.0 - done / updates)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            done += 1
-    with torch.no_grad():
-        spread = test_latents.unsqueeze(1).expand(-1, POSES, -1)
-        inputs = torch.cat([spread, test_places], dim=2).flatten(0, 1)
-        predicted = torch.cat([network(batch) for batch in inputs.split(4096)])
-    error = (predicted - test_distances.flatten(0, 1)).abs()
-    return error[test_distances.flatten(0, 1) < NEAR].mean().item()
 
 
 def cells_of(points):
@@ -239,7 +176,7 @@ def decoded(name, training, cells, testing, test_cells, test_data):
             found.append(cells_of(nearer(scene, points, reach)))
     best = max(REACHES, key=lambda reach: iou(np.stack(guesses[reach]), cells[:200]))
     found, errors = [], []
-    _, distances, states = test_data
+    distances, states = test_data
     for scene, truth, batch in zip(tqdm(testing, desc="decoded"), distances, states, strict=True):
         points = encoder.decoded_points(scene)
         found.append(cells_of(nearer(scene, points, best)))
@@ -279,7 +216,7 @@ def cross_entropy(probabilities, cells):
 
 
 def scores(probabilities, means, cells):
-    """The first two scores of the module's docstring; `means` (cells,) are the training scenes'."""
+    """The scores of the module's docstring; `means` (cells,) are the training scenes'."""
     guess = probabilities > 0.5
     means = np.broadcast_to(means, cells.shape)
     return {
@@ -308,11 +245,8 @@ def main():
     sometimes = grids[0].any(0)
     cells, test_cells = (grid[:, sometimes] for grid in grids)
     means = cells.mean(0)
-    data, test_data = link_distances(training, 0), link_distances(testing, 1)
+    test_data = link_distances(testing, 1)
     results = {"mean": scores(means[None].repeat(len(test_cells), 0), means, test_cells)}
-    nothing = np.zeros((len(training), 1), np.float32), np.zeros((len(testing), 1), np.float32)
-    error = distance_probe(nothing[0], data, nothing[1], test_data)
-    results["mean"]["links_cm"] = 100 * error
     names = args.encoders or pretrained_encoders()
     codes, test_codes = latents(names, training), latents(names, testing)
     codes[ORACLE], test_codes[ORACLE] = (
@@ -320,10 +254,8 @@ def main():
         for scenes in (training, testing)
     )
     for name in tqdm([ORACLE, *names], desc="encoders"):
-        (z, test_z), is_set = (codes[name], test_codes[name]), name == ORACLE
-        result = scores(probe(z, cells, test_z, is_set), means, test_cells)
-        error = distance_probe(z, data, test_z, test_data, is_set)
-        result["links_cm"] = 100 * error
+        probabilities = probe(codes[name], cells, test_codes[name], is_set=name == ORACLE)
+        result = scores(probabilities, means, test_cells)
         if make_encoder(name).decoder is not None:
             result |= decoded(name, training, grids[0], testing, grids[1], test_data)
         results[name] = result
@@ -333,7 +265,6 @@ def main():
     print(f"{test_cells.mean():.3f} of them occupied")
     for name, result in results.items():
         line = f"{name:40} information {result['information']:.3f}  IoU {result['iou']:.3f}"
-        line += f"  links {result['links_cm']:.2f} cm"
         if "decoded_cm" in result:
             line += f"; decoded: IoU {result['decoded_iou']:.3f}, {result['decoded_cm']:.2f} cm"
         print(line)

@@ -7,6 +7,7 @@ benchmarks/results, shown as it is.
 
 import csv
 import io
+import json
 import re
 from pathlib import Path
 
@@ -61,6 +62,15 @@ def write_csv(name, head, rows):
     csv.writer(text, lineterminator="\n").writerows([head, *rows])
     write_atomically(RESULTS / name, text.getvalue().encode())
     write({name: csv_table(name)})
+
+
+def write_cells(path, results):
+    """Write results as JSON, dict of task -> dict of cell -> result: a line per cell."""
+    tasks = []
+    for task, cells in results.items():
+        lines = [f"  {json.dumps(name)}: {json.dumps(cell)}" for name, cell in cells.items()]
+        tasks.append(f" {json.dumps(task)}: {{\n" + ",\n".join(lines) + "\n }")
+    write_atomically(path, ("{\n" + ",\n".join(tasks) + "\n}\n").encode())
 
 
 def csv_tables():

@@ -79,8 +79,6 @@ ENCODERS = {
 }
 # What a policy's scene input is computed from. Policies of the fixed scenes have none.
 SOURCES = ENCODERS | {"": "none", "oracle": "ground truth (privileged)"}
-LINES = {"bc": ":", "sac": "-", "td3": "--"}  # of the curves
-COLOURS = ("sac", "td3", "bc")
 FAR_BELOW = 0.05  # of the paper's mean: worth an explanation
 # In benchmarks/results/baselines.json; the second in `UNSEEN`.
 GO_TO_GOAL, REACTIVE = "go-to-goal", "go-to-goal, filter, point_cloud"
@@ -492,113 +490,6 @@ def draw_story(cells, results, baselines, unseen, path):
     _save(figure, path)
 
 
-def groups(cells):
-    """Row -> title -> cells: a row per goal and one for encoders, a title per task."""
-    rows = {f"goal {goal_type}": {} for goal_type in ("ee", "config", "combined")}
-    for cell in cells:
-        row = "scene encoders" if cell.encoder else f"goal {cell.goal_type}"
-        title = cell.task.replace("walls_", "walls_\n") + "\n(no hindsight)" * (
-            cell.hindsight == "no"
-        )
-        rows.setdefault(row, {}).setdefault(title, []).append(cell)
-    return {row: titles for row, titles in rows.items() if titles}
-
-
-def style_of(cell):
-    """One colour per method and encoder in all panels."""
-    colour = list(COLOURS).index(cell.algorithm) if cell.algorithm in COLOURS else 4
-    shade = {"0": 0.45, "1": 1.0, "vae": 1.0, "vqvae": 0.75, "pointnet2": 0.5, "oracle": 0.3}
-    return {
-        "color": (f"C{colour}", shade.get(cell.encoder or cell.demo_prob, 0.75)),
-        "linestyle": LINES.get(cell.algorithm, "-."),
-    }
-
-
-def draw_curves(cells, results, baselines, path):
-    """Validation success over steps of SAC and TD3 beside BC: a line per run."""
-    done = [cell for cell in cells if cell.task == cell.trained_on and cell.name in results]
-    shown = [
-        (f"{title}, {row}".replace("_\n", "_").replace("\n", " "), chosen)
-        for row, titles in groups(done).items()
-        for title, chosen in titles.items()
-        if any(cell.algorithm != "bc" for cell in chosen)
-    ]
-    columns = 3
-    lines = -(-len(shown) // columns)
-    figure, all_axes = plt.subplots(
-        *(lines, columns), figsize=(10, 2.7 * lines), squeeze=False, layout="constrained"
-    )
-    for axes in all_axes.flat[len(shown) :]:
-        axes.set_visible(False)
-    labels = {}
-    for (title, chosen), axes in zip(shown, all_axes.flat, strict=False):
-        floor = baselines.get(chosen[0].task, {}).get(GO_TO_GOAL)
-        if floor:
-            line = axes.axhline(floor["success_rate"], color="0.6", linewidth=1)
-            labels["go-to-goal"] = line
-        for cell in chosen:
-            for result in of_recipe(cell, results):
-                steps, success = zip(*result["curve"], strict=True)
-                (line,) = axes.plot(np.divide(steps, 1000), success, **style_of(cell))
-            labels[method_of(cell)] = line
-        axes.set_title(title, fontsize="small")
-        axes.set(ylim=(0, 1.02), xlim=(0, None))
-        axes.grid(alpha=0.3)
-    for axes in all_axes[:, 0]:
-        axes.set_ylabel("validation success")
-    all_axes[-1, 0].set_xlabel("training steps, thousands (BC: batches)")
-    figure.legend(labels.values(), labels, loc="outside lower center", ncols=4, fontsize="small")
-    _save(figure, path)
-
-
-def draw_success(cells, results, baselines, path):
-    """Test success with its 95 % interval, ours beside the paper's: a panel per task and goal."""
-    rows = groups([cell for cell in cells if cell.name in results])
-    methods = {
-        row: list(dict.fromkeys(method_of(cell) for chosen in titles.values() for cell in chosen))
-        for row, titles in rows.items()
-    }
-    columns = max(map(len, rows.values()))
-    heights = [1.6 + len(names) for names in methods.values()]
-    figure, all_axes = plt.subplots(
-        *(len(rows), columns), figsize=(11, 1 + 0.34 * sum(heights)), squeeze=False,
-        height_ratios=heights, sharex=True, sharey="row", layout="constrained",
-    )  # fmt: skip
-    labels = {}
-    for (row, titles), line in zip(rows.items(), all_axes, strict=True):
-        for axes in line[len(titles) :]:
-            axes.set_visible(False)
-        names = methods[row]
-        line[0].set_yticks(range(len(names)), names, fontsize=8)
-        line[0].set_ylim(len(names) - 0.4, -0.6)
-        line[0].set_ylabel(row)
-        for (title, chosen), axes in zip(titles.items(), line, strict=False):
-            floor = baselines.get(chosen[0].task, {}).get(GO_TO_GOAL)
-            if floor:
-                rule = axes.axvline(floor["success_rate"], color="0.6", linewidth=1)
-                labels["go-to-goal"] = rule
-            for cell in chosen:
-                y = names.index(method_of(cell))
-                success, (low, high), _, _ = pooled(of_recipe(cell, results))
-                ends = [[max(success - low, 0)], [max(high - success, 0)]]
-                style = {"fmt": "o", "markersize": 4, "capsize": 2}
-                labels["ours, 95 % interval"] = axes.errorbar(
-                    success, y - 0.15, xerr=ends, color="C0", **style
-                )
-                if cell.mean is not None:
-                    style |= {"fmt": "D", "color": "C1"}
-                    labels["paper, standard deviation of four seeds"] = axes.errorbar(
-                        cell.mean, y + 0.15, xerr=cell.std, **style
-                    )
-            axes.set_title(title, fontsize="small")
-            axes.set_xlim(-0.02, 1.04)
-            axes.grid(alpha=0.3, axis="x")
-            axes.tick_params(labelbottom=True)
-    all_axes[-1, 0].set_xlabel("success on test queries")
-    figure.legend(labels.values(), labels, loc="outside lower center", ncols=3, fontsize="small")
-    _save(figure, path)
-
-
 def _save(figure, path):
     """A quarter as large as it would be with all colours."""
     figure.savefig(path, dpi=100)
@@ -726,8 +617,6 @@ def main():
     baselines, unseen = load_references()
     if results:
         draw_story(cells, results, baselines, unseen, FIGURES / "results_story.png")
-        draw_curves(cells, results, baselines, FIGURES / "results_curves.png")
-        draw_success(cells, results, baselines, FIGURES / "results_success.png")
     write(tables(cells, results, baselines))
 
 

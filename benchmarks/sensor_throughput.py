@@ -1,4 +1,4 @@
-"""Sensors: their agreement with PyBullet, their time, and the time and memory of whole steps.
+"""Sensors: their agreement with PyBullet, their time, and the time of whole steps.
 
     python benchmarks/sensor_throughput.py
 
@@ -12,7 +12,6 @@ import argparse
 import time
 
 import numpy as np
-import psutil
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.perception.geometry_source import observed_checker
@@ -29,7 +28,6 @@ from roboarm_nmp.envs.perception.sensors import (
     cardinal,
     deproject,
 )
-from roboarm_nmp.envs.wrappers import SensorWrapper
 from roboarm_nmp.policies.registry import find_policy, make_policy
 from roboarm_nmp.utils.bullet import pybullet as p
 
@@ -160,23 +158,9 @@ def policy_step(queries):
     return 1e3 * np.median(sensing), 1e3 * np.median(acting)
 
 
-def growth(episodes):
-    """MB the process grows by in `episodes` episodes of one step, four cameras looking."""
-    env = SensorWrapper(envs.make(TASK), cardinal(size=(64, 64)))
-    for episode in range(episodes + 200):
-        if episode == 200:  # by then everything that is made once has been
-            before = psutil.Process().memory_info().rss
-        env.reset(seed=episode)
-        env.step(np.zeros(7))
-    grown = psutil.Process().memory_info().rss - before
-    env.close()
-    return grown / 1e6
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--repeats", type=int, default=100, help="scenes (100)")
-    parser.add_argument("--episodes", type=int, default=5000, help="for the memory (5,000)")
     args = parser.parse_args()
     observed_checker(SceneObservation.of(*next(scenes(1))))  # compiled functions are loaded
     same, near, others = agreement(args.repeats)
@@ -196,8 +180,6 @@ def main():
         print(f"step, {name}: {milliseconds:.2f} ms", flush=True)
     sensing, acting = policy_step(10)
     print(f"{POLICY}: sensing and observation {sensing:.2f} ms, policy and filter {acting:.2f} ms")
-    if args.episodes:
-        print(f"{args.episodes} episodes with four cameras: {growth(args.episodes):.1f} MB more")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""How long until a policy is good? SAC and HER: ours, Stable-Baselines3's and SBX's.
+"""How long until a policy is good? SAC and HER: ours and Stable-Baselines3's.
 
     pip install -c constraints.txt -e ".[bench]"
-    pip install sbx-rl                                            # for `sbx`
     python benchmarks/time_to_success.py --folder time_to_success --workers 2
     python benchmarks/time_to_success.py --folder time_to_success --task double_walls
 
@@ -15,14 +14,12 @@ run has a process of its own, and one thread.
   episode, the arm's Jacobian is no input of the networks, and no behavioural cloning (`EARLIER`).
 - `sb3`: Stable-Baselines3's SAC with its `HerReplayBuffer` and its defaults, but 2,000 random
   steps first, because it needs a whole episode.
-- `sb3-ours`, `sbx-ours`: Stable-Baselines3 and SBX with our rates, discount, number of
-  environments, updates per step, network inputs and (SBX) LayerNorm and frequency of the policy's
-  updates.
+- `sb3-ours`: Stable-Baselines3 with our rates, discount, number of environments, updates per step
+  and network inputs.
 
 A run that is done has a file in `--folder`, beside the log of its output, and is not repeated. The
 table shows the median run over seeds; of an even number of runs, the faster one of the two in the
-middle. The success of all runs over time goes to a file of benchmarks/results and a figure of the
-docs.
+middle. A figure of the docs shows the success of all runs over time.
 """
 
 import contextlib
@@ -47,6 +44,7 @@ import numpy as np
 import torch
 import tyro
 from markdown_tables import NOTHING, ROOT, write_csv
+from PIL import Image
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -59,12 +57,15 @@ from roboarm_nmp.training import protocol
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import write_atomically
 
-Learner = Literal["ours", "earlier", "sb3", "sb3-ours", "sbx-ours"]
-LEARNERS, WITH_DEMOS = get_args(Learner), ("ours", "earlier")
+Learner = Literal["ours", "earlier", "sb3", "sb3-ours"]
+LEARNERS = get_args(Learner)
+WITH_DEMOS = ("ours", "earlier")
 EARLIER = ["--her-exponent", "1", "--no-jacobian", "--bc-weight", "0"]
 GOALS = {"no_obstacles": 0.9, "double_walls": 0.75}  # success rates
-QUERIES, QUERY_SEED, INTERVAL, LIMIT = 200, 20_261_127, 10_000, 3600.0
-ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"  # of JAX
+QUERIES = 200
+QUERY_SEED = 20_261_127
+INTERVAL = 10_000  # environment steps between evaluations
+LIMIT = 3600.0  # s
 
 
 @dataclasses.dataclass
@@ -72,7 +73,7 @@ class Args:
     folder: Path
     """where results are kept, a JSON file per run"""
     task: Literal["no_obstacles", "double_walls"] = "no_obstacles"
-    """task; Stable-Baselines3 and SBX have no demonstrations, so `double_walls` is for ours"""
+    """task; Stable-Baselines3 has no demonstrations, so `double_walls` is for ours"""
     only: tuple[Learner, ...] = ()
     """learners to run, by default all that can learn the task; the table has all in `--folder`"""
     seeds: tuple[flags.Seed, ...] = (1, 2, 3)
@@ -138,7 +139,8 @@ def train_ours(task, seed, clock, changed):
     script = sac_her_mp.__file__
     sys.argv = [script, "--task", task, "--seed", str(seed), "--eval-every", str(INTERVAL)]
     sys.argv += ["--runs-dir", os.environ["TMPDIR"], "--total-timesteps", "10000000"]
-    sys.argv += ["--demo-prob", "1", "--bc-weight", "5"] * (task == "double_walls")
+    if task == "double_walls":
+        sys.argv += ["--demo-prob", "1", "--bc-weight", "5"]
     sys.argv += changed
     changed_run = mock.patch.multiple(protocol.PolicyRun, start=start, validate=validate)
     with changed_run, contextlib.suppress(Done):
@@ -164,13 +166,14 @@ def our_args():
 
 
 def train_peer(name, task, seed, clock):
-    """Stable-Baselines3 or SBX."""
-    from stable_baselines3 import HerReplayBuffer
+    """Stable-Baselines3."""
+    from stable_baselines3 import SAC, HerReplayBuffer
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
 
     torch.set_num_threads(1)
-    args, ours, kind = our_args(), name.endswith("-ours"), name.split("-")[0]
+    args = our_args()
+    ours = name == "sb3-ours"
     her = {"n_sampled_goal": 4, "goal_selection_strategy": "future"}
     options = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": her, "seed": seed}
     options |= {"learning_starts": args.learning_starts, "device": "cpu"}  # after the first episode
@@ -180,17 +183,9 @@ def train_peer(name, task, seed, clock):
         gamma = sac_her_mp.discount_factor(args.gamma, PANDA)
         options |= {"learning_rate": args.q_lr, "gamma": gamma, "tau": args.tau}
         options |= {"train_freq": steps, "gradient_steps": args.num_envs}
-    if kind == "sbx":
-        from sbx import SAC
-
-        options["policy_kwargs"] = sbx_networks(args)
-        options |= {"policy_delay": args.policy_frequency, "qf_learning_rate": args.q_lr}
-    else:
-        from stable_baselines3 import SAC
-
         size = [args.hidden_size] * args.num_hidden_layers
         networks = {"features_extractor_class": OurFeatures, "net_arch": size}
-        options["policy_kwargs"] = networks if ours else {}
+        options["policy_kwargs"] = networks
 
     class Policy(torch.nn.Module):
         def forward(self, **data):
@@ -209,51 +204,6 @@ def train_peer(name, task, seed, clock):
     vec_env = make_vec_env(envs.gymnasium_id(task), number, seed=seed)
     model = SAC("MultiInputPolicy", vec_env, **options)
     model.learn(10_000_000, callback=Evaluate())
-
-
-def sbx_networks(args):
-    """SBX's networks with our inputs, which it receives as one vector."""
-    import jax.numpy as jnp
-    from sbx.common.policies import SquashedGaussianActor, VectorCritic
-
-    features = sac_her_mp.Features(args, envs.make("no_obstacles"))
-    middle, half_range = features.middle.numpy(), features.half_range.numpy()
-    joints, chain = len(middle), features.jacobian
-    weights, biases, per_state = (
-        array.numpy() for array in (chain.weights, chain.biases, chain.per_state)
-    )
-
-    def towards(state, position, vector):  # as `JacobianTranspose` does it
-        values = state @ per_state.T + chain.middle.numpy()
-        cosines, sines = jnp.cos(values), jnp.sin(values)
-        vectors = jnp.concatenate([position, vector], 1)
-        frames = [(vectors @ weights[0].T + biases[0])[:, 12:]]
-        for i in range(1, joints):
-            a, b, c = jnp.split(frames[-1] @ weights[i].T + biases[i], 3, 1)
-            frames.append(cosines[:, i - 1 : i] * a + sines[:, i - 1 : i] * b + c)
-        px, py, _, vx, vy, _ = jnp.moveaxis(jnp.stack(frames, 1), 2, 0)
-        return (px * vy - py * vx) @ per_state
-
-    def inputs(flat):
-        goal, observation = flat[:, 3:6], flat[:, 6:]  # the hand's position is also in observation
-        angles = observation[:, :joints] * half_range + middle
-        position, parts = observation[:, features.ee], [observation, goal]
-        parts += [jnp.sin(angles), jnp.cos(angles), 5.0 * (goal - position)]
-        pull = towards(observation[:, :joints], position, parts[-1])
-        parts += [pull, pull / (jnp.linalg.norm(pull, axis=1, keepdims=True) + 1e-6)]
-        return jnp.concatenate(parts, 1)
-
-    class Actor(SquashedGaussianActor):
-        def __call__(self, flat):
-            return super().__call__(inputs(flat))
-
-    class Critic(VectorCritic):
-        def __call__(self, flat, action):
-            return super().__call__(inputs(flat), action)
-
-    size = [args.hidden_size] * args.num_hidden_layers
-    networks = {"actor_class": Actor, "vector_critic_class": Critic}
-    return networks | {"net_arch": size, "layer_norm": True}
 
 
 def run_one(args, name, seed):
@@ -279,7 +229,7 @@ def run_in_process(args, name, seed):
         subprocess.run(
             [*command, "--limit", str(args.limit)],
             check=True,
-            env=os.environ | {"TMPDIR": folder, "XLA_FLAGS": ONE_THREAD},
+            env=os.environ | {"TMPDIR": folder},
             stdout=log,
             stderr=subprocess.STDOUT,
         )
@@ -296,7 +246,7 @@ def runs_of(args, names):
     for name in names:
         files = [file_of(args, name, seed) for seed in args.seeds]
         runs[name] = [json.loads(file.read_text()) for file in files if file.exists()]
-    return {name: own for name, own in runs.items() if own}
+    return {name: done for name, done in runs.items() if done}
 
 
 def median(runs):
@@ -307,9 +257,11 @@ def median(runs):
 
 def rows_of(all_runs):
     """Cells of the table, a row per learner."""
-    rows, ours = [], all_runs.get("ours")
+    rows = []
+    ours = all_runs.get("ours")
     for name, runs in all_runs.items():
-        run, reached = median(runs), sum(run["reached"] for run in runs)
+        run = median(runs)
+        reached = sum(run["reached"] for run in runs)
         more = "" if run["reached"] else "more than "
         row = [name, f"{reached} of {len(runs)}", f"{more}{run['seconds'] / 60:.1f}"]
         row += [f"{run['steps']:,}", f"{run['updates']:,}", f"{max_success(run):.3f}"]
@@ -320,16 +272,6 @@ def rows_of(all_runs):
 
 def max_success(run):
     return max(point["success"] for point in run["curve"])
-
-
-def curve_rows(all_runs):
-    """Success of all runs after each evaluation."""
-    return [
-        [name, run["seed"], point["steps"], round(point["seconds"], 1), point["success"]]
-        for name, runs in all_runs.items()
-        for run in runs
-        for point in run["curve"]
-    ]
 
 
 def figure_of(task, all_runs):
@@ -348,13 +290,15 @@ def figure_of(task, all_runs):
     contents = io.BytesIO()
     figure.savefig(contents, format="png", dpi=110)
     plt.close(figure)
-    return contents.getvalue()
+    few_colours = io.BytesIO()
+    Image.open(contents).convert("RGB").quantize(64).save(few_colours, "png", optimize=True)
+    return few_colours.getvalue()
 
 
 def main():
     args = tyro.cli(Args, description=__doc__)
     flags.check(args)
-    able = LEARNERS if args.task == "no_obstacles" else WITH_DEMOS
+    able = LEARNERS if args.task == "no_obstacles" else WITH_DEMOS  # that can learn the task
     names = args.only or able
     if not set(names) <= set(able):
         sys.exit(f"--only: on {args.task}, with demonstrations, there are {' and '.join(able)}")
@@ -368,10 +312,9 @@ def main():
         list(pool.map(lambda run: run_in_process(args, *run), waiting))
     head = ["learner", "runs that reached it", "minutes", "environment steps", "updates"]
     head += ["best success rate", "minutes / minutes of `ours`"]
-    all_runs, name = runs_of(args, able), f"time_to_success_{args.task}"
+    all_runs = runs_of(args, able)
+    name = f"time_to_success_{args.task}"
     write_csv(f"{name}.csv", head, rows_of(all_runs))
-    curve_head = ["learner", "seed", "environment steps", "seconds", "success"]
-    write_csv(f"{name}_curves.csv", curve_head, curve_rows(all_runs))
     write_atomically(ROOT / "docs" / "figures" / f"{name}.png", figure_of(args.task, all_runs))
 
 

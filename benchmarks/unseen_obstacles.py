@@ -24,7 +24,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from markdown_tables import NOTHING, interval, share, table, write
+from markdown_tables import NOTHING, interval, share, table, write, write_cells
 
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.perception.encoders import PRETRAINED
@@ -143,16 +143,10 @@ OF_BASELINES = {
     "plan from the point cloud": "plan from the point cloud, 5 s",
     "RRT-Connect": "RRT-Connect, 5 s",
 }
-KEPT = (
-    *(
-        "success_rate",
-        "success_rate_interval",
-        "collision_free_success_rate",
-        "collision_free_success_rate_interval",
-    ),
-    *("num_queries", "ms_per_action", "planning_seconds", "mean_steps", "path_length"),
-    *("env", "geometry_source", "privileged", "safety_filter", "seed"),
-)
+KEPT = ("success_rate", "success_rate_interval", "collision_free_success_rate")
+KEPT += ("collision_free_success_rate_interval", "num_queries", "ms_per_action", "planning_seconds")
+KEPT += ("mean_steps", "path_length", "env", "geometry_source", "privileged", "safety_filter")
+KEPT += ("seed",)
 FILTER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the safety filter that a result had
 ENCODER_MARK = "†"
 MARKS = {
@@ -191,7 +185,7 @@ def load_results():
 
 
 def write_results(results):
-    write_atomically(RESULTS, (json.dumps(results, indent=1) + "\n").encode())
+    write_cells(RESULTS, results)
 
 
 def run(tasks, names, num, workers):

@@ -191,24 +191,11 @@ def encoder_policies():
     return markdown([*header, "DAgger: collision-free success"], rows)
 
 
-def scaling():
-    """DAgger with fewer scenes, and with other numbers of rounds."""
-    rows = []
-    for result in read(RESULTS / "scaling.json"):
-        every = result["round_every"]
-        rounds = (result["updates"] - 1) // every if every else 0
-        row = [str(result["scenes"]), str(rounds), share(result["success_rate"]), interval(result)]
-        rows.append([*row, share(result["collision_free_success_rate"])])
-    header = ["scenes", "rounds of DAgger", "success", "95 % interval", "collision-free success"]
-    return markdown(header, rows)
-
-
 TABLES = {
     "sac": lambda: reinforcement("sac"),
     "td3": lambda: reinforcement("td3"),
     "bc": behavioural_cloning,
     "dagger": dagger,
-    "scaling": scaling,
     "encoder runs": encoder_runs,
     "encoder scores": encoder_scores,
     "encoder policies": encoder_policies,

@@ -425,7 +425,7 @@ def test_episodes_leave_no_memory_behind(env):
     for _ in range(300):
         env.reset()
         env.step(env.action_space.sample())
-    # The full check of 20,000 episodes is benchmarks/memory.py.
+    # 20,000 episodes: docs/lab_notebook.md, "Memory over many episodes".
     assert psutil.Process().memory_info().rss - resident < 2e6
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from encoder_trainers import FOLDER, OF_CLOUDS, SCRIPTS, command
-from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainers import GPU, error_here, run_here
 
@@ -69,27 +68,6 @@ def test_run_writes_an_encoder_a_result_and_events(run):
     assert {f"eval/{name}" for name in scores} <= scalars
     assert all(0 <= result[name] <= 1 for name in scores)
     assert [event.step for event in events.Scalars(f"eval/{min(scores)}")] == [4, 8]
-
-
-def test_keep_encoders_copies_network_scores_and_figure(run, tmp_path, capsys):
-    name, folder = run
-    script = FOLDER.parent / "benchmarks" / "keep_encoders.py"
-    where = ["--encoders", str(tmp_path), "--figures", str(tmp_path)]
-    run_here(script, folder, *where, *(["--float16"] if name == "field" else []))
-    if name == "field":
-        for ending in ("", ".decoder"):
-            kept, whole = tmp_path / f"{name}{ending}.pt", folder / f"encoder{ending}.pt"
-            assert kept.stat().st_size < whole.stat().st_size
-            assert load_network(kept).metadata == load_network(whole).metadata
-    else:
-        kept = (tmp_path / f"{name}.pt").read_bytes()
-        assert kept == (folder / "encoder.pt").read_bytes()
-    assert Image.open(tmp_path / f"encoder_{name}.png").height > 0
-    text = (tmp_path / f"{name}.json").read_text()
-    result = json.loads(text)
-    assert result["scenes"] == 14 and result["args"]["seed"] == 1 and str(folder.parent) not in text
-    assert result["observations"].startswith("roboarm observations --task random_boxes_hard")
-    assert "no finished run" in error_here(capsys, script, tmp_path)
 
 
 def test_saved_encoder_runs_without_its_script(run, observations):
