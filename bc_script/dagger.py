@@ -258,6 +258,8 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         seed = int(rng.integers(2**32))  # of the random-walk escapes
         result = protocol.evaluate(act, [env], [query], device, safety_filter, seed)
         reached.append(result["success_rate"])
+        if not visited:  # the start was at the goal
+            continue
         states = np.array(visited)
         weights = np.ones(len(states))
         moved = np.linalg.norm(states[PATIENCE:] - states[:-PATIENCE], axis=1)

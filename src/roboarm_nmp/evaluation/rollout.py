@@ -1,23 +1,30 @@
-"""Rollouts: one episode of a policy on one query, recorded as a `Trajectory`.
+"""Rollouts: episodes of a policy on queries, each recorded as a `Trajectory`.
 
     begin = make_policy("go-to-goal", env)
     trajectory = rollout(env, query, begin(0, query).act)
     trajectory.success, trajectory.collides, trajectory.configurations
 
-`rollout` runs one episode. `Episode` is the same step by step, for a network that predicts the
-actions of several episodes at once. Metrics and images are derived from trajectories.
+`rollout` runs one episode. `rollouts` runs several at once, for a network that predicts all of
+their actions in one call. `Episode` goes step by step, for a loop of your own. Metrics and images
+are derived from trajectories.
 """
 
 import math
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
+from roboarm_nmp.datasets.queries import Query
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.policies.baselines import Observation, Policy
 
+AnyPolicy = TypeVar("AnyPolicy", bound=Policy)
 REAL_TIME = "real_time"
 """A delay: as many steps as an action takes to compute, of wall-clock time."""
 
@@ -62,7 +69,7 @@ class Episode:
 
     Args:
         env: a `RoboArmEnv`, possibly wrapped. It is reset to the query.
-        query: an `datasets.queries.Query`.
+        query: a `datasets.queries.Query`.
 
     Attributes:
         observation, info: the last ones.
@@ -72,34 +79,54 @@ class Episode:
         ValueError: the environment refuses the query.
     """
 
-    def __init__(self, env, query):
+    def __init__(self, env: RoboArmEnv, query: Query):
+        self.env = env
         self.observation, self.info = env.reset_specific(*query)
-        self.env, self._robot = env, env.unwrapped.robot  # the query's, in its scene
-        self.ended = self._success = self.info["is_success"]
-        self._states, self._actions = [self._state()], []
-        self._contacts, self._times = [], []
+        self._robot = env.unwrapped.robot  # the query's, in its scene
+        self._success = self.info["is_success"]
+        self.ended = self._success
+        self._states = [self._state()]
+        self._actions = []
+        self._contacts = []
+        self._times = []
+        self._delayed = None  # the last action, until it takes effect
         self._observed = time.perf_counter()
 
     def _state(self):
         return self.observation["observation"][: self._robot.num_joints]
 
-    def hold(self):
+    def _hold(self):
         """The action that keeps the arm where it is."""
         state = self._state()
         return state if self.env.unwrapped.action_mode == "subgoal" else np.zeros_like(state)
 
-    def step(self, action):
+    def step(self, action: np.ndarray) -> None:
         """One step of the environment. Raises ValueError: it refuses the action."""
         seconds = time.perf_counter() - self._observed
         self.observation, _, terminated, truncated, self.info = self.env.step(action)
-        self.ended, self._success = terminated or truncated, self.info["is_success"]
+        self._success = self.info["is_success"]
+        self.ended = terminated or truncated
         self._states.append(self._state())
         self._actions.append(np.array(action, dtype=np.float64))
         self._contacts.append(self.info["collision"])
         self._times.append(seconds)
         self._observed = time.perf_counter()
 
-    def trajectory(self):
+    def step_delayed(self, action: np.ndarray, delay: int) -> None:
+        """Steps of the environment until an action takes effect `delay` steps later.
+
+        Meanwhile the arm makes the step of the action before it, and then holds its configuration.
+        """
+        if delay == 0:
+            self.step(action)
+            return
+        for _ in range(delay):
+            if not self.ended:
+                self.step(self._hold() if self._delayed is None else self._delayed)
+                self._delayed = None
+        self._delayed = action
+
+    def trajectory(self) -> Trajectory:
         """The `Trajectory` so far."""
         return Trajectory(
             np.array(self._states),
@@ -111,7 +138,13 @@ class Episode:
         )
 
 
-def rollout(env, query, policy, delay=0, planning_seconds=0.0):
+def rollout(
+    env: RoboArmEnv,
+    query: Query,
+    policy: Policy | None,
+    delay: int | str = 0,
+    planning_seconds: float = 0.0,
+) -> Trajectory:
     """The `Trajectory` of a policy on a query.
 
     With a delay, an action takes effect some steps after its observation, and the policy observes
@@ -120,7 +153,7 @@ def rollout(env, query, policy, delay=0, planning_seconds=0.0):
 
     Args:
         env: a `RoboArmEnv`, possibly wrapped.
-        query: an `datasets.queries.Query`.
+        query: a `datasets.queries.Query`.
         policy: a function from an observation to an action (n,); None: no step is made.
         delay: of each action, in steps; 0: the simulation waits for the policy. `REAL_TIME`: the
             steps of 1/30 s that pass while the policy computes, at least 1. The trajectory then
@@ -130,23 +163,62 @@ def rollout(env, query, policy, delay=0, planning_seconds=0.0):
     Raises:
         ValueError: the environment refuses the query or an action.
     """
-    episode, command = Episode(env, query), None
-    while policy is not None and not episode.ended:
+    if policy is None:
+        return Episode(env, query).trajectory()
+    [trajectory] = rollouts(
+        [env], [query], lambda env, number: policy, delay=delay, planning_seconds=planning_seconds
+    )
+    return trajectory
+
+
+def rollouts(
+    envs: Sequence[RoboArmEnv],
+    queries: Sequence[Query],
+    begin: Callable[[RoboArmEnv, int], AnyPolicy],
+    predict: Callable[[list[AnyPolicy], list[Observation]], None] | None = None,
+    delay: int | str = 0,
+    planning_seconds: float = 0.0,
+) -> Iterator[Trajectory]:
+    """Yield the `Trajectory` of every query, in the order in which the episodes end.
+
+    Args:
+        envs: environments that are alike. In each of them there is one episode at a time.
+        queries: `datasets.queries.Queries`, or a list of `Query`.
+        begin: begin(env, number) makes the policy for an episode, after its reset, on the query
+            of that number.
+        predict: predict(policies, observations), which is called before each step, for policies
+            whose actions are predicted by one call of a network.
+        delay, planning_seconds: see `rollout`. `REAL_TIME` needs a single environment.
+
+    Raises:
+        ValueError: an environment refuses a query or an action.
+    """
+    waiting = enumerate(queries)
+    idle = list(envs)
+    running = []
+    while True:
+        for env, (number, query) in zip(idle, waiting, strict=False):  # as long as there are both
+            running.append((Episode(env, query), begin(env, number)))
+        if not running:
+            return
         began = time.perf_counter()
-        action = policy(episode.observation)
-        steps = delay
-        if delay == REAL_TIME:
-            seconds = time.perf_counter() - began + planning_seconds
-            steps, planning_seconds = max(1, math.ceil(seconds / STEP_SECONDS)), 0.0
-        if steps == 0:
-            episode.step(action)
-            continue
-        for _ in range(steps):
-            if not episode.ended:
-                episode.step(episode.hold() if command is None else command)
-                command = None
-        command = action
-    return episode.trajectory()
+        active = [(episode, policy) for episode, policy in running if not episode.ended]
+        if predict is not None and active:
+            observations = [episode.observation for episode, _ in active]
+            predict([policy for _, policy in active], observations)
+        for episode, policy in active:
+            action = policy(episode.observation)
+            steps = delay
+            if delay == REAL_TIME:
+                seconds = time.perf_counter() - began + planning_seconds
+                planning_seconds = 0.0
+                steps = max(1, math.ceil(seconds / STEP_SECONDS))
+            episode.step_delayed(action, steps)
+        ended = [episode for episode, _ in running if episode.ended]
+        running = [pair for pair in running if not pair[0].ended]
+        idle = [episode.env for episode in ended]
+        for episode in ended:
+            yield episode.trajectory()
 
 
 def render_strip(env, query, actions, steps):

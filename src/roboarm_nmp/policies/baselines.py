@@ -42,6 +42,12 @@ TRIES = 16  # of `via-points`, by default
 TIME_LIMIT = 5.0  # s, of `planner`, by default
 
 
+Observation = dict[str, np.ndarray]
+"""An observation of `RoboArmEnv`."""
+Policy = Callable[[Observation], np.ndarray]
+"""A policy in one episode: from an observation to an action (n,)."""
+
+
 class EpisodePolicy(NamedTuple):
     """A policy in one episode.
 
@@ -49,7 +55,7 @@ class EpisodePolicy(NamedTuple):
     plan_found: whether it found a motion; None if it does not look for one.
     """
 
-    act: Callable | None
+    act: Policy | None
     plan_found: bool | None = None
 
 

@@ -24,7 +24,7 @@ from roboarm_nmp.envs.arm_env import HORIZON, STANDARD_RULES, deviations
 from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name, task_with_robot
-from roboarm_nmp.evaluation.rollout import Episode, render_strip
+from roboarm_nmp.evaluation.rollout import render_strip, rollouts
 from roboarm_nmp.networks.exported_networks import (
     load_network,
     save_network,
@@ -228,11 +228,11 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0, descript
     Raises:
         FloatingPointError: the policy's actions or its recurrent state are not finite.
     """
-    rollouts = _rollouts(policy, envs, queries, device, safety_filter, seed)
+    trajectories = _rollouts(policy, envs, queries, device, safety_filter, seed)
     bar = {"unit": "query", "transient": True, "disable": description is None}
     results = [
         (trajectory.success, trajectory.collides, len(trajectory))
-        for trajectory in progress_bar(rollouts, description, len(queries), **bar)
+        for trajectory in progress_bar(trajectories, description, len(queries), **bar)
     ]
     success, collides, steps = np.array(results, dtype=np.float64).T
     return {
@@ -243,68 +243,57 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0, descript
     }
 
 
-class _Running:
-    """One of the episodes whose actions one call of the policy predicts.
+class _NetworkPolicy:
+    """The policy of one of the episodes whose actions one call of a network predicts.
 
-    Args:
-        episode: the `Episode`.
-        size: of the policy's recurrent state.
-        safety_filter, rng: the filter around the policy, or None, and its random numbers.
+    Attributes:
+        recurrent_state: of the network, in this episode.
+        prediction: the action (n,) for the current observation, and the recurrent state after it.
+        act: from an observation to an action (n,), through the safety filter, if there is one.
     """
 
-    def __init__(self, episode, size, safety_filter, rng):
-        self.episode, self.recurrent_state = episode, np.zeros(size, np.float32)
-        self._act = self._predicted
-        if safety_filter is not None:
-            self._act = safety_filter.filter_policy(self._predicted, episode.env, rng)
+    def __init__(self, recurrent_size):
+        self.recurrent_state = np.zeros(recurrent_size, np.float32)
+        self.prediction = None
+        self.act = self.predicted
 
-    def _predicted(self, observation):
+    def predicted(self, observation):
         # During an escape the filter does not call this: the recurrent state stays as it is.
-        action, self.recurrent_state = self._prediction
+        action, self.recurrent_state = self.prediction
         return action
 
-    def step(self, action, recurrent_state):
-        """One step with the policy's prediction for the current observation."""
-        self._prediction = action, recurrent_state
-        self.episode.step(self._act(self.episode.observation))
+    def __call__(self, observation):
+        return self.act(observation)
 
 
-@torch.no_grad()
-def _rollouts(policy, envs, queries, device, safety_filter, seed=0):
-    """Yield the `Trajectory` of every query, in any order; arguments as for `evaluate`."""
-    waiting, size = iter(range(len(queries))), recurrent_size(policy)
+def _rollouts(network, envs, queries, device, safety_filter, seed=0):
+    """An iterator of the `Trajectory` of every query, in any order; arguments as for `evaluate`."""
+    size = recurrent_size(network)
 
-    def begin(idle):
-        for env, i in zip(idle, waiting, strict=False):  # as long as there are queries
-            rng = np.random.default_rng([seed, i])
-            yield _Running(Episode(env, queries[i]), size, safety_filter, rng)
+    def begin(env, number):
+        policy = _NetworkPolicy(size)
+        if safety_filter is not None:
+            rng = np.random.default_rng([seed, number])
+            policy.act = safety_filter.filter_policy(policy.predicted, env, rng)
+        return policy
 
-    running = list(begin(envs))
-    while running:
-        observations = [one.episode.observation for one in running]
-        states = [one.recurrent_state for one in running]
-        actions, states = _actions(policy, observations, states, device)
-        for one, action, state in zip(running, actions, states, strict=True):
-            one.step(action, state)
-        ended = [one.episode for one in running if one.episode.ended]
-        for episode in ended:
-            yield episode.trajectory()
-        running = [one for one in running if not one.episode.ended]
-        running += begin(episode.env for episode in ended)
+    @torch.no_grad()
+    def predict(policies, observations):
+        states = [policy.recurrent_state for policy in policies]
+        if size:
+            observations = [
+                observation | {"recurrent_state": state}
+                for observation, state in zip(observations, states, strict=True)
+            ]
+            actions, states = (x.cpu().numpy() for x in network(**stack(observations, device)))
+            check_finite("the policy's recurrent state", states)
+        else:
+            actions = network(**stack(observations, device)).cpu().numpy()
+        check_finite("the policy's actions", actions)
+        for policy, action, state in zip(policies, actions, states, strict=True):
+            policy.prediction = action, state
 
-
-def _actions(policy, observations, states, device):
-    """Actions (m, n) for m observations, and the policy's m recurrent states after them."""
-    if not len(states[0]):
-        actions = policy(**stack(observations, device)).cpu().numpy()
-    else:
-        given = [
-            o | {"recurrent_state": state} for o, state in zip(observations, states, strict=True)
-        ]
-        actions, states = (x.cpu().numpy() for x in policy(**stack(given, device)))
-        check_finite("the policy's recurrent state", states)
-    check_finite("the policy's actions", actions)
-    return actions, states
+    return rollouts(envs, queries, begin, predict)
 
 
 def rollout_image(policy, env, query, device, safety_filter=None, frames=8):
