@@ -8,10 +8,12 @@ below. There is neither the standard table nor the floor, so places may be below
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from roboarm_nmp.envs.robots.panda import scale_of
+from roboarm_nmp.envs.scenes.numbers import Vector
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import (
     FRICTION,
@@ -31,7 +33,8 @@ OPEN_BOX = {
     "height": (0.35, 0.8),
     "thickness": (0.01, 0.04),
 }
-FRONT, LID = (0.75, 1.0), (math.radians(30), math.radians(100))  # height of the front wall, opening
+FRONT = (0.75, 1.0)  # height of the front wall, as a share of the others'
+LID = (math.radians(30), math.radians(100))  # how far it is open
 LIDS = 2 / 3
 DEEP = 0.5  # share of an open box's height that is its place
 SHELF = {
@@ -42,7 +45,10 @@ SHELF = {
     "spacing": (0.2, 0.45),
     "thickness": (0.02, 0.04),
 }
-BOARDS, DIVIDED, BACK, SIDES = (2, 6), 0.4, 0.3, 0.7  # number; shares of levels, shelves, shelves
+BOARDS = (2, 6)  # fewest, most
+DIVIDED = 0.4  # share of the levels
+BACK = 0.3  # share of the shelves
+SIDES = 0.7  # share of the shelves
 TABLE = {
     "near": (0.2, 0.5),
     "base": (-0.35, 0.4),
@@ -52,7 +58,10 @@ TABLE = {
 }
 OBJECTS = {"radius": (0.02, 0.06), "length": (0.08, 0.35)}
 PANELS = {"length": (0.1, 0.25), "thickness": (0.02, 0.25), "height": (0.1, 0.4)}
-ON_TABLE, IN_BOX, IN_SHELF = (2, 9), (0, 4), (0, 8)  # objects: fewest, most + 1
+# Objects: fewest, most + 1.
+ON_TABLE = (2, 9)
+IN_BOX = (0, 4)
+IN_SHELF = (0, 8)
 OVER_TABLE = 0.2  # m, the height of the place above a table
 TURNED = math.radians(35)  # furniture is turned by at most this from facing the robot
 INSET = 0.015  # m between a place and the boards around it
@@ -84,26 +93,29 @@ class Containers:
 
     base: Scene = Scene(friction=FRICTION, table=None, floor=None)
 
-    def sample(self, rng):
+    def sample(self, rng: np.random.Generator) -> Scene:
         """A `Scene` drawn with a NumPy Generator."""
         return self.sample_with_places(rng)[0]
 
-    def sample_with_places(self, rng):
+    def sample_with_places(self, rng: np.random.Generator) -> tuple[Scene, list[Place]]:
         """The same, and a list of its `Place`s."""
-        scale, obstacles, places = scale_of(self.base.robot), [], []
-        azimuth, count = rng.uniform(-math.pi, math.pi), int(rng.integers(1, 3))
+        scale = scale_of(self.base.robot)
+        obstacles = []
+        places = []
+        azimuth = rng.uniform(-math.pi, math.pi)
+        count = int(rng.integers(1, 3))
         while count:
-            parts, regions, near, depth = _KINDS[rng.integers(len(_KINDS))](rng, MOST // 2)
-            turned = rng.uniform(-TURNED, TURNED)
-            yaw = round((azimuth + turned) / TURN) * TURN
+            parts, regions, near, depth = _KINDS[rng.integers(len(_KINDS))](rng)
+            yaw = round((azimuth + rng.uniform(-TURNED, TURNED)) / TURN) * TURN
             distance = near + depth / 2
-            origin = distance * math.cos(azimuth), distance * math.sin(azimuth)
-            made = [_placed(part, origin, yaw, scale) for part in parts]
-            boxes = [one for one in made if isinstance(one, Box) and one.orientation[:2] == (0, 0)]
-            if min(distance_to_robot(box, scale) for box in boxes) < KEEP_CLEAR * scale:
+            origin = (distance * math.cos(azimuth), distance * math.sin(azimuth))
+            placed = [_placed(part, origin, yaw, scale) for part in parts[: MOST // 2]]
+            upright = [o for o in placed if isinstance(o, Box) and o.orientation[:2] == (0, 0)]
+            if min(distance_to_robot(box, scale) for box in upright) < KEEP_CLEAR * scale:
                 continue
-            obstacles += made
-            cos, sin = math.cos(yaw), math.sin(yaw)
+            obstacles += placed
+            cos = math.cos(yaw)
+            sin = math.sin(yaw)
             turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
             for centre, size, approach in regions:
                 centre = scale * (turn @ centre + [*origin, 0.0])
@@ -116,13 +128,16 @@ class Containers:
 # Furniture, centred at the origin of x and y, facing -x. Each function returns its parts, its
 # places as (centre, size, approach), and its `near` and `depth`. A part is (centre, size) of a box,
 # (centre, (radius, length)) of an upright cylinder, or (centre, size, pitch).
+Furniture = tuple[list[tuple[Any, ...]], list[tuple[Vector, Vector, Vector]], float, float]
 
 
-def _open_box(rng, most):
+def _open_box(rng: np.random.Generator) -> Furniture:
     near, base, depth, width, height, thickness = _drawn(rng, OPEN_BOX)
-    front, middle = height * rng.uniform(*FRONT), base + height / 2
-    x, y = (depth - thickness) / 2, (width - thickness) / 2
-    parts = [
+    front = height * rng.uniform(*FRONT)
+    middle = base + height / 2
+    x = (depth - thickness) / 2
+    y = (width - thickness) / 2
+    parts: list[tuple[Any, ...]] = [
         ((0.0, 0.0, base + thickness / 2), (depth, width, thickness)),
         ((x, 0.0, middle), (thickness, width, height)),
         ((-x, 0.0, base + front / 2), (thickness, width, front)),
@@ -130,22 +145,24 @@ def _open_box(rng, most):
         ((0.0, -y, middle), (depth, thickness, height)),
     ]
     if rng.random() < LIDS:
-        opening, length = rng.uniform(*LID), rng.uniform(0.5, 1.0) * depth
+        opening = rng.uniform(*LID)
+        length = rng.uniform(0.5, 1.0) * depth
         centre = (
             depth / 2 - length / 2 * math.cos(opening),
             0.0,
             base + height + thickness + length / 2 * math.sin(opening),
         )
         parts.append((centre, (length, width, thickness), math.pi + opening))
-    inside = depth - 2 * thickness, width - 2 * thickness
+    inside = (depth - 2 * thickness, width - 2 * thickness)
     parts += _objects(rng, int(rng.integers(*IN_BOX)), (0.0, 0.0), inside, base + thickness)
-    low, high = base + thickness + INSET, base + DEEP * height
-    size = inside[0] - 2 * INSET, inside[1] - 2 * INSET, high - low
-    place = (0.0, 0.0, (low + high) / 2), size, (0.0, 0.0, -1.0)
-    return parts[:most], [place], near, depth
+    low = base + thickness + INSET
+    high = base + DEEP * height
+    size = (inside[0] - 2 * INSET, inside[1] - 2 * INSET, high - low)
+    place = ((0.0, 0.0, (low + high) / 2), size, (0.0, 0.0, -1.0))
+    return parts, [place], near, depth
 
 
-def _shelf(rng, most):
+def _shelf(rng: np.random.Generator) -> Furniture:
     near, base, depth, width, spacing, thickness = _drawn(rng, SHELF)
     boards = int(rng.integers(BOARDS[0], BOARDS[1] + 1))
     heights = [base + thickness / 2 + level * spacing for level in range(boards)]
@@ -161,49 +178,55 @@ def _shelf(rng, most):
         parts.append((((depth + thickness) / 2, 0.0, middle), (thickness, width, top)))
     places = []
     for z in heights[:-1]:
-        free, middle = spacing - thickness, z + spacing / 2
+        free = spacing - thickness
+        middle = z + spacing / 2
         cuts = [-width / 2, width / 2]
         if rng.random() < DIVIDED:
             cuts.insert(1, rng.uniform(-0.25, 0.25) * width)
             parts.append(((0.0, cuts[1], middle), (depth, thickness, free)))
         for left, right in zip(cuts[:-1], cuts[1:], strict=True):
-            size = depth, right - left - thickness - 2 * INSET, free - 2 * INSET
+            size = (depth, right - left - thickness - 2 * INSET, free - 2 * INSET)
             places.append(((0.0, (left + right) / 2, middle), size, (1.0, 0.0, 0.0)))
     for _ in range(int(rng.integers(*IN_SHELF))):
         z = heights[rng.integers(boards - 1)] + thickness / 2
         parts += _objects(rng, 1, (0.0, 0.0), (depth, width), z, 0.7 * (spacing - thickness))
-    return parts[:most], places, near, depth
+    return parts, places, near, depth
 
 
-def _table(rng, most):
+def _table(rng: np.random.Generator) -> Furniture:
     near, base, depth, width, thickness = _drawn(rng, TABLE)
     parts = [((0.0, 0.0, base), (depth, width, thickness))]
     top = base + thickness / 2
     # Objects within reach.
-    reach = min(depth, 0.7), min(width, 1.2)
+    reach = (min(depth, 0.7), min(width, 1.2))
     x = (reach[0] - depth) / 2
     parts += _objects(rng, int(rng.integers(*ON_TABLE)), (x, 0.0), reach, top)
-    size = *reach, OVER_TABLE
-    centre = x, 0.0, top + INSET + OVER_TABLE / 2
+    size = (*reach, OVER_TABLE)
+    centre = (x, 0.0, top + INSET + OVER_TABLE / 2)
     places = [(centre, size, (0.0, 0.0, -1.0)), (centre, size, (0.8, 0.0, -0.6))]
-    return parts[:most], places, near, depth
+    return parts, places, near, depth
 
 
-_KINDS = _open_box, _open_box, _shelf, _table
+_KINDS = (_open_box, _open_box, _shelf, _table)
 
 
-def _drawn(rng, ranges):
+def _drawn(rng: np.random.Generator, ranges: dict[str, tuple[float, float]]) -> list[float]:
     return [rng.uniform(*limits) for limits in ranges.values()]
 
 
-def _objects(rng, count, centre, area, z, highest=1.0):
+def _objects(
+    rng: np.random.Generator,
+    count: int,
+    centre: tuple[float, float],
+    area: tuple[float, float],
+    z: float,
+    highest: float = 1.0,
+) -> list[tuple[Any, ...]]:
     """Parts that stand at the height z on an area (x, y) around a centre."""
     parts = []
     for _ in range(count):
-        x, y = (
-            middle + rng.uniform(-0.45, 0.45) * edge
-            for middle, edge in zip(centre, area, strict=True)
-        )
+        x = centre[0] + rng.uniform(-0.45, 0.45) * area[0]
+        y = centre[1] + rng.uniform(-0.45, 0.45) * area[1]
         if rng.random() < 0.6:
             radius, length = _drawn(rng, OBJECTS)
             length = min(length, highest)
@@ -216,14 +239,21 @@ def _objects(rng, count, centre, area, z, highest=1.0):
     return parts
 
 
-def _placed(part, origin, yaw, scale):
+def _placed(
+    part: tuple[Any, ...], origin: tuple[float, float], yaw: float, scale: float
+) -> Box | Cylinder:
     """The obstacle of a part, at the origin (x, y) and turned about it by the yaw."""
     (x, y, z), size, *pitch = part
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    place = origin[0] + cos * x - sin * y, origin[1] + sin * x + cos * y, z
-    place, size = (rounded(*(scale * length for length in lengths)) for lengths in (place, size))
+    cos = math.cos(yaw)
+    sin = math.sin(yaw)
+    position = (origin[0] + cos * x - sin * y, origin[1] + sin * x + cos * y, z)
+    position = rounded(*[scale * length for length in position])
+    size = rounded(*[scale * length for length in size])
     if len(size) == 2:
-        return Cylinder(place, *size)
-    half, (cos, sin) = pitch[0] / 2 if pitch else 0.0, (math.cos(yaw / 2), math.sin(yaw / 2))
-    u, v = math.sin(half), math.cos(half)
-    return Box(place, size, (-sin * u, cos * u, sin * v, cos * v))
+        return Cylinder(position, *size)
+    half_pitch = pitch[0] / 2 if pitch else 0.0
+    u = math.sin(half_pitch)
+    v = math.cos(half_pitch)
+    cos = math.cos(yaw / 2)
+    sin = math.sin(yaw / 2)
+    return Box(position, size, (-sin * u, cos * u, sin * v, cos * v))

@@ -53,31 +53,32 @@ reports collisions with the arm.
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-
-import yaml
+from typing import Any
 
 from roboarm_nmp.envs.robots.attached import MAX_ATTACHED
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.meshes import load_mesh, mesh_hulls
 from roboarm_nmp.envs.scenes.motions import (
     MAX_INTERVALS,
     MAX_TIME,
     MAX_WAYPOINTS,
     ONCE,
     REPEATS,
+    Motion,
     Oscillation,
     Presence,
     Waypoints,
 )
+from roboarm_nmp.envs.scenes.numbers import MAX_LENGTH, Quaternion, unit_quaternion
 from roboarm_nmp.envs.scenes.primitives import (
-    FLOOR,
     FRICTION,
     IDENTITY,
     MAX_HULL_VERTICES,
-    MAX_LENGTH,
     MAX_SCENE_OBSTACLES,
     TABLE,
     Attached,
@@ -85,587 +86,458 @@ from roboarm_nmp.envs.scenes.primitives import (
     ConvexHull,
     Cylinder,
     ObservedScene,
+    Obstacle,
     Scene,
     Sphere,
     check_obstacle,
-    unit_quaternion,
+)
+from roboarm_nmp.utils import documents
+from roboarm_nmp.utils.documents import (
+    DocumentError,
+    Mistake,
+    Node,
+    describe,
+    errors_at,
+    mistakes_in,
+    number,
+    numbers,
+    parse_document,
+    read_text,
+    sequence,
+    shorten,
+    switch,
 )
 from roboarm_nmp.utils.files import write_atomically
 
-_MAX_DEPTH = 12  # a scene needs 10
-# Values of a file with aliases, each repeated value counted. (A small file could be gigabytes.)
-_MAX_REPEATED = 1_000_000
 _HEADER = """\
 # A scene for RoboArm-NMP. Lengths in metres, in the frame of the robot's base: x forward, y left,
 # z up. The format is described in envs/scenes/files.py.
 """
 
 
-class SceneFileError(ValueError):
-    """A scene file that cannot be used. The message is `PATH:LINE: reason`, with lines from 1.
-
-    It is `PATH: reason` where a file cannot be read, or a scene cannot be written.
-    """
-
-
-def load_scene(path):
+def load_scene(path: str | Path) -> Scene:
     """The `Scene` in a YAML file (format: see the module). Nothing in the file is executed.
 
     Raises:
-        SceneFileError: the file is missing, or is not a scene; also for a misspelt key.
+        DocumentError: the file is missing, or is not a scene; also for a misspelt key.
     """
-    try:
-        contents = Path(path).read_bytes()
-    except OSError as error:
-        raise SceneFileError(f"{path}: {error.strerror}") from error
-    try:
-        return _parse(contents, Path(path).parent)
-    except _Mistake as mistake:
-        raise SceneFileError(f"{path}:{mistake.line}: {mistake.reason}") from mistake.__cause__
+    text = read_text(path)
+    with mistakes_in(path):
+        return _scene(parse_document(text, allow_tags=False), Path(path).parent)
 
 
-def save_scene(scene, path):
+def save_scene(scene: Scene, path: str | Path) -> None:
     """Write a scene so that `load_scene` returns an equal one, with every float exact.
 
     Atomic: at every moment `path` is the old file or the whole new one.
 
     Raises:
-        SceneFileError: `load_scene` would reject the file, which is then not written; or the scene
+        DocumentError: `load_scene` would reject the file, which is then not written; or the scene
             is an `ObservedScene`, whose points a scene file cannot have.
         OSError: the file cannot be written; an old file is left as it was.
     """
     path = Path(path)
     if isinstance(scene, ObservedScene):
-        raise SceneFileError(f"{path}: cannot be written, the scene has points: save them as .npy")
+        raise DocumentError(f"{path}: cannot be written, the scene has points: save them as .npy")
     text = _format_scene(scene)
     try:
-        _parse(text.encode(), path.parent)
-    except _Mistake as mistake:
+        _scene(parse_document(text), path.parent)
+    except Mistake as mistake:
         line = text.splitlines()[mistake.line - 1].strip()
-        raise SceneFileError(f"{path}: cannot be written, {mistake.reason}: {line}") from None
+        raise DocumentError(f"{path}: cannot be written, {mistake.reason}: {line}") from None
     write_atomically(path, text.encode())
 
 
 # --- Writing
 
 
-def _format_scene(scene):
-    table = "false" if scene.table is None else _format_fields(scene.table)
-    robot, held = scene.robot, ""
+def _format_scene(scene: Scene) -> str:
+    robot = scene.robot
+    lines = []
+    if robot.arm != PANDA:
+        lines.append(f"robot: {robot.source}")
     if robot.held_positions != robot.arm.held_positions:
         held = ", ".join(f"{joint}: {value!r}" for joint, value in robot.held.items())
-    lines = [
-        *[f"robot: {robot.source}"] * (robot.arm != PANDA),
-        *[f"held: {{{held}}}"] * bool(held),
-        *["attached:"] * bool(robot.attached),
-        *[f"  - {_format_obstacle(one.shape, _format_link(one))}" for one in robot.attached],
-        f"table: {'true' if scene.table == TABLE else table}",
-        f"floor: {'false' if scene.floor is None else repr(float(scene.floor))}",
-        *[f"friction: {float(scene.friction)!r}"] * (scene.friction != FRICTION),
-        "obstacles:" if scene.obstacles else "obstacles: []",
-    ]
+        lines.append(f"held: {{{held}}}")
+    if robot.attached:
+        lines.append("attached:")
+    for attached in robot.attached:
+        more = [f"link: {json.dumps(attached.link)}"]
+        if attached.touch_links:
+            more.append(f"touch_links: {json.dumps(attached.touch_links)}")
+        lines.append(f"  - {_format_obstacle(attached.shape, more)}")
+    if scene.table is None:
+        lines.append("table: false")
+    else:
+        lines.append(f"table: {'true' if scene.table == TABLE else _format_fields(scene.table)}")
+    lines.append(f"floor: {'false' if scene.floor is None else repr(float(scene.floor))}")
+    if scene.friction != FRICTION:
+        lines.append(f"friction: {float(scene.friction)!r}")
+    lines.append("obstacles:" if scene.obstacles else "obstacles: []")
     lines += [f"  - {_format_obstacle(obstacle)}" for obstacle in scene.obstacles]
     return _HEADER + "\n".join(lines) + "\n"
 
 
-def _format_obstacle(obstacle, more=()):
+def _format_obstacle(obstacle: Obstacle, more: Iterable[str] = ()) -> str:
     kind = "convex_hull" if isinstance(obstacle, ConvexHull) else type(obstacle).__name__.lower()
     return f"{kind}: {_format_fields(obstacle, more)}"
 
 
-def _format_link(attached):
-    yield f"link: {json.dumps(attached.link)}"
-    if attached.touch_links:
-        yield f"touch_links: {json.dumps(attached.touch_links)}"
-
-
-def _format_fields(obstacle, more=()):
+def _format_fields(obstacle: Obstacle, more: Iterable[str] = ()) -> str:
     """The dataclass's fields, and texts of more fields, as a YAML mapping on one line."""
     fields = []
     for name, value in vars(obstacle).items():
         if name == "motion":
             if value is not None:
                 fields.append(f"motion: {_format_motion(value)}")
-        elif name in ("position", "size", "orientation"):
-            if name == "orientation" and tuple(value) == IDENTITY:
-                continue
-            fields.append(f"{name}: {_format_numbers(value)}")
-        elif name == "vertices":
-            fields.append(f"{name}: [{', '.join(map(_format_numbers, value))}]")
         elif name == "may_touch":
-            fields += [f"{name}: {json.dumps(value)}"] * bool(value)
+            if value:
+                fields.append(f"may_touch: {json.dumps(value)}")
+        elif name in ("position", "size"):
+            fields.append(f"{name}: {_format_numbers(value)}")
+        elif name == "orientation":
+            if tuple(value) != IDENTITY:
+                fields.append(f"orientation: {_format_numbers(value)}")
+        elif name == "vertices":
+            fields.append(f"vertices: {_format_rows(value)}")
         else:
             fields.append(f"{name}: {float(value)!r}")
     return "{" + ", ".join([*fields, *more]) + "}"
 
 
-def _format_motion(motion):
-    present = ""
+def _format_motion(motion: Motion) -> str:
+    parts = []
+    moves = motion.motion if isinstance(motion, Presence) else motion
+    if isinstance(moves, Oscillation):
+        parts.append(
+            f"oscillation: {{amplitude: {_format_numbers(moves.amplitude)}, "
+            f"axis: {_format_numbers(moves.axis)}, period: {moves.period!r}, "
+            f"phase: {moves.phase!r}, angle: {moves.angle!r}}}"
+        )
+    elif isinstance(moves, Waypoints):
+        fields = [f"times: {_format_numbers(moves.times)}"]
+        fields.append(f"displacements: {_format_rows(moves.displacements)}")
+        if moves.rotations:
+            fields.append(f"rotations: {_format_rows(moves.rotations)}")
+        fields.append(f"repeat: {moves.repeat}")
+        parts.append(f"waypoints: {{{', '.join(fields)}}}")
     if isinstance(motion, Presence):
-        intervals = [_format_numbers(n for n in one if n < math.inf) for one in motion.intervals]
-        present, motion = f"present: [{', '.join(intervals)}]", motion.motion
-    if motion is None:
-        return f"{{{present}}}"
-    if isinstance(motion, Oscillation):
-        kind, vectors = "oscillation", ("amplitude", "axis")
-        fields = [f"{name}: {_format_numbers(getattr(motion, name))}" for name in vectors]
-        fields += [f"{name}: {getattr(motion, name)!r}" for name in ("period", "phase", "angle")]
-    else:
-        kind, fields = "waypoints", [f"times: {_format_numbers(motion.times)}"]
-        for name in ("displacements", "rotations"):
-            if rows := getattr(motion, name):
-                fields.append(f"{name}: [{', '.join(map(_format_numbers, rows))}]")
-        fields.append(f"repeat: {motion.repeat}")
-    present = f", {present}" if present else ""
-    return f"{{{kind}: {{{', '.join(fields)}}}{present}}}"
+        finite = [[time for time in interval if time < math.inf] for interval in motion.intervals]
+        parts.append(f"present: {_format_rows(finite)}")
+    return "{" + ", ".join(parts) + "}"
 
 
-def _format_numbers(numbers):
+def _format_numbers(numbers: Iterable[float]) -> str:
     return f"[{', '.join(repr(float(number)) for number in numbers)}]"
 
 
-# --- Reading. PyYAML only composes nodes, which have line numbers; the functions below descend the
-# format. So neither aliases that contain themselves nor deep ones need any care.
+def _format_rows(rows: Iterable[Iterable[float]]) -> str:
+    return f"[{', '.join(map(_format_numbers, rows))}]"
 
 
-class _Mistake(Exception):
-    def __init__(self, line, reason):
-        super().__init__(line, reason)
-        self.line, self.reason = line, reason
+# --- Reading. Each function gets a node of the file, and raises `Mistake`.
 
 
-def _mistake(node, reason):
-    return _Mistake(node.start_mark.line + 1, reason)
-
-
-class _Loader(yaml.SafeLoader):
-    """Composes nodes, except tagged or deeply nested ones (PyYAML would recurse without limit).
-
-    Aliases may repeat up to `_MAX_REPEATED` values.
-    """
-
-    depth = values = 0
-
-    def compose_node(self, parent, index):
-        event = self.peek_event()
-        if getattr(event, "tag", None) is not None:
-            raise _mistake(event, "tags (words that start with !) are not allowed")
-        if self.depth == _MAX_DEPTH:
-            raise _mistake(event, "nested too deeply")
-        self.depth += 1
-        before = self.values
-        node = super().compose_node(parent, index)
-        self.depth -= 1
-        if not isinstance(event, yaml.AliasEvent):
-            self.values += 1
-            node.values = self.values - before
-            return node
-        self.values += getattr(node, "values", 1)  # it has none yet where it contains itself
-        if self.values > _MAX_REPEATED:
-            raise _mistake(event, f"with its aliases, the file has over {_MAX_REPEATED:,} values")
-        return node
-
-
-def _parse(contents, folder):
-    """bytes -> `Scene`, whose robot's file is relative to `folder`. Raises `_Mistake`."""
-    try:
-        text = contents.decode()
-    except UnicodeDecodeError as error:
-        line = contents.count(b"\n", 0, error.start) + 1
-        raise _Mistake(line, f"byte {contents[error.start]:#04x} is not UTF-8 text") from error
-    node = _compose(text)
-    if node is None or _is_plain(node) and node.value == "":
-        raise _Mistake(1, "the file is empty (a scene without obstacles of its own is {})")
-    return _scene(node, folder)
-
-
-def _compose(text):
-    """The root node of the only document; None if there is no document."""
-    try:
-        loader = _Loader(text)
-    except yaml.reader.ReaderError as error:
-        line = text.count("\n", 0, error.position) + 1
-        raise _Mistake(line, f"character {error.character:#x} is not allowed") from error
-    try:
-        return loader.get_single_node()
-    except yaml.MarkedYAMLError as error:
-        reason, mark = error.problem, error.problem_mark
-        if error.context and error.context_mark:
-            reason = f"{error.context} from line {error.context_mark.line + 1} on, {reason}"
-        raise _Mistake(mark.line + 1, reason) from error
-    except (ValueError, OverflowError) as error:  # PyYAML's, of an escape such as "\UFFFFFFFF"
-        raise _Mistake(loader.line + 1, f"not valid YAML ({error})") from error
-    finally:
-        loader.dispose()
-
-
-def _scene(node, folder):
+def _scene(node: Node, folder: Path) -> Scene:
+    """The `Scene` of a document; the files it names are relative to `folder`."""
     keys = ("robot", "held", "attached", "table", "floor", "friction", "obstacles")
-    fields = _mapping(node, "a scene", optional=keys)
-    table, floor, friction, obstacles, robot = TABLE, FLOOR, FRICTION, (), PANDA
+    fields = _fields(node, "a scene", optional=keys)
+    scene = {}
+    robot = PANDA
     if "robot" in fields:
         robot = _robot(fields["robot"], folder)
     if "held" in fields:
-        robot = _held(fields["held"], robot)
+        held = _fields(fields["held"], "held", optional=tuple(robot.held))
+        positions = {joint: number(at, joint, MAX_LENGTH) for joint, at in held.items()}
+        with errors_at(fields["held"]):
+            robot = robot.with_held(positions)
     if "attached" in fields:
-        robot = _attached(fields["attached"], robot, folder)
+        attached = _attached(fields["attached"], folder)
+        with errors_at(fields["attached"]):
+            robot = robot.with_attached(attached)
     if "table" in fields:
-        table = _table(fields["table"])
+        scene["table"] = _table(fields["table"])
     if "floor" in fields:
-        switch = _switch(fields["floor"])
-        if switch is True:
-            raise _mistake(fields["floor"], "floor must be a height in metres or false, got true")
-        floor = None if switch is False else _number(fields["floor"], "floor")
+        scene["floor"] = _floor(fields["floor"])
     if "friction" in fields:
-        friction = _number(fields["friction"], "friction")
+        friction = scene["friction"] = number(fields["friction"], "friction", MAX_LENGTH)
         if friction < 0:
-            raise _mistake(fields["friction"], f"friction must not be negative, got {friction}")
+            raise Mistake(fields["friction"], f"friction must not be negative, got {friction}")
     if "obstacles" in fields:
-        node = fields["obstacles"]
-        if not isinstance(node, yaml.SequenceNode):
-            reason = f"obstacles must be a list ([] if there are none), got {_describe(node)}"
-            raise _mistake(node, reason)
-        if len(node.value) > MAX_SCENE_OBSTACLES:
-            raise _mistake(node, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
-        obstacles = []
-        for entry in node.value:
-            obstacles += _obstacle(entry, folder)
-            if len(obstacles) > MAX_SCENE_OBSTACLES:  # a mesh may be several
-                raise _mistake(entry, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
-    try:
-        return Scene(obstacles, table, floor, friction, robot)
-    except ValueError as error:  # an obstacle may touch a link that the robot does not have
-        raise _mistake(node, str(error)) from error
+        scene["obstacles"] = _obstacles(fields["obstacles"], folder)
+    with errors_at(node):  # an obstacle may touch a link that the robot does not have
+        return Scene(robot=robot, **scene)
 
 
-def _robot(node, folder):
-    if not isinstance(node, yaml.ScalarNode):
-        raise _mistake(node, f"robot must be a file's name, got {_describe(node)}")
-    try:
-        return load_robot(node.value if node.value == PANDA.name else folder / node.value)
-    except ValueError as error:
-        raise _mistake(node, str(error)) from error
+def _robot(node: Node, folder: Path) -> Robot:
+    name = documents.text(node, "robot")
+    with errors_at(node):
+        return load_robot(name if name == PANDA.name else folder / name)
 
 
-def _held(node, robot):
-    held = _mapping(node, "held", optional=tuple(robot.held))
-    try:
-        return robot.with_held({joint: _number(at, joint) for joint, at in held.items()})
-    except ValueError as error:
-        raise _mistake(node, str(error)) from error
-
-
-def _attached(node, robot, folder):
-    if not isinstance(node, yaml.SequenceNode):
-        raise _mistake(node, f"attached must be a list, got {_describe(node)}")
-    found = []
-    for entry in node.value:
+def _attached(node: Node, folder: Path) -> list[Attached]:
+    objects = []
+    for entry in _list(node, "attached"):
         shapes, more = _shapes(entry, folder, ("link", "touch_links"))
-        link = more.get("link")
-        if link is not None and not isinstance(link, yaml.ScalarNode):
-            raise _mistake(link, f"link must be a link's name, got {_describe(link)}")
-        touched = _names(more["touch_links"], "touch_links") if "touch_links" in more else ()
-        try:
-            found += [Attached(shape, link and link.value, touched) for shape in shapes]
-        except ValueError as error:
-            raise _mistake(entry, str(error)) from error
-        if len(found) > MAX_ATTACHED:
-            raise _mistake(entry, f"an arm has at most {MAX_ATTACHED} attached objects")
-    try:
-        return robot.with_attached(found)
-    except ValueError as error:
-        raise _mistake(node, str(error)) from error
+        link = documents.text(more["link"], "link") if "link" in more else None
+        touch_links = _names(more["touch_links"], "touch_links") if "touch_links" in more else ()
+        with errors_at(entry):
+            objects += [Attached(shape, link, touch_links) for shape in shapes]
+        if len(objects) > MAX_ATTACHED:
+            raise Mistake(entry, f"an arm has at most {MAX_ATTACHED} attached objects")
+    return objects
 
 
-def _names(node, what):
-    """Names of links, a tuple."""
-    if not isinstance(node, yaml.SequenceNode):
-        raise _mistake(node, f"{what} must be a list of links' names, got {_describe(node)}")
-    if wrong := [one for one in node.value if not isinstance(one, yaml.ScalarNode)]:
-        raise _mistake(wrong[0], f"a link's name must be text, got {_describe(wrong[0])}")
-    return tuple(one.value for one in node.value)
+def _names(node: Node, what: str) -> tuple[str, ...]:
+    """Names of links."""
+    if not isinstance(node.value, list):
+        raise Mistake(node, f"{what} must be a list of links' names, got {describe(node)}")
+    return tuple(documents.text(name, "a link's name") for name in node.value)
 
 
-def _table(node):
-    switch = _switch(node)
-    if switch is not None:
-        return TABLE if switch else None
-    if not isinstance(node, yaml.MappingNode):
+def _table(node: Node) -> Box | None:
+    standard = switch(node)
+    if standard is not None:
+        return TABLE if standard else None
+    if not isinstance(node.value, dict):
         expected = "true, false or {position: [x, y, z], size: [x, y, z]}"
-        raise _mistake(node, f"table must be {expected}, got {_describe(node)}")
-    table = _box(node, "table", ("may_touch", "motion"))
-    if table.motion is not None:
-        raise _mistake(node, "the table cannot move: leave it out, and add a box that does")
-    return replace(table, may_touch=_may_touch(_some(node, ("may_touch",))))
+        raise Mistake(node, f"table must be {expected}, got {describe(node)}")
+    fields = _fields(node, "table", *_KEYS["box"], more=("may_touch", "motion"))
+    if "motion" in fields:
+        raise Mistake(node, "the table cannot move: leave it out, and add a box that does")
+    return replace(_box(fields, "table"), may_touch=_may_touch(fields))
 
 
-def _obstacle(node, folder):
-    """A tuple of obstacles: a mesh may be several."""
-    shapes, more = _shapes(node, folder, ("may_touch", "motion"))
-    return [replace(shape, may_touch=_may_touch(more)) for shape in shapes]
+def _floor(node: Node) -> float | None:
+    is_standard = switch(node)
+    if is_standard:
+        raise Mistake(node, "floor must be a height in metres or false, got true")
+    return None if is_standard is False else number(node, "floor", MAX_LENGTH)
 
 
-def _may_touch(fields):
-    """`may_touch` of an obstacle, from the values of its further keys."""
+def _obstacles(node: Node, folder: Path) -> list[Obstacle]:
+    if not isinstance(node.value, list):
+        reason = f"obstacles must be a list ([] if there are none), got {describe(node)}"
+        raise Mistake(node, reason)
+    obstacles = []
+    for entry in node.value:
+        shapes, more = _shapes(entry, folder, ("may_touch", "motion"))
+        may_touch = _may_touch(more)
+        obstacles += [replace(shape, may_touch=may_touch) for shape in shapes]
+        if len(obstacles) > MAX_SCENE_OBSTACLES:
+            raise Mistake(entry, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")
+    return obstacles
+
+
+def _may_touch(fields: dict[str, Node]) -> tuple[str, ...] | bool:
     if "may_touch" not in fields:
         return ()
-    switch = _switch(fields["may_touch"])
-    try:
-        return _names(fields["may_touch"], "may_touch") if switch is None else switch
-    except _Mistake as mistake:
-        reason = f"{mistake.reason}, or true, or false"
-        raise _Mistake(mistake.line, reason) from None
+    node = fields["may_touch"]
+    touches_hand = switch(node)
+    if touches_hand is not None:
+        return touches_hand
+    if not isinstance(node.value, list):
+        expected = "a list of links' names, or true, or false"
+        raise Mistake(node, f"may_touch must be {expected}, got {describe(node)}")
+    return _names(node, "may_touch")
 
 
-def _shapes(node, folder, more):
-    """An entry's shapes, a tuple, and the values (nodes) of its keys that are in `more`, a dict."""
-    kinds = ", ".join((*_KINDS, "mesh"))
-    if not isinstance(node, yaml.MappingNode):
+# The keys of each kind of obstacle: those that it needs, and those that it may have.
+_KEYS = {
+    "box": (("position", "size"), ("orientation", "yaw")),
+    "cylinder": (("position", "radius", "length"), ("orientation", "yaw")),
+    "sphere": (("position", "radius"), ()),
+    "convex_hull": (("position", "vertices"), ("orientation", "yaw")),
+    "mesh": (("file", "position"), ("scale", "decompose", "orientation", "yaw")),
+}
+
+
+def _shapes(
+    node: Node, folder: Path, more: tuple[str, ...]
+) -> tuple[tuple[Obstacle, ...], dict[str, Node]]:
+    """An entry's shapes, of which a mesh may be several, and its fields.
+
+    `more`: the keys that the entry may have besides those of its kind.
+    """
+    kinds = ", ".join(_KEYS)
+    if not isinstance(node.value, dict):
         expected = f"a mapping of its kind ({kinds}) to its fields"
-        raise _mistake(node, f"an obstacle must be {expected}, got {_describe(node)}")
+        raise Mistake(node, f"an obstacle must be {expected}, got {describe(node)}")
     if len(node.value) != 1:
-        keys = ", ".join(_describe(key) for key, _ in node.value[:5]) or "none"
-        raise _mistake(node, f"an obstacle must have exactly one key, its kind ({kinds}): {keys}")
-    [(key, fields)] = node.value
-    if isinstance(key, yaml.ScalarNode) and key.value == "mesh":
-        more = [name for name in more if name != "motion"]
-        return _mesh(fields, key.value, folder, more), _some(fields, more)
-    if not isinstance(key, yaml.ScalarNode) or key.value not in _KINDS:
-        raise _mistake(key, f"unknown kind of obstacle {_describe(key)}: one of {kinds}")
-    return (_KINDS[key.value](fields, key.value, more),), _some(fields, more)
+        keys = ", ".join(map(shorten, list(node.value)[:5])) or "none"
+        raise Mistake(node, f"an obstacle must have exactly one key, its kind ({kinds}): {keys}")
+    [(kind, value)] = node.value.items()
+    if kind not in _KEYS:
+        raise Mistake(kind, f"unknown kind of obstacle {shorten(kind)}: one of {kinds}")
+    if kind == "mesh":
+        more = tuple(name for name in more if name != "motion")
+    fields = _fields(value, kind, *_KEYS[kind], more=more)
+    if kind == "mesh":
+        return _mesh(fields, folder), fields
+    read = {"box": _box, "cylinder": _cylinder, "sphere": _sphere, "convex_hull": _convex_hull}
+    return (replace(read[kind](fields, kind), motion=_motion(fields, kind)),), fields
 
 
-def _some(node, names):
-    """The values (nodes) of those keys of a mapping that are in `names`."""
-    return {key.value: value for key, value in node.value if key.value in names}
-
-
-def _box(node, what, more=()):
-    fields = _mapping(node, what, ("position", "size"), ("orientation", "yaw", *more))
+def _box(fields: dict[str, Node], what: str) -> Box:
     return Box(
-        _vector(fields["position"], f"position of {what}", 3),
-        _vector(fields["size"], f"size of {what}", 3, positive=True),
+        numbers(fields["position"], f"position of {what}", 3, MAX_LENGTH),
+        numbers(fields["size"], f"size of {what}", 3, MAX_LENGTH, positive=True),
         _orientation(fields, what),
-        _motion(fields, what),
     )
 
 
-def _cylinder(node, what, more):
-    fields = _mapping(node, what, ("position", "radius", "length"), ("orientation", "yaw", *more))
+def _cylinder(fields: dict[str, Node], what: str) -> Cylinder:
     return Cylinder(
-        _vector(fields["position"], f"position of {what}", 3),
-        _number(fields["radius"], f"radius of {what}", positive=True),
-        _number(fields["length"], f"length of {what}", positive=True),
+        numbers(fields["position"], f"position of {what}", 3, MAX_LENGTH),
+        number(fields["radius"], f"radius of {what}", MAX_LENGTH, positive=True),
+        number(fields["length"], f"length of {what}", MAX_LENGTH, positive=True),
         _orientation(fields, what),
-        _motion(fields, what),
     )
 
 
-def _sphere(node, what, more):
-    fields = _mapping(node, what, ("position", "radius"), more)
+def _sphere(fields: dict[str, Node], what: str) -> Sphere:
     return Sphere(
-        _vector(fields["position"], f"position of {what}", 3),
-        _number(fields["radius"], f"radius of {what}", positive=True),
-        _motion(fields, what),
+        numbers(fields["position"], f"position of {what}", 3, MAX_LENGTH),
+        number(fields["radius"], f"radius of {what}", MAX_LENGTH, positive=True),
     )
 
 
-def _convex_hull(node, what, more):
-    fields = _mapping(node, what, ("position", "vertices"), ("orientation", "yaw", *more))
+def _convex_hull(fields: dict[str, Node], what: str) -> ConvexHull:
     vertices = fields["vertices"]
-    if not isinstance(vertices, yaml.SequenceNode):
-        raise _mistake(vertices, f"vertices must be a list of points, got {_describe(vertices)}")
+    if not isinstance(vertices.value, list):
+        raise Mistake(vertices, f"vertices must be a list of points, got {describe(vertices)}")
     if len(vertices.value) > MAX_HULL_VERTICES:
-        raise _mistake(vertices, f"{what} has at most {MAX_HULL_VERTICES} vertices")
+        raise Mistake(vertices, f"{what} has at most {MAX_HULL_VERTICES} vertices")
     hull = ConvexHull(
-        _vector(fields["position"], f"position of {what}", 3),
-        tuple(_vector(vertex, f"a vertex of {what}", 3) for vertex in vertices.value),
+        numbers(fields["position"], f"position of {what}", 3, MAX_LENGTH),
+        tuple(numbers(one, f"a vertex of {what}", 3, MAX_LENGTH) for one in vertices.value),
         _orientation(fields, what),
-        _motion(fields, what),
     )
-    try:
+    with errors_at(vertices):
         check_obstacle(hull)
-    except ValueError as error:
-        raise _mistake(vertices, str(error)) from error
     return hull
 
 
-def _mesh(node, what, folder, more):
-    optional = ("scale", "decompose", "orientation", "yaw", *more)
-    fields = _mapping(node, what, ("file", "position"), optional)
-    file, scale, decompose = fields["file"], 1.0, False
-    if not isinstance(file, yaml.ScalarNode):
-        raise _mistake(file, f"file must be a file's name, got {_describe(file)}")
+def _mesh(fields: dict[str, Node], folder: Path) -> tuple[ConvexHull, ...]:
+    file = documents.text(fields["file"], "file")
+    scale = 1.0
     if "scale" in fields:
-        scale = _number(fields["scale"], f"scale of {what}", positive=True)
+        scale = number(fields["scale"], "scale of mesh", MAX_LENGTH, positive=True)
+    decompose = False
     if "decompose" in fields:
-        decompose = _switch(fields["decompose"])
+        decompose = switch(fields["decompose"])
         if decompose is None:
-            found = _describe(fields["decompose"])
-            raise _mistake(fields["decompose"], f"decompose must be true or false, got {found}")
-    position = _vector(fields["position"], f"position of {what}", 3)
-    orientation = _orientation(fields, what)
-    try:
-        mesh = load_mesh(file.value, folder)
-        return mesh_hulls(*mesh, position, orientation, scale, decompose)
-    except MeshError as error:
-        raise _mistake(file, str(error)) from error
+            got = describe(fields["decompose"])
+            raise Mistake(fields["decompose"], f"decompose must be true or false, got {got}")
+    position = numbers(fields["position"], "position of mesh", 3, MAX_LENGTH)
+    orientation = _orientation(fields, "mesh")
+    with errors_at(fields["file"]):
+        vertices, faces = load_mesh(file, folder)
+        return mesh_hulls(vertices, faces, position, orientation, scale, decompose)
 
 
-_KINDS = {"box": _box, "cylinder": _cylinder, "sphere": _sphere, "convex_hull": _convex_hull}
-
-
-def _orientation(fields, what):
+def _orientation(fields: dict[str, Node], what: str) -> Quaternion:
     """Quaternion (x, y, z, w) from `orientation` or `yaw`; the identity without both."""
     if "yaw" in fields and "orientation" in fields:
-        raise _mistake(fields["yaw"], f"{what} has both yaw and orientation, only one is allowed")
+        raise Mistake(fields["yaw"], f"{what} has both yaw and orientation, only one is allowed")
     if "yaw" in fields:
-        half = math.radians(_number(fields["yaw"], f"yaw of {what}")) / 2
+        half = math.radians(number(fields["yaw"], f"yaw of {what}", MAX_LENGTH)) / 2
         return (0.0, 0.0, math.sin(half), math.cos(half))
     if "orientation" not in fields:
         return IDENTITY
     node = fields["orientation"]
-    try:
-        return unit_quaternion(_vector(node, f"orientation of {what}", 4))
-    except ValueError as error:
-        raise _mistake(node, f"orientation of {what}: {error}") from error
+    quaternion = numbers(node, f"orientation of {what}", 4, MAX_LENGTH)
+    with errors_at(node, f"orientation of {what}"):
+        return unit_quaternion(quaternion)
 
 
-def _motion(fields, what):
+def _motion(fields: dict[str, Node], what: str) -> Motion | None:
     """The motion of an obstacle; None without one."""
-    node = fields.get("motion")
-    if node is None:
+    if "motion" not in fields:
         return None
-    kinds = {"oscillation": _oscillation, "waypoints": _waypoints}
-    parts = _mapping(node, f"motion of {what}", optional=(*kinds, "present"))
-    chosen = [kind for kind in kinds if kind in parts]
-    if len(chosen) > 1 or not parts:
-        raise _mistake(node, f"motion of {what} must be one of {', '.join(kinds)}, or present")
-    try:
-        motion = kinds[chosen[0]](parts[chosen[0]], chosen[0]) if chosen else None
+    node = fields["motion"]
+    parts = _fields(node, f"motion of {what}", optional=("oscillation", "waypoints", "present"))
+    if not parts or "oscillation" in parts and "waypoints" in parts:
+        raise Mistake(node, f"motion of {what} must be one of oscillation, waypoints, or present")
+    motion = None
+    with errors_at(node, f"motion of {what}"):
+        if "oscillation" in parts:
+            motion = _oscillation(parts["oscillation"])
+        if "waypoints" in parts:
+            motion = _waypoints(parts["waypoints"])
         if "present" in parts:
             motion = Presence(_intervals(parts["present"]), motion)
-    except ValueError as error:
-        raise _mistake(node, f"motion of {what}: {error}") from error
     return motion
 
 
-def _oscillation(node, what):
-    vectors, numbers = ("amplitude", "axis"), ("period", "phase", "angle")
-    fields = _mapping(node, what, ("period",), ("amplitude", "axis", "phase", "angle"))
-    given = {
-        name: _vector(fields[name], f"{name} of {what}", 3)
-        for name in sorted(fields.keys() & set(vectors))
-    }
-    for name in sorted(fields.keys() & set(numbers)):
-        given[name] = _number(fields[name], f"{name} of {what}", most=MAX_TIME)
-    return Oscillation(**given)
+def _oscillation(node: Node) -> Oscillation:
+    what = "oscillation"
+    fields = _fields(node, what, ("period",), ("amplitude", "axis", "phase", "angle"))
+    values = {}
+    for name, value in fields.items():
+        if name in ("amplitude", "axis"):
+            values[name] = numbers(value, f"{name} of {what}", 3, MAX_LENGTH)
+        else:
+            values[name] = number(value, f"{name} of {what}", MAX_TIME)
+    return Oscillation(**values)
 
 
-def _waypoints(node, what):
-    fields = _mapping(node, what, ("times", "displacements"), ("rotations", "repeat"))
-    times = _list(fields["times"], f"times of {what}", MAX_WAYPOINTS)
-    rows = {
-        name: tuple(
-            _vector(row, f"{name} of {what}", width)
-            for row in _list(fields[name], f"{name} of {what}", MAX_WAYPOINTS)
-        )
-        for name, width in (("displacements", 3), ("rotations", 4))
-        if name in fields
-    }
+def _waypoints(node: Node) -> Waypoints:
+    fields = _fields(node, "waypoints", ("times", "displacements"), ("rotations", "repeat"))
+
+    def rows(name: str) -> list[Node]:
+        return _list(fields[name], f"{name} of waypoints", MAX_WAYPOINTS)
+
+    def vectors(name: str, count: int) -> tuple[tuple[Any, ...], ...]:
+        return tuple(numbers(row, f"{name} of waypoints", count, MAX_LENGTH) for row in rows(name))
+
+    times = tuple(number(time, "times of waypoints", MAX_TIME) for time in rows("times"))
+    rotations = vectors("rotations", 4) if "rotations" in fields else ()
     repeat = ONCE
     if "repeat" in fields:
         repeat = fields["repeat"].value
-        if repeat not in REPEATS:
-            found = _describe(fields["repeat"])
-            kinds = ", ".join(REPEATS)
-            raise _mistake(fields["repeat"], f"repeat must be one of {kinds}, got {found}")
-    return Waypoints(
-        tuple(_number(time, f"times of {what}", most=MAX_TIME) for time in times),
-        repeat=repeat,
-        **rows,
-    )
+        if not isinstance(repeat, str) or repeat not in REPEATS:
+            got = describe(fields["repeat"])
+            reason = f"repeat must be one of {', '.join(REPEATS)}, got {got}"
+            raise Mistake(fields["repeat"], reason)
+    return Waypoints(times, vectors("displacements", 3), rotations, repeat)
 
 
-def _intervals(node):
+def _intervals(node: Node) -> tuple[tuple[float, float], ...]:
     """Intervals of `Presence`; one of a single time has no end."""
     intervals = []
     for row in _list(node, "present", MAX_INTERVALS):
         ends = _list(row, "an interval of present", 2)
-        times = [_number(end, "an interval of present", most=MAX_TIME) for end in ends]
-        intervals.append(tuple(times) if len(times) == 2 else (*times, math.inf))
+        times = [number(end, "an interval of present", MAX_TIME) for end in ends]
+        if len(times) == 1:
+            times.append(math.inf)
+        intervals.append(tuple(times))
     return tuple(intervals)
 
 
-def _list(node, what, most):
-    """The nodes of a list that is not longer than `most`."""
-    if not isinstance(node, yaml.SequenceNode):
-        raise _mistake(node, f"{what} must be a list, got {_describe(node)}")
-    if len(node.value) > most:
-        raise _mistake(node, f"{what} has {len(node.value):,} entries, at most {most:,}")
-    return node.value
+def _list(node: Node, what: str, most: int | None = None) -> list[Node]:
+    """The nodes of a list, which must not be null. Raises Mistake: it has more than `most`."""
+    if not isinstance(node.value, list):
+        raise Mistake(node, f"{what} must be a list, got {describe(node)}")
+    return sequence(node, what, most)
 
 
-def _mapping(node, what, required=(), optional=()):
-    """The values (nodes) of a mapping by key, with all required keys and no unknown key."""
-    known = ", ".join((*required, *optional))
-    if not isinstance(node, yaml.MappingNode):
-        raise _mistake(node, f"{what} must be a mapping with keys {known}, got {_describe(node)}")
-    fields = {}
-    for key, value in node.value:
-        if not isinstance(key, yaml.ScalarNode) or key.value not in (*required, *optional):
-            raise _mistake(key, f"unknown key {_describe(key)} in {what}: known are {known}")
-        if key.value in fields:
-            raise _mistake(key, f"{key.value} is in {what} twice")
-        fields[key.value] = value
-    missing = [key for key in required if key not in fields]
+def _fields(
+    node: Node,
+    what: str,
+    required: tuple[str, ...] = (),
+    optional: tuple[str, ...] = (),
+    more: tuple[str, ...] = (),
+) -> dict[str, Node]:
+    """The values of a mapping by key, with all required keys and no unknown key."""
+    known = (*required, *optional, *more)
+    keys = ", ".join(known)
+    if not isinstance(node.value, dict):
+        raise Mistake(node, f"{what} must be a mapping with keys {keys}, got {describe(node)}")
+    for key in node.value:
+        if key not in known:
+            raise Mistake(key, f"unknown key {shorten(key)} in {what}: known are {keys}")
+    missing = [key for key in required if key not in node.value]
     if missing:
-        raise _mistake(node, f"{what} lacks {', '.join(missing)}")
-    return fields
-
-
-def _vector(node, what, length, positive=False):
-    if not isinstance(node, yaml.SequenceNode):
-        raise _mistake(node, f"{what} must be a list of {length} numbers, got {_describe(node)}")
-    if len(node.value) != length:
-        raise _mistake(node, f"{what} must be a list of {length} numbers, got {len(node.value)}")
-    return tuple(_number(number, what, positive) for number in node.value)
-
-
-def _number(node, what, positive=False, most=MAX_LENGTH):
-    try:
-        number = float(node.value) if _is_plain(node) else math.nan
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise _mistake(node, f"{what} must be a finite number, got {_describe(node)}")
-    if abs(number) > most:
-        limit = f"{most:.0f}"
-        raise _mistake(node, f"{what} must be at most {limit}, got {_describe(node)}")
-    if positive and number <= 0:
-        raise _mistake(node, f"{what} must be positive, got {_describe(node)}")
-    return number
-
-
-def _switch(node):
-    """True, False, or None if the node is neither `true` nor `false`."""
-    return {"true": True, "false": False}.get(node.value) if _is_plain(node) else None
-
-
-def _is_plain(node):
-    """Whether a node is a scalar without quotes; a quoted one is always text."""
-    return isinstance(node, yaml.ScalarNode) and node.style is None
-
-
-def _describe(node):
-    if isinstance(node, yaml.MappingNode):
-        return "a mapping"
-    if isinstance(node, yaml.SequenceNode):
-        return "a list"
-    if _is_plain(node):
-        return _shorten(" ".join(node.value.split())) or "nothing"  # it may have line breaks
-    return f"the text {_shorten(node.value)!r}"
-
-
-def _shorten(text):
-    return text if len(text) <= 40 else text[:40] + "..."
+        raise Mistake(node, f"{what} lacks {', '.join(missing)}")
+    return documents.mapping(node, what)

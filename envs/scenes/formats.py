@@ -7,44 +7,52 @@ floor. Meshes become convex hulls (`envs.scenes.meshes`). What cannot be represe
 with its line: see `UNSUPPORTED`.
 """
 
-import math
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 
 from roboarm_nmp.envs.robots.attached import MAX_ATTACHED
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import matrix
-from roboarm_nmp.envs.scenes import documents, meshes
-from roboarm_nmp.envs.scenes.documents import (
-    DocumentError,
-    Mistake,
-    Node,
-    describe,
-    get,
-    is_nothing,
-    load_document,
-    mapping,
-    number,
-    numbers,
-    read_text,
-    sequence,
-    shorten,
-)
+from roboarm_nmp.envs.robots.robot import Robot, matrix
+from roboarm_nmp.envs.scenes import meshes
 from roboarm_nmp.envs.scenes.files import load_scene
+from roboarm_nmp.envs.scenes.numbers import Quaternion, Vector, multiply, unit_quaternion
 from roboarm_nmp.envs.scenes.primitives import (
     IDENTITY,
     MAX_LENGTH,
     MAX_SCENE_OBSTACLES,
     Attached,
     Box,
+    ConvexHull,
     Cylinder,
+    Obstacle,
     Scene,
     Sphere,
-    unit_quaternion,
+)
+from roboarm_nmp.utils import documents
+from roboarm_nmp.utils.documents import (
+    DocumentError,
+    Mistake,
+    Node,
+    describe,
+    errors_at,
+    get,
+    is_nothing,
+    load_document,
+    mapping,
+    mistakes_in,
+    number,
+    numbers,
+    read_text,
+    sequence,
+    shorten,
 )
 
+Pose = tuple[Vector, Quaternion]
+"""Position, m, and orientation (x, y, z, w)."""
 UNSUPPORTED = {
     "mesh": "meshes",
     "meshes": "meshes",
@@ -68,12 +76,10 @@ MAX_NAMES = 1000  # of an allowed collision matrix
 WORLD_FILES = (".yaml", ".yml", ".scene")
 
 
-def load_world(path):
+def load_world(path: str | Path) -> Scene:
     """The `Scene` in a file: of this project's YAML, MoveIt's `.scene` or YAML, or cuRobo's YAML.
 
-    Raises:
-        DocumentError, envs.scenes.files.SceneFileError: the file cannot be used; ValueErrors whose
-            message is `PATH:LINE: reason`.
+    Raises DocumentError: the file cannot be used. The message is `PATH:LINE: reason`.
     """
     path = Path(path)
     if path.suffix == ".scene":
@@ -86,37 +92,36 @@ def load_world(path):
         return load_scene(path)  # its messages say what a scene file needs
     if not is_world(root):
         return load_scene(path)
-    try:
-        if any(key in root.value for key in _MOVEIT_SCENE):
+    with mistakes_in(path):
+        if _has_key(root, _MOVEIT_SCENE):
             return moveit_scene(root, PANDA)
         return checked_scene(root, curobo_obstacles(root, path.parent))
-    except Mistake as mistake:
-        raise DocumentError(f"{path}:{mistake.line}: {mistake.reason}") from mistake
 
 
-def is_world(root):
-    """Whether a document, a `Node`, is a world of MoveIt's or cuRobo's YAML."""
-    keys = root.value if isinstance(root.value, dict) else ()
-    return any(key in keys for key in (*_MOVEIT_SCENE, *_CUROBO_KINDS))
+def is_world(root: Node) -> bool:
+    """Whether a document is a world of MoveIt's or cuRobo's YAML."""
+    return _has_key(root, _MOVEIT_SCENE) or _has_key(root, _CUROBO_KINDS)
 
 
-def reject(node, name):
-    """Raise Mistake: a file has contents of `UNSUPPORTED`."""
+def _has_key(node: Node, keys: Iterable[str]) -> bool:
+    return isinstance(node.value, dict) and any(key in node.value for key in keys)
+
+
+def _reject(node: Node, name: str) -> NoReturn:
     raise Mistake(node, f"{UNSUPPORTED[name]} are not supported ({name})")
 
 
-def _reject_unless_empty(fields, *names):
-    """Raise Mistake if one of these keys of a dict of `Node`s has contents."""
+def _reject_unless_empty(fields: dict[str, Node], *names: str) -> None:
     for name in names:
         if not is_nothing(fields.get(name)):
-            reject(fields[name], name)
+            _reject(fields[name], name)
 
 
 # --- MoveIt: PlanningScene messages as YAML
 
 
-def moveit_scene(root, robot):
-    """The `Scene` of a PlanningScene, a `Node`, with a `Robot`. Raises Mistake."""
+def moveit_scene(root: Node, robot: Robot) -> Scene:
+    """The `Scene` of a PlanningScene, with a robot. Raises Mistake."""
     fields = mapping(root, "a planning scene")
     check_frames(fields, robot)
     world = mapping(fields["world"], "world") if "world" in fields else fields
@@ -125,110 +130,110 @@ def moveit_scene(root, robot):
     obstacles = []
     if "collision_objects" in world:
         for entry in sequence(world["collision_objects"], "collision_objects"):
-            found = _collision_object(entry, robot)
-            if touching := allowed.links(_id(entry), robot):
-                found = [replace(one, may_touch=touching) for one in found]
-            obstacles += found
+            shapes = _collision_object(entry, robot)
+            may_touch = allowed.links(_id(entry), robot)
+            obstacles += [replace(shape, may_touch=may_touch) for shape in shapes]
             _check_number(entry, obstacles)
     state = fields.get("robot_state")
-    if not is_nothing(state):
+    if state is not None and not is_nothing(state):
         robot = with_attached_objects(mapping(state, "robot_state"), robot, allowed)
-    return checked_scene(root, tuple(obstacles), robot)
+    return checked_scene(root, obstacles, robot)
 
 
-def _id(node):
+def _id(node: Node) -> str:
     name = mapping(node, "a collision object").get("id")
     return "" if name is None else documents.text(name, "id")
 
 
 class _AllowedCollisions:
-    """MoveIt's allowed collision matrix, a `Node` or None. Raises Mistake."""
+    """MoveIt's allowed collision matrix. Raises Mistake."""
 
-    def __init__(self, node):
-        self._rows, self._defaults = {}, {}
-        if is_nothing(node):
+    def __init__(self, node: Node | None):
+        self._rows = {}
+        self._defaults = {}
+        if node is None or is_nothing(node):
             return
-        fields, names = mapping(node, "allowed_collision_matrix"), {}
-        for what in ("entry_names", "entry_values", "default_entry_names", "default_entry_values"):
-            names[what] = sequence(fields.get(what, Node([], node.line)), what, MAX_NAMES)
-        columns = [documents.text(name, "entry_names") for name in names["entry_names"]]
-        rows = [self._row(row, columns) for row in names["entry_values"]]
+        fields = mapping(node, "allowed_collision_matrix")
+
+        def entries(what: str) -> list[Node]:
+            return sequence(fields[what], what, MAX_NAMES) if what in fields else []
+
+        columns = [documents.text(name, "entry_names") for name in entries("entry_names")]
+        rows = [self._row(row, columns) for row in entries("entry_values")]
         if len(rows) != len(columns):
             raise Mistake(node, f"{len(columns)} entry_names have {len(rows)} entry_values")
         self._rows = dict(zip(columns, rows, strict=True))
-        named = [documents.text(name, "a name") for name in names["default_entry_names"]]
-        values = [_switch(value) for value in names["default_entry_values"]]
-        if len(named) != len(values):
-            raise Mistake(node, f"{len(named)} default_entry_names have {len(values)} values")
-        self._defaults = dict(zip(named, values, strict=True))
+        names = [documents.text(name, "a name") for name in entries("default_entry_names")]
+        values = [self._is_allowed(value) for value in entries("default_entry_values")]
+        if len(names) != len(values):
+            raise Mistake(node, f"{len(names)} default_entry_names have {len(values)} values")
+        self._defaults = dict(zip(names, values, strict=True))
 
-    def _row(self, node, columns):
+    def _row(self, node: Node, columns: list[str]) -> dict[str, bool]:
         if isinstance(node.value, dict):
             node = get(node, "enabled", "a row of entry_values")
-        values = [_switch(value) for value in sequence(node, "a row of entry_values")]
+        values = [self._is_allowed(value) for value in sequence(node, "a row of entry_values")]
         if len(values) != len(columns):
             raise Mistake(node, f"{len(columns)} entry_names have a row of {len(values)} values")
         return dict(zip(columns, values, strict=True))
 
-    def links(self, name, robot):
-        """Names of the robot's links that an object may touch, a tuple."""
-        row, default = self._rows.get(name, {}), self._defaults.get(name, False)
+    @staticmethod
+    def _is_allowed(node: Node) -> bool:
+        value = documents.text(node, "an entry of the allowed collision matrix").lower()
+        if value not in ("true", "false", "0", "1"):
+            raise Mistake(node, f"an entry must be true or false, got {describe(node)}")
+        return value in ("true", "1")
+
+    def links(self, name: str, robot: Robot) -> tuple[str, ...]:
+        """Names of the robot's links that an object may touch."""
+        row = self._rows.get(name, {})
+        default = self._defaults.get(name, False)
         if not row and not default:
             return ()
-        links = robot.arm.bullet_names[1].values()
-        return tuple(link for link in links if row.get(link, default))
+        return tuple(link for link in robot.arm.bullet_names[1].values() if row.get(link, default))
 
 
-def _switch(node):
-    value = documents.text(node, "an entry of the allowed collision matrix").lower()
-    if value not in ("true", "false", "0", "1"):
-        raise Mistake(node, f"an entry must be true or false, got {describe(node)}")
-    return value in ("true", "1")
-
-
-def with_attached_objects(state, robot, allowed=None):
-    """A `Robot` with the attached objects of a RobotState, a dict of `Node`s. Raises Mistake."""
+def with_attached_objects(
+    state: dict[str, Node], robot: Robot, allowed: _AllowedCollisions | None = None
+) -> Robot:
+    """The robot with the attached objects of a RobotState. Raises Mistake."""
     node = state.get("attached_collision_objects")
-    if is_nothing(node):
+    if node is None or is_nothing(node):
         return robot
-    found = list(robot.attached)
+    objects = list(robot.attached)
     for entry in sequence(node, "attached_collision_objects", MAX_ATTACHED):
         link = documents.text(get(entry, "link_name", "an attached object"), "link_name")
         shape = get(entry, "object", "an attached object")
-        touched = mapping(entry, "an attached object").get("touch_links")
-        touched = [] if touched is None else sequence(touched, "touch_links", MAX_NAMES)
-        touched = [documents.text(one, "touch_links") for one in touched]
+        touch_links = []
+        if "touch_links" in mapping(entry, "an attached object"):
+            names = sequence(get(entry, "touch_links", ""), "touch_links", MAX_NAMES)
+            touch_links += [documents.text(name, "touch_links") for name in names]
         if allowed is not None:
-            touched += allowed.links(_id(shape), robot)
+            touch_links += allowed.links(_id(shape), robot)
         shapes = _collision_object(shape, robot, link)
         if not shapes:
             raise Mistake(shape, "an attached object needs primitives or meshes of its own")
-        try:
-            objects = [Attached(one, link, touched) for one in shapes]
-            found += [one for one in objects if one not in found]  # of the start state, too
-        except ValueError as error:
-            raise Mistake(entry, str(error)) from error
-    try:
-        return robot.with_attached(found)
-    except ValueError as error:
-        raise Mistake(node, str(error)) from error
+        with errors_at(entry):
+            for attached in [Attached(shape, link, tuple(touch_links)) for shape in shapes]:
+                if attached not in objects:  # the scene and the start state may both have it
+                    objects.append(attached)
+    with errors_at(node):
+        return robot.with_attached(objects)
 
 
-def checked_scene(node, obstacles, robot=PANDA):
+def checked_scene(node: Node, obstacles: Iterable[Obstacle], robot: Robot = PANDA) -> Scene:
     """The `Scene` of obstacles from a file, without table and floor. Raises Mistake."""
-    try:
-        return Scene(obstacles, table=None, floor=None, robot=robot)
-    except ValueError as error:  # after a move by an outer pose, say
-        raise Mistake(node, str(error)) from error
+    with errors_at(node):  # after a move by an outer pose, say
+        return Scene(tuple(obstacles), table=None, floor=None, robot=robot)
 
 
-def check_frames(fields, robot):
-    """Raise Mistake unless the frames of a message, a dict of `Node`s, are the base's."""
+def check_frames(fields: dict[str, Node], robot: Robot) -> None:
+    """Raise Mistake unless the frames of a message are the base's."""
     transforms = fields.get("fixed_frame_transforms")
-    for entry in [] if transforms is None else sequence(transforms, "fixed_frame_transforms"):
-        one = mapping(entry, "a fixed frame")
-        if "transform" in one:
-            check_identity(one["transform"], "a fixed frame's transform")
+    if transforms is not None:
+        for entry in sequence(transforms, "fixed_frame_transforms"):
+            if "transform" in mapping(entry, "a fixed frame"):
+                _check_identity(get(entry, "transform", ""), "a fixed frame's transform")
     state = fields.get("robot_state", fields.get("start_state"))
     if state is None or is_nothing(state):
         return
@@ -236,94 +241,89 @@ def check_frames(fields, robot):
     if joints is None or is_nothing(joints):
         return
     transforms = mapping(joints, "multi_dof_joint_state").get("transforms")
-    for entry in [] if transforms is None else sequence(transforms, "transforms"):
-        check_identity(entry, "the transform of the base")
+    if transforms is not None:
+        for entry in sequence(transforms, "transforms"):
+            _check_identity(entry, "the transform of the base")
 
 
-def check_identity(node, what):
-    """Raise Mistake unless a transform moves nothing."""
+def _check_identity(node: Node, what: str) -> None:
     fields = mapping(node, what)
+    x, y, z, w = _vector(fields.get("rotation"), what, IDENTITY)
     moves = any(_vector(fields.get("translation"), what, (0.0, 0.0, 0.0)))
-    _, _, _, w = turn = _vector(fields.get("rotation"), what, IDENTITY)
-    if moves or not (abs(abs(w) - 1) < 1e-9 and not any(turn[:3])):
+    turns = x != 0 or y != 0 or z != 0 or abs(abs(w) - 1) >= 1e-9
+    if moves or turns:
         raise Mistake(node, f"{what} must be the identity: obstacles are read in the base's frame")
 
 
-def check_frame(node, robot):
+def check_frame(node: Node, robot: Robot) -> None:
     """Raise Mistake unless a frame's name is that of the robot's base, `world`, or empty."""
     name = documents.text(node, "a frame")
     base = robot.bullet_names[1][-1]
     if name not in ("", "world", base, "/" + base):
-        raise Mistake(node, f"the frame {shorten(name)} is neither {base}, the base, nor world")
+        raise Mistake(node, f"the frame {shorten(name)!r} is neither {base}, the base, nor world")
 
 
-def _collision_object(node, robot, link=None):
+def _collision_object(node: Node, robot: Robot, link: str | None = None) -> list[Obstacle]:
     """The obstacles of a collision object; `link`: the frame of an attached one."""
     fields = mapping(node, "a collision object")
-    if "header" in fields:
-        header = mapping(fields["header"], "header")
-        if "frame_id" in header and link is None:
+    header = mapping(fields["header"], "header") if "header" in fields else {}
+    if "frame_id" in header:
+        if link is None:
             check_frame(header["frame_id"], robot)
-        elif "frame_id" in header and documents.text(header["frame_id"], "a frame") != link:
-            name = shorten(header["frame_id"].value)
-            raise Mistake(header["frame_id"], f"the frame {name} is not {link}, the object's link")
+        elif (name := documents.text(header["frame_id"], "a frame")) != link:
+            reason = f"the frame {shorten(name)!r} is not {link}, the object's link"
+            raise Mistake(header["frame_id"], reason)
     _reject_unless_empty(fields, "planes")
     if "operation" in fields:
         operation = documents.text(fields["operation"], "operation")
         if operation not in ("0", "add"):
-            raise Mistake(fields["operation"], f"operation {shorten(operation)} is not `add`")
+            raise Mistake(fields["operation"], f"operation {shorten(operation)!r} is not `add`")
     outer = _moveit_pose(fields["pose"], "pose") if "pose" in fields else None
-    found = []
-    for many, one, read in (
+    obstacles = []
+    for plural, singular, read in (
         ("primitives", "primitive", _moveit_primitive),
         ("meshes", "mesh", _moveit_mesh),
     ):
-        if is_nothing(fields.get(many)):
+        if is_nothing(fields.get(plural)):
             continue
-        shapes = sequence(fields[many], many, MAX_SCENE_OBSTACLES)
-        poses = sequence(get(node, f"{one}_poses", "a collision object"), f"{one}_poses")
+        shapes = sequence(fields[plural], plural, MAX_SCENE_OBSTACLES)
+        poses = sequence(get(node, f"{singular}_poses", "a collision object"), f"{singular}_poses")
         if len(shapes) != len(poses):
-            raise Mistake(node, f"{len(shapes)} {many} have {len(poses)} {one}_poses")
+            raise Mistake(node, f"{len(shapes)} {plural} have {len(poses)} {singular}_poses")
         for shape, pose in zip(shapes, poses, strict=True):
-            position, orientation = _moveit_pose(pose, f"{one}_poses")
-            if outer is not None:  # from the left
-                position, orientation = compose_poses(*outer, position, orientation)
-            found += read(shape, position, orientation)
-            _check_number(shape, found)
-    return found
+            obstacles += read(shape, _placed(_moveit_pose(pose, f"{singular}_poses"), outer))
+            _check_number(shape, obstacles)
+    return obstacles
 
 
-def _moveit_primitive(node, position, orientation):
+def _moveit_primitive(node: Node, pose: Pose) -> list[Obstacle]:
     kind = documents.text(get(node, "type", "a primitive"), "type").lower()
     kind = _MOVEIT_TYPES.get(kind, kind)
-    sizes = get(node, "dimensions", "a primitive")
-    if kind == "box":
-        return [Box(position, _sizes(sizes, "the dimensions of a box", 3), orientation)]
-    if kind == "sphere":
-        return [Sphere(position, *_sizes(sizes, "the dimensions of a sphere", 1))]
-    if kind == "cylinder":
-        length, radius = _sizes(sizes, "the dimensions of a cylinder", 2)
-        return [Cylinder(position, radius, length, orientation)]
-    _unknown_kind(node, kind)
+    if kind not in NUM_DIMENSIONS:
+        _unknown_kind(node, kind)
+    dimensions = get(node, "dimensions", "a primitive")
+    return [_primitive(kind, _dimensions(dimensions, kind), pose)]
 
 
-def _moveit_mesh(node, position, orientation):
+def _moveit_mesh(node: Node, pose: Pose) -> tuple[ConvexHull, ...]:
     points = sequence(get(node, "vertices", "a mesh"), "vertices")
     vertices = [_vector(point, "a vertex", (0.0, 0.0, 0.0)) for point in points]
     triangles = sequence(get(node, "triangles", "a mesh"), "triangles", meshes.MAX_TRIANGLES)
-    faces = (_face(get(one, "vertex_indices", "a triangle")) for one in triangles)
-    return _hulls(node, vertices, faces, position, orientation)
+    faces = [_face(get(one, "vertex_indices", "a triangle")) for one in triangles]
+    return _hulls(node, vertices, faces, pose)
 
 
-def _moveit_pose(node, what):
-    """Position and quaternion (xyzw) of a pose; lists, or dicts with x, y, z, w."""
+def _moveit_pose(node: Node, what: str) -> Pose:
+    """A pose of lists, or of dicts with x, y, z, w."""
     fields = mapping(node, what)
     position = _vector(fields.get("position"), f"position of {what}", (0.0, 0.0, 0.0))
     turn = fields.get("orientation")
-    return position, _turn(turn, _vector(turn, f"orientation of {what}", IDENTITY))
+    if turn is None:
+        return position, IDENTITY
+    return position, _unit(turn, _vector(turn, f"orientation of {what}", IDENTITY))
 
 
-def _vector(node, what, default):
+def _vector(node: Node | None, what: str, default: tuple[float, ...]) -> tuple[Any, ...]:
     """Numbers of a list, or of a dict with keys x, y, z, w; `default` if there are none."""
     if node is None or is_nothing(node):
         return default
@@ -336,195 +336,166 @@ def _vector(node, what, default):
 # --- MoveIt: the text that its plugin for RViz exports
 
 
-def read_scene_text(path):
+def read_scene_text(path: str | Path) -> Scene:
     """The `Scene` in a `.scene` file, in either of its versions. Raises DocumentError."""
-    lines = [line.strip() for line in read_text(path).splitlines()]
-    try:
-        return checked_scene(Node("", 1), tuple(_scene_text(lines)))
-    except Mistake as mistake:
-        raise DocumentError(f"{path}:{mistake.line}: {mistake.reason}") from mistake
+    text = read_text(path)
+    with mistakes_in(path):
+        return checked_scene(Node("", 1), _SceneText(text).obstacles())
 
 
-def _scene_text(lines):
-    at, obstacles = 0, []
+class _SceneText:
+    """The lines of a `.scene` file, one after another. Raises Mistake."""
 
-    def take(what, count=None, most=MAX_LENGTH):
-        """The next line; with a count, so many numbers of it."""
-        nonlocal at
-        while at < len(lines) and not lines[at]:
-            at += 1
-        if at == len(lines):
-            raise Mistake(Node("", max(at, 1)), f"the file ends before {what}")
-        at += 1
-        node = Node(lines[at - 1], at)
-        if count is None:
-            return node
-        words = Node([Node(word, at) for word in node.value.split()], at)
-        return numbers(words, what, count, most), words
+    def __init__(self, text: str):
+        self._lines = [line.strip() for line in text.splitlines()]
+        self._number = 0  # of the present line, from 1
 
-    def starts_with_pose():
-        """Whether an object's pose follows, as in newer files; else the number of its shapes."""
-        line = next((i for i in range(at, len(lines)) if lines[i]), None)
-        return line is not None and len(lines[line].split()) > 1
+    def _take(self, what: str) -> Node:
+        """The next line with contents."""
+        while self._number < len(self._lines):
+            self._number += 1
+            if self._lines[self._number - 1]:
+                return Node(self._lines[self._number - 1], self._number)
+        raise Mistake(Node("", max(self._number, 1)), f"the file ends before {what}")
 
-    def pose():
-        position, _ = take("a position", 3)
-        turn, node = take("an orientation", 4)
-        return position, _turn(node, turn)
+    def _take_words(self, what: str) -> Node:
+        """The words of the next line."""
+        line = self._take(what)
+        return Node([Node(word, line.line) for word in str(line.value).split()], line.line)
 
-    def placed(outer):
-        """The pose of a shape in the base's frame, and its colour, which is dropped."""
-        position, orientation = pose()
-        take("a colour", 4)
-        if outer is not None:
-            return compose_poses(*outer, position, orientation)
-        return position, orientation
+    def _take_numbers(self, what: str, count: int, most: float = MAX_LENGTH) -> tuple[Any, ...]:
+        return numbers(self._take_words(what), what, count, most)
 
-    def count(what):
-        node = take(what)
-        if not node.value.isdecimal() or len(node.value) > 9:
-            raise Mistake(node, f"{what} must be a whole number, got {describe(node)}")
-        return int(node.value)
+    def _take_count(self, what: str) -> int:
+        line = self._take(what)
+        digits = str(line.value)
+        if not digits.isdecimal() or len(digits) > 9:
+            raise Mistake(line, f"{what} must be a whole number, got {describe(line)}")
+        return int(digits)
 
-    take("the scene's name")
-    while (node := take("the last line, a dot")).value != ".":
-        if not node.value.startswith("*"):
-            raise Mistake(node, f"an object begins with *, got {describe(node)}")
-        is_new = starts_with_pose()
-        outer = pose() if is_new else None
-        for _ in range(count("the number of shapes")):
-            kind = take("a shape")
-            if kind.value == "mesh":
-                (num_vertices, num_faces), node = take(
-                    "the numbers of vertices and triangles", 2, 1e9
-                )
-                if max(num_vertices, num_faces) > len(lines):
-                    raise Mistake(node, "the file ends before the last triangle")
-                vertices = [take("a vertex", 3)[0] for _ in range(int(num_vertices))]
-                faces = [_face(take("a triangle", 3, 1e9)[1]) for _ in range(int(num_faces))]
-                position, orientation = placed(outer)
-                obstacles += _hulls(kind, vertices, faces, position, orientation)
+    def _take_pose(self) -> Pose:
+        position = self._take_numbers("a position", 3)
+        words = self._take_words("an orientation")
+        return position, _unit(words, numbers(words, "an orientation", 4, MAX_LENGTH))
+
+    def _pose_follows(self) -> bool:
+        """Whether an object's pose comes next, as in newer files; else the number of its shapes."""
+        line = next(filter(None, self._lines[self._number :]), "")
+        return len(line.split()) > 1
+
+    def obstacles(self) -> list[Obstacle]:
+        obstacles = []
+        self._take("the scene's name")
+        while (line := self._take("the last line, a dot")).value != ".":
+            if not str(line.value).startswith("*"):
+                raise Mistake(line, f"an object begins with *, got {describe(line)}")
+            is_new = self._pose_follows()
+            outer = self._take_pose() if is_new else None
+            for _ in range(self._take_count("the number of shapes")):
+                kind = self._take("a shape")
+                obstacles += self._shapes(kind, outer)
                 _check_number(kind, obstacles)
-                continue
-            number_of_sizes = {"box": 3, "sphere": 1, "cylinder": 2}.get(kind.value)
-            if number_of_sizes is None:
-                _unknown_kind(kind, kind.value)
-            what = f"the dimensions of a {kind.value}"
-            sizes = _sizes(take(what, number_of_sizes)[1], what, number_of_sizes)
-            position, orientation = placed(outer)
-            if kind.value == "box":
-                obstacles.append(Box(position, sizes, orientation))
-            elif kind.value == "sphere":
-                obstacles.append(Sphere(position, *sizes))
-            else:
-                radius, length = sizes
-                obstacles.append(Cylinder(position, radius, length, orientation))
-            _check_number(kind, obstacles)
-        for _ in range(count("the number of subframes") if is_new else 0):
-            take("a subframe's name")
-            pose()
-    return obstacles
+            if is_new:
+                for _ in range(self._take_count("the number of subframes")):
+                    self._take("a subframe's name")
+                    self._take_pose()
+        return obstacles
+
+    def _shapes(self, node: Node, outer: Pose | None) -> Iterable[Obstacle]:
+        kind = str(node.value)
+        if kind == "mesh":
+            what = "the numbers of vertices and triangles"
+            counts = self._take_words(what)
+            num_vertices, num_faces = numbers(counts, what, 2, 1e9)
+            if max(num_vertices, num_faces) > len(self._lines):
+                raise Mistake(counts, "the file ends before the last triangle")
+            vertices = [self._take_numbers("a vertex", 3) for _ in range(int(num_vertices))]
+            faces = [_face(self._take_words("a triangle")) for _ in range(int(num_faces))]
+            return _hulls(node, vertices, faces, self._take_shape_pose(outer))
+        if kind not in NUM_DIMENSIONS:
+            _unknown_kind(node, kind)
+        dimensions = _dimensions(self._take_words(f"the dimensions of a {kind}"), kind)
+        if kind == "cylinder":  # here the radius comes first
+            dimensions = dimensions[::-1]
+        return [_primitive(kind, dimensions, self._take_shape_pose(outer))]
+
+    def _take_shape_pose(self, outer: Pose | None) -> Pose:
+        """The pose of a shape in the base's frame; its colour is dropped."""
+        pose = self._take_pose()
+        self._take_numbers("a colour", 4)
+        return _placed(pose, outer)
 
 
 # --- robometrics and cuRobo
 
 
-def curobo_obstacles(node, folder):
-    """The obstacles of a cuRobo world, or of robometrics' `obstacles`, a `Node`. Raises Mistake.
+def curobo_obstacles(node: Node, folder: Path) -> list[Obstacle]:
+    """The obstacles of a cuRobo world, or of robometrics' `obstacles`. Raises Mistake.
 
     Kinds are dicts from names to fields. A pose is x, y, z and a quaternion w, x, y, z; `dims` are
     full edges. Files of meshes are relative to `folder`, and inside of it.
     """
+    kinds = ("cuboid", "box", "cylinder", "sphere", "mesh")
     fields = mapping(node, "obstacles")
-    for kind in fields:
-        if kind not in ("cuboid", "cylinder", "sphere", "box", "mesh") and not is_nothing(
-            fields[kind]
-        ):
-            _unknown_kind(fields[kind], kind)
+    for kind, value in fields.items():
+        if kind not in kinds and not is_nothing(value):
+            _unknown_kind(value, kind)
     obstacles = []
-    for kind in ("cuboid", "box", "cylinder", "sphere", "mesh"):
+    for kind in kinds:
         if is_nothing(fields.get(kind)):
             continue
         for name, one in mapping(fields[kind], kind).items():
-            what = f"{kind} {name[:40]}"
+            what = f"{kind} {shorten(name)}"
             if kind == "mesh":
                 obstacles += _curobo_mesh(one, what, folder)
             else:
                 obstacles.append(_curobo_obstacle(one, kind, what))
             _check_number(one, obstacles)
-    return tuple(obstacles)
+    return obstacles
 
 
-def _curobo_obstacle(node, kind, what):
+def _curobo_obstacle(node: Node, kind: str, what: str) -> Obstacle:
     fields = mapping(node, what)
     if kind == "sphere" and "pose" not in fields:
-        position = numbers(get(node, "position", what), f"position of {what}", 3, MAX_LENGTH)
-    else:
-        position, orientation = _curobo_pose(node, what)
+        return Sphere(_numbers(node, "position", what, 3), _size(node, "radius", what))
+    position, orientation = _curobo_pose(node, what)
     if kind in ("cuboid", "box"):
-        return Box(position, _sizes(get(node, "dims", what), f"dims of {what}", 3), orientation)
-    radius = _size(get(node, "radius", what), f"radius of {what}")
+        return Box(position, _numbers(node, "dims", what, 3, positive=True), orientation)
+    radius = _size(node, "radius", what)
     if kind == "sphere":
         return Sphere(position, radius)
-    return Cylinder(
-        position, radius, _size(get(node, "height", what), f"height of {what}"), orientation
-    )
+    return Cylinder(position, radius, _size(node, "height", what), orientation)
 
 
-def _curobo_pose(node, what):
-    pose = get(node, "pose", what)
-    x, y, z, w, i, j, k = numbers(pose, f"pose of {what}", 7, MAX_LENGTH)
-    return (x, y, z), _turn(pose, (i, j, k, w))
+def _curobo_pose(node: Node, what: str) -> Pose:
+    x, y, z, w, i, j, k = _numbers(node, "pose", what, 7)
+    return (x, y, z), _unit(get(node, "pose", what), (i, j, k, w))
 
 
-def _curobo_mesh(node, what, folder):
-    """The `ConvexHull`s of a mesh, which has a `file_path`, or `vertices` and `faces`."""
-    fields, scale = mapping(node, what), 1.0
+def _curobo_mesh(node: Node, what: str, folder: Path) -> tuple[ConvexHull, ...]:
+    """The hulls of a mesh, which has a `file_path`, or `vertices` and `faces`."""
+    fields = mapping(node, what)
+    scale = (1.0, 1.0, 1.0)
     if not is_nothing(fields.get("scale")):
-        scale = numbers(fields["scale"], f"scale of {what}", 3, MAX_LENGTH)
-        if min(scale) <= 0:
-            raise Mistake(fields["scale"], f"scale of {what} must be positive")
+        scale = _numbers(node, "scale", what, 3, positive=True)
     position, orientation = _curobo_pose(node, what)
     if is_nothing(fields.get("file_path")):
         points = sequence(get(node, "vertices", what), "vertices")
-        vertices = [numbers(one, "a vertex", 3, MAX_LENGTH) for one in points]
-        faces = sequence(get(node, "faces", what), "faces", meshes.MAX_TRIANGLES)
-        return _hulls(node, vertices, map(_face, faces), position, orientation, scale)
-    try:
-        file = fields["file_path"]
-        mesh = meshes.load_mesh(documents.text(file, "file_path"), folder)
-        return meshes.mesh_hulls(*mesh, position, orientation, scale)
-    except meshes.MeshError as error:
-        raise Mistake(file, str(error)) from error
-
-
-def _face(node):
-    """The vertices of a triangle, three whole numbers."""
-    return tuple(int(number(one, "a triangle's vertex", 1e9)) for one in _three(node))
-
-
-def _three(node):
-    corners = sequence(node, "a triangle")
-    if len(corners) != 3:
-        raise Mistake(node, f"a triangle has 3 vertices, got {len(corners)}")
-    return corners
-
-
-def _hulls(node, vertices, faces, position, orientation, scale=1.0):
-    """The `ConvexHull`s of a mesh in the file itself. Raises Mistake."""
-    vertices = np.reshape(vertices, (-1, 3)).astype(np.float64)
-    faces = np.reshape(list(faces), (-1, 3)).astype(np.int64)
-    try:
+        vertices = [numbers(point, "a vertex", 3, MAX_LENGTH) for point in points]
+        triangles = sequence(get(node, "faces", what), "faces", meshes.MAX_TRIANGLES)
+        faces = [_face(triangle) for triangle in triangles]
+        return _hulls(node, vertices, faces, (position, orientation), scale)
+    with errors_at(fields["file_path"]):
+        name = documents.text(fields["file_path"], "file_path")
+        vertices, faces = meshes.load_mesh(name, folder)
         return meshes.mesh_hulls(vertices, faces, position, orientation, scale)
-    except meshes.MeshError as error:
-        raise Mistake(node, str(error)) from error
 
 
 # --- VAMP's JSON
 
 
-def vamp_obstacles(node):
-    """The obstacles of a problem in VAMP's JSON, a `Node`: lists by kind. Raises Mistake.
+def vamp_obstacles(node: Node) -> list[Obstacle]:
+    """The obstacles of a problem in VAMP's JSON: lists by kind. Raises Mistake.
 
     A box has `half_extents`, or `size`, its full edges; orientations are `orientation_quat_xyzw`,
     `quat_xyzw`, or `orientation_euler_xyz` (rad: about the fixed x, then y, then z axis).
@@ -536,94 +507,117 @@ def vamp_obstacles(node):
         for one in sequence(fields[kind], kind) if kind in fields else ():
             obstacles.append(_vamp_obstacle(one, kind))
             _check_number(one, obstacles)
-    return tuple(obstacles)
+    return obstacles
 
 
-def _vamp_obstacle(node, kind):
-    fields, what = mapping(node, kind), f"of a {kind}"
-    position = numbers(get(node, "position", kind), f"position {what}", 3, MAX_LENGTH)
+def _vamp_obstacle(node: Node, kind: str) -> Obstacle:
+    fields = mapping(node, kind)
+    position = _numbers(node, "position", kind, 3)
     orientation = IDENTITY
-    for name in ("quat_xyzw", "orientation_quat_xyzw"):
-        if name in fields:
-            turn = numbers(fields[name], f"{name} {what}", 4, MAX_LENGTH)
-            orientation = _turn(fields[name], turn)
-            break
-    else:
-        if "orientation_euler_xyz" in fields:
-            angles = numbers(fields["orientation_euler_xyz"], f"orientation {what}", 3, MAX_LENGTH)
-            orientation = from_euler(*angles)
+    if "quat_xyzw" in fields:
+        orientation = _unit(fields["quat_xyzw"], _numbers(node, "quat_xyzw", kind, 4))
+    elif "orientation_quat_xyzw" in fields:
+        name = "orientation_quat_xyzw"
+        orientation = _unit(fields[name], _numbers(node, name, kind, 4))
+    elif "orientation_euler_xyz" in fields:
+        from scipy.spatial.transform import Rotation  # here, because it takes a while to import
+
+        angles = _numbers(node, "orientation_euler_xyz", kind, 3)
+        orientation = tuple(Rotation.from_euler("xyz", angles).as_quat().tolist())
+    if kind == "box" and "half_extents" in fields:
+        x, y, z = _numbers(node, "half_extents", kind, 3, positive=True)
+        return Box(position, (2 * x, 2 * y, 2 * z), orientation)
     if kind == "box":
-        if "half_extents" in fields:
-            halves = _sizes(fields["half_extents"], f"half_extents {what}", 3)
-            return Box(position, tuple(2 * half for half in halves), orientation)
-        return Box(position, _sizes(get(node, "size", kind), f"size {what}", 3), orientation)
-    radius = _size(get(node, "radius", kind), f"radius {what}")
+        return Box(position, _numbers(node, "size", kind, 3, positive=True), orientation)
+    radius = _size(node, "radius", kind)
     if kind == "sphere":
         return Sphere(position, radius)
-    return Cylinder(
-        position, radius, _size(get(node, "length", kind), f"length {what}"), orientation
-    )
+    return Cylinder(position, radius, _size(node, "length", kind), orientation)
 
 
-# --- Poses and sizes
+# --- What the formats share
+
+NUM_DIMENSIONS = {"box": 3, "sphere": 1, "cylinder": 2}
+"""Of MoveIt's primitives: a box's edges, a sphere's radius, a cylinder's length and radius."""
 
 
-def from_euler(x, y, z):
-    """The quaternion (xyzw) of turns about the fixed x, then y, then z axis, rad."""
-    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a / 2), math.sin(a / 2)) for a in (x, y, z))
-    return (
-        sx * cy * cz - cx * sy * sz,
-        cx * sy * cz + sx * cy * sz,
-        cx * cy * sz - sx * sy * cz,
-        cx * cy * cz + sx * sy * sz,
-    )
+def _dimensions(node: Node, kind: str) -> tuple[Any, ...]:
+    what = f"the dimensions of a {kind}"
+    return numbers(node, what, NUM_DIMENSIONS[kind], MAX_LENGTH, positive=True)
 
 
-def multiply(one, other):
-    """The product of two quaternions (xyzw)."""
-    (a, b, c, d), (x, y, z, w) = one, other
-    return (
-        d * x + a * w + b * z - c * y,
-        d * y - a * z + b * w + c * x,
-        d * z + a * y - b * x + c * w,
-        d * w - a * x - b * y - c * z,
-    )
+def _primitive(kind: str, dimensions: tuple[Any, ...], pose: Pose) -> Obstacle:
+    position, orientation = pose
+    if kind == "box":
+        return Box(position, dimensions, orientation)
+    if kind == "sphere":
+        return Sphere(position, *dimensions)
+    length, radius = dimensions
+    return Cylinder(position, radius, length, orientation)
 
 
-def compose_poses(position, orientation, inner_position, inner_orientation):
-    """The pose of an inner pose in an outer one: position (3,), m, and quaternion (xyzw)."""
-    moved = np.array(position) + matrix(orientation) @ np.array(inner_position)
-    return tuple(moved.tolist()), multiply(orientation, inner_orientation)
+def _face(node: Node) -> tuple[int, int, int]:
+    """The vertices of a triangle."""
+    corners = sequence(node, "a triangle")
+    if len(corners) != 3:
+        raise Mistake(node, f"a triangle has 3 vertices, got {len(corners)}")
+    a, b, c = [int(number(corner, "a triangle's vertex", 1e9)) for corner in corners]
+    return a, b, c
 
 
-def _turn(node, quaternion):
-    """A quaternion (xyzw) of norm 1. Raises Mistake."""
-    try:
+def _hulls(
+    node: Node,
+    vertices: list[Any],
+    faces: list[tuple[int, int, int]],
+    pose: Pose,
+    scale: float | Vector = 1.0,
+) -> tuple[ConvexHull, ...]:
+    """The hulls of a mesh in the file itself."""
+    corners = np.reshape(vertices, (-1, 3)).astype(np.float64)
+    triangles = np.reshape(faces, (-1, 3)).astype(np.int64)
+    with errors_at(node):
+        return meshes.mesh_hulls(corners, triangles, *pose, scale)
+
+
+def _numbers(
+    node: Node, key: str, what: str, count: int, positive: bool = False
+) -> tuple[Any, ...]:
+    """The numbers of a key."""
+    return numbers(get(node, key, what), f"{key} of {what}", count, MAX_LENGTH, positive)
+
+
+def _size(node: Node, key: str, what: str) -> float:
+    return number(get(node, key, what), f"{key} of {what}", MAX_LENGTH, positive=True)
+
+
+def _unit(node: Node, quaternion: Iterable[float]) -> Quaternion:
+    with errors_at(node):
         return unit_quaternion(quaternion)
-    except ValueError as error:
-        raise Mistake(node, str(error)) from error
 
 
-def _sizes(node, what, count):
-    values = numbers(node, what, count, MAX_LENGTH)
-    if min(values) <= 0:
-        raise Mistake(node, f"{what} must be positive")
-    return values
+def _placed(pose: Pose, outer: Pose | None) -> Pose:
+    """A pose in an outer one, if there is one."""
+    return pose if outer is None else compose_poses(*outer, *pose)
 
 
-def _size(node, what):
-    value = number(node, what, MAX_LENGTH)
-    if value <= 0:
-        raise Mistake(node, f"{what} must be positive, got {describe(node)}")
-    return value
+def compose_poses(
+    position: Vector,
+    orientation: Quaternion,
+    inner_position: Vector,
+    inner_orientation: Quaternion,
+) -> Pose:
+    """The pose of an inner pose in an outer one: position, m, and quaternion (xyzw)."""
+    moved = np.array(position) + matrix(orientation) @ np.array(inner_position)
+    x, y, z = moved.tolist()
+    return (x, y, z), multiply(orientation, inner_orientation)
 
 
-def _unknown_kind(node, kind):
+def _unknown_kind(node: Node, kind: str) -> NoReturn:
     if kind in UNSUPPORTED:
-        reject(node, kind)
-    raise Mistake(node, f"unknown kind of obstacle {shorten(kind)}")
+        _reject(node, kind)
+    raise Mistake(node, f"unknown kind of obstacle {shorten(kind)!r}")
 
 
-def _check_number(node, obstacles):
+def _check_number(node: Node, obstacles: list[Obstacle]) -> None:
     if len(obstacles) > MAX_SCENE_OBSTACLES:
         raise Mistake(node, f"a scene has at most {MAX_SCENE_OBSTACLES:,} obstacles")

@@ -13,19 +13,25 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from roboarm_nmp.envs.scenes.primitives import IDENTITY, MAX_LENGTH, ConvexHull, convex_hull
+from roboarm_nmp.envs.scenes.numbers import IDENTITY, MAX_LENGTH, Quaternion, Vector
+from roboarm_nmp.envs.scenes.primitives import ConvexHull, convex_hull
 
 MESH_FILES = (".stl", ".obj", ".ply")
-MAX_MESH_BYTES, MAX_TRIANGLES = 20_000_000, 500_000
+MAX_MESH_BYTES = 20_000_000
+MAX_TRIANGLES = 500_000
 MAX_CONCAVITY = 0.001
 """m. A mesh is convex if no triangle's centre is deeper inside its convex hull."""
-THRESHOLD, SEED = 0.05, 0
-"""Of CoACD: the concavity that is left, 0.01 (many hulls) to 1, and its random seed."""
+THRESHOLD = 0.05
+"""Of CoACD: the concavity that is left, 0.01 (many hulls) to 1."""
+SEED = 0
+"""Of CoACD."""
 # CoACD takes minutes for some damaged meshes, so it runs in another process, with limits.
-SPLIT_SECONDS, SPLIT_MEMORY = 60, 4_000_000_000  # of processor time; bytes
+SPLIT_SECONDS = 60  # of processor time
+SPLIT_MEMORY = 4_000_000_000  # bytes
 SPLIT = """
 import io, os, resource, sys
 resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
@@ -33,20 +39,23 @@ resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
 answer = os.dup(1)
 os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 import coacd, numpy
-given, split = numpy.load(io.BytesIO(sys.stdin.buffer.read())), io.BytesIO()
 coacd.set_log_level("error")
-mesh = coacd.Mesh(given["corners"], given["faces"])
-numpy.savez(split, *[part for part, _ in coacd.run_coacd(mesh, threshold=THRESHOLD, seed=SEED)])
-os.fdopen(answer, "wb").write(split.getvalue())
+arrays = numpy.load(io.BytesIO(sys.stdin.buffer.read()))
+mesh = coacd.Mesh(arrays["corners"], arrays["faces"])
+parts = io.BytesIO()
+numpy.savez(parts, *[part for part, _ in coacd.run_coacd(mesh, threshold=THRESHOLD, seed=SEED)])
+os.fdopen(answer, "wb").write(parts.getvalue())
 """
-_MAX_COMPARISONS, _AT_ONCE = 50_000_000, 2_000_000  # of triangles with planes of the hull
+# Comparisons of triangles with planes of the hull: at most, and at once.
+_MAX_COMPARISONS = 50_000_000
+_AT_ONCE = 2_000_000
 
 
 class MeshError(ValueError):
     """A mesh that cannot be used. The message names the file, if there is one, and the reason."""
 
 
-def load_mesh(name, folder):
+def load_mesh(name: str, folder: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """The triangles of a file inside of a folder: float64 (v, 3) vertices and int64 (f, 3).
 
     Nothing outside of the folder is read, and no other file, such as one of materials.
@@ -54,22 +63,21 @@ def load_mesh(name, folder):
     Raises MeshError: the file is missing, outside of the folder, too large, or damaged; or trimesh
     is not installed.
     """
-    path, folder = Path(folder) / name, Path(folder).resolve()
     try:
-        found = path.resolve(strict=True)
-        if not found.is_relative_to(folder):
+        path = (Path(folder) / name).resolve(strict=True)
+        if not path.is_relative_to(Path(folder).resolve()):
             raise MeshError(f"{name}: outside of the folder of the file that names it")
-        if not found.is_file():  # a pipe would never end
+        if not path.is_file():  # a pipe would never end
             raise MeshError(f"{name}: no regular file")
-        kind = found.suffix.lower()
+        kind = path.suffix.lower()
         if kind not in MESH_FILES:
             raise MeshError(f"{name}: a mesh's file ends in {', '.join(MESH_FILES)}")
-        if found.stat().st_size > MAX_MESH_BYTES:
+        if path.stat().st_size > MAX_MESH_BYTES:
             raise MeshError(f"{name}: more than {MAX_MESH_BYTES // 1_000_000} MB")
-        contents = found.read_bytes()
+        contents = path.read_bytes()
+    except MeshError:
+        raise
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links; a name with byte 0
-        if isinstance(error, MeshError):
-            raise
         reason = getattr(error, "strerror", None) or "cannot be read"
         raise MeshError(f"{name}: {reason}") from error
     try:
@@ -77,7 +85,7 @@ def load_mesh(name, folder):
     except ImportError as error:
         raise MeshError(f"{name}: meshes need: pip install 'roboarm-nmp[meshes]'") from error
     try:
-        mesh = trimesh.load_mesh(
+        mesh: Any = trimesh.load_mesh(
             io.BytesIO(contents), file_type=kind[1:], process=False, skip_materials=True
         )
         vertices = np.array(mesh.vertices, dtype=np.float64)
@@ -91,7 +99,7 @@ def load_mesh(name, folder):
     return vertices, faces
 
 
-def check_mesh(vertices, faces):
+def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
     """Raise MeshError unless vertices (v, 3) and triangles (f, 3) are those of a mesh."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError("not a mesh of triangles")
@@ -103,7 +111,14 @@ def check_mesh(vertices, faces):
         raise MeshError("a vertex is not finite")
 
 
-def mesh_hulls(vertices, faces, position, orientation=IDENTITY, scale=1.0, decompose=True):
+def mesh_hulls(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    position: Vector,
+    orientation: Quaternion = IDENTITY,
+    scale: float | Vector = 1.0,
+    decompose: bool = True,
+) -> tuple[ConvexHull, ...]:
     """A mesh as a tuple of `ConvexHull`s: one, if it is convex to `MAX_CONCAVITY`.
 
     Args:
@@ -137,7 +152,7 @@ def mesh_hulls(vertices, faces, position, orientation=IDENTITY, scale=1.0, decom
     return tuple(ConvexHull(position, part, orientation) for part in parts)
 
 
-def _concavity(triangles):
+def _concavity(triangles: np.ndarray) -> float:
     """How deep (m) the deepest of triangles' (f, 3, 3) centres is inside of their convex hull.
 
     Of meshes with very many triangles, every second one is examined, or every third, and so on.
@@ -146,7 +161,8 @@ def _concavity(triangles):
 
     planes = spatial.ConvexHull(triangles.reshape(-1, 3)).equations
     step = 1 + len(triangles) * len(planes) // _MAX_COMPARISONS
-    centres, deepest = triangles[::step].mean(axis=1), 0.0
+    centres = triangles[::step].mean(axis=1)
+    deepest = 0.0
     count = 1 + _AT_ONCE // len(planes)
     for i in range(0, len(centres), count):
         depths = -(centres[i : i + count] @ planes[:, :3].T + planes[:, 3]).max(axis=1)
@@ -155,23 +171,23 @@ def _concavity(triangles):
 
 
 @functools.lru_cache(maxsize=256)
-def _parts(vertices, faces):
-    """The vertices of the convex parts of a mesh, given as bytes: a tuple of tuples."""
+def _parts(vertices_bytes: bytes, faces_bytes: bytes) -> tuple[tuple[Vector, ...], ...]:
+    """The vertices of the convex parts of a mesh."""
     if importlib.util.find_spec("coacd") is None:
         raise MeshError("a mesh that is not convex needs: pip install 'roboarm-nmp[meshes]'")
-    vertices = np.frombuffer(vertices).reshape(-1, 3)
-    faces = np.frombuffer(faces, np.int64).reshape(-1, 3)
+    vertices = np.frombuffer(vertices_bytes).reshape(-1, 3)
+    faces = np.frombuffer(faces_bytes, np.int64).reshape(-1, 3)
     # In an STL file each triangle has corners of its own: joined, the surface is closed, which
     # spares CoACD the repair of the mesh, most of its time.
     corners, faces = np.unique(vertices[faces.ravel()], axis=0, return_inverse=True)
-    given = io.BytesIO()
-    np.savez(given, corners=corners, faces=faces.reshape(-1, 3))
+    arrays = io.BytesIO()
+    np.savez(arrays, corners=corners, faces=faces.reshape(-1, 3))
     limits = (
         f"SECONDS, MEMORY, THRESHOLD, SEED = {SPLIT_SECONDS}, {SPLIT_MEMORY}, {THRESHOLD}, {SEED}"
     )
     command = [sys.executable, "-c", f"{limits}\n{SPLIT}"]
     one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(command, input=given.getvalue(), capture_output=True, env=one_thread)
+    done = subprocess.run(command, input=arrays.getvalue(), capture_output=True, env=one_thread)
     try:
         if done.returncode:
             raise ValueError(f"not within {SPLIT_SECONDS} s and {SPLIT_MEMORY // 10**9} GB")

@@ -15,18 +15,36 @@ the obstacle's own position, a quaternion (x, y, z, w) in the same axes.
 import bisect
 import itertools
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from roboarm_nmp.envs.scenes.numbers import IDENTITY, MAX_LENGTH, is_number, unit_quaternion
+from roboarm_nmp.envs.scenes.numbers import (
+    IDENTITY,
+    MAX_LENGTH,
+    Quaternion,
+    Vector,
+    is_number,
+    multiply,
+    unit_quaternion,
+)
 
-MAX_SPEED, MAX_ANGULAR_SPEED = 5.0, 20.0
-"""m/s and rad/s. Faster motions are rejected: in a physics step of 1/120 s an obstacle would move
-by more than 4 cm, and through a link without any contact."""
-MIN_SECONDS, MAX_TIME = 1e-3, 1e6
-"""s: the least period, and time from one waypoint to the next; the largest of all times."""
-MAX_WAYPOINTS, MAX_INTERVALS = 1_000, 1_000
-"""Of one motion."""
-ONCE, BACK_AND_FORTH, CYCLIC = REPEATS = "once", "back_and_forth", "cyclic"
+# Faster motions are rejected: in a physics step of 1/120 s an obstacle would move by more than
+# 4 cm, and through a link without any contact.
+MAX_SPEED = 5.0
+"""m/s."""
+MAX_ANGULAR_SPEED = 20.0
+"""rad/s."""
+MIN_SECONDS = 1e-3
+"""s, the least period, and time from one waypoint to the next."""
+MAX_TIME = 1e6
+"""s, the largest of all times."""
+MAX_WAYPOINTS = 1_000
+MAX_INTERVALS = 1_000
+ONCE = "once"
+BACK_AND_FORTH = "back_and_forth"
+CYCLIC = "cyclic"
+REPEATS = (ONCE, BACK_AND_FORTH, CYCLIC)
 # Cyclic waypoints end where they begin, up to this (m, and of a quaternion's components).
 _CLOSED = 1e-6
 
@@ -46,20 +64,21 @@ class Oscillation:
     zero, or the motion exceeds `MAX_SPEED` or `MAX_ANGULAR_SPEED`.
     """
 
-    amplitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    amplitude: Vector = (0.0, 0.0, 0.0)
     period: float = 1.0
     phase: float = 0.0
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    axis: Vector = (0.0, 0.0, 1.0)
     angle: float = 0.0
 
     def __post_init__(self):
         for name in ("amplitude", "axis"):
-            _set(self, name, _vector(f"the {name} of an oscillation", getattr(self, name), 3))
+            _set(self, name, _vector(f"the {name} of an oscillation", getattr(self, name)))
         for name in ("period", "phase", "angle"):
             _set(self, name, _number(f"the {name} of an oscillation", getattr(self, name)))
         if self.period < MIN_SECONDS:
-            least = f"at least {MIN_SECONDS} s"
-            raise ValueError(f"the period of an oscillation must be {least}, got {self.period}")
+            raise ValueError(
+                f"the period of an oscillation must be at least {MIN_SECONDS} s, got {self.period}"
+            )
         norm = math.hypot(*self.axis)
         if norm < 1e-6:
             raise ValueError("the axis of an oscillation must not be zero")
@@ -69,16 +88,17 @@ class Oscillation:
         _check_speed("an oscillation", math.hypot(*self.amplitude) * frequency)
         _check_angular_speed("an oscillation", abs(self.angle) * frequency)
 
-    def pose(self, t):
+    def pose(self, t: float) -> tuple[Vector, Quaternion]:
         """Displacement (3), m, and rotation (4) at a time (s)."""
         share = math.sin(2 * math.pi / self.period * t + self.phase)
         half = 0.5 * self.angle * share
-        sine, (x, y, z) = math.sin(half), self.axis
-        rotation = x * sine, y * sine, z * sine, math.cos(half)
+        sine = math.sin(half)
+        x, y, z = self.axis
+        rotation = (x * sine, y * sine, z * sine, math.cos(half))
         a, b, c = self.amplitude
         return (a * share, b * share, c * share), rotation
 
-    def is_present(self, t):
+    def is_present(self, t: float) -> bool:
         """Whether the obstacle is there at a time (s): always."""
         return True
 
@@ -104,8 +124,8 @@ class Waypoints:
     """
 
     times: tuple[float, ...]
-    displacements: tuple[tuple[float, float, float], ...]
-    rotations: tuple[tuple[float, float, float, float], ...] = ()
+    displacements: tuple[Vector, ...]
+    rotations: tuple[Quaternion, ...] = ()
     repeat: str = ONCE
 
     def __post_init__(self):
@@ -113,38 +133,41 @@ class Waypoints:
         if not 1 <= count <= MAX_WAYPOINTS:
             raise ValueError(f"a motion has 1 to {MAX_WAYPOINTS:,} waypoints, got {count}")
         _set(self, "times", tuple(_number("times of waypoints", t) for t in self.times))
-        what = "displacements of waypoints"
-        displacements = tuple(_vector(what, one, 3) for one in self.displacements)
-        _set(self, "displacements", displacements)
-        rotations = (tuple(map(float, unit_quaternion(one))) for one in self.rotations)
+        displacements = [_vector("displacements of waypoints", d) for d in self.displacements]
+        _set(self, "displacements", tuple(displacements))
+        rotations = [tuple(map(float, unit_quaternion(turn))) for turn in self.rotations]
         _set(self, "rotations", tuple(rotations))
-        for name in ("displacements", "rotations"):
-            given = len(getattr(self, name))
-            if given != count and (given or name == "displacements"):
-                raise ValueError(f"waypoints have {count} times, but {given} {name}")
+        for name, rows in (("displacements", displacements), ("rotations", rotations)):
+            if len(rows) != count and (rows or name == "displacements"):
+                raise ValueError(f"waypoints have {count} times, but {len(rows)} {name}")
         if self.repeat not in REPEATS:
             raise ValueError(f"repeat must be one of {', '.join(REPEATS)}, got {self.repeat!r}")
         if self.times[0] < 0 or any(b - a < MIN_SECONDS for a, b in itertools.pairwise(self.times)):
-            least = f"ascend, by at least {MIN_SECONDS} s"
-            raise ValueError(f"times of waypoints must be at least 0, and {least}")
+            raise ValueError(
+                f"times of waypoints must be at least 0, and ascend, by at least {MIN_SECONDS} s"
+            )
         if self.repeat != ONCE and count == 1:
             raise ValueError(f"a motion of one waypoint cannot be {self.repeat}")
         if self.repeat == CYCLIC and not self._is_closed():
             raise ValueError("cyclic waypoints must end where they begin: add the first one again")
         for i in range(1, count):
-            seconds, what = self.times[i] - self.times[i - 1], f"the way to waypoint {i}"
-            _check_speed(what, math.dist(*self.displacements[i - 1 : i + 1]) / seconds)
+            seconds = self.times[i] - self.times[i - 1]
+            what = f"the way to waypoint {i}"
+            distance = math.dist(self.displacements[i - 1], self.displacements[i])
+            _check_speed(what, distance / seconds)
             if self.rotations:
-                _check_angular_speed(what, _angle(*self.rotations[i - 1 : i + 1]) / seconds)
+                angle = _angle(self.rotations[i - 1], self.rotations[i])
+                _check_angular_speed(what, angle / seconds)
 
-    def _is_closed(self):
+    def _is_closed(self) -> bool:
         near = math.dist(self.displacements[0], self.displacements[-1]) <= _CLOSED
         return near and (not self.rotations or _angle(self.rotations[0], self.rotations[-1]) < 1e-5)
 
-    def pose(self, t):
+    def pose(self, t: float) -> tuple[Vector, Quaternion]:
         """As `Oscillation.pose`."""
         times = self.times
-        begin, span = times[0], times[-1] - times[0]
+        begin = times[0]
+        span = times[-1] - times[0]
         if self.repeat != ONCE and t > begin:
             t -= begin
             if self.repeat == CYCLIC:
@@ -159,13 +182,14 @@ class Waypoints:
         i = min(max(bisect.bisect_right(times, t), 1), len(times) - 1)
         share = (t - times[i - 1]) / (times[i] - times[i - 1])
         share = min(max(share, 0.0), 1.0)
-        (x, y, z), (u, v, w) = self.displacements[i - 1], self.displacements[i]
-        displacement = x + share * (u - x), y + share * (v - y), z + share * (w - z)
+        x, y, z = self.displacements[i - 1]
+        u, v, w = self.displacements[i]
+        displacement = (x + share * (u - x), y + share * (v - y), z + share * (w - z))
         if not self.rotations:
             return displacement, IDENTITY
         return displacement, _slerp(self.rotations[i - 1], self.rotations[i], share)
 
-    def is_present(self, t):
+    def is_present(self, t: float) -> bool:
         """As `Oscillation.is_present`."""
         return True
 
@@ -200,23 +224,23 @@ class Presence:
         if not isinstance(self.motion, Oscillation | Waypoints | None):
             raise TypeError(f"motion must be Oscillation, Waypoints or None, got {self.motion!r}")
 
-    def pose(self, t):
+    def pose(self, t: float) -> tuple[Vector, Quaternion]:
         """As `Oscillation.pose`."""
         return _NO_MOTION if self.motion is None else self.motion.pose(t)
 
-    def is_present(self, t):
+    def is_present(self, t: float) -> bool:
         """Whether the obstacle is there at a time (s)."""
         return any(begin <= t < end for begin, end in self.intervals)
 
 
 Motion = Oscillation | Waypoints | Presence
-_NO_MOTION = (0.0, 0.0, 0.0), IDENTITY
+_NO_MOTION = ((0.0, 0.0, 0.0), IDENTITY)
 
 
 # --- Motions as lists of numbers, for files
 
 
-def motion_to_numbers(motion):
+def motion_to_numbers(motion: Motion | None) -> list[float]:
     """A motion as a list of floats; empty for None.
 
     The first number is the kind. 0, an oscillation: amplitude 3, period, phase, axis 3, angle. 1,
@@ -229,97 +253,105 @@ def motion_to_numbers(motion):
     if isinstance(motion, Oscillation):
         return [0.0, *motion.amplitude, motion.period, motion.phase, *motion.axis, motion.angle]
     if isinstance(motion, Waypoints):
-        begin = 1.0, float(REPEATS.index(motion.repeat)), float(bool(motion.rotations))
-        rows = *motion.displacements, *motion.rotations
-        return [*begin, float(len(motion.times)), *motion.times, *itertools.chain(*rows)]
+        repeat = float(REPEATS.index(motion.repeat))
+        turns = 1.0 if motion.rotations else 0.0
+        rows = itertools.chain(*motion.displacements, *motion.rotations)
+        return [1.0, repeat, turns, float(len(motion.times)), *motion.times, *rows]
     times = itertools.chain(*motion.intervals)
     return [2.0, float(len(motion.intervals)), *times, *motion_to_numbers(motion.motion)]
 
 
-def motion_from_numbers(numbers):
+def motion_from_numbers(numbers: Iterable[float]) -> Motion | None:
     """The inverse of `motion_to_numbers`. Raises ValueError: there is no such motion."""
     numbers = [float(number) for number in numbers]
     if not numbers:
         return None
     kind = numbers[0]
     if kind == 0 and len(numbers) == 10:
-        _, a, b, c, period, phase, *axis, angle = numbers
-        return Oscillation((a, b, c), period, phase, tuple(axis), angle)
+        _, a, b, c, period, phase, x, y, z, angle = numbers
+        return Oscillation((a, b, c), period, phase, (x, y, z), angle)
     if kind == 1 and len(numbers) > 4:
         _, repeat, turns, count, *rest = numbers
         width = 8 if turns else 4
         if repeat in (0, 1, 2) and turns in (0, 1) and len(rest) == width * count:
             n = int(count)
-            triples, quadruples = rest[n : 4 * n], rest[4 * n :]
-            displacements = tuple(zip(*[iter(triples)] * 3, strict=True))
-            rotations = tuple(zip(*[iter(quadruples)] * 4, strict=True))
+            displacements = _rows(rest[n : 4 * n], 3)
+            rotations = _rows(rest[4 * n :], 4)
             return Waypoints(tuple(rest[:n]), displacements, rotations, REPEATS[int(repeat)])
     if kind == 2 and len(numbers) > 3 and numbers[1] in range(1, (len(numbers) - 2) // 2 + 1):
         end = 2 + 2 * int(numbers[1])
-        intervals = tuple(zip(*[iter(numbers[2:end])] * 2, strict=True))
         inner = numbers[end:]
         if not inner or inner[0] != 2:
-            return Presence(intervals, motion_from_numbers(inner))
+            motion = motion_from_numbers(inner)
+            if not isinstance(motion, Presence):
+                return Presence(_rows(numbers[2:end], 2), motion)
     raise ValueError("numbers of a motion that make no sense")
 
 
-def _set(motion, name, value):
+def _rows(numbers: Sequence[float], width: int) -> tuple[tuple[Any, ...], ...]:
+    """Numbers as rows of a width, of which their length is a multiple."""
+    return tuple(tuple(numbers[i : i + width]) for i in range(0, len(numbers), width))
+
+
+def _set(motion: Motion, name: str, value: Any) -> None:
     object.__setattr__(motion, name, value)
 
 
-def _number(what, value):
+def _number(what: str, value: Any) -> float:
     if not is_number(value) or abs(value) > MAX_TIME:
         raise ValueError(f"{what} must be a finite number, at most {MAX_TIME:.0f}, got {value!r}")
     return float(value)
 
 
-def _vector(what, value, length):
+def _vector(what: str, value: Iterable[float]) -> tuple[float, ...]:
     value = tuple(value)
-    if len(value) != length or not all(is_number(n) and abs(n) <= MAX_LENGTH for n in value):
-        raise ValueError(
-            f"{what} must be {length} finite numbers, up to {MAX_LENGTH:.0f}, got {value}"
-        )
+    if len(value) != 3 or not all(is_number(n) and abs(n) <= MAX_LENGTH for n in value):
+        raise ValueError(f"{what} must be 3 finite numbers, up to {MAX_LENGTH:.0f}, got {value}")
     return tuple(map(float, value))
 
 
-def _interval(interval):
+def _interval(interval: Iterable[float]) -> tuple[float, float]:
     interval = tuple(interval)
     if len(interval) != 2:
         raise ValueError(f"an interval of presence is two times, got {interval}")
     begin, end = interval
-    if end == math.inf:
-        return _number("times of presence", begin), math.inf
-    return _number("times of presence", begin), _number("times of presence", end)
+    if end != math.inf:
+        end = _number("times of presence", end)
+    return _number("times of presence", begin), end
 
 
-def _check_speed(what, speed):
+def _check_speed(what: str, speed: float) -> None:
     if speed > MAX_SPEED:
         raise ValueError(f"{what} is too fast: {speed:.3g} m/s, at most {MAX_SPEED:g} m/s")
 
 
-def _check_angular_speed(what, speed):
+def _check_angular_speed(what: str, speed: float) -> None:
     if speed > MAX_ANGULAR_SPEED:
-        limit = f"at most {MAX_ANGULAR_SPEED:g} rad/s"
-        raise ValueError(f"{what} turns too fast: {speed:.3g} rad/s, {limit}")
+        raise ValueError(
+            f"{what} turns too fast: {speed:.3g} rad/s, at most {MAX_ANGULAR_SPEED:g} rad/s"
+        )
 
 
-def _angle(a, b):
+def _angle(a: Quaternion, b: Quaternion) -> float:
     """The angle (rad) between two orientations."""
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     sign = -1.0 if dot < 0.0 else 1.0
-    apart, together = math.dist(a, [sign * n for n in b]), math.dist(a, [-sign * n for n in b])
+    apart = math.dist(a, [sign * n for n in b])
+    together = math.dist(a, [-sign * n for n in b])
     return 4 * math.atan2(apart, together)  # exact for small angles, as acos is not
 
 
-def _slerp(a, b, share):
+def _slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
     """The orientation between two of them, on the shorter way."""
     dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     sign = -1.0 if dot < 0.0 else 1.0
     angle = 0.5 * _angle(a, b)
     sine = math.sin(angle)
-    first, second = 1.0 - share, share
+    first = 1.0 - share
+    second = share
     if sine > 1e-9:
-        first, second = math.sin(first * angle) / sine, math.sin(second * angle) / sine
+        first = math.sin(first * angle) / sine
+        second = math.sin(second * angle) / sine
     second *= sign
     return (
         first * a[0] + second * b[0],
@@ -329,15 +361,13 @@ def _slerp(a, b, share):
     )
 
 
-def moved(position, orientation, displacement, rotation):
+def moved(
+    position: Vector, orientation: Quaternion, displacement: Vector, rotation: Quaternion
+) -> tuple[Vector, Quaternion]:
     """An obstacle's own pose after a displacement (3), m, and a rotation (4)."""
-    position = tuple(a + b for a, b in zip(position, displacement, strict=True))
+    x, y, z = position
+    u, v, w = displacement
+    position = (x + u, y + v, z + w)
     if rotation == IDENTITY:
         return position, orientation
-    (a, b, c, d), (x, y, z, w) = rotation, orientation
-    return position, (
-        d * x + a * w + b * z - c * y,
-        d * y - a * z + b * w + c * x,
-        d * z + a * y - b * x + c * w,
-        d * w - a * x - b * y - c * z,
-    )
+    return position, multiply(rotation, orientation)

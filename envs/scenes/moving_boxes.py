@@ -14,14 +14,17 @@ speeds are multiplied by the ratio of their reaches.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.panda import scale_of
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.motions import CYCLIC, Oscillation, Presence, Waypoints
-from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.envs.scenes.numbers import Vector
+from roboarm_nmp.envs.scenes.primitives import Box, Obstacle, Scene
 from roboarm_nmp.envs.scenes.random_boxes import (
     FRICTION,
     KEEP_CLEAR,
@@ -36,28 +39,34 @@ START_FREE = 1.0
 """s: until then the start is free."""
 SPEED = 0.03 / STEP_SECONDS  # of the arm, normalised, per second (paper: 0.03 per step)
 
-# Boxes oscillate, mostly horizontally. m; share of upward amplitudes.
-AMPLITUDE, RISE = (0.1, 0.3), 0.3
-# Boxes appear, s; nowhere near an arm on the straight way to its goal: then, and until `AHEAD` (s)
+# Boxes oscillate, mostly horizontally.
+AMPLITUDE = (0.1, 0.3)  # m
+RISE = 0.3  # share of upward amplitudes
+# Boxes appear, nowhere near an arm on the straight way to its goal: then, and until `AHEAD` (s)
 # later, its joints and the middles between them are at least `ROOM` (m) away.
-APPEARING, APPEARS = 0.5, (0.3, 3.0)
-AHEAD, ROOM = (0.0, 0.25, 0.5), 0.15
-# A visitor is a box at the goal. Edges and distance from the goal, m; speed, m/s; how far it goes,
-# outwards and upwards, m.
-VISITOR, OFF_CENTRE = (0.08, 0.16), 0.02
-VISITOR_SPEED, WAY = (0.15, 0.35), (0.5, 0.7)
-LEAVES, FREE_FROM = (2.0, 6.0), 8.0  # s, of `BlockedGoals`: when it leaves; the goal is free
-STAYS, STAYS_AWAY = (0.5, 1.5), (2.0, 4.0)  # s, of `ChasedGoals`
-FREE_SHARE, BLOCKED_FOR = 0.4, 5.0  # of the time, at least; s without a break, at most
+APPEARING = 0.5  # share of the boxes
+APPEARS = (0.3, 3.0)  # s
+AHEAD = (0.0, 0.25, 0.5)
+ROOM = 0.15
+# A visitor is a box at the goal.
+VISITOR = (0.08, 0.16)  # m, edges
+OFF_CENTRE = 0.02  # m, from the goal
+VISITOR_SPEED = (0.15, 0.35)  # m/s
+WAY = (0.5, 0.7)  # m, how far it goes, outwards and upwards
+# Of `BlockedGoals`, s.
+LEAVES = (2.0, 6.0)
+FREE_FROM = 8.0
+# Of `ChasedGoals`, s.
+STAYS = (0.5, 1.5)
+STAYS_AWAY = (2.0, 4.0)
+FREE_SHARE = 0.4  # of the time, at least
+BLOCKED_FOR = 5.0  # s without a break, at most
 TRIES = 50
 
 
 @dataclass(frozen=True)
 class MovingScenes:
     """What the distributions of this file share.
-
-    Each has `animate(scene, start, goal, rng)`, too: the scene with motions, drawn with a NumPy
-    Generator for a start and a goal (n,), rad.
 
     Attributes:
         base: the `Scene` without the obstacles that vary.
@@ -69,15 +78,21 @@ class MovingScenes:
     boxes: tuple[int, int] = (4, 8)  # as in `random_boxes_hard`
     check_times = np.arange(0.0, DURATION, 0.1)
 
-    def sample(self, rng):
+    def sample(self, rng: np.random.Generator) -> Scene:
         """A `Scene` at rest, drawn with a NumPy Generator."""
         return RandomBoxes(*self.boxes, self.base).sample(rng)
 
-    def accepts(self, start_free, goal_free):
+    def animate(
+        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
+    ) -> Scene:
+        """The scene with motions, drawn for a start and a goal (n,), rad."""
+        raise NotImplementedError
+
+    def accepts(self, start_free: np.ndarray, goal_free: np.ndarray) -> bool:
         """Whether start and goal are free when they have to be: bool (t,), at `check_times`."""
         return self._starts(start_free) and bool(goal_free.all())
 
-    def _starts(self, start_free):
+    def _starts(self, start_free: np.ndarray) -> bool:
         return bool(start_free[self.check_times <= START_FREE].all())
 
 
@@ -93,9 +108,12 @@ class MovingBoxes(MovingScenes):
     share: float = 0.5
     periods: tuple[float, float] = (3.0, 8.0)
 
-    def animate(self, scene, start, goal, rng):
-        boxes, scale = list(scene.obstacles), scale_of(scene.robot)
-        for i in _some(boxes, self.share, rng):
+    def animate(
+        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
+    ) -> Scene:
+        boxes = list(scene.obstacles)
+        scale = scale_of(scene.robot)
+        for i in _choose(boxes, self.share, rng):
             for _ in range(TRIES):
                 motion = self._oscillation(rng, scale)
                 if _stays_clear(boxes[i], motion, scale):
@@ -103,11 +121,12 @@ class MovingBoxes(MovingScenes):
                     break
         return replace(scene, obstacles=boxes)
 
-    def _oscillation(self, rng, scale):
+    def _oscillation(self, rng: np.random.Generator, scale: float) -> Oscillation:
         direction = rng.normal(size=3) * (1.0, 1.0, RISE)
         length = scale * rng.uniform(*AMPLITUDE) / np.linalg.norm(direction)
         amplitude = rounded(*(length * direction))
-        period, phase = rng.uniform(*self.periods), rng.uniform(0.0, 2 * math.pi)
+        period = rng.uniform(*self.periods)
+        phase = rng.uniform(0.0, 2 * math.pi)
         return Oscillation(amplitude, *rounded(period, phase))
 
 
@@ -115,12 +134,15 @@ class MovingBoxes(MovingScenes):
 class AppearingBoxes(MovingScenes):
     """Half of the boxes appear in the first seconds. The goal is free at all times."""
 
-    def animate(self, scene, start, goal, rng):
-        boxes, robot = list(scene.obstacles), scene.robot
+    def animate(
+        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
+    ) -> Scene:
+        boxes = list(scene.obstacles)
+        robot = scene.robot
         first, last = robot.normalise(np.array([start, goal]))
         duration = np.linalg.norm(last - first) / SPEED
 
-        def arm_points(times):
+        def arm_points(times: np.ndarray) -> np.ndarray:
             """The joints, the end effector, and the middles between them: (n, 3), m."""
             shares = np.minimum(times / duration, 1.0)[:, None]
             configurations = robot.denormalise(first + shares * (last - first))
@@ -128,7 +150,7 @@ class AppearingBoxes(MovingScenes):
             points = np.array([*points, robot.forward_kinematics(configurations)])
             return np.concatenate([*points, *(points[1:] + points[:-1]) / 2])
 
-        for i in _some(boxes, APPEARING, rng):
+        for i in _choose(boxes, APPEARING, rng):
             for _ in range(TRIES):
                 (appears,) = rounded(rng.uniform(*APPEARS))
                 apart = _distances(boxes[i], arm_points(appears + np.array(AHEAD)))
@@ -144,15 +166,17 @@ class BlockedGoals(MovingScenes):
 
     boxes: tuple[int, int] = (3, 6)  # as in `random_boxes_medium`
 
-    def animate(self, scene, start, goal, rng):
+    def animate(
+        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
+    ) -> Scene:
         box, away, duration = _visitor(scene.robot, goal, rng)
         (leaves,) = rounded(rng.uniform(*LEAVES))
         motion = Waypoints((leaves, leaves + duration), ((0.0, 0.0, 0.0), away))
         return replace(scene, obstacles=(*scene.obstacles, replace(box, motion=motion)))
 
-    def accepts(self, start_free, goal_free):
+    def accepts(self, start_free: np.ndarray, goal_free: np.ndarray) -> bool:
         later = goal_free[self.check_times >= FREE_FROM]
-        return self._starts(start_free) and not goal_free[0] and bool(later.all())
+        return self._starts(start_free) and bool(not goal_free[0] and later.all())
 
 
 @dataclass(frozen=True)
@@ -161,7 +185,9 @@ class ChasedGoals(MovingScenes):
 
     boxes: tuple[int, int] = (3, 6)
 
-    def animate(self, scene, start, goal, rng):
+    def animate(
+        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
+    ) -> Scene:
         visitors = []
         for _ in range(rng.integers(1, 3)):
             box, away, duration = _visitor(scene.robot, goal, rng)
@@ -170,23 +196,23 @@ class ChasedGoals(MovingScenes):
             )
             times = np.cumsum([first, duration, stays, duration, stays_away])
             here = (0.0, 0.0, 0.0)
-            motion = Waypoints(times, (away, here, here, away, away), repeat=CYCLIC)
+            motion = Waypoints(tuple(times), (away, here, here, away, away), repeat=CYCLIC)
             visitors.append(replace(box, motion=motion))
         return replace(scene, obstacles=(*scene.obstacles, *visitors))
 
-    def accepts(self, start_free, goal_free):
+    def accepts(self, start_free: np.ndarray, goal_free: np.ndarray) -> bool:
         changes = np.flatnonzero(np.diff(np.concatenate([[True], goal_free, [True]])))
         longest = np.diff(changes)[::2].max(initial=0) * self.check_times[1]
         often = FREE_SHARE <= goal_free.mean() < 1.0 and longest <= BLOCKED_FOR
         return self._starts(start_free) and bool(often)
 
 
-def _some(boxes, share, rng):
-    """The numbers of a share of the boxes, at random."""
+def _choose(boxes: Sequence[Obstacle], share: float, rng: np.random.Generator) -> np.ndarray:
+    """The indices of a share of the boxes, at random."""
     return rng.permutation(len(boxes))[: round(share * len(boxes))]
 
 
-def _stays_clear(box, motion, scale):
+def _stays_clear(box: Box, motion: Oscillation, scale: float) -> bool:
     """Whether an oscillating box stays away from the robot's base."""
     for share in np.linspace(-1.0, 1.0, 9):
         position = tuple(np.add(box.position, share * np.array(motion.amplitude)))
@@ -195,22 +221,25 @@ def _stays_clear(box, motion, scale):
     return True
 
 
-def _distances(box, points):
+def _distances(box: Box, points: np.ndarray) -> np.ndarray:
     """Distances (m) of points (n, 3) from an upright box."""
-    sin, cos = 2 * box.orientation[2] * box.orientation[3], 1 - 2 * box.orientation[2] ** 2
+    sin = 2 * box.orientation[2] * box.orientation[3]
+    cos = 1 - 2 * box.orientation[2] ** 2
     apart = points - box.position
     local = apart @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return np.linalg.norm(np.maximum(np.abs(local) - np.divide(box.size, 2), 0.0), axis=1)
 
 
-def _visitor(robot, goal, rng):
+def _visitor(robot: Robot, goal: np.ndarray, rng: np.random.Generator) -> tuple[Box, Vector, float]:
     """A box at the goal, how it goes away (m, and the time it takes, s)."""
-    scale, position = scale_of(robot), robot.forward_kinematics(goal)
+    scale = scale_of(robot)
+    position = robot.forward_kinematics(goal)
     size = rounded(*(scale * rng.uniform(*VISITOR, 3)))
     centre = rounded(*(position + scale * rng.uniform(-OFF_CENTRE, OFF_CENTRE, 3)))
     # Away from the robot's axis, within 60 degrees, and up to 45 degrees upwards.
     azimuth = math.atan2(position[1], position[0]) + rng.uniform(-1.0, 1.0) * math.pi / 3
-    elevation, way = rng.uniform(0.0, math.pi / 4), scale * rng.uniform(*WAY)
+    elevation = rng.uniform(0.0, math.pi / 4)
+    way = scale * rng.uniform(*WAY)
     level = way * math.cos(elevation)
     away = rounded(level * math.cos(azimuth), level * math.sin(azimuth), way * math.sin(elevation))
     (duration,) = rounded(way / (scale * rng.uniform(*VISITOR_SPEED)))

@@ -7,8 +7,9 @@ import functools
 import hashlib
 import json
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import repeat
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from roboarm_nmp.envs.scenes.numbers import (
     IDENTITY,
     MAX_LENGTH,
     MAX_SCENE_OBSTACLES,
+    Quaternion,
+    Vector,
     is_number,
     unit_quaternion,
 )
@@ -34,28 +37,33 @@ MAX_TOUCHING = 200
 """Names of links that one obstacle may touch."""
 
 
-def _normalise(body):
-    """Make tuples of lists and arrays, so that bodies can be compared and hashed."""
+def _normalise(obstacle: "Obstacle") -> None:
+    """Make tuples of lists and arrays, so that obstacles can be compared and hashed."""
     for name in ("position", "size"):
-        value = getattr(body, name, ())
+        value = getattr(obstacle, name, ())
         if type(value) is not tuple:
-            object.__setattr__(body, name, tuple(value))
-    if hasattr(body, "orientation"):
-        object.__setattr__(body, "orientation", unit_quaternion(body.orientation))
-    if not isinstance(body.motion, Motion | None):
+            object.__setattr__(obstacle, name, tuple(value))
+    if not isinstance(obstacle, Sphere):
+        object.__setattr__(obstacle, "orientation", unit_quaternion(obstacle.orientation))
+    if not isinstance(obstacle.motion, Motion | None):
         raise TypeError(
-            f"motion must be Oscillation, Waypoints, Presence or None, got {body.motion!r}"
+            f"motion must be Oscillation, Waypoints, Presence or None, got {obstacle.motion!r}"
         )
-    if body.may_touch is not True and (type(body.may_touch) is not tuple or body.may_touch):
-        object.__setattr__(body, "may_touch", _link_names(body.may_touch, "may_touch"))
+    may_touch = obstacle.may_touch
+    if may_touch is not True and may_touch != ():
+        object.__setattr__(obstacle, "may_touch", _link_names(may_touch, "may_touch"))
 
 
-def _link_names(names, what):
+def _link_names(names: Any, what: str) -> tuple[str, ...]:
     """Names of links as a sorted tuple; False is none. Raises ValueError."""
     if names is False:
         return ()
-    names = tuple(names) if isinstance(names, (tuple, list, set, frozenset)) else (None,)
-    if not all(isinstance(name, str) for name in names) or len(names) > MAX_TOUCHING:
+    is_collection = isinstance(names, (tuple, list, set, frozenset))
+    if (
+        not is_collection
+        or len(names) > MAX_TOUCHING
+        or not all(isinstance(name, str) for name in names)
+    ):
         raise ValueError(f"{what} must be names of up to {MAX_TOUCHING} links, got {names!r}")
     return tuple(sorted(set(names)))
 
@@ -73,9 +81,9 @@ class Box:
     otherwise.
     """
 
-    position: tuple[float, float, float]
-    size: tuple[float, float, float]
-    orientation: tuple[float, float, float, float] = IDENTITY
+    position: Vector
+    size: Vector
+    orientation: Quaternion = IDENTITY
     motion: Motion | None = None
     may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
@@ -89,10 +97,10 @@ class Cylinder:
     `position` is its centre, `orientation` and `motion` are as of a `Box`.
     """
 
-    position: tuple[float, float, float]
+    position: Vector
     radius: float
     length: float
-    orientation: tuple[float, float, float, float] = IDENTITY
+    orientation: Quaternion = IDENTITY
     motion: Motion | None = None
     may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
@@ -103,7 +111,7 @@ class Cylinder:
 class Sphere:
     """A sphere; `position` is its centre, `motion` as of a `Box`."""
 
-    position: tuple[float, float, float]
+    position: Vector
     radius: float
     motion: Motion | None = None
     may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
@@ -121,17 +129,15 @@ class ConvexHull:
     `orientation` and `motion` as of a `Box`.
     """
 
-    position: tuple[float, float, float]
-    vertices: tuple[tuple[float, float, float], ...]
-    orientation: tuple[float, float, float, float] = IDENTITY
+    position: Vector
+    vertices: tuple[Vector, ...]
+    orientation: Quaternion = IDENTITY
     motion: Motion | None = None
     may_touch: tuple[str, ...] | bool = field(default=(), kw_only=True)
 
     def __post_init__(self):
         _normalise(self)
-        vertices = self.vertices
-        if type(vertices) is not tuple or any(type(vertex) is not tuple for vertex in vertices):
-            object.__setattr__(self, "vertices", tuple(map(tuple, vertices)))
+        object.__setattr__(self, "vertices", tuple(map(tuple, self.vertices)))
 
 
 Obstacle = Box | Cylinder | Sphere | ConvexHull
@@ -171,11 +177,11 @@ class Attached:
         object.__setattr__(self, "touch_links", _link_names(self.touch_links, "touch_links"))
 
     @property
-    def triangles(self):
+    def triangles(self) -> np.ndarray:
         """The triangles of a `ConvexHull`'s surface: `hull_faces`."""
-        return hull_faces(self.shape.vertices)
+        return hull_faces(self.shape.vertices)  # pyright: ignore[reportAttributeAccessIssue]
 
-    def described(self):
+    def described(self) -> list[Any]:
         """All of it as lists, for files and fingerprints: row of `to_lists`, link, touch_links."""
         return [to_lists([self.shape])[0], self.link, list(self.touch_links)]
 
@@ -186,7 +192,7 @@ FLOOR = -0.6
 FRICTION = 0.5  # PyBullet's default
 
 
-def floor_box(height):
+def floor_box(height: float) -> Box:
     """The floor as a `Box`; `height` (m) is that of its surface."""
     return Box((0.0, 0.0, height - 0.05), (6.0, 6.0, 0.1))
 
@@ -236,17 +242,17 @@ class Scene:
         if not isinstance(self.robot, Robot):
             raise TypeError(f"robot must be a Robot, got {self.robot!r}")
 
-    def _check_links(self, obstacle):
+    def _check_links(self, obstacle: Obstacle) -> None:
         """Raise ValueError if an obstacle may touch a link that the robot does not have."""
         if obstacle.may_touch and isinstance(self.robot, Robot):
             self.robot.links_called(obstacle.may_touch)
 
     @property
-    def is_static(self):
+    def is_static(self) -> bool:
         """Whether no obstacle moves, appears or disappears."""
         return all(obstacle.motion is None for obstacle in self.obstacles)
 
-    def at(self, t):
+    def at(self, t: float) -> "Scene":
         """The static `Scene` at a time t, s: the obstacles that are present, where they are then.
 
         A static scene is itself at all times. Raises ValueError: the time is not finite.
@@ -255,12 +261,24 @@ class Scene:
             return self
         if not is_number(t):
             raise ValueError(f"a time is a finite number of seconds, got {t!r}")
-        return replace(
-            self, obstacles=[o for o in map(obstacle_at, self.obstacles, repeat(t)) if o]
-        )
+        present = [obstacle_at(obstacle, t) for obstacle in self.obstacles]
+        return replace(self, obstacles=[obstacle for obstacle in present if obstacle is not None])
 
 
-def pose_at(obstacle, t):
+class SceneDistribution(Protocol):
+    """Scenes drawn at random.
+
+    `base` is the `Scene` without the obstacles that vary, and `sample` draws a scene with a NumPy
+    Generator.
+    """
+
+    @property
+    def base(self) -> Scene: ...
+
+    def sample(self, rng: np.random.Generator) -> Scene: ...
+
+
+def pose_at(obstacle: Obstacle, t: float) -> tuple[Vector, Quaternion] | None:
     """Position (3), m, and orientation (4) of an obstacle at a time (s); None: it is absent."""
     orientation = IDENTITY if isinstance(obstacle, Sphere) else obstacle.orientation
     if obstacle.motion is None:
@@ -270,20 +288,22 @@ def pose_at(obstacle, t):
     return moved(obstacle.position, orientation, *obstacle.motion.pose(t))
 
 
-def obstacle_at(obstacle, t):
+def obstacle_at(obstacle: Obstacle, t: float) -> Obstacle | None:
     """An obstacle as it is at a time (s), without its motion; None: it is absent."""
     if obstacle.motion is None:
         return obstacle
-    if (pose := pose_at(obstacle, t)) is None:
+    pose = pose_at(obstacle, t)
+    if pose is None:
         return None
     position, orientation = pose
-    turned = {} if isinstance(obstacle, Sphere) else {"orientation": orientation}
-    return replace(obstacle, position=position, motion=None, **turned)
+    if isinstance(obstacle, Sphere):
+        return replace(obstacle, position=position, motion=None)
+    return replace(obstacle, position=position, orientation=orientation, motion=None)
 
 
 POINT_RADIUS = 0.01
-"""m. The ball around a point in collision checks: with one point per 2.5 cm, surfaces have hardly a
-hole."""
+"""m, of the ball around a point in collision checks. With one point per 2.5 cm, surfaces have
+hardly a hole."""
 
 
 @dataclass(frozen=True)
@@ -302,7 +322,7 @@ class ObservedScene(Scene):
     Raises ValueError: the points are not finite or of another shape, or the radius is negative.
     """
 
-    points: np.ndarray = field(default=(), compare=False, repr=False)
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False)
     point_radius: float = POINT_RADIUS
     digest: str = field(init=False)
 
@@ -320,63 +340,66 @@ class ObservedScene(Scene):
         object.__setattr__(self, "digest", hashlib.sha256(points.tobytes()).hexdigest())
 
 
-def _is_length(value):
+def _is_length(value: Any) -> bool:
     return is_number(value) and abs(value) <= MAX_LENGTH
 
 
-def check_obstacle(body):
+def check_obstacle(obstacle: Obstacle) -> None:
     """Raise ValueError unless an obstacle's numbers are finite, its sizes positive, in bounds."""
-    if isinstance(body, ConvexHull):
-        _check_hull(body)
+    if isinstance(obstacle, ConvexHull):
+        _check_hull(obstacle)
         return
-    sizes = (body.radius,) if not isinstance(body, Box) else body.size
-    if isinstance(body, Cylinder):
-        sizes = body.radius, body.length
+    if isinstance(obstacle, Box):
+        sizes = tuple(obstacle.size)
+    elif isinstance(obstacle, Cylinder):
+        sizes = (obstacle.radius, obstacle.length)
+    else:
+        sizes = (obstacle.radius,)
     if not (
-        len(body.position) == 3
-        and (len(sizes) == 3 or not isinstance(body, Box))
-        and all(map(_is_length, (*body.position, *sizes)))
+        len(obstacle.position) == 3
+        and (len(sizes) == 3 or not isinstance(obstacle, Box))
+        and all(map(_is_length, (*obstacle.position, *sizes)))
         and min(sizes) > 0
     ):
         raise ValueError(
-            f"an obstacle needs finite numbers and positive sizes, up to {MAX_LENGTH:.0f} m: {body}"
+            f"an obstacle needs finite numbers and positive sizes, up to {MAX_LENGTH:.0f} m: "
+            f"{obstacle}"
         )
 
 
-def _check_hull(hull):
+def _check_hull(hull: ConvexHull) -> None:
     if not 4 <= len(hull.vertices) <= MAX_HULL_VERTICES:
         raise ValueError(
             f"a convex hull has 4 to {MAX_HULL_VERTICES} vertices, got {len(hull.vertices)}: "
             f"`convex_hull` reduces them"
         )
-    if not (
-        len(hull.position) == 3
-        and all(map(_is_length, hull.position))
-        and all(len(vertex) == 3 and all(map(_is_length, vertex)) for vertex in hull.vertices)
-    ):
-        raise ValueError(
-            f"a convex hull needs finite numbers, up to {MAX_LENGTH:.0f} m, three per vertex"
-        )
+    for point in (hull.position, *hull.vertices):
+        if len(point) != 3 or not all(map(_is_length, point)):
+            raise ValueError(
+                f"a convex hull needs finite numbers, up to {MAX_LENGTH:.0f} m, three per vertex"
+            )
     hull_faces(hull.vertices)
 
 
 @functools.lru_cache(maxsize=1024)
-def hull_faces(vertices):
+def hull_faces(vertices: tuple[Vector, ...]) -> np.ndarray:
     """The triangles of a `ConvexHull`'s surface: int64 (f, 3), counterclockwise from outside.
 
     Raises ValueError: the vertices are in one plane.
     """
     points = np.array(vertices, dtype=np.float64)
-    found = _qhull(points)
-    faces = found.simplices.astype(np.int64)
-    a, b, c = (points[faces[:, i]] for i in range(3))
-    inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), found.equations[:, :3]) < 0
+    hull = _qhull(points)
+    faces = hull.simplices.astype(np.int64)
+    a = points[faces[:, 0]]
+    b = points[faces[:, 1]]
+    c = points[faces[:, 2]]
+    inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces[inwards] = faces[inwards][:, ::-1]
     faces.flags.writeable = False  # the next caller gets the same array
     return faces
 
 
-def _qhull(points):
+def _qhull(points: np.ndarray):
     from scipy import spatial  # here, because it takes a while to import
 
     try:
@@ -385,7 +408,11 @@ def _qhull(points):
         raise ValueError("the vertices of a convex hull are in one plane, or too close") from error
 
 
-def convex_hull(points, position=(0.0, 0.0, 0.0), orientation=IDENTITY):
+def convex_hull(
+    points: np.ndarray | Sequence[Sequence[float]],
+    position: Vector = (0.0, 0.0, 0.0),
+    orientation: Quaternion = IDENTITY,
+) -> ConvexHull:
     """The `ConvexHull` of points (n, 3), m, in its own frame; interior points are dropped.
 
     If more than `MAX_HULL_VERTICES` remain, those that are farthest along as many directions are
@@ -393,26 +420,28 @@ def convex_hull(points, position=(0.0, 0.0, 0.0), orientation=IDENTITY):
 
     Raises ValueError: the points are in one plane, not finite, or of another shape.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise ValueError(f"points must be finite, of shape (n, 3), got {points.shape}")
-    if len(points) < 4:
-        raise ValueError(f"a convex hull needs at least 4 points, got {len(points)}")
-    points = points[np.sort(_qhull(points).vertices)]
-    if len(points) > MAX_HULL_VERTICES:
-        # Evenly spread over the sphere (Gonzalez, 2010), of a box around the points as a cube.
+    corners = np.array(points, dtype=np.float64)
+    if corners.ndim != 2 or corners.shape[1] != 3 or not np.isfinite(corners).all():
+        raise ValueError(f"points must be finite, of shape (n, 3), got {corners.shape}")
+    if len(corners) < 4:
+        raise ValueError(f"a convex hull needs at least 4 points, got {len(corners)}")
+    corners = corners[np.sort(_qhull(corners).vertices)]
+    if len(corners) > MAX_HULL_VERTICES:
+        # Evenly spread over the sphere (Gonzalez, 2010), of a box around the corners as a cube.
         i = np.arange(MAX_HULL_VERTICES) + 0.5
-        z, angle = 1 - 2 * i / MAX_HULL_VERTICES, i * math.pi * (3 - math.sqrt(5))
+        z = 1 - 2 * i / MAX_HULL_VERTICES
+        angle = i * math.pi * (3 - math.sqrt(5))
         across = np.sqrt(1 - z * z)
         directions = np.stack([across * np.cos(angle), across * np.sin(angle), z])
-        kept = np.unique((points / np.ptp(points, axis=0) @ directions).argmax(axis=0))
-        inner = _qhull(points[kept])
-        kept = points[kept][np.sort(inner.vertices)]
-        centre, normals = kept.mean(axis=0), inner.equations[:, :3]
-        reach = ((points - centre) @ normals.T).max(axis=0)
+        farthest = np.unique((corners / np.ptp(corners, axis=0) @ directions).argmax(axis=0))
+        inner = _qhull(corners[farthest])
+        kept = corners[farthest][np.sort(inner.vertices)]
+        centre = kept.mean(axis=0)
+        normals = inner.equations[:, :3]
+        reach = ((corners - centre) @ normals.T).max(axis=0)
         grown = (reach / -(inner.equations[:, 3] + normals @ centre)).max()
-        points = centre + grown * (kept - centre)
-    return ConvexHull(position, tuple(map(tuple, points.tolist())), orientation)
+        corners = centre + grown * (kept - centre)
+    return ConvexHull(position, tuple(map(tuple, corners.tolist())), orientation)
 
 
 _KINDS = (Box, Cylinder, Sphere, ConvexHull)
@@ -421,7 +450,7 @@ HULL = 3
 """Kind of a `ConvexHull` in `to_array`."""
 
 
-def to_array(obstacles):
+def to_array(obstacles: Sequence[Obstacle]) -> np.ndarray:
     """Obstacles -> float64 array (n, 11): kind, position, quaternion, size.
 
     Kinds: 0 box, 1 cylinder, 2 sphere, 3 convex hull. Sizes: a box's three edges; (radius, radius,
@@ -430,9 +459,11 @@ def to_array(obstacles):
     """
     rows = np.zeros((len(obstacles), ROW))
     for row, obstacle in zip(rows, obstacles, strict=True):
-        row[0], row[1:4] = _KINDS.index(type(obstacle)), obstacle.position
+        row[0] = _KINDS.index(type(obstacle))
+        row[1:4] = obstacle.position
         if isinstance(obstacle, Sphere):
-            row[4:8], row[8:11] = IDENTITY, obstacle.radius
+            row[4:8] = IDENTITY
+            row[8:11] = obstacle.radius
             continue
         row[4:8] = obstacle.orientation
         if isinstance(obstacle, Box):
@@ -440,33 +471,33 @@ def to_array(obstacles):
         elif isinstance(obstacle, ConvexHull):
             row[8:11] = len(obstacle.vertices)
         else:
-            row[8:11] = obstacle.radius, obstacle.radius, obstacle.length
+            row[8:11] = (obstacle.radius, obstacle.radius, obstacle.length)
     return rows
 
 
-def hull_vertices(obstacles):
+def hull_vertices(obstacles: Iterable[Obstacle]) -> np.ndarray:
     """The vertices of all `ConvexHull`s among obstacles, one after another: float64 (v, 3), m."""
-    hulls = [o.vertices for o in obstacles if isinstance(o, ConvexHull)]
-    return np.array([vertex for vertices in hulls for vertex in vertices]).reshape(-1, 3)
+    hulls = [obstacle for obstacle in obstacles if isinstance(obstacle, ConvexHull)]
+    return np.array([vertex for hull in hulls for vertex in hull.vertices]).reshape(-1, 3)
 
 
-def motion_numbers(obstacles):
+def motion_numbers(obstacles: Iterable[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
     """The motions of obstacles as numbers, one after another, and how many numbers each has.
 
     Returns: float64 (m,) and uint32 (n,); see `envs.scenes.motions.motion_to_numbers`.
     """
     numbers = [motion_to_numbers(obstacle.motion) for obstacle in obstacles]
-    flat = [number for of_one in numbers for number in of_one]
-    return np.array(flat, np.float64), np.array([len(of_one) for of_one in numbers], np.uint32)
+    flat = [number for motion in numbers for number in motion]
+    return np.array(flat, np.float64), np.array([len(motion) for motion in numbers], np.uint32)
 
 
-def with_motion(obstacle, numbers):
+def with_motion(obstacle: Obstacle, numbers: Iterable[float]) -> Obstacle:
     """An obstacle with the motion that numbers describe. Raises ValueError: there is none."""
     motion = motion_from_numbers(numbers)
     return obstacle if motion is None else replace(obstacle, motion=motion)
 
 
-def vertex_counts(rows):
+def vertex_counts(rows: np.ndarray) -> np.ndarray:
     """How many of `hull_vertices` each row of `to_array` has: int64 (n,). Raises ValueError."""
     counts = np.where(rows[:, 0] == HULL, rows[:, 8], 0)
     if not (np.isfinite(counts).all() and (counts >= 0).all() and (counts == counts.round()).all()):
@@ -474,7 +505,7 @@ def vertex_counts(rows):
     return counts.astype(np.int64)
 
 
-def padded_rows(obstacles, number):
+def padded_rows(obstacles: Sequence[Obstacle], number: int) -> np.ndarray:
     """Obstacles -> float32 array (number, 12): 1 and a row of `to_array`, then rows of zeros.
 
     Raises ValueError: a `ConvexHull`, whose vertices a row cannot have, or a motion.
@@ -489,7 +520,7 @@ def padded_rows(obstacles, number):
     return rows
 
 
-def from_array(rows, vertices=()):
+def from_array(rows: np.ndarray, vertices: Any = ()) -> tuple[Obstacle, ...]:
     """The inverse of `to_array`, and of `hull_vertices`.
 
     Raises ValueError: another shape, an unknown kind, no unit quaternion, or another number of
@@ -498,14 +529,16 @@ def from_array(rows, vertices=()):
     rows = np.asarray(rows, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != ROW:
         raise ValueError(f"an obstacle array has shape (n, {ROW}), got {rows.shape}")
-    vertices = np.reshape(vertices, (-1, 3))
     counts = vertex_counts(rows)
-    if counts.sum() != len(vertices):
-        raise ValueError(f"convex hulls of {counts.sum()} vertices have {len(vertices)}")
-    vertices, used = [tuple(vertex) for vertex in vertices.tolist()], 0
+    points = [tuple(vertex) for vertex in np.array(vertices).reshape(-1, 3).tolist()]
+    if counts.sum() != len(points):
+        raise ValueError(f"convex hulls of {counts.sum()} vertices have {len(points)}")
+    used = 0
     obstacles = []
     for kind, *numbers in rows.tolist():
-        position, orientation, size = tuple(numbers[:3]), tuple(numbers[3:7]), tuple(numbers[7:])
+        position = tuple(numbers[:3])
+        orientation = tuple(numbers[3:7])
+        size = tuple(numbers[7:])
         if kind == 0:
             obstacles.append(Box(position, size, orientation))
         elif kind == 1:
@@ -514,7 +547,7 @@ def from_array(rows, vertices=()):
             obstacles.append(Sphere(position, size[0]))
         elif kind == HULL:
             end = used + int(size[0])
-            obstacles.append(ConvexHull(position, tuple(vertices[used:end]), orientation))
+            obstacles.append(ConvexHull(position, tuple(points[used:end]), orientation))
             used = end
         else:
             raise ValueError(
@@ -523,13 +556,13 @@ def from_array(rows, vertices=()):
     return tuple(obstacles)
 
 
-def to_lists(obstacles):
+def to_lists(obstacles: Sequence[Obstacle]) -> list[list[Any]]:
     """Obstacles as JSON's lists: rows of `to_array`, a hull's followed by its vertices' numbers.
 
     Two more entries follow, where there are any: the numbers of its motion, a list; `may_touch`,
     true or a list of names.
     """
-    rows = to_array(obstacles).tolist()
+    rows: list[list[Any]] = to_array(obstacles).tolist()
     for row, obstacle in zip(rows, obstacles, strict=True):
         if isinstance(obstacle, ConvexHull):
             row += [float(number) for vertex in obstacle.vertices for number in vertex]
@@ -540,68 +573,77 @@ def to_lists(obstacles):
     return rows
 
 
-def from_lists(rows):
+def from_lists(rows: Iterable[list[Any]]) -> tuple[Obstacle, ...]:
     """The inverse of `to_lists`. Raises ValueError, TypeError: as `from_array`."""
-    rows, motions, touching = zip(*map(split_list, rows), strict=True) if rows else ((), (), ())
-    vertices = np.array([number for row in rows for number in row[ROW:]]).reshape(-1, 3)
-    obstacles = from_array(np.array([row[:ROW] for row in rows]).reshape(-1, ROW), vertices)
-    return with_may_touch(map(with_motion, obstacles, motions), touching)
+    obstacles = []
+    for row in rows:
+        numbers, motion, may_touch = split_list(row)
+        [obstacle] = from_array(np.array([numbers[:ROW]]), np.array(numbers[ROW:]))
+        obstacles.append(replace(obstacle, motion=motion_from_numbers(motion), may_touch=may_touch))
+    return tuple(obstacles)
 
 
-def split_list(row):
+def split_list(row: list[Any]) -> tuple[list[float], list[float], tuple[str, ...] | bool]:
     """The numbers, the motion's numbers and `may_touch` of a row of `to_lists`."""
-    row, motion, may_touch = list(row), [], ()
-    if row and (isinstance(row[-1], bool) or _is_list_of(str, row[-1])):
+    row = list(row)
+    motion = []
+    may_touch = ()
+    if row and (isinstance(row[-1], bool) or _is_list_of_text(row[-1])):
         may_touch = row.pop()
     if row and isinstance(row[-1], list):
         motion = row.pop()
     return row, motion, may_touch
 
 
-def _is_list_of(kind, value):
-    return isinstance(value, list) and len(value) > 0 and isinstance(value[0], kind)
+def _is_list_of_text(value: Any) -> bool:
+    return isinstance(value, list) and len(value) > 0 and isinstance(value[0], str)
 
 
-def scene_to_json(scene):
+def scene_to_json(scene: Scene) -> str:
     """A `Scene` as text; equal scenes give equal texts. Raises ValueError: it has points."""
     if isinstance(scene, ObservedScene):
         raise ValueError("a scene with points cannot be written: save the points as .npy instead")
-    fields = {
+    fields: dict[str, Any] = {
         "obstacles": to_lists(scene.obstacles),
         "table": None if scene.table is None else to_lists([scene.table])[0],
         "floor": scene.floor,
     }
     if scene.friction != FRICTION:
         fields["friction"] = scene.friction
-    if scene.robot.arm != PANDA:
-        fields["robot"] = scene.robot.arm.name, scene.robot.arm.fingerprint
-    if scene.robot.held_positions != scene.robot.arm.held_positions:
-        fields["held"] = scene.robot.held
-    if scene.robot.attached:
-        fields["attached"] = [one.described() for one in scene.robot.attached]
+    robot = scene.robot
+    if robot.arm != PANDA:
+        fields["robot"] = (robot.arm.name, robot.arm.fingerprint)
+    if robot.held_positions != robot.arm.held_positions:
+        fields["held"] = robot.held
+    if robot.attached:
+        fields["attached"] = [attached.described() for attached in robot.attached]
     return json.dumps(fields, sort_keys=True)
 
 
-def scene_from_json(text, robot=PANDA):
+def scene_from_json(text: str, robot: Robot = PANDA) -> Scene:
     """The inverse of `scene_to_json`.
 
     `robot` is the scene's arm: the text has only its fingerprint, and where joints are held.
     """
     fields = json.loads(text)
-    table = fields["table"] and from_lists([fields["table"]])[0]
-    friction = fields.get("friction", FRICTION)
+    table: Any = fields["table"] and from_lists([fields["table"]])[0]
     robot = robot.arm.with_held(fields["held"]) if "held" in fields else robot.arm
-    robot = robot.with_attached(map(_attached, fields.get("attached", ())))
-    return Scene(from_lists(fields["obstacles"]), table, fields["floor"], friction, robot)
+    attached = []
+    for row, link, touch_links in fields.get("attached", ()):
+        [shape] = from_lists([row])
+        attached.append(Attached(shape, link, touch_links))
+    return Scene(
+        from_lists(fields["obstacles"]),
+        table,
+        fields["floor"],
+        fields.get("friction", FRICTION),
+        robot.with_attached(attached),
+    )
 
 
-def _attached(fields):
-    """The inverse of `Attached.described`."""
-    row, link, touch_links = fields
-    return Attached(*from_lists([row]), link, touch_links)
-
-
-def with_may_touch(obstacles, touching):
+def with_may_touch(
+    obstacles: Iterable[Obstacle], touching: Iterable[tuple[str, ...] | bool]
+) -> tuple[Obstacle, ...]:
     """Obstacles, each with its `may_touch`, a tuple. Raises ValueError: of another number."""
     pairs = zip(obstacles, touching, strict=True)
-    return tuple(replace(one, may_touch=may) if may else one for one, may in pairs)
+    return tuple(replace(obstacle, may_touch=links) for obstacle, links in pairs)

@@ -7,6 +7,9 @@ lengths are multiplied by the ratio of their reaches.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
@@ -15,9 +18,10 @@ from roboarm_nmp.envs.scenes.primitives import Box, Scene
 # so that files are small.
 GRID = 2.0**-10
 TURN = 2 * math.pi / 256
+SHELVES = 0.33  # share of the obstacles
+POLES = 0.57  # the rest are walls
 # Uniform ranges, m: distance of the near side (of a pole's centre) from the robot's axis, and
 # sizes. A shelf is a board, wider than deep; walls and poles stand on the table.
-SHELVES, POLES = 0.33, 0.57  # shares of the obstacles; the rest are walls
 SHELF = {"near": (0.28, 0.42), "depth": (0.15, 0.3), "width": (0.3, 0.5), "thickness": (0.02, 0.04)}
 SHELF_HEIGHT = (0.3, 0.9)
 POLE = {"centre": (0.26, 0.45), "thickness": (0.02, 0.04), "height": (1.2, 1.5)}
@@ -30,7 +34,8 @@ WALL = {
 # Obstacles are rough, because the arm slides along smooth ones to its goal.
 FRICTION = 2.45
 # The least distance (m) of obstacles from the robot's axis, below the shoulder's top (m).
-KEEP_CLEAR, SHOULDER = 0.14, 0.45
+KEEP_CLEAR = 0.14
+SHOULDER = 0.45
 
 
 @dataclass(frozen=True)
@@ -41,9 +46,10 @@ class RandomBoxes:
     most: int
     base: Scene = Scene(friction=FRICTION)
 
-    def sample(self, rng):
+    def sample(self, rng: np.random.Generator) -> Scene:
         """A `Scene` drawn with a NumPy Generator."""
-        count, scale = int(rng.integers(self.fewest, self.most + 1)), scale_of(self.base.robot)
+        count = int(rng.integers(self.fewest, self.most + 1))
+        scale = scale_of(self.base.robot)
         first = rng.uniform(-math.pi, math.pi)
         sector = 2 * math.pi / count
         boxes = []
@@ -56,23 +62,26 @@ class RandomBoxes:
         return replace(self.base, obstacles=tuple(boxes))
 
 
-def _sample_box(rng, azimuth, scale):
-    def shape_of(ranges):
+def _sample_box(rng: np.random.Generator, azimuth: float, scale: float) -> Box:
+    def shape_of(ranges: dict[str, tuple[float, float]]) -> dict[str, float]:
         return {name: scale * rng.uniform(*limits) for name, limits in ranges.items()}
 
     kind = rng.random()
     if kind < SHELVES:
         shape = shape_of(SHELF)
         size = (shape["depth"], shape["width"], shape["thickness"])
-        distance, height = shape["near"] + shape["depth"] / 2, scale * rng.uniform(*SHELF_HEIGHT)
+        distance = shape["near"] + shape["depth"] / 2
+        height = scale * rng.uniform(*SHELF_HEIGHT)
     elif kind < SHELVES + POLES:
         shape = shape_of(POLE)
         size = (shape["thickness"], scale * rng.uniform(*POLE["thickness"]), shape["height"])
-        distance, height = shape["centre"], shape["height"] / 2
+        distance = shape["centre"]
+        height = shape["height"] / 2
     else:
         shape = shape_of(WALL)
         size = (shape["length"], shape["thickness"], shape["height"])
-        distance, height = shape["near"] + shape["length"] / 2, shape["height"] / 2
+        distance = shape["near"] + shape["length"] / 2
+        height = shape["height"] / 2
     yaw = azimuth + rng.uniform(-math.pi / 2, math.pi / 2)
     half = round(yaw / TURN) * TURN / 2
     return Box(
@@ -82,16 +91,19 @@ def _sample_box(rng, azimuth, scale):
     )
 
 
-def rounded(*lengths):
+def rounded(*lengths: float) -> tuple[Any, ...]:
     """Lengths (m), as multiples of `GRID`."""
     return tuple(round(length / GRID) * GRID for length in lengths)
 
 
-def distance_to_robot(box, scale):
+def distance_to_robot(box: Box, scale: float) -> float:
     """Distance (m) of an upright box from the part of the robot's axis below its shoulder's top."""
-    sin, cos = 2 * box.orientation[2] * box.orientation[3], 1 - 2 * box.orientation[2] ** 2
+    sin = 2 * box.orientation[2] * box.orientation[3]
+    cos = 1 - 2 * box.orientation[2] ** 2
     x, y, z = box.position
     # The axis in the box's frame.
-    across = (abs(cos * x + sin * y) - box.size[0] / 2, abs(cos * y - sin * x) - box.size[1] / 2)
-    below, above = z - box.size[2] / 2 - SHOULDER * scale, -(z + box.size[2] / 2)
-    return math.hypot(max(across[0], 0.0), max(across[1], 0.0), max(below, above, 0.0))
+    along_x = abs(cos * x + sin * y) - box.size[0] / 2
+    along_y = abs(cos * y - sin * x) - box.size[1] / 2
+    below = z - box.size[2] / 2 - SHOULDER * scale
+    above = -(z + box.size[2] / 2)
+    return math.hypot(max(along_x, 0.0), max(along_y, 0.0), max(below, above, 0.0))

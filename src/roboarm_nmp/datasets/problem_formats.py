@@ -12,19 +12,6 @@ import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.urdf import link_placement
-from roboarm_nmp.envs.scenes import documents
-from roboarm_nmp.envs.scenes.documents import (
-    DocumentError,
-    Mistake,
-    get,
-    is_nothing,
-    load_document,
-    mapping,
-    number,
-    numbers,
-    sequence,
-    shorten,
-)
 from roboarm_nmp.envs.scenes.formats import (
     check_frame,
     check_frames,
@@ -37,6 +24,20 @@ from roboarm_nmp.envs.scenes.formats import (
     with_attached_objects,
 )
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, unit_quaternion
+from roboarm_nmp.utils import documents
+from roboarm_nmp.utils.documents import (
+    DocumentError,
+    Mistake,
+    get,
+    is_nothing,
+    load_document,
+    mapping,
+    mistakes_in,
+    number,
+    numbers,
+    sequence,
+    shorten,
+)
 
 MAX_PROBLEMS, MAX_GOALS, MAX_OBSTACLES = 100_000, 1_000, 1_000_000
 """Limits of a file's problems, of a problem's goals, and of all obstacles of a file."""
@@ -77,7 +78,7 @@ def read_file(path, robot):
     Raises DocumentError: the file is of no known format.
     """
     root = load_document(path)
-    try:
+    with mistakes_in(path):
         fields = mapping(root, "a file of problems")
         if is_world(root) or "obstacles" in fields:
             raise Mistake(root, "a world without starts and goals, which can be a task: --task")
@@ -90,8 +91,6 @@ def read_file(path, robot):
             raise Mistake(root, "no problems")
         if len(entries) > MAX_PROBLEMS:
             raise Mistake(root, f"{len(entries):,} problems, at most {MAX_PROBLEMS:,}")
-    except Mistake as mistake:
-        raise DocumentError(f"{path}:{mistake.line}: {mistake.reason}") from mistake
     obstacles = 0
     for name, node in entries:
         try:
@@ -199,7 +198,7 @@ def _configuration(node, positions, robot, what, with_held=True):
         raise Mistake(node, f"{what} lacks {', '.join(missing)}")
     held = {name: at for name, at in positions.items() if name not in robot.joint_names}
     if unknown := sorted(name for name in held if name not in robot.held):
-        raise Mistake(node, f"{robot.name} has no joint {shorten(unknown[0])}")
+        raise Mistake(node, f"{robot.name} has no joint {shorten(unknown[0])!r}")
     angles = np.array([positions[name] for name in robot.joint_names])
     return angles, _held(node, robot, held) if with_held else robot
 
@@ -255,7 +254,7 @@ def _goal_pose(node, robot):
     end = robot.bullet_names[1][robot.end_effector_link]
     end_joint, end_rotation, end_at = link_placement(robot, end)
     if joint != end_joint:
-        raise Mistake(node, f"the frame {shorten(frame)} does not move with the end effector")
+        raise Mistake(node, f"the frame {shorten(frame)!r} does not move with the end effector")
     end_at = end_at + end_rotation @ np.array(robot.end_effector_offset)
     inner = rotation.T @ (end_at - at), _quaternion(rotation.T @ end_rotation)
     return np.concatenate(compose_poses(position, quaternion, *inner))
@@ -301,7 +300,7 @@ def _vamp_problem(name, node, robot):
     found = [_angles(goal, "a goal", robot) for goal in sequence(goals, "goals", MAX_GOALS)]
     if not found:
         raise Mistake(goals, "no goal")
-    obstacles = vamp_obstacles(fields.get("obstacles", node))
+    obstacles = vamp_obstacles(fields["obstacles"] if "obstacles" in fields else node)
     return Problem(name, start, np.array(found), None, checked_scene(node, obstacles, robot))
 
 

@@ -47,8 +47,8 @@ from roboarm_nmp.datasets.problem_formats import (
 )
 from roboarm_nmp.datasets.queries import Query, validate
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.documents import DocumentError
 from roboarm_nmp.envs.scenes.primitives import scene_from_json, scene_to_json, unit_quaternion
+from roboarm_nmp.utils.documents import DocumentError
 from roboarm_nmp.utils.files import write_atomically
 
 SCHEMA, SCHEMA_VERSION = "roboarm-nmp problems", 1
@@ -133,7 +133,7 @@ def load_problems(path, robot=PANDA):
         robot: the `Robot` of the problems.
 
     Raises:
-        DatasetError, envs.scenes.documents.DocumentError: the file cannot be used; ValueErrors with
+        DatasetError, utils.documents.DocumentError: the file cannot be used; ValueErrors with
             the path, and the line where there is one. Unusable problems of a file that can be used
             are in `rejected`.
     """

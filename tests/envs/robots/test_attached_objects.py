@@ -17,7 +17,7 @@ from roboarm_nmp.envs.perception.point_clouds import obstacle_points, prepare_cl
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
 from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.motions import Oscillation
 from roboarm_nmp.envs.scenes.primitives import (
     Attached,
@@ -36,6 +36,7 @@ from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 from roboarm_nmp.utils.bullet import pybullet as p
+from roboarm_nmp.utils.documents import DocumentError
 
 TURN = (0.3, -0.1, 0.4, np.sqrt(0.74))
 BOARD = Attached(Box((0.0, 0.0, 0.05), (0.06, 0.1, 0.2), TURN))
@@ -258,7 +259,7 @@ def test_files_keep_objects(tmp_path):
 def test_mistake_in_a_file_is_rejected_with_its_line(fields, reason, tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text(f"attached:\n- sphere: {{position: [0, 0, 0], radius: 0.1, {fields}}}\n")
-    with pytest.raises(SceneFileError) as error:
+    with pytest.raises(DocumentError) as error:
         load_scene(path)
     line, _, rest = reason.partition(": ")
     assert str(error.value).startswith(f"{path}:{line}: {rest}")

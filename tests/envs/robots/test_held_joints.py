@@ -12,11 +12,12 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
-from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, scene_from_json, scene_to_json
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.utils.bullet import pybullet as p
+from roboarm_nmp.utils.documents import DocumentError
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 OPEN = PANDA.with_held(dict.fromkeys(FINGERS, 0.065))  # wider than the URDF's limit, 0.04
@@ -122,7 +123,7 @@ def test_scene_files_keep_the_opening(tmp_path):
     (tmp_path / "b.yaml").write_text("held: {panda_finger_joint1: 0.065}")
     assert load_scene(tmp_path / "b.yaml").robot == OPEN
     (tmp_path / "c.yaml").write_text("floor: 0\nheld: {thumb: 0.065}")
-    with pytest.raises(SceneFileError, match="c.yaml:2: unknown key thumb in held"):
+    with pytest.raises(DocumentError, match="c.yaml:2: unknown key thumb in held"):
         load_scene(tmp_path / "c.yaml")
 
 

@@ -30,7 +30,7 @@ from roboarm_nmp.envs.perception.sensors import OBSTACLE, Camera, observe_scene
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import matrix
 from roboarm_nmp.envs.scenes import meshes
-from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.formats import load_world
 from roboarm_nmp.envs.scenes.meshes import MeshError, load_mesh, mesh_hulls
 from roboarm_nmp.envs.scenes.primitives import (
@@ -49,6 +49,7 @@ from roboarm_nmp.envs.scenes.primitives import (
 )
 from roboarm_nmp.envs.tasks import TASKS
 from roboarm_nmp.utils.bullet import pybullet as p
+from roboarm_nmp.utils.documents import DocumentError
 
 WEDGE = ConvexHull(
     (0.5, 0.1, 0.3),
@@ -303,7 +304,7 @@ def test_mesh_of_a_scene_file_becomes_its_hull(name, tmp_path):
         ("{file: part.obj, scale: 1e3, position: [900, 0, 0]}", "finite numbers|scale"),
         ("{file: part.obj, scale: 0, position: [0, 0, 0]}", "scale of mesh must be positive"),
         ("{file: part.obj, decompose: 1, position: [0, 0, 0]}", "decompose must be true or fal"),
-        ("{file: [part.obj], position: [0, 0, 0]}", "file must be a file's name, got a list"),
+        ("{file: [part.obj], position: [0, 0, 0]}", "file must be text, got a list"),
         ("{position: [0, 0, 0]}", "mesh lacks file"),
     ],
 )
@@ -318,7 +319,7 @@ def test_mesh_that_cannot_be_used_is_rejected_with_its_line(mesh, reason, tmp_pa
     write_file(folder / "part.obj", OBJ.replace("0.2", "2.2"))
     write_file(folder / "flat.obj", OBJ.replace("v 0.0 0.0 0.2", "v 0.1 0.1 0.0"))
     path = write_file(folder / "scene.yaml", f"floor: false\nobstacles:\n- mesh: {mesh}\n")
-    with pytest.raises(SceneFileError, match=f"scene.yaml:3: .*({reason})"):
+    with pytest.raises(DocumentError, match=f"scene.yaml:3: .*({reason})"):
         load_scene(path)
 
 
@@ -330,7 +331,7 @@ def test_invalid_hull_of_a_scene_file_is_rejected_with_its_line(tmp_path):
         ([[1, 2]], "a vertex of convex_hull must be a list of 3 numbers, got 2"),
     ]:
         text = f"obstacles:\n- convex_hull: {{position: [0, 0, 0], vertices: {vertices}}}\n"
-        with pytest.raises(SceneFileError, match=f"scene.yaml:2: .*{reason}"):
+        with pytest.raises(DocumentError, match=f"scene.yaml:2: .*{reason}"):
             load_scene(write_file(tmp_path / "scene.yaml", text))
 
 

@@ -12,7 +12,7 @@ from roboarm_nmp.envs.collision.moving import free_over_time
 from roboarm_nmp.envs.collision.timed_checker import TimedChecker
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.files import SceneFileError, load_scene, save_scene
+from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence
 from roboarm_nmp.envs.scenes.primitives import (
     Attached,
@@ -31,6 +31,7 @@ from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.utils.documents import DocumentError
 
 START = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)
 GOAL = np.array([0.3, 0.3, 0.1, -1.9, 0.1, 2.1, 0.8], np.float32)
@@ -162,5 +163,5 @@ def test_links_that_cannot_be_are_rejected(tmp_path):
         replace(CAN, may_touch="panda_hand")
     path = tmp_path / "a.yaml"
     path.write_text("obstacles:\n- sphere: {position: [0, 0, 0.5], radius: 0.1, may_touch: 1}\n")
-    with pytest.raises(SceneFileError, match="a.yaml:2: may_touch must be a list of links"):
+    with pytest.raises(DocumentError, match="a.yaml:2: may_touch must be a list of links"):
         load_scene(path)
