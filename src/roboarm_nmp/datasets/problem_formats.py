@@ -300,7 +300,7 @@ def _vamp_problem(name, node, robot):
     found = [_angles(goal, "a goal", robot) for goal in sequence(goals, "goals", MAX_GOALS)]
     if not found:
         raise Mistake(goals, "no goal")
-    obstacles = vamp_obstacles(fields["obstacles"] if "obstacles" in fields else node)
+    obstacles = vamp_obstacles(fields.get("obstacles", node))
     return Problem(name, start, np.array(found), None, checked_scene(node, obstacles, robot))
 
 

@@ -586,7 +586,7 @@ class Simulation:
     def save_scene(self, path):
         """Write the scene as YAML, never over a file that is there: `name_2.yaml` follows it.
 
-        Returns the path of the file. Raises SceneFileError, OSError: it cannot be written.
+        Returns the path of the file. Raises DocumentError, OSError: it cannot be written.
         """
         path = Path(path)
         if path.suffix not in (".yaml", ".yml"):
