@@ -25,7 +25,7 @@ import torch.nn.functional as F
 
 from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
-from roboarm_nmp.envs.arm_env import end_effector_size
+from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.subgoals import MAX_STEP
@@ -160,7 +160,7 @@ class Actor(nn.Module):
         robot, self.token_size = env.unwrapped.robot, env.encoder.token_size  # numbers per token
         self.num_joints = joints = robot.num_joints
         self.goal_is_pose = args.goal_type == "pose"
-        self.arm_size = joints + end_effector_size(args.goal_type)  # in the observation
+        self.arm_size = joints + GOAL_TYPES[args.goal_type].end_effector_size  # in the observation
         low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())

@@ -1,29 +1,33 @@
 """RoboArm-NMP's environments. `make(task)` builds one; importing registers the Gymnasium ids."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.arm_env import RoboArmEnv, check_bool
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import TASKS, get_task
+
+if TYPE_CHECKING:
+    from roboarm_nmp.envs.perception.noise import SensorNoise
 
 __all__ = ["TASKS", "RoboArmEnv", "get_task", "gymnasium_id", "make"]
 ANY_TASK = "RoboArmNMP/Task-v0"
 
 
 def make(
-    task,
-    encoder=None,
-    num_points=64,
-    geometry_source=None,
-    link_distances=False,
-    append_link_distances=False,
-    goal_link_distances=True,
-    observe_every=None,
-    sensor_noise=None,
-    **kwargs,
-):
+    task: str | Path | Scene,
+    encoder: str | Path | None = None,
+    num_points: int = 64,
+    geometry_source: str | Path | None = None,
+    link_distances: bool = False,
+    append_link_distances: bool = False,
+    goal_link_distances: bool = True,
+    observe_every: int | None = None,
+    sensor_noise: "SensorNoise | None" = None,
+    **kwargs: Any,
+) -> RoboArmEnv:
     """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
     Args:
@@ -47,21 +51,21 @@ def make(
         sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
         kwargs: arguments of `RoboArmEnv`.
 
+    Returns:
+        A `RoboArmEnv`, or one in wrappers that have all of its attributes.
+
     Raises:
         ValueError: unknown task, malformed scene or robot's file, an argument out of its range,
             or a file that is no encoder of this robot.
     """
-    for name, value in (("task", task), ("encoder", encoder), ("geometry_source", geometry_source)):
-        kinds = (str, Path, Scene) if name == "task" else (str, Path)
-        if not isinstance(value, kinds) and (value is not None or name == "task"):
+    if not isinstance(task, (str, Path, Scene)):
+        raise ValueError(f"task must be a name or a path, got {task!r}")
+    for name, value in {"encoder": encoder, "geometry_source": geometry_source}.items():
+        if not isinstance(value, (str, Path, type(None))):
             raise ValueError(f"{name} must be a name or a path, got {value!r}")
-    for name, value in (
-        ("link_distances", link_distances),
-        ("append_link_distances", append_link_distances),
-        ("goal_link_distances", goal_link_distances),
-    ):
-        if not isinstance(value, bool):
-            raise ValueError(f"{name} must be a bool, got {value!r}")
+    check_bool("link_distances", link_distances)
+    check_bool("append_link_distances", append_link_distances)
+    check_bool("goal_link_distances", goal_link_distances)
     if append_link_distances and not link_distances:
         raise ValueError("append_link_distances needs link_distances")
     if link_distances and geometry_source is None:
@@ -70,7 +74,7 @@ def make(
         )
     if geometry_source is not None and not link_distances and encoder != "point_cloud":
         raise ValueError("geometry_source goes with link_distances, or the encoder point_cloud")
-    env = RoboArmEnv(task if isinstance(task, Scene) else get_task(task).scene, **kwargs)
+    env: Any = RoboArmEnv(task if isinstance(task, Scene) else get_task(task).scene, **kwargs)
     # PyTorch and Numba take long to import, so they are imported only where they are needed.
     observes = encoder is not None or link_distances
     if observes or observe_every is not None or sensor_noise is not None:
@@ -82,20 +86,24 @@ def make(
         from roboarm_nmp.envs.wrappers import SceneEncodingWrapper
 
         decoded_by = None if geometry_source in ("ground_truth", "point_cloud") else geometry_source
-        encoder = make_encoder(encoder, num_points, decoded_by)
-        encoder.check_robot(env.robot)
-        env = SceneEncodingWrapper(env, encoder)
+        scene_encoder = make_encoder(encoder, num_points, decoded_by)
+        scene_encoder.check_robot(env.robot)
+        env = SceneEncodingWrapper(env, scene_encoder)
     if link_distances:
         from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
         from roboarm_nmp.envs.wrappers import LinkDistancesWrapper
 
-        sources = [find_geometry_source(geometry_source, env.robot, fine) for fine in (False, True)]
-        options = append_link_distances, goal_link_distances, sources[1]
-        env = LinkDistancesWrapper(env, sources[0], *options)
+        env = LinkDistancesWrapper(
+            env,
+            find_geometry_source(geometry_source, env.robot),
+            append_link_distances,
+            goal_link_distances,
+            find_geometry_source(geometry_source, env.robot, fine=True),
+        )
     return env
 
 
-def gymnasium_id(task):
+def gymnasium_id(task: str) -> str:
     """The Gymnasium id of a task: "double_walls" -> "RoboArmNMP/DoubleWalls-v0".
 
     Tasks that are not in `TASKS`, of scene files and other arms, share the id `ANY_TASK`, whose
@@ -104,14 +112,11 @@ def gymnasium_id(task):
     return f"RoboArmNMP/{task.title().replace('_', '')}-v0" if task in TASKS else ANY_TASK
 
 
-for _id, _kwargs in {
-    **{gymnasium_id(name): {"task": name} for name in TASKS},
-    ANY_TASK: {},
-}.items():
+for _name in (*TASKS, None):
     gymnasium.register(
-        _id,
+        gymnasium_id(_name) if _name else ANY_TASK,
         entry_point="roboarm_nmp.envs:make",
-        kwargs=_kwargs,
+        kwargs={"task": _name} if _name else {},
         # Without wrappers `reset_specific` and all other attributes are reached directly. The env
         # itself refuses a step before a reset; the checker would warn of unbounded observations.
         order_enforce=False,

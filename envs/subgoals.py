@@ -1,6 +1,9 @@
 """Sub-goals: the points of a plan that are commanded one by one, one per environment step."""
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from roboarm_nmp.envs.robots.robot import Robot
 
 # With this spacing, the controller's lag seldom makes a step longer than the paper's 0.03, to which
 # it is clipped.
@@ -8,7 +11,7 @@ MAX_STEP = 0.03
 SUBGOAL_SPACING = 0.95 * MAX_STEP
 
 
-def subgoals(path, robot):
+def subgoals(path: ArrayLike, robot: Robot) -> np.ndarray:
     """Points along a path at most `SUBGOAL_SPACING` apart, including all waypoints.
 
     Near waypoints they are closer, if the robot has `acceleration_steps`.
@@ -20,14 +23,18 @@ def subgoals(path, robot):
     Returns:
         float64 (m, n), normalised; the first is the path's start, the last its goal.
     """
-    return all_subgoals(np.asarray(path), np.array([0, len(path)]), robot)[0]
+    path = np.asarray(path)
+    return all_subgoals(path, np.array([0, len(path)]), robot)[0]
 
 
-def all_subgoals(plan, plan_offsets, robot):
+def all_subgoals(
+    plan: np.ndarray, plan_offsets: np.ndarray, robot: Robot
+) -> tuple[np.ndarray, np.ndarray]:
     """The sub-goals of all plans (k, n), and the offset of each plan's first sub-goal (n + 1,)."""
     waypoints = robot.normalise(plan.astype(np.float64))
     moves = np.diff(waypoints, axis=0)
-    lengths, n = np.sqrt(np.square(moves).sum(1)) / SUBGOAL_SPACING, robot.acceleration_steps
+    lengths = np.sqrt(np.square(moves).sum(1)) / SUBGOAL_SPACING
+    n = robot.acceleration_steps
     # How far 1, 2, ... steps lead at most, with lengths of 1/n, 2/n, ..., 1, 1, ..., 2/n, 1/n.
     steps = np.arange(2, 2 * n + 3 + int(lengths.max(initial=0.0)))
     reach = np.cumsum(np.minimum(steps // 2, n)) / n
@@ -43,7 +50,9 @@ def all_subgoals(plan, plan_offsets, robot):
     return points, np.concatenate([first[plan_offsets[:-1]], [len(points)]])
 
 
-def schedule(plan, plan_offsets, offsets, robot):
+def schedule(
+    plan: np.ndarray, plan_offsets: np.ndarray, offsets: np.ndarray, robot: Robot
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each executed configuration the previous, the due and the next sub-goal, each (m, n).
 
     Before the first sub-goal and after the last, these are repeated.
@@ -52,5 +61,9 @@ def schedule(plan, plan_offsets, offsets, robot):
     demo = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     step = np.arange(offsets[-1]) - offsets[demo]
     here = first[demo] + step
-    low, high = first[demo], first[demo + 1] - 1
-    return (points[np.clip(here + shift, low, high)] for shift in (-1, 0, 1))
+    low = first[demo]
+    high = first[demo + 1] - 1
+    previous = points[np.clip(here - 1, low, high)]
+    due = points[np.clip(here, low, high)]
+    following = points[np.clip(here + 1, low, high)]
+    return previous, due, following

@@ -10,9 +10,11 @@ another arm (`envs.robots.files`).
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.containers import Containers
 from roboarm_nmp.envs.scenes.formats import WORLD_FILES, load_world
 from roboarm_nmp.envs.scenes.mixed_scenes import MixedScenes
@@ -45,12 +47,12 @@ class Task:
     trainable: bool = True
 
     @property
-    def base_scene(self):
+    def base_scene(self) -> Scene:
         """The `Scene` without the obstacles that vary."""
         return self.scene if isinstance(self.scene, Scene) else self.scene.base
 
 
-def get_task(task):
+def get_task(task: str | Path) -> Task:
     """The `Task` of a name in `TASKS` or `TRAINING_SCENES`, or of the path of a scene file.
 
     With `@` and a robot's file after it, the task is that robot's (`envs.robots.files`).
@@ -60,14 +62,14 @@ def get_task(task):
     """
     task, robot = split_robot(task)
     if robot is not None:
-        found, robot = get_task(task), load_robot(robot)
         if has_name(task) and not is_for_any_robot(task):
             names = [name for name in (*TASKS, *TRAINING_SCENES) if is_for_any_robot(name)]
             raise ValueError(
                 f"{task} is the Panda's: its obstacles and queries are. Tasks of any robot are "
                 f"{', '.join(names)} and scene files"
             )
-        return replace(found, scene=with_robot(found.scene, robot))
+        named = get_task(task)
+        return replace(named, scene=with_robot(named.scene, load_robot(robot)))
     if has_name(task):
         return TASKS[task] if task in TASKS else TRAINING_SCENES[task]
     if is_task(task):
@@ -79,7 +81,7 @@ def get_task(task):
     raise ValueError(f"unknown task {task!r}: {suggest(task, TASKS)} (or a scene file, .yaml)")
 
 
-def split_robot(task):
+def split_robot(task: str | Path) -> tuple[str, str | None]:
     """`TASK@ROBOT` as (task, robot); the robot is None without `@`, and for a name's `@panda`.
 
     The `@` follows a name or a scene file: folders may have one in their names, and so do a task's
@@ -109,31 +111,31 @@ def task_with_robot(task, robot):
     return f"{task}@{robot}"
 
 
-def with_robot(scene, robot):
+def with_robot(scene: Any, robot: Robot) -> Any:
     """A `Scene`, or a distribution of scenes, with another robot."""
     if isinstance(scene, Scene):
         return replace(scene, robot=robot)
     return replace(scene, base=replace(scene.base, robot=robot))
 
 
-def is_for_any_robot(name):
+def is_for_any_robot(name: str) -> bool:
     """Whether a task's obstacles are made for any robot: there are none, or they are random."""
     scene = TASKS[name].scene if name in TASKS else TRAINING_SCENES[name].scene
     return not isinstance(scene, Scene) or not scene.obstacles
 
 
-def is_task(task):
+def is_task(task: str | Path) -> bool:
     """Whether `task` is a name, or the path of a scene file; a robot may follow."""
     task, _ = split_robot(task)
     return has_name(task) or Path(task).suffix in SCENE_FILES
 
 
-def has_name(task):
+def has_name(task: str | Path) -> bool:
     """Whether `task` is one of `TASKS` or `TRAINING_SCENES`."""
     return task in TASKS or task in TRAINING_SCENES
 
 
-def task_name(task):
+def task_name(task: str | Path) -> str:
     """The name of a task in files: its own, or that of its files without suffix."""
     return "@".join(Path(part).stem for part in split_robot(task) if part is not None)
 
@@ -182,13 +184,14 @@ def _racks(quarters, near, width, heights, sides=True, table=_WIDE_TABLE):
 # MotionBenchMaker's nominal scenes (Chamzas et al., RA-L 7(2), 2022), to the millimetre. They have
 # neither table nor floor: the shelves stand 0.7 m below the robot's base. A floor at the base's
 # height would collide with 42 of the 100 original goals of the thin shelf (docs/guide/tasks.md).
-_CAN = {"radius": 0.03, "length": 0.14}
+def _can(x, y, z):
+    return Cylinder((x, y, z), radius=0.03, length=0.14)
 
 
 def _bookshelf_tall():
     shelves = [Box((1.3, 0.0, z), (1.2, 1.0, 0.04)) for z in (0.0, 0.3, 0.6, 0.9)]
     sides = [Box((1.3, y, 0.12), (1.3, 0.04, 1.64)) for y in (-0.5, 0.5)]
-    cans = [Cylinder((x, 0.0, z), **_CAN) for z in (0.68, 0.08, 0.38) for x in (1.2, 1.0, 0.8)]
+    cans = [_can(x, 0.0, z) for z in (0.68, 0.08, 0.38) for x in (1.2, 1.0, 0.8)]
     return Scene((*shelves, *sides, *cans), table=None, floor=None)
 
 
@@ -198,11 +201,11 @@ def _bookshelf_thin():
     board = Box((0.9, 0.0, 0.2), (0.62, 0.04, 1.4))
     legs = [Box((x, y, 0.12), (0.04, 0.04, 1.64)) for x in (0.6, 1.2) for y in (0.5, -0.5)]
     levels = ((-0.26, 0.25), (-0.01, -0.25), (0.24, 0.25), (0.49, -0.25), (0.74, 0.25))
-    cans = [Cylinder((x, y, z), **_CAN) for z, y in levels for x in (1.0, 0.7)]
+    cans = [_can(x, y, z) for z, y in levels for x in (1.0, 0.7)]
     return Scene((*shelves, board, *legs, *cans), table=None, floor=None)
 
 
-TASKS = {
+TASKS: dict[str, Task] = {
     "no_obstacles": Task(Scene(), "the arm, its table and the floor"),
     "wall": Task(
         Scene((Box((0.6, 0.0, 0.3875), (0.7, 0.04, 0.775)),)),

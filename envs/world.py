@@ -8,10 +8,14 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Collection
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import (
     FRICTION,
     Box,
@@ -29,14 +33,17 @@ from roboarm_nmp.utils.bullet import pybullet as p
 HOLD_STEPS = 5
 HOLD_DRIFT = 1e-3
 # Colour and friction.
-FLOOR_STYLE, TABLE_STYLE = ((0.55, 0.55, 0.55, 1), FRICTION), ((0.76, 0.70, 0.60, 1), FRICTION)
-OBSTACLE_COLOUR, TOUCHABLE_COLOUR = (0.36, 0.50, 0.65, 1), (0.59, 0.47, 0.67, 1)
+FLOOR_STYLE = (0.55, 0.55, 0.55, 1), FRICTION
+TABLE_STYLE = (0.76, 0.70, 0.60, 1), FRICTION
+OBSTACLE_COLOUR = (0.36, 0.50, 0.65, 1)
+TOUCHABLE_COLOUR = (0.59, 0.47, 0.67, 1)
 MAX_SAMPLING_TRIES = 10_000
 MAX_EDGE = 4096  # pixels of an image: 20,000 by 20,000 would need all of a machine's memory
 # PyBullet keeps about 4 kB of each body that is removed, so the world is made anew after this many
 # bodies. That takes as long as 100 changes of scene.
 MAX_BODIES_MADE = 5_000
-FAR_AWAY, NO_TURN = (0.0, 0.0, 50.0), (0.0, 0.0, 0.0, 1.0)  # a place without contacts (m)
+FAR_AWAY = (0.0, 0.0, 50.0)  # m: a place without contacts
+NO_TURN = (0.0, 0.0, 0.0, 1.0)
 # Where obstacles are that have disappeared, or not appeared yet (m).
 ABSENT = (0.0, 0.0, -10_000.0), NO_TURN
 # A program that connects to the X server, and how long (s) it may take.
@@ -49,7 +56,7 @@ sys.exit(not open_display(None))
 DISPLAY_SECONDS = 10
 
 
-def why_no_window():
+def why_no_window() -> str | None:
     """The reason, in words, why PyBullet's window cannot be opened here; None if it can.
 
     Call this before opening a window: without a display PyBullet ends the process, and it waits
@@ -68,7 +75,7 @@ def why_no_window():
     return None if answer.returncode == 0 else f"DISPLAY is {display}, which cannot be opened"
 
 
-def image_array(pixels, width, height):
+def image_array(pixels: Any, width: int, height: int) -> np.ndarray:
     """The colours that `getCameraImage` returns, as uint8 (height, width, 3).
 
     A PyBullet built without NumPy returns a tuple of integers, which `bytes` converts six times as
@@ -107,8 +114,14 @@ class World:
         RuntimeError: of all methods but `close`: the world is closed.
     """
 
-    def __init__(self, scene=None, window=False, drawn=True):
-        self.client = None
+    robot: Robot
+    body: int
+    scene: Scene
+
+    def __init__(
+        self, scene: Scene | None = None, window: bool = False, drawn: bool = True
+    ) -> None:
+        self.client: int | None = None
         self._drawn = drawn
         scene = Scene() if scene is None else scene
         _check_scene(scene)
@@ -117,7 +130,7 @@ class World:
         self._target = ()  # of the position controllers, n angles (rad); empty before a command
         self._make(scene)
 
-    def check_open(self):
+    def check_open(self) -> None:
         """Raise RuntimeError if the world is closed."""
         if self.client is None:
             raise RuntimeError("this environment, or its world, is closed")
@@ -134,15 +147,17 @@ class World:
         self.body = self._load_robot()
         # PyBullet places a body by its centre of mass.
         self._in_place = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
-        self._parts, self._bodies, self._bodies_made = [], [], 0
-        self._goal_marker, self._goal = None, None
+        self._parts = []
+        self._bodies = []
+        self._bodies_made = 0
+        self._goal_marker = None
+        self._goal = None
         self._speck = p.createVisualShape(
             p.GEOM_BOX, halfExtents=[0.001] * 3, physicsClientId=self.client
         )
-        self.scene = None
-        self.set_scene(scene)
+        self._change_scene(scene)
 
-    def draw(self):
+    def draw(self) -> None:
         """Give all bodies visual shapes, now and from now on."""
         self.check_open()
         if not self._drawn:
@@ -207,7 +222,7 @@ class World:
         if self._start is not None:
             self._events.append(event)
 
-    def set_scene(self, scene):
+    def set_scene(self, scene: Scene) -> bool:
         """Put the arm into another `Scene`. Returns False, and does nothing, for an equal one."""
         self.check_open()
         _check_scene(scene)
@@ -215,9 +230,15 @@ class World:
             return False
         if self._bodies_made > MAX_BODIES_MADE or scene.robot != self.robot:
             self._make(scene)
-            return True
-        self._start, self._events = None, []
-        before, self.scene = self._parts, scene
+        else:
+            self._change_scene(scene)
+        return True
+
+    def _change_scene(self, scene):
+        self._start = None
+        self._events = []
+        self.scene = scene
+        before = self._parts
         self._parts = []
         if scene.floor is not None:
             self._parts.append((floor_box(scene.floor), *FLOOR_STYLE))
@@ -239,40 +260,38 @@ class World:
         pairs = zip(self._bodies, self._parts, strict=True)
         self._movers = {body: part[0] for body, part in pairs if part[0].motion is not None}
         self._move_obstacles(0)
-        return True
 
     # --- Moving obstacles
 
     @property
-    def time(self):
+    def time(self) -> float:
         """Seconds since the arm was placed, of simulated time; or as given to `place`."""
         return self._substep * TIME_STEP
 
     @property
-    def current_scene(self):
+    def current_scene(self) -> Scene:
         """The static `Scene` at this time."""
         if self._current_scene is None:
             self._current_scene = self.scene.at(self.time)
         return self._current_scene
 
-    def set_time(self, time):
+    def set_time(self, time: float) -> None:
         """Put moving obstacles where they are at a time (s), whatever the arm does; for images."""
         self.check_open()
         self._move_obstacles(round(time / TIME_STEP))
 
     def _move_obstacles(self, substep):
         """Put moving obstacles where they are after so many physics steps, at rest."""
-        self._substep, self._current_scene = substep, None
+        self._substep = substep
+        self._current_scene: Scene | None = None
         self._poses = {body: pose_at(o, self.time) for body, o in self._movers.items()}
         for body, pose in self._poses.items():
             p.resetBasePositionAndOrientation(body, *(pose or ABSENT), physicsClientId=self.client)
 
-    def _step_physics(self):
+    def _step_with_movers(self):
         """One physics step. Obstacles have their velocity in it, and are then at their new pose."""
-        before, self._substep = self._poses, self._substep + 1
-        if not self._movers:
-            p.stepSimulation(physicsClientId=self.client)
-            return
+        before = self._poses
+        self._substep += 1
         self._poses = {body: pose_at(o, self.time) for body, o in self._movers.items()}
         for body, pose in self._poses.items():
             if pose is not None and before[body] is not None:
@@ -303,7 +322,8 @@ class World:
         else:
             kind, collision = p.GEOM_SPHERE, {"radius": obstacle.radius}
             visual = collision
-        client, shape = self.client, self._speck
+        client = self.client
+        shape = self._speck
         if self._drawn:
             shape = p.createVisualShape(kind, **visual, rgbaColor=colour, physicsClientId=client)
         body = p.createMultiBody(
@@ -332,7 +352,9 @@ class World:
 
     # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
 
-    def in_collision(self, configuration, time=0.0, moving=True):
+    def in_collision(
+        self, configuration: ArrayLike, time: float = 0.0, moving: bool = True
+    ) -> bool:
         """Whether the arm at joint angles (n, rad, inside the limits) overlaps the scene or itself.
 
         Moves the arm: call it between episodes, or continue with a reset.
@@ -355,7 +377,7 @@ class World:
         p.performCollisionDetection(physicsClientId=self.client)
         self._record(None)
 
-    def is_feasible(self, configuration, hold_steps=HOLD_STEPS):
+    def is_feasible(self, configuration: np.ndarray, hold_steps: int = HOLD_STEPS) -> bool:
         """Whether joint angles (n, rad) are inside the limits, collision free and held.
 
         Held: the position controller keeps the arm there for `hold_steps` environment steps, in
@@ -373,7 +395,7 @@ class World:
         drift = self.read_arm()[0] - self.robot.normalise(configuration)
         return math.sqrt(drift @ drift) <= HOLD_DRIFT
 
-    def sample_feasible(self, rng):
+    def sample_feasible(self, rng: np.random.Generator) -> np.ndarray:
         """A feasible configuration, uniform in the limits: float32 (n,), rad.
 
         `rng` is a NumPy Generator.
@@ -384,7 +406,9 @@ class World:
                 return configuration
         raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
 
-    def check_free(self, ignoring_motions=(), **configurations):
+    def check_free(
+        self, ignoring_motions: Collection[str] = (), **configurations: np.ndarray
+    ) -> None:
         """Raise ValueError, naming the contacts, if one of the configurations is in collision.
 
         The episode then continues as if it had not been checked; otherwise the arm has moved. E.g.
@@ -400,10 +424,13 @@ class World:
                 self._restore(before)
                 raise ValueError(f"{name} is in collision: {contacts}")
 
-    def contact_names(self, moving=True):
+    def contact_names(self, moving: bool = True) -> str:
         """The pairs in contact, in words; after `in_collision`, with the same `moving`."""
-        kinds = ["the floor"] * (self.scene.floor is not None)
-        kinds += ["the table"] * (self.scene.table is not None)
+        kinds = []
+        if self.scene.floor is not None:
+            kinds.append("the floor")
+        if self.scene.table is not None:
+            kinds.append("the table")
         kinds += [f"obstacle {i}" for i in range(len(self.scene.obstacles))]
         names = {
             body: f"the arm with {kind}" for body, kind in zip(self._bodies, kinds, strict=True)
@@ -413,7 +440,7 @@ class World:
 
     # --- The arm
 
-    def place(self, configuration, time=0.0):
+    def place(self, configuration: ArrayLike, time: float = 0.0) -> None:
         """Teleport the arm to joint angles (n, rad), at rest, leaving no old contact points.
 
         `time`: s, from which on obstacles move, as a multiple of `TIME_STEP`.
@@ -423,35 +450,48 @@ class World:
         nearly as close. Far away, in a configuration without contacts, all of them are dropped.
         """
         self.check_open()
-        client, body, robot = self.client, self.body, self.robot
+        client = self.client
+        body = self.body
+        robot = self.robot
         p.resetBasePositionAndOrientation(body, FAR_AWAY, NO_TURN, physicsClientId=client)
         robot.set_configuration(client, body, robot.contact_free)
         self._move_obstacles(round(time / TIME_STEP))
         p.performCollisionDetection(physicsClientId=client)
         p.resetBasePositionAndOrientation(body, *self._in_place, physicsClientId=client)
         robot.set_configuration(client, body, configuration)
-        self._start, self._events = (tuple(configuration), self.time), []
+        self._start = tuple(np.asarray(configuration)), self.time
+        self._events = []
 
-    def command(self, configuration):
+    def command(self, configuration: list[float]) -> None:
         """Set the targets of the arm's position controllers: joint angles (list of n, rad)."""
         self.check_open()
         self._target = tuple(configuration)
         self.robot.command(self.client, self.body, configuration)
 
-    def simulate(self):
+    def simulate(self) -> bool:
         """Run the physics of one environment step. Returns whether the arm was in contact."""
         self.check_open()
         self._record(self._target)
+        client = self.client
+        body = self.body
         contact = False
         for _ in range(SUBSTEPS):
-            self._step_physics()
+            if self._movers:
+                self._step_with_movers()
+            else:
+                p.stepSimulation(physicsClientId=client)
+                self._substep += 1
             if not contact:
                 # A contact also counts at distance zero, when the surfaces push on each other.
-                points = p.getContactPoints(bodyA=self.body, physicsClientId=self.client)
-                contact = any(point[8] < 0.0 or point[9] > 0.0 for point in points)
+                for point in p.getContactPoints(bodyA=body, physicsClientId=client):
+                    if point[8] < 0.0 or point[9] > 0.0:
+                        contact = True
+                        break
         return contact
 
-    def read_arm(self, velocities=False, pose=False):
+    def read_arm(
+        self, velocities: bool = False, pose: bool = False
+    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """The arm's state.
 
         Returns:
@@ -462,14 +502,15 @@ class World:
         self.check_open()
         robot = self.robot
         joints = p.getJointStates(self.body, robot.joint_indices, physicsClientId=self.client)
-        state, velocity = robot.normalise([joint[0] for joint in joints]), None
+        state = robot.normalise([joint[0] for joint in joints])
+        velocity = None
         if velocities:
             speeds = np.array([joint[1] for joint in joints])
             velocity = 2.0 * speeds / (robot.upper - robot.lower)
         read = robot.read_end_effector_pose if pose else robot.read_end_effector
         return state, velocity, read(self.client, self.body)
 
-    def mark_goal(self, position, radius):
+    def mark_goal(self, position: np.ndarray, radius: float) -> None:
         """Show a green ball, visual only, at a position (3,), m. There is only one."""
         self.check_open()
         if self._goal_marker is None:
@@ -487,7 +528,7 @@ class World:
         )
         self._goal = position, radius
 
-    def close(self):
+    def close(self) -> None:
         """Disconnect from PyBullet. Closing twice is allowed."""
         if self.client is not None:
             p.disconnect(physicsClientId=self.client)

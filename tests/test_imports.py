@@ -25,7 +25,7 @@ ROWS = [
 # The environment's own files and packages, likewise.
 ENV_ROWS = [
     ("robots",),
-    ("scenes", "subgoals"),
+    ("scenes", "subgoals", "goals"),
     ("world", "collision", "tasks"),
     ("arm_env", "perception"),
     ("wrappers",),

@@ -12,6 +12,7 @@ Table and floor are known to all of them, and so are obstacles with `may_touch`:
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
@@ -23,9 +24,10 @@ from roboarm_nmp.envs.perception.point_clouds import (
     without_known,
 )
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
-from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene
+from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scene
 from roboarm_nmp.utils.names import suggest
 
+GeometrySource = Callable[[Scene], CollisionChecker]
 GROUND_TRUTH = "ground_truth"
 CACHED_CHECKERS = 64  # about 60 kB each
 CACHED_FINE_CHECKERS = 4  # about 1 MB each

@@ -58,9 +58,7 @@ def play(env, steps, seed):
 @pytest.mark.parametrize(
     "task, arguments",
     [
-        ("random_boxes_hard", {}),
         ("random_boxes_hard", {"render_mode": "rgb_array", "episodes_per_scene": 2}),
-        ("random_boxes_hard", {"encoder": "oracle", "velocities": True}),
         ("wall", {"stop_on_collision": True, "sink_state": True, "goal_type": "config"}),
         (
             "random_boxes_easy",

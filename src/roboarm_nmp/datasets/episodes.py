@@ -12,6 +12,7 @@ import numpy as np
 
 from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.format import DatasetError
+from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.subgoals import MAX_STEP
 
 
@@ -29,29 +30,6 @@ class Episode(NamedTuple):
     reached: np.ndarray
 
 
-def end_effector_of(goal_type, configuration, robot):
-    """What `observation` has of the end effector: its position (..., 3), or for `pose` (..., 7).
-
-    `configuration`: joint angles (..., n), rad.
-    """
-    if goal_type == "pose":
-        return robot.end_effector_pose(configuration)
-    return robot.forward_kinematics(configuration)
-
-
-def goal_of(goal_type, state, end_effector):
-    """The goal that an arm achieves: (..., 3) for `ee`, (..., n) `config`, (..., n + 3) `combined`.
-
-    And (..., 7) for `pose`. `state` (..., n) is its normalised configuration, `end_effector` as of
-    `end_effector_of`.
-    """
-    if goal_type in ("ee", "pose"):
-        return end_effector
-    if goal_type == "config":
-        return state
-    return np.concatenate([state, end_effector], axis=-1)
-
-
 def observed(states, goal, goal_type, robot):
     """Observations at `states`, without velocities, in an episode with `goal`.
 
@@ -65,10 +43,16 @@ def observed(states, goal, goal_type, robot):
         float32 `observation` (m, n + 3), for `pose` (m, n + 7), `achieved_goal` (m, g),
         `desired_goal` (..., g).
     """
-    end_effectors = end_effector_of(goal_type, robot.denormalise(states), robot)
-    goal = goal_of(goal_type, robot.normalise(goal), end_effector_of(goal_type, goal, robot))
-    arrays = np.hstack([states, end_effectors]), goal_of(goal_type, states, end_effectors), goal
-    return tuple(array.astype(np.float32) for array in arrays)
+    kind = GOAL_TYPES[goal_type]
+    end_effectors = kind.end_effector(robot, robot.denormalise(states))
+    observations = np.hstack([states, end_effectors])
+    achieved = kind.achieved(states, end_effectors)
+    desired = kind.achieved(robot.normalise(goal), kind.end_effector(robot, goal))
+    return (
+        observations.astype(np.float32),
+        achieved.astype(np.float32),
+        desired.astype(np.float32),
+    )
 
 
 def demo_episode(demo, env):

@@ -26,6 +26,7 @@ from roboarm_nmp.datasets.format import QueryScenes
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import Query, load_queries, validate
 from roboarm_nmp.envs.arm_env import deviations
+from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.noise import SensorNoise
@@ -46,7 +47,6 @@ from roboarm_nmp.policies.baselines import (
 )
 from roboarm_nmp.policies.pose_goals import goal_configuration
 from roboarm_nmp.policies.registry import (
-    FOR_POSES,
     filter_around,
     find_policy,
     make_policy,
@@ -272,7 +272,9 @@ def _prepare(policy, task, options):
             policy, trained = find_policy(policy)
             task = own_task(policy) if task is None else task
             own = trained.get("goal_type")
-            by_kinematics = options.goal_type == "pose" and own in FOR_POSES
+            by_kinematics = (
+                options.goal_type == "pose" and trained and GOAL_TYPES[own].has_configuration
+            )
             if trained and options.goal_type not in (None, own) and not by_kinematics:
                 raise EvaluationError(
                     f"{policy} was trained with the goal type {trained['goal_type']!r}, it cannot "

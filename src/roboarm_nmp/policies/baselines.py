@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.policies.pose_goals import goal_configuration, observed_at_start
 
@@ -79,7 +80,7 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
     if env.action_mode != "relative":
         raise ValueError(f"{name} gives displacements, not actions of mode {env.action_mode!r}")
     if name == "go-to-goal":
-        observes_goal = env.goal_type in ("config", "combined")
+        observes_goal = GOAL_TYPES[env.goal_type].has_configuration
         return lambda number, query: EpisodePolicy(
             _go_to_goal(_goal(env, query), robot, observes_goal)
         )

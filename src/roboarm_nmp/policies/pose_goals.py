@@ -6,7 +6,7 @@ much clearance as `CLEARANCES` says, if there is one.
 
 import numpy as np
 
-from roboarm_nmp.datasets.episodes import goal_of
+from roboarm_nmp.envs.goals import GOAL_TYPES
 
 # m, in the geometry source of the environment's link distances: the first that any solution has.
 CLEARANCES = (0.02, 0.01, 0.0)
@@ -55,7 +55,8 @@ class ConfigurationGoals:
     """
 
     def __init__(self, env, goal_type):
-        self.env, self.goal_type, self.robot = env, goal_type, env.unwrapped.robot
+        self.env, self.robot = env, env.unwrapped.robot
+        self._goal_type = GOAL_TYPES[goal_type]
         self._has_distances = "link_distances" in env.observation_space.spaces
         self._more = {}
 
@@ -79,7 +80,8 @@ class ConfigurationGoals:
         self._set(goal, np.zeros(3), self.env.unwrapped.current_scene)
 
     def _set(self, state, position, scene):
-        self._more = {"desired_goal": goal_of(self.goal_type, state, position).astype(np.float32)}
+        desired = self._goal_type.achieved(state, position)
+        self._more = {"desired_goal": desired.astype(np.float32)}
         if self._has_distances:
             at = self.env.get_wrapper_attr("link_distances_at")
             self._more["goal_link_distances"] = at(np.clip(state, -1.0, 1.0), scene)
@@ -89,6 +91,6 @@ class ConfigurationGoals:
         joints, inner = self.robot.num_joints, observation["observation"]
         end = self.env.unwrapped.observation_space["observation"].shape[0]  # of the quaternion
         position = inner[end - 7 : end - 4]
-        achieved = goal_of(self.goal_type, inner[:joints], position)
+        achieved = self._goal_type.achieved(inner[:joints], position)
         more = {"observation": np.delete(inner, np.s_[end - 4 : end]), "achieved_goal": achieved}
         return {**observation, **more, **self._more}

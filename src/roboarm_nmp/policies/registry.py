@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.policies.baselines import (
     BASELINES,
     OMPL_PLANNERS,
@@ -35,7 +36,6 @@ ENV_ARGUMENTS = (
     *("goal_type", "action_mode", "max_step", "velocities"),
     *("encoder", "num_points", "geometry_source", "link_distances", "append_link_distances"),
 )
-FOR_POSES = ("config", "combined")
 """Goal types of policies that also take goal poses, by inverse kinematics."""
 PRETRAINED = Path(__file__).parent / "pretrained"
 MAX_RECURRENT_SIZE = 65_536  # numbers
@@ -311,7 +311,7 @@ def _trained(path, env):
 
     example = {name: np.zeros(one.shape, np.float32) for name, one in env.observation_space.items()}
     as_observed = None
-    if env.goal_type == "pose" and trained["goal_type"] in FOR_POSES:
+    if env.goal_type == "pose" and GOAL_TYPES[trained["goal_type"]].has_configuration:
         as_observed = ConfigurationGoals(env, trained["goal_type"])
         as_observed.begin_anywhere()
         example = as_observed(example)

@@ -11,8 +11,8 @@ import torch
 
 from attacks.children import RAN, REFUSED
 from roboarm_nmp import envs
-from roboarm_nmp.envs import arm_env
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.perception import sensors
 from roboarm_nmp.envs.perception.sensors import SensorWorld
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -34,8 +34,8 @@ ARGUMENTS = (
 )
 GOOD_VALUES = {
     "episodes_per_scene": (1, 3),
-    "goal_type": arm_env.GOAL_TYPES,
-    "action_mode": arm_env.ACTION_MODES,
+    "goal_type": tuple(GOAL_TYPES),
+    "action_mode": ("relative", "subgoal"),
     "horizon": (1, 50),
     "velocities": (False, True),
     "render_mode": (None, "rgb_array"),
