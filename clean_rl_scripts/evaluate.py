@@ -39,6 +39,7 @@ From Python: `roboarm_nmp.evaluate(policy, task, ...)` returns the same numbers 
 import io
 import json
 import sys
+from collections.abc import Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,12 +47,13 @@ from typing import Literal
 
 from PIL import Image
 
-from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.evaluation.report import report
 from roboarm_nmp.policies.baselines import OMPL_PLANNERS, TIME_LIMIT, TRIES
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import check_writable, write_atomically
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
+
+FILTER_FLAGS = ("safety_margin", "escape", "lookahead", "obstacle_velocities", "approach")
 
 
 @dataclass
@@ -61,10 +63,8 @@ class Args:
     policy network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy
     (`roboarm policies`)"""
     task: str | None = None
-    """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); by default the one that the
-    policy was trained on"""
-    robot: Path | None = None
-    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
+    """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); with another arm TASK@FILE, a
+    robot's file (docs/customise/robot.md); by default the task that the policy was trained on"""
     goal_type: Literal["ee", "config", "combined", "pose"] | None = None
     """what the goal is; by default the policy's own, otherwise `ee`"""
     split: Literal["test", "validation", "original"] = "test"
@@ -95,7 +95,7 @@ class Args:
     lookahead: flags.NonNegativeFloat = 0.0
     """s: the safety filter takes distances as they will be after this time, if obstacles continue
     to approach as they do now"""
-    velocities: bool = True
+    obstacle_velocities: bool = True
     """the safety filter takes the velocities of obstacles into account, estimated from successive
     observations; otherwise each observation counts as if nothing moved"""
     approach: bool = False
@@ -119,7 +119,7 @@ class Args:
     real_time: bool = False
     """instead: as many steps of 1/30 s as an action, or a plan, takes to compute, at least 1; the
     numbers depend on the machine and its load"""
-    clearance: bool = False
+    measure_clearance: bool = False
     """also measure each successful episode's smallest distance from the ground-truth obstacles"""
     json: Path | None = None
     """write the results to this file too"""
@@ -127,7 +127,7 @@ class Args:
     """render the first query's episode as an image strip into this PNG file"""
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """The command. Returns the exit code: 0, or 2 for arguments that cannot be used."""
     args = flags.parse(Args, arguments)
     try:
@@ -135,21 +135,23 @@ def main(arguments=None):
         _check_baseline_flags(args)
         if args.json is not None and args.json == args.image:
             raise ValueError(f"--json and --image are the same file, {args.json}")
-        for path in filter(None, (args.json, args.image)):
-            check_writable(path)
+        for path in (args.json, args.image):
+            if path is not None:
+                check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
         from roboarm_nmp.envs.perception.noise import SensorNoise
         from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_image
 
-        noise = SensorNoise.parse(args.sensor_noise) if args.sensor_noise else None
-        options = vars(args) | {"safety_filter": _safety_filter(args), "sensor_noise": noise}
-        options["task"] = task_with_robot(args.task, args.robot)
-        filters = "safety_margin", "escape", "lookahead", "velocities", "approach"
-        for name in ("robot", *filters, "json", "image"):
+        options = dict(vars(args))
+        for name in ("json", "image", *FILTER_FLAGS):
             del options[name]
+        options["sensor_noise"] = None
+        if args.sensor_noise:
+            options["sensor_noise"] = SensorNoise.parse(args.sensor_noise)
+        options["safety_filter"] = _safety_filter(args)
         result = evaluate(**options, progress=True)
     except (ValueError, BrokenProcessPool) as error:
-        print(f"evaluate.py: {error}", file=sys.stderr)
+        print(error_line(error), file=sys.stderr)
         return 2
     print(report(result | {"policy": args.policy}), flush=True)  # before JSON on /dev/stdout
     try:
@@ -160,7 +162,7 @@ def main(arguments=None):
             Image.fromarray(first_episode_image(**options)).save(png, format="PNG")
             write_atomically(args.image, png.getvalue())
     except OSError as error:
-        print(f"evaluate.py: cannot write: {error}", file=sys.stderr)
+        print(error_line(f"cannot write: {error}"), file=sys.stderr)
         return 2
     return 0
 
@@ -178,30 +180,33 @@ def _safety_filter(args):
     from roboarm_nmp.policies.registry import find_policy, own_safety_filter
     from roboarm_nmp.policies.safety_filter import SafetyFilter
 
-    flags_given = {
-        "--no-escape": not args.escape,
-        "--approach": args.approach,
-        "--lookahead": args.lookahead != 0.0,
-        "--no-velocities": not args.velocities,
-    }
-    given = [flag for flag, is_given in flags_given.items() if is_given]
-    if {"--lookahead", "--no-velocities"} <= set(given):
-        raise ValueError("--lookahead needs the velocities that --no-velocities leaves out")
-    if given and args.safety_margin == 0:
-        raise ValueError(f"{given[0]}: there is no safety filter with --safety-margin 0")
-    lookahead = args.lookahead if args.velocities else None
+    changes = {}
+    if not args.escape:
+        changes["--no-escape"] = {"escape": False}
+    if args.approach:
+        changes["--approach"] = {"approach": True}
+    if args.lookahead:
+        changes["--lookahead"] = {"lookahead": args.lookahead}
+    if not args.obstacle_velocities:
+        changes["--no-obstacle-velocities"] = {"lookahead": None}
+    if args.lookahead and not args.obstacle_velocities:
+        raise ValueError(
+            "--lookahead needs the velocities that --no-obstacle-velocities leaves out"
+        )
     if args.safety_margin is not None:
-        options = args.safety_margin, args.escape, args.approach, lookahead
-        return SafetyFilter(*options) if args.safety_margin else False
-    if not given:
-        return None
-    own = own_safety_filter(find_policy(args.policy)[0])
-    if own is None:
-        raise ValueError(f"{given[0]}: the policy has no safety filter; --safety-margin adds one")
-    if not {"--lookahead", "--no-velocities"} & set(given):
-        lookahead = own.lookahead
-    options = {"approach": own.approach or args.approach, "lookahead": lookahead}
-    return replace(own, escape=own.escape and args.escape, **options)
+        safety_filter = SafetyFilter(args.safety_margin) if args.safety_margin else False
+    elif changes:
+        safety_filter = own_safety_filter(find_policy(args.policy)[0])
+    else:
+        safety_filter = None  # the policy's own
+    if changes and not safety_filter:
+        [flag, *_] = changes
+        if args.safety_margin == 0:
+            raise ValueError(f"{flag}: there is no safety filter with --safety-margin 0")
+        raise ValueError(f"{flag}: the policy has no safety filter; --safety-margin adds one")
+    for change in changes.values():
+        safety_filter = replace(safety_filter, **change)
+    return safety_filter
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ import tyro
 from roboarm_nmp.utils import names
 from roboarm_nmp.utils.files import check_folder, write_atomically
 from roboarm_nmp.utils.flags import CORES, PositiveInt, Seed, Workers, check, parse
-from roboarm_nmp.utils.signals import Terminated, end_with_one_line, exit_interrupted
+from roboarm_nmp.utils.signals import Terminated, end_with_one_line, error_line, exit_interrupted
 from roboarm_nmp.utils.workers import check_ray
 
 try:
@@ -356,11 +356,11 @@ def main(arguments=None):
             )
             values = [t.value for t in study.trials if t.state == TrialState.COMPLETE]
     except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
     except KeyboardInterrupt as interrupt:
         exit_interrupted(interrupt, "the same command continues the search")
     if not values:
-        sys.exit(f"error: every trial failed; see {args.folder / 'trials.csv'}")
+        sys.exit(error_line(f"every trial failed; see {args.folder / 'trials.csv'}"))
     print(
         f"best of {len(values)}: {max(values):.3f}; all of them are in {args.folder / 'trials.csv'}"
     )

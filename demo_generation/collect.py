@@ -39,7 +39,7 @@ from roboarm_nmp.utils.flags import (
 )
 from roboarm_nmp.utils.progress import progress_bar, write_line
 from roboarm_nmp.utils.random_streams import Stream
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 MAX_QUERIES = 100  # tried for one demonstration
 ATTEMPTS = 3  # plans tried on a query of the Panda
@@ -290,10 +290,10 @@ def main(args):
         counts = collect(path, args.num, options, args.workers, args.ray_address)
     except OSError as error:
         sys.exit(
-            f"error: {error}\nwhat was collected is safe; the same command continues from here"
+            f"{error_line(error)}\nwhat was collected is safe; the same command continues from here"
         )
     except (ValueError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
     rejected = ", ".join(f"{counts[reason]} {reason}" for reason in REASONS)
     solved = args.num / (args.num + counts["queries_given_up"])
     print(

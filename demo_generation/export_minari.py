@@ -39,7 +39,7 @@ from roboarm_nmp.envs.tasks import has_name, split_robot, task_with_robot
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.progress import progress_bar
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 PREFIX = ".exporting-"  # of incomplete folders; Minari ignores hidden ones
 
@@ -241,7 +241,7 @@ def main(args):
         options = args.goal_type, args.dataset_id, args.exact, args.overwrite
         dataset_id, steps = export(demos, *options, task=task)
     except (ImportError, OSError, ValueError) as error:  # a DatasetError is a ValueError
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
     print(f"{dataset_id}: {len(demos)} episodes, {steps} steps")
 
 

@@ -52,7 +52,7 @@ from roboarm_nmp.utils.files import check_writable
 from roboarm_nmp.utils.flags import CORES, PositiveInt, Seed, Workers
 from roboarm_nmp.utils.progress import progress_bar, write_line
 from roboarm_nmp.utils.random_streams import Stream
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 # Stored queries are held longer than those sampled in training: 0.8 s.
 HOLD_STEPS = 24
@@ -342,7 +342,7 @@ def main(args):
     try:
         pairs = _check(args)
     except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
     try:
         for task, path in pairs:
             rejected = make_queries(
@@ -366,7 +366,7 @@ def main(args):
                 text += f", {rejected['unsolved']} not solved by the planner ({share:.3f})"
             print(text)
     except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
 
 
 if __name__ == "__main__":

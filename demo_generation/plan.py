@@ -31,7 +31,7 @@ from roboarm_nmp.utils.flags import (
     PositiveFloat,
     Seed,
 )
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 CLOUD_FLAGS = (
     *("units", "frame", "intrinsics", "recorded_at", "arm_distance", "table", "workspace"),
@@ -318,7 +318,7 @@ def main(args):
                 save_trajectory(args.output, episode)
             print(f"{args.output}: {len(configurations)} configurations")
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
     sys.exit(int(args.policy != "planner" and not episode.success))
 
 

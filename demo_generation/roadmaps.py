@@ -44,7 +44,7 @@ from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.utils.random_streams import Stream
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 # L2, normalised, between checked states of a motion before a path wants to take it.
 COARSE = 8 * RESOLUTION
@@ -600,7 +600,7 @@ def main(args):
     try:
         made = collect(args)
     except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
     count = len(made.offsets) - 1
     print(f"{args.output}: {len(made)} scenes, {count} paths, {size / 1e6:.1f} MB")

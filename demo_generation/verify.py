@@ -25,7 +25,7 @@ from roboarm_nmp.planning.following import follow
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.flags import CORES, Workers
 from roboarm_nmp.utils.progress import progress_bar, write_line
-from roboarm_nmp.utils.signals import end_with_one_line, exit_interrupted
+from roboarm_nmp.utils.signals import end_with_one_line, error_line, exit_interrupted
 
 VERDICTS = ("good", "changed", "missed", "collided", "refused")
 REPAIR_ATTEMPTS = 10
@@ -164,7 +164,7 @@ def main(args):
         if args.robot and not task and not all(map(is_task, args.files)):
             raise ValueError("--robot of a file needs its --task")
     except ValueError as error:
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
     failed = False
     for name in args.files:
         try:
@@ -172,7 +172,7 @@ def main(args):
                 name = task_with_robot(name, args.robot)
             counts = verify(name, args.workers, args.repair, task=task)
         except (ValueError, OSError, RuntimeError) as error:
-            print(f"error: {error}", file=sys.stderr)
+            print(error_line(error), file=sys.stderr)
             failed = True
             continue
         except KeyboardInterrupt as interrupt:

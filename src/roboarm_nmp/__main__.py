@@ -71,7 +71,7 @@ def main(arguments=None):
     try:
         runpy.run_module(
             f"roboarm_nmp.{commands[name][0]}",
-            init_globals={"PROGRAM": f"{prog} {name}"},  # for `utils.flags.program`
+            init_globals={"PROGRAM": f"{prog} {name}"},  # for `utils.signals.program`
             run_name="__main__",
             alter_sys=True,
         )

@@ -85,7 +85,7 @@ def test_search_space_is_parsed(text, name, distribution):
 def test_bad_search_space_is_rejected(trainer, text, capsys):
     with pytest.raises(SystemExit) as exit:
         sweep.main([str(trainer), "--search", text])
-    assert str(exit.value).startswith("error: ") and text in str(exit.value)
+    assert text in str(exit.value)
     assert not list(trainer.parent.glob("sweep*"))
 
 

@@ -524,7 +524,10 @@ def test_make_queries_command_repeats_itself(tmp_path):
     again = ["roboarm_nmp", *made_by.split()[1:], "--output", path, "--workers", 1]
     refused = command(*again)
     assert refused.returncode == 1 and path.read_bytes() == first
-    assert refused.stderr.splitlines()[-1] == f"error: {path} exists; --overwrite replaces it"
+    assert (
+        refused.stderr.splitlines()[-1]
+        == f"roboarm queries: {path} exists; --overwrite replaces it"
+    )
     path.write_bytes(b"old")
     assert command(*again, "--overwrite").returncode == 0
     assert path.read_bytes() == first
@@ -580,7 +583,7 @@ def test_goal_region_without_room_is_an_error_that_counts(tmp_path, monkeypatch)
         yield from map(make_worker(*arguments), jobs)
 
     monkeypatch.setattr(make_queries.workers, "run", in_this_process)
-    with pytest.raises(SystemExit, match="error: --goal-region: of 20,000"):
+    with pytest.raises(SystemExit, match="--goal-region: of 20,000"):
         make_queries.main(args)
     assert not list(tmp_path.iterdir())
 

@@ -33,6 +33,7 @@ from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.utils import workers
+from roboarm_nmp.utils.signals import error_line
 
 TASK, NUM = "double_walls", 16
 
@@ -199,9 +200,11 @@ def test_rejected_attempts_are_counted(output):
 def test_limits_too_tight_for_every_query_are_an_error(tmp_path):
     result = run(tmp_path / "demos.h5", "--max-checks", 1, task="no_obstacles")
     assert result.returncode == 1
-    assert "error: 100 queries in a row could not be solved ({'no_plan': 300})" in result.stderr
+    assert (
+        "collect.py: 100 queries in a row could not be solved ({'no_plan': 300})" in result.stderr
+    )
     last = result.stderr.strip().splitlines()[-1]
-    assert last.startswith("error: ") and "Traceback" not in result.stderr
+    assert last.startswith("collect.py: ") and "Traceback" not in result.stderr
 
 
 # --- Interrupted, killed, damaged
@@ -331,7 +334,7 @@ def test_full_disk_keeps_the_journal(whole, output):
         command(output), cwd=ROOT, capture_output=True, text=True, preexec_fn=small_files
     )
     assert result.returncode == 1
-    assert "error: " in result.stderr and "Traceback" not in result.stderr
+    assert "collect.py: " in result.stderr and "Traceback" not in result.stderr
     assert result.stderr.strip().splitlines()[-1].startswith("what was collected is safe")
     contents = collect.journal_of(output).read_bytes()
     assert contents.endswith(b"\n") and 1000 < len(contents) <= 9000
@@ -353,7 +356,7 @@ def test_disk_too_full_for_the_file_keeps_the_journal(whole, journal, output, mo
         patched.setattr("os.fsync", full)
         with pytest.raises(SystemExit) as ended:
             collect.main(collect.Args(TASK, num=NUM, output=output))
-    assert str(ended.value.code).startswith("error: [Errno 28] No space left on device")
+    assert str(ended.value.code).startswith(error_line("[Errno 28] No space left on device"))
     assert collect.journal_of(output).read_bytes() == journal and not output.exists()
     assert finish(output, whole) == NUM
 
@@ -364,7 +367,7 @@ def test_second_collection_of_the_same_file_is_rejected(whole, output):
         second = run(output)
         process.send_signal(signal.SIGCONT)
         assert second.returncode == 1
-        expected = f"error: {collect.journal_of(output)}: another process is writing to it\n"
+        expected = f"collect.py: {collect.journal_of(output)}: another process is writing to it\n"
         assert second.stderr.endswith(expected) and "Traceback" not in second.stderr
         assert process.wait(60) == 0
     assert output.read_bytes() == whole.read_bytes()
@@ -380,7 +383,7 @@ def rejection(args):
         collect.main(args)
     assert time.monotonic() - begin < 10
     message = ended.value.code
-    assert isinstance(message, str) and message.startswith("error: ") and "\n" not in message
+    assert isinstance(message, str) and message.startswith(error_line("")) and "\n" not in message
     return message
 
 
@@ -419,14 +422,14 @@ def test_error_is_one_line(tmp_path):
     result = run(tmp_path / "missing" / "demos.h5", task="wall")
     assert result.returncode == 1 and result.stdout.count("\n") <= 1
     errors = [line for line in result.stderr.splitlines() if "pybullet" not in line]
-    assert len(errors) == 1 and errors[0].startswith("error: cannot write")
+    assert len(errors) == 1 and errors[0].startswith("collect.py: cannot write")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_existing_file_is_rejected_without_overwrite(whole, output):
     output.write_bytes(b"precious")
     args = collect.Args(TASK, num=NUM, output=output)
-    assert rejection(args) == f"error: {output} exists; --overwrite replaces it"
+    assert rejection(args) == error_line(f"{output} exists; --overwrite replaces it")
     assert output.read_bytes() == b"precious" and list(output.parent.iterdir()) == [output]
     assert finish(output, whole, "--overwrite") == 0
 
@@ -698,7 +701,7 @@ def test_verify_continues_after_a_bad_file(whole, tmp_path):
     (tmp_path / "bad.h5").write_bytes(whole.read_bytes()[:3000])
     result = verify_command(tmp_path / "bad.h5", tmp_path / "none.h5", whole)
     assert result.returncode == 1 and "Traceback" not in result.stderr
-    errors = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    errors = [line for line in result.stderr.splitlines() if line.startswith("verify.py: ")]
     assert len(errors) == 2 and "bad.h5" in errors[0] and "none.h5: no such file" in errors[1]
     assert f"{whole}: {NUM} good" in result.stdout
 
@@ -738,5 +741,5 @@ def test_missing_cluster_is_an_error(output):
     pytest.importorskip("ray")
     result = run(output, "--ray-address", "auto")
     assert result.returncode == 1 and "Traceback" not in result.stderr
-    assert "error: Could not find any running Ray instance" in result.stderr
+    assert "collect.py: Could not find any running Ray instance" in result.stderr
     assert not output.exists()

@@ -21,6 +21,7 @@ from roboarm_nmp.envs.robots.files import load_robot  # noqa: E402
 from roboarm_nmp.envs.robots.panda import PANDA  # noqa: E402
 from roboarm_nmp.envs.scenes.files import save_scene  # noqa: E402
 from roboarm_nmp.envs.scenes.primitives import to_array  # noqa: E402
+from roboarm_nmp.utils.signals import error_line
 
 OPTIONS = {
     "task": "wall",
@@ -67,7 +68,7 @@ def error_of(*flags):
     result = run(*flags)
     assert result.returncode == 1
     lines = [line for line in result.stderr.splitlines() if not line.startswith("pybullet")]
-    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
+    assert len(lines) == 1 and lines[0].startswith("export_minari.py: "), result.stderr
     return lines[0]
 
 
@@ -186,7 +187,7 @@ def test_scene_file_is_exported_with_its_path(demos, storage, tmp_path_factory):
     plans, states = zip(*((demo.plan, demo.states) for demo in demos), strict=True)
     file = folder / "mine_demos.h5"
     write_demos(file, str(folder / "mine.yaml"), 5, plans, states, columns, "a test", {})
-    with pytest.raises(SystemExit, match="^error: .* task 'mine' is not in envs.TASKS: .* --task"):
+    with pytest.raises(SystemExit, match="task 'mine' is not in envs.TASKS: .* --task"):
         export_minari.main(export_minari.Args(file=file))
     assert list(storage.iterdir()) == []
     export_minari.main(export_minari.Args(task=str(folder / "mine.yaml")))
@@ -249,7 +250,7 @@ def test_main_names_the_error(path, monkeypatch):
             export_minari.main(export_minari.Args(**flags))
         return caught.value.code
 
-    assert error() == "error: give --task, or the --file of a named task of the Panda"
+    assert error() == error_line("give --task, or the --file of a named task of the Panda")
     assert error(file=path, robot=path) == error()
     assert "no such file" in error(file=path.with_name("none.h5"))
     for bad in ("no version-v0", "name", "../up-v0"):

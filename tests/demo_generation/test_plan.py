@@ -12,6 +12,7 @@ from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.motions.trajectories import load_joint_path, load_trajectory
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.signals import error_line
 
 POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
 
@@ -180,4 +181,4 @@ def test_bad_arguments_give_one_line(arguments, message, tmp_path, monkeypatch):
     np.save("goal.npy", hand + np.random.default_rng(0).normal(0, 0.02, (200, 3)))
     code = run("--start", START, *arguments)
     assert isinstance(code, str) and message in code and "\n" not in code
-    assert code.startswith("error: ")
+    assert code.startswith(error_line(""))

@@ -36,6 +36,7 @@ from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.policies.registry import make_policy
 from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
+from roboarm_nmp.utils.signals import error_line
 
 SCRIPT = ROOT / "clean_rl_scripts" / "evaluate.py"
 HARD = "random_boxes_hard"
@@ -419,7 +420,7 @@ def test_headers_of_different_evaluations_differ():
 
 
 def test_header_says_once_how_the_filter_takes_moving_obstacles():
-    for lookahead, words in ((0.5, ", 0.5 s ahead"), (None, ", no velocities")):
+    for lookahead, words in ((0.5, ", 0.5 s ahead"), (None, ", no obstacle velocities")):
         safety_filter = SafetyFilter(FILTER.margin, lookahead=lookahead)
         result = evaluate("go-to-goal", "wall", num_queries=1, safety_filter=safety_filter)
         expected = "margin 0.01 m, escapes local minima" + words
@@ -610,8 +611,8 @@ def test_errors_of_the_command_are_one_line_before_any_work(
             "there is no safety filter with --safety-margin",
         ),
         (
-            {"safety-margin": "0.01", "no-velocities": None, "lookahead": "0.2"},
-            "--lookahead needs the velocities that --no-velocities leaves out",
+            {"safety-margin": "0.01", "no-obstacle-velocities": None, "lookahead": "0.2"},
+            "--lookahead needs the velocities that --no-obstacle-velocities leaves out",
         ),
         ({"policy": "replanning", "replan": None}, "replan: replanning plans again by itself"),
         ({"policy": "planner", "tries": "3"}, "--tries is for via-points"),
@@ -648,7 +649,7 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         assert command.main(arguments) == 2, change
         output = capsys.readouterr()
         assert output.out == "" and message in output.err
-        assert output.err.startswith("evaluate.py: ") and output.err.count("\n") == 1
+        assert output.err.startswith(error_line("")) and output.err.count("\n") == 1
     assert command.main(["--policy", "go-to-goal"]) == 2
     assert "go-to-goal has no task of its own: choose one (--task)" in capsys.readouterr().err
 
@@ -659,7 +660,7 @@ def test_dead_workers_give_one_line(monkeypatch, capsys):
 
     monkeypatch.setattr(evaluation, "_run", die)
     assert command.main(["--policy", "go-to-goal", "--task", "wall"]) == 2
-    assert capsys.readouterr().err == "evaluate.py: workers died 5 times without a result\n"
+    assert capsys.readouterr().err == error_line("workers died 5 times without a result") + "\n"
 
 
 def test_goal_type_that_does_not_exist_is_rejected():
@@ -717,7 +718,7 @@ def test_moving_obstacles_are_evaluated_and_a_delay_is_noted(tmp_path, capsys):
     coming = Waypoints((1.0, 2.0), ((0.0, 0.0, 0.0), (0.0, 0.4, 0.0)))
     scene = Scene((Box((0.307, -0.4, 0.5), (0.1, 0.1, 0.1), motion=coming),))
     queries = SimpleNamespace(start=here[None], goal=there[None], scenes=[scene])
-    options = {"queries": queries, "goal_type": "config", "clearance": True}
+    options = {"queries": queries, "goal_type": "config", "measure_clearance": True}
     found = evaluate("go-to-goal", "no_obstacles", **options)
     assert found["collision_free_success_rate"] == 1 and found["action_delay"] == 0
     checkers = [CollisionChecker(scene.at(t)) for t in (0.0, found["mean_steps"] / 30)]
@@ -745,7 +746,7 @@ def test_header_names_each_option_of_a_filter_once(queries):
     options = {"queries": queries, "num_queries": 1, "goal_type": "combined"}
     safety_filter = SafetyFilter(escape=False, lookahead=None)
     text = report(evaluate("go-to-goal", "no_obstacles", safety_filter=safety_filter, **options))
-    assert "margin 0.01 m, no escape, no velocities\n" in text
+    assert "margin 0.01 m, no escape, no obstacle velocities\n" in text
 
 
 def test_time_per_action_does_not_depend_on_the_delay(queries):

@@ -63,7 +63,7 @@ def test_sparc_is_that_of_its_publication():
 
 def test_evaluation_reports_the_metrics_of_its_episodes():
     options = {"goal_type": "config", "num_queries": 3}
-    result = roboarm_nmp.evaluate("go-to-goal", "no_obstacles", clearance=True, **options)
+    result = roboarm_nmp.evaluate("go-to-goal", "no_obstacles", measure_clearance=True, **options)
     assert result["duration"] == pytest.approx(result["mean_steps"] / 30)
     assert 0 < result["ee_path_length"] < 5 and result["sparc"] < -1 and result["ee_sparc"] < -1
     assert result["max_jerk"] > result["mean_jerk"] / np.sqrt(7) > 0

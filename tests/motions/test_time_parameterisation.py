@@ -15,6 +15,7 @@ from roboarm_nmp.motions import retime
 from roboarm_nmp.motions.time_parameterisation import time_parameterise
 from roboarm_nmp.motions.trajectories import load_trajectory, save_joint_path
 from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.utils.signals import error_line
 
 START = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
 LIMITS = (PANDA.velocity, PANDA.acceleration, PANDA.jerk)
@@ -216,7 +217,7 @@ def test_command_names_the_file_and_the_reason_in_one_line(tmp_path, capsys, mon
     arguments = [str(path), "--output", str(output)]
     assert retime.main([*arguments, "--limits", "datasheet"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"error: {path}: waypoint 1") and error.count("\n") == 1
+    assert error.startswith(error_line(f"{path}: waypoint 1")) and error.count("\n") == 1
     assert retime.main([*arguments, "--task", "moving_boxes_easy"]) == 2
     assert "--task: obstacles of moving_boxes_easy move" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "toppra", None)  # not installed

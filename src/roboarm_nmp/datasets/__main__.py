@@ -12,7 +12,7 @@ from roboarm_nmp.datasets.demonstrations import demo_path, describe, load_demos
 from roboarm_nmp.datasets.format import locate
 from roboarm_nmp.datasets.queries import query_path, validate
 from roboarm_nmp.envs.tasks import get_task, is_task, task_with_robot
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 
 def main(arguments=None):
@@ -49,7 +49,7 @@ def main(arguments=None):
             options.task = task_with_robot(options.task, options.robot)
             get_task(options.task)
         except ValueError as error:
-            print(f"error: --task: {error}", file=sys.stderr)
+            print(error_line(f"--task: {error}"), file=sys.stderr)
             return 1
     return {"validate": _validate, "describe": _describe}[options.command](options)
 
@@ -83,7 +83,7 @@ def _validate(options):
             path, task = _locate(file, query_path, options)
             queries = validate(path, task, options.simulate, progress=True)
         except ValueError as error:
-            print(f"error: {error}", file=sys.stderr)
+            print(error_line(error), file=sys.stderr)
             bad = True
         else:
             test, validation = queries["test"], queries["validation"]
@@ -98,7 +98,7 @@ def _describe(options):
             describe(load_demos(*_locate(file, demo_path, options))) for file in options.files
         ]
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(error_line(error), file=sys.stderr)
         return 1
     print(" | ".join(["", *options.files]))
     for name in columns[0]:

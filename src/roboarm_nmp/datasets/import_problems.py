@@ -31,7 +31,7 @@ from roboarm_nmp.envs.world import World
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import check_writable
 from roboarm_nmp.utils.progress import progress_bar
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 LISTED = 20  # rejected problems that are listed, at most
 
@@ -150,7 +150,7 @@ def main(args):
         command += ["--robot", str(args.robot)] if args.robot else []
         write_problems(args.output, kept, shlex.join(command))
     except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(error_line(error))
     print(f"{args.output}: written")
 
 

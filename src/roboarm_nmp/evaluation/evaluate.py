@@ -101,7 +101,8 @@ class EvaluationOptions:
             policy (`evaluation.rollout.rollout`).
         real_time: instead of `action_delay`, as many steps as an action, or a plan, takes to
             compute, at least 1. Results then depend on the machine and its load.
-        clearance: also measure each episode's smallest distance from the ground-truth obstacles.
+        measure_clearance: also measure each episode's smallest distance from the ground-truth
+            obstacles.
         workers: processes, >= 1. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
         env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
@@ -127,7 +128,7 @@ class EvaluationOptions:
     sensor_noise: SensorNoise | None = None
     action_delay: int = 0
     real_time: bool = False
-    clearance: bool = False
+    measure_clearance: bool = False
     workers: int = 1
     env: dict | None = None
 
@@ -167,8 +168,8 @@ def evaluate(policy, task=None, *, progress=False, **options):
           interval, `..._interval`;
         - `mean_steps`, `path_length` (rad), `smoothness` (rad per step^2): means over successes;
         - `ee_path_length` (m), `ee_rotation` (degrees), `duration` (s), `mean_jerk` and `max_jerk`
-          (rad/s^3), `sparc`, `ee_sparc`, and with `clearance` `min_clearance` (m): means over
-          successes of `motions.metrics.motion_metrics`;
+          (rad/s^3), `sparc`, `ee_sparc`, and with `measure_clearance` `min_clearance` (m): means
+          over successes of `motions.metrics.motion_metrics`;
         - `ms_per_action`: of the policy alone, without the simulator and without planning;
         - `planning_seconds`, `planning_seconds_solved`: means over all queries, and over those with
           a motion found; `free_motion_rate`, only of `via-points`;
@@ -481,7 +482,7 @@ class _Worker:
 
     def _checker(self, scene, steps):
         """For the clearance in an episode; None where it is not measured."""
-        if not self.job.options.clearance:
+        if not self.job.options.measure_clearance:
             return None
         # Here, because Numba takes a while to import.
         from roboarm_nmp.envs.collision.checker import CollisionChecker
@@ -538,7 +539,7 @@ def _summary(job, outcomes):
 
     motion = np.array(columns.motion, dtype=np.float64).T
     motion = dict(zip(MOTION_METRICS, map(mean, motion), strict=True))
-    if not options.clearance:
+    if not options.measure_clearance:
         motion["min_clearance"] = None
     plans, safety_filter = job.policy in PLANNERS, options.safety_filter
     planning = {"planning_seconds": None, "planning_seconds_solved": None, "free_motion_rate": None}

@@ -65,7 +65,7 @@ def _settings(result):
         margin += ", approach paths" * ("approach" in safety_filter)
         if "lookahead" in safety_filter:
             ahead = safety_filter["lookahead"]
-            margin += ", no velocities" if ahead is None else f", {ahead:g} s ahead"
+            margin += ", no obstacle velocities" if ahead is None else f", {ahead:g} s ahead"
     limit, noise = result["time_limit"], result.get("sensor_noise", {})
     return {
         "robot": None if result["robot"] == PANDA.name else result["robot"],

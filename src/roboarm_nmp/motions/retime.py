@@ -21,7 +21,7 @@ import tyro
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import check_writable
 from roboarm_nmp.utils.flags import NonNegativeFloat, NonNegativeInt, PositiveShare
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 
 @dataclass
@@ -134,10 +134,10 @@ def main(arguments=None):
     try:
         print(retime(args))
     except (OSError, ValueError) as error:
-        print(f"error: {error}".replace("\n", " "), file=sys.stderr)
+        print(error_line(error), file=sys.stderr)
         return 2
     except ImportError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(error_line(error), file=sys.stderr)
         return 1
     return 0
 

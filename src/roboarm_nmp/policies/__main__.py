@@ -9,6 +9,7 @@ import json
 import sys
 
 from roboarm_nmp.policies.registry import PolicyError, pretrained_policies
+from roboarm_nmp.utils.signals import error_line
 
 
 def main(arguments=None):
@@ -32,7 +33,7 @@ def main(arguments=None):
         try:
             card = policy_card(options.name)
         except PolicyError as error:
-            print(f"error: {error}", file=sys.stderr)
+            print(error_line(error), file=sys.stderr)
             return 2
         print(json.dumps(card, indent=2) if options.json else _card(card))
         return 0

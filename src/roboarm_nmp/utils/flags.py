@@ -26,6 +26,8 @@ import docstring_parser
 import tyro
 from tyro.conf import arg
 
+from roboarm_nmp.utils.signals import program
+
 T = TypeVar("T")
 
 # The groups of `--help`, in its order, and the flags in each. Flags of other names are in OTHERS.
@@ -41,7 +43,7 @@ GROUPS = {
         *("encoder", "num_points", "velocities", "geometry_source", "link_distances"),
         *("observe_every", "sensor_noise"),
     ),
-    "safety_filter": ("safety_margin", "escape", "approach", "lookahead"),
+    "safety_filter": ("safety_margin", "escape", "approach", "lookahead", "obstacle_velocities"),
     "data": (
         *("demo_prob", "demos", "num_demos", "bc_weight", "demo_batch_size"),
         *("paths", "observations", "validation_share"),
@@ -49,7 +51,7 @@ GROUPS = {
     OTHERS: (),
     "evaluation": (
         *("eval_every", "eval_queries", "test_queries", "stop_at_success", "eval_scenes"),
-        *("clearance", "action_delay", "real_time"),
+        *("measure_clearance", "action_delay", "real_time"),
     ),
     "run": (
         *("seed", "runs_dir", "resume", "device", "bf16", "compile", "track", "workers"),
@@ -97,12 +99,6 @@ NonNegativeFloat = Annotated[
     float, Range(0.0, LARGEST, "at least 0, and finite"), arg(metavar="FLOAT >= 0")
 ]
 FiniteFloat = Annotated[float, Range(-LARGEST, LARGEST, "finite"), arg(metavar="FLOAT")]
-
-
-def program() -> str:
-    """The name of the running program, for messages: `roboarm evaluate`, or a script's name."""
-    main = sys.modules["__main__"]
-    return getattr(main, "PROGRAM", Path(sys.argv[0]).name)  # `roboarm` sets it
 
 
 def parse(

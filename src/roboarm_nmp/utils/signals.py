@@ -11,6 +11,18 @@ import os
 import select
 import signal
 import sys
+from pathlib import Path
+
+
+def program() -> str:
+    """The name of the running program, for messages: `roboarm evaluate`, or a script's name."""
+    main = sys.modules["__main__"]
+    return getattr(main, "PROGRAM", Path(sys.argv[0]).name)  # `roboarm` sets it
+
+
+def error_line(error: object) -> str:
+    """An error in one line that begins with the command that was typed: `roboarm evaluate: …`."""
+    return f"{program()}: {error}".replace("\n", " ")
 
 
 class Terminated(KeyboardInterrupt):

@@ -30,6 +30,7 @@ from roboarm_nmp.envs.world import World
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.files import check_writable
 from roboarm_nmp.utils.flags import PositiveInt, Seed, check
+from roboarm_nmp.utils.signals import error_line
 from roboarm_nmp.viewer.show import render_configurations
 
 SCENES_TASK = "random_boxes_hard"  # of the collision checks that are compared
@@ -244,5 +245,5 @@ if __name__ == "__main__":
         check(args)
         sys.exit(0 if main(args) else 1)
     except (OSError, RuntimeError, ValueError) as error:
-        print(f"error: {error}".replace("\n", " "), file=sys.stderr)
+        print(error_line(error), file=sys.stderr)
         sys.exit(2)

@@ -228,7 +228,7 @@ def test_sensor_wrapper_has_rate_latency_and_noise():
 def test_evaluation_with_noise_does_not_depend_on_earlier_episodes():
     noise = SensorNoise(gaussian=0.01, missing_cameras=1)
     options = {"task": "random_boxes_hard", "split": "validation", "sensor_noise": noise}
-    options |= {"geometry_source": "point_cloud", "clearance": True}
+    options |= {"geometry_source": "point_cloud", "measure_clearance": True}
     results = [evaluate("via-points", num_queries=n, **options) for n in (3, 3)]
     assert results[0]["sensor_noise"] == {"gaussian": 0.01, "missing_cameras": 1}
     assert results[0]["success_rate"] == results[1]["success_rate"]
