@@ -19,12 +19,11 @@ from problem_files import (
 )
 
 from roboarm_nmp.datasets import observations, roadmap_paths
-from roboarm_nmp.datasets.format import DatasetError, QueryScenes, read_scenes, scene_arrays
+from roboarm_nmp.datasets.format import DatasetError, read_scenes, scene_arrays
 from roboarm_nmp.datasets.problems import load_problems, write_problems
 from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, Camera, observe_scene
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -110,42 +109,24 @@ def assert_wedge(obstacles):
 def test_checks_and_distances_agree_with_pybullet():
     rng = np.random.default_rng(1)
     scene = random_scene(rng, 10)
-    env, checker = RoboArmEnv(scene), CollisionChecker(scene)
-    states = rng.uniform(-1, 1, (400, 7))
-    free, nearest = checker.is_free(states), checker.signed_distances(states).distance.min(1)
+    env = RoboArmEnv(scene)
+    checker = CollisionChecker(scene)
+    states = rng.uniform(-1, 1, (100, 7))
+    free = checker.is_free(states)
+    nearest = checker.signed_distances(states).distance.min(1)
     hits = np.array([env.in_collision(PANDA.denormalise(state)) for state in states])
     assert 0.2 < hits.mean() < 0.8
     assert (free == ~hits)[np.abs(nearest) > 1e-4].all()
-    found = checker.signed_distances(states[:100], self_collisions=False)
-    assert (found.distance < -0.01).any()
-    for i, state in enumerate(states[:100]):
+    distances = checker.signed_distances(states[:20], self_collisions=False).distance
+    assert (distances < -0.01).any()
+    bodies = [b for b in range(p.getNumBodies(physicsClientId=env.client)) if b != env.body]
+    for state, row in zip(states, distances, strict=False):
         PANDA.set_configuration(env.client, env.body, PANDA.denormalise(state))
-        for row, link in enumerate(PANDA.collision_links):
-            points = [
-                point
-                for body in range(p.getNumBodies(physicsClientId=env.client))
-                if body != env.body
-                for point in p.getClosestPoints(
-                    env.body, body, 3.0, linkIndexA=link, physicsClientId=env.client
-                )
-            ]
-            assert abs(min(point[8] for point in points) - found.distance[i, row]) < 2e-4
+        for link, distance in zip(PANDA.collision_links, row, strict=True):
+            options = {"linkIndexA": link, "physicsClientId": env.client}
+            points = [p.getClosestPoints(env.body, body, 3.0, **options) for body in bodies]
+            assert abs(min(point[8] for found in points for point in found) - distance) < 2e-4
     env.close()
-
-
-def test_hull_among_other_obstacles_is_the_nearest_geometry():
-    at = PANDA.forward_kinematics(PANDA.contact_free)
-    cube = np.array(np.meshgrid(*[[-0.02, 0.02]] * 3)).reshape(3, -1).T
-    hull = convex_hull(cube, tuple((at + [0.0, 0.0, 0.1]).tolist()))
-    scene = Scene((Sphere((0.0, 0.9, 0.9), 0.05), hull, Box((-0.9, 0.0, 0.9), (0.1, 0.1, 0.1))))
-    state = PANDA.normalise(PANDA.contact_free)
-    found = CollisionChecker(scene).signed_distances(state)
-    box = Box(hull.position, (0.042,) * 3)  # its edges are as round as those of the thicker hull
-    same = CollisionChecker(Scene((scene.obstacles[0], box))).signed_distances(state)
-    assert (found.geometry == 1).any()
-    rows = found.geometry == 1
-    np.testing.assert_allclose(found.distance[rows], same.distance[rows], atol=2e-5)
-    np.testing.assert_allclose(found.gradient[rows], same.gradient[rows], atol=1e-3)
 
 
 def test_hull_of_many_points_contains_all_of_them():
@@ -188,10 +169,8 @@ def test_hull_is_seen_as_an_obstacle_with_points_on_its_surface():
     ("vertices", "reason"),
     [
         (CORNERS[:3], "4 to 256 vertices, got 3"),
-        (np.random.default_rng(0).normal(size=(300, 3)), "4 to 256 vertices, got 300"),
         ([*CORNERS[:3], [0.1, 0.1, 0.0]], "in one plane"),
         ([*CORNERS[:3], [0.0, 0.0, np.nan]], "finite numbers"),
-        ([*CORNERS[:3], [0.0, 0.0, 2000.0]], "up to 1000 m"),
         ([*CORNERS[:3], [0.0, 0.0]], "three per vertex"),
     ],
 )
@@ -204,11 +183,6 @@ def test_hulls_are_values():
     same = ConvexHull(list(WEDGE.position), np.array(WEDGE.vertices), list(WEDGE.orientation))
     assert same == WEDGE and hash(same) == hash(WEDGE)
     assert convex_hull(np.array([*CORNERS, [0.05, 0.05, 0.05]])).vertices == WEDGE.vertices
-
-
-def test_oracle_refuses_hulls():
-    with pytest.raises(ValueError, match="convex hulls cannot be described"):
-        make_encoder("oracle")(Scene((WEDGE,)))
 
 
 # --- Files
@@ -266,13 +240,6 @@ def test_observations_and_roadmap_paths_keep_their_hulls(tmp_path):
         assert "hull_vertices" not in file  # as before there were hulls
 
 
-def test_scenes_of_queries_have_only_their_own_vertices():
-    rows = to_array([*MIXED, *OTHER])
-    vertices = hull_vertices([*MIXED, *OTHER])
-    scenes = QueryScenes(Scene(), np.array([1, 0]), np.array([0, 3, 5]), rows, vertices)
-    assert scenes[0].obstacles == OTHER and scenes.take([1])[0].obstacles == MIXED
-
-
 # --- Meshes
 
 
@@ -292,20 +259,12 @@ def test_mesh_of_a_scene_file_becomes_its_hull(name, tmp_path):
     ("mesh", "reason"),
     [
         ("{file: none.stl, position: [0, 0, 0]}", "none.stl: No such file"),
-        ("{file: ../part.stl, position: [0, 0, 0]}", "../part.stl: outside of the folder"),
         ("{file: link.stl, position: [0, 0, 0]}", "link.stl: outside of the folder"),
-        ("{file: /etc/passwd, position: [0, 0, 0]}", "/etc/passwd: outside of the folder"),
         ("{file: ., position: [0, 0, 0]}", r"\.: no regular file"),
-        ("{file: scene.yaml, position: [0, 0, 0]}", "a mesh's file ends in .stl, .obj, .ply"),
-        ("{file: bad.stl, position: [0, 0, 0]}", "bad.stl: 0 triangles"),
-        ("{file: bad.ply, position: [0, 0, 0]}", "bad.ply: not a mesh of triangles"),
         ("{file: bad.obj, position: [0, 0, 0]}", "bad.obj: damaged, or no OBJ file"),
         ("{file: flat.obj, position: [0, 0, 0]}", "in one plane"),
         ("{file: part.obj, scale: 1e3, position: [900, 0, 0]}", "finite numbers|scale"),
-        ("{file: part.obj, scale: 0, position: [0, 0, 0]}", "scale of mesh must be positive"),
-        ("{file: part.obj, decompose: 1, position: [0, 0, 0]}", "decompose must be true or fal"),
         ("{file: [part.obj], position: [0, 0, 0]}", "file must be text, got a list"),
-        ("{position: [0, 0, 0]}", "mesh lacks file"),
     ],
 )
 def test_mesh_that_cannot_be_used_is_rejected_with_its_line(mesh, reason, tmp_path):
@@ -313,26 +272,12 @@ def test_mesh_that_cannot_be_used_is_rejected_with_its_line(mesh, reason, tmp_pa
     folder.mkdir()
     write_file(tmp_path / "part.stl", STL)
     (folder / "link.stl").symlink_to(tmp_path / "part.stl")
-    write_file(folder / "bad.stl", "solid " + "x" * 100)
-    write_file(folder / "bad.ply", PLY[:-30])
     write_file(folder / "bad.obj", OBJ + "f 1 2 x\n")
     write_file(folder / "part.obj", OBJ.replace("0.2", "2.2"))
     write_file(folder / "flat.obj", OBJ.replace("v 0.0 0.0 0.2", "v 0.1 0.1 0.0"))
     path = write_file(folder / "scene.yaml", f"floor: false\nobstacles:\n- mesh: {mesh}\n")
     with pytest.raises(DocumentError, match=f"scene.yaml:3: .*({reason})"):
         load_scene(path)
-
-
-def test_invalid_hull_of_a_scene_file_is_rejected_with_its_line(tmp_path):
-    for vertices, reason in [
-        (CORNERS[:3], "4 to 256 vertices, got 3"),
-        (CORNERS * 100, "at most 256 vertices"),
-        ("5", "vertices must be a list of points"),
-        ([[1, 2]], "a vertex of convex_hull must be a list of 3 numbers, got 2"),
-    ]:
-        text = f"obstacles:\n- convex_hull: {{position: [0, 0, 0], vertices: {vertices}}}\n"
-        with pytest.raises(DocumentError, match=f"scene.yaml:2: .*{reason}"):
-            load_scene(write_file(tmp_path / "scene.yaml", text))
 
 
 # Two boxes, 0.2 x 0.1 x 0.1 and 0.1 x 0.1 x 0.3, that stand side by side: an L.
@@ -368,7 +313,7 @@ def test_mesh_that_takes_too_much_to_split_gives_one_error(monkeypatch):
 
 def test_damaged_mesh_files_give_one_error(tmp_path):
     rng, rejected = np.random.default_rng(0), 0
-    for i in range(150):
+    for i in range(60):
         name, text = list(FILES.items())[i % 3]
         contents = bytearray(text.encode())
         for at in rng.integers(len(contents), size=rng.integers(1, 4)):
@@ -378,7 +323,7 @@ def test_damaged_mesh_files_give_one_error(tmp_path):
             mesh_hulls(*load_mesh(name, tmp_path), (0, 0, 0), decompose=False)
         except MeshError:
             rejected += 1
-    assert 50 < rejected < 150
+    assert 20 < rejected < 60
 
 
 @pytest.mark.parametrize(
@@ -400,11 +345,9 @@ def test_meshes_of_other_programs_are_read(name, text, tmp_path):
     [
         ("a.yaml", MOVEIT_MESH.replace("[0, 2, 1]", "[0, 2, 9]"), 4, "a vertex that is not there"),
         ("a.yaml", MOVEIT_MESH.replace("[0, 2, 1]", "[0, 2]"), 5, "3 vertices, got 2"),
-        ("a.yaml", MOVEIT_MESH.replace("  mesh_poses", "  poses"), 2, "lacks mesh_poses"),
         ("a.yaml", CUROBO_MESH.replace("part", "../part"), 1, r"\.\./part.stl: (outside|No such)"),
         ("a.yaml", CUROBO_MESH.replace("part", "none"), 1, "none.stl: No such file"),
         ("a.scene", SCENE_MESH.replace("\n4 4\n", "\n4 4000\n"), 7, "before the last triangle"),
-        ("a.scene", SCENE_MESH.replace("\n4 4\n", "\n4 0\n"), 13, "an orientation must be"),
         ("a.yaml", MOVEIT_SCENE.replace("- id: can", "- id: can\n      planes: [{a: 1}]"), 14,
          "planes are not supported"),
         ("a.yaml", CUROBO.replace("mesh: {}", "capsule: {a: {b: 1}}"), 7, "capsules are not"),
@@ -428,29 +371,3 @@ def test_problems_keep_the_hulls_of_their_meshes(tmp_path):
     (tmp_path / "part.stl").unlink()
     [rejected] = load_problems(tmp_path / "set.yaml").rejected
     assert "part.stl: No such file" in rejected.reason
-
-
-def test_viewer_draws_moves_and_selects_a_hull():
-    viser = pytest.importorskip("viser")
-    from roboarm_nmp.viewer.drawing import SELECTED_COLOUR, Drawing
-    from roboarm_nmp.viewer.simulation import PolicyArm, Simulation, task_episodes
-
-    simulation = Simulation(task_episodes("no_obstacles"))
-    simulation.add(PolicyArm("no_obstacles", "go-to-goal"))
-    simulation.select("test", 0)
-    server = viser.ViserServer(port=0, verbose=False)
-    try:
-        drawing = Drawing(server, simulation)
-        simulation.add_obstacle(WEDGE)
-        drawing.update()
-        handle = drawing._places[0].bodies[0][1]
-        assert handle.vertices.shape == (4, 3) and handle.faces.shape == (4, 3)
-        drawing.selected = 0
-        simulation.replace_obstacle(0, replace(WEDGE, position=(0.4, 0.1, 0.5)))
-        drawing.update()
-        assert drawing._places[0].bodies[0][1] is handle  # moved, not made anew
-        assert handle.color == SELECTED_COLOUR
-        np.testing.assert_allclose(handle.position, (0.4, 0.1, 0.5))
-    finally:
-        server.stop()
-        simulation.close()

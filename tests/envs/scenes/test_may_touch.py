@@ -49,8 +49,8 @@ def test_compiled_checks_agree_with_pybullet_in_one_scene_after_another():
     rng, free, robot = np.random.default_rng(0), 0, PANDA
     rod = PANDA.with_attached([Attached(Box((0, 0, 0.1), (0.05, 0.05, 0.3)))])
     world, choices = World(drawn=False), [(), True, ("panda_link5", "panda_link6"), ()]
-    for i in range(6):
-        robot = rod if i > 2 else PANDA
+    for i in range(4):
+        robot = rod if i > 1 else PANDA
         boxes = RandomBoxes(4, 6).sample(rng).obstacles
         obstacles = [replace(one, may_touch=choices[(i + j) % 4]) for j, one in enumerate(boxes)]
         scene = Scene(tuple(obstacles), robot=robot)
@@ -63,7 +63,7 @@ def test_compiled_checks_agree_with_pybullet_in_one_scene_after_another():
         np.testing.assert_array_equal(distance > 0, expected)
         free += sum(expected)
     world.close()
-    assert 50 < free < 310
+    assert 30 < free < 210
 
 
 def test_object_is_grasped_and_not_hit_by_other_links():

@@ -78,14 +78,10 @@ def test_oscillation_turns_about_an_axis_of_the_base():
 @pytest.mark.parametrize(
     ("repeat", "t", "expected"),
     [
-        ("once", 0, (0, 0, 0)),
         ("once", 1.25, (0, 0.1, 0)),
         ("once", 2.5, (0, 0.4, 0.1)),
-        ("once", 99, (0, 0.4, 0.2)),
-        ("back_and_forth", 0.5, (0, 0, 0)),
         ("back_and_forth", 3.5, (0, 0.4, 0.1)),
         ("back_and_forth", 4.75, (0, 0.1, 0)),
-        ("back_and_forth", 5.25, (0, 0.1, 0)),
     ],
 )
 def test_waypoints_once_and_back_and_forth(repeat, t, expected):
@@ -138,13 +134,6 @@ def test_all_kinds_of_obstacles_move():
     assert (found[3].position, found[3].orientation) == (there, QUARTER)
 
 
-def test_static_scene_is_itself_at_all_times():
-    scene = Scene((Box(PLACE, SIZE),))
-    assert scene.is_static
-    assert scene.at(3.0) is scene
-    assert not Scene((Box(PLACE, SIZE, motion=VISIT),)).is_static
-
-
 def test_scenes_with_motions_are_values():
     def scene(period=2.0):
         motion = Presence([[0, 5]], Oscillation([0, 0.1, 0], period))
@@ -160,32 +149,22 @@ def test_scenes_with_motions_are_values():
     ("make", "reason"),
     [
         (lambda: Oscillation((0, math.nan, 0)), "amplitude"),
-        (lambda: Oscillation((0, 0.1)), "3 finite numbers"),
         (lambda: Oscillation((0, 0.1, 0), period=0), "period .* at least 0.001 s"),
-        (lambda: Oscillation((0, 0.1, 0), period=-1), "period .* at least 0.001 s"),
         (lambda: Oscillation(period=1e-320), "period .* at least 0.001 s"),  # its frequency: inf
-        (lambda: Oscillation((0, 0.1, 0), phase=math.inf), "phase"),
         (lambda: Oscillation(axis=(0, 0, 0)), "axis"),
         (lambda: Oscillation((0, 1, 0), period=1), "too fast: 6.28 m/s"),
         (lambda: Oscillation(angle=4, period=1), "turns too fast"),
-        (lambda: Waypoints((), ()), "1 to 1,000 waypoints"),
         (lambda: Waypoints(range(MAX_WAYPOINTS + 1), ()), "1 to 1,000 waypoints"),
         (lambda: Waypoints((0, 0), ((0, 0, 0),) * 2), "ascend"),
         (lambda: Waypoints((0, 5e-324), ((0, 0, 0),) * 2, repeat="cyclic"), "at least 0.001 s"),
-        (lambda: Waypoints((-1, 0), ((0, 0, 0),) * 2), "at least 0"),
-        (lambda: Waypoints((0, math.nan), ((0, 0, 0),) * 2), "times"),
         (lambda: Waypoints((0, 1), ((0, 0, 0),)), "2 times, but 1 displacements"),
-        (lambda: Waypoints((0, 1), ((0, 0, 0),) * 2, (QUARTER,)), "2 times, but 1 rotations"),
         (lambda: Waypoints((0,), ((0, 0, 0),), ((0, 0, 0, 2),)), "norm 1"),
-        (lambda: Waypoints((0, 1), ((0, 0, 0),) * 2, repeat="twice"), "repeat must be one of"),
         (lambda: Waypoints((0,), ((0, 0, 0),), repeat="cyclic"), "one waypoint cannot be cyclic"),
         (lambda: Waypoints((0, 1), ((0, 0, 0), (0, 0.1, 0)), repeat="cyclic"), "end where"),
         (lambda: Waypoints((0, 0.1), ((0, 0, 0), (0, MAX_SPEED, 0))), "waypoint 1 is too fast"),
         (lambda: Waypoints((0, 0.05), ((0, 0, 0),) * 2, ((0, 0, 0, 1), QUARTER)), "turns too fast"),
         (lambda: Presence(()), "1 to 1,000 intervals"),
-        (lambda: Presence(((1, 1),)), "ascend"),
         (lambda: Presence(((0, 2), (1, 3))), "ascend"),
-        (lambda: Presence(((0, math.nan),)), "times of presence"),
         (lambda: Presence(((0, 1, 2),)), "two times"),
     ],
 )
@@ -251,13 +230,6 @@ def test_json_of_moving_obstacles_is_exact():
     assert from_lists(json.loads(json.dumps(to_lists(MOVING.obstacles)))) == MOVING.obstacles
 
 
-def test_motion_of_numpy_numbers_is_exact_in_json():
-    turns = np.float32([(0, 0, 0, 1), QUARTER])
-    motion = Waypoints(np.float32([0, 2]), np.zeros((2, 3), np.float32), turns)
-    scene = Scene((Box(PLACE, SIZE, motion=Presence(np.float32([[0, 1]]), motion)),))
-    assert scene_from_json(scene_to_json(scene)) == scene
-
-
 def test_query_file_of_moving_scenes_is_exact(tmp_path):
     path = tmp_path / "queries.h5"
     scenes = [MOVING, Scene(MOVING.obstacles[:2]), MOVING]
@@ -317,19 +289,12 @@ def test_motion_in_a_scene_file(tmp_path, text, motion):
     ("text", "reason"),
     [
         ("2", "motion of box must be a mapping with keys oscillation, waypoints, present"),
-        ("{}", "motion of box must be one of oscillation, waypoints, or present"),
         ("{spin: {period: 2}}", "unknown key spin"),
         ("{oscillation: {amplitude: [0, 1, 0]}}", "oscillation lacks period"),
-        ("{oscillation: {period: 0}}", "motion of box: the period .* at least 0.001 s"),
-        ("{oscillation: {period: .nan}}", "period of oscillation must be a finite number"),
         ("{oscillation: {amplitude: [0, 9, 0], period: 1}}", "motion of box: .* too fast"),
-        ("{waypoints: {times: [1, 1], displacements: [[0, 0, 0], [0, 0, 0]]}}", "ascend"),
-        ("{waypoints: {times: [1], displacements: [[0, 0]]}}", "must be a list of 3 numbers"),
         ("{waypoints: {times: [1], displacements: [[0, 0, 0]], repeat: [1]}}", "got a list"),
         ("{waypoints: {times: 1, displacements: []}}", "times of waypoints must be a list"),
-        ("{present: [[]]}", "an interval of presence is two times"),
         ("{present: [[1], [2, 3]]}", "ascend"),
-        ("{present: [[0, .inf]]}", "must be a finite number"),
     ],
 )
 def test_mistake_in_a_motion_is_reported_with_its_line(tmp_path, text, reason):
@@ -350,11 +315,4 @@ def test_small_file_that_repeats_a_long_motion_too_often_is_rejected(tmp_path):
     assert len({obstacle.motion for obstacle in load_scene(path).obstacles}) == 1
     path.write_text(f"obstacles:{sphere}{motion}}}" + f"{sphere}*m}}" * 900)
     with pytest.raises(DocumentError, match=r"scene.yaml:599: more than 3,000,000 values"):
-        load_scene(path)
-
-
-def test_table_of_a_scene_file_cannot_move(tmp_path):
-    path = tmp_path / "scene.yaml"
-    path.write_text("table: {position: [0, 0, 0], size: [1, 1, 1], motion: {present: [[0]]}}\n")
-    with pytest.raises(DocumentError, match="scene.yaml:1: the table cannot move"):
         load_scene(path)

@@ -115,25 +115,22 @@ def test_distribution_that_accepts_no_motions_is_an_error(monkeypatch):
     env.close()
 
 
-def test_query_file_stores_seeds_and_is_the_same_for_any_number_of_workers(tmp_path):
-    for workers in (1, 2):
-        path = tmp_path / f"{workers}.h5"
-        make_queries(path, "blocked_goals", 3, 3, 2, num_workers=workers, progress=False)
-    assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()
-    queries = load_queries(tmp_path / "1.h5", task="blocked_goals")
-    assert queries[1].scene == queries[:2][1].scene != queries[0].scene
-
-
-def test_the_tasks_file_repeats_its_first_query(tmp_path):
-    make_queries(tmp_path / "again.h5", "moving_boxes_easy", 0, 1, 1, progress=False)
-    again, stored = load_queries(tmp_path / "again.h5"), load_queries("moving_boxes_easy")
-    assert (again.start[0] == stored.start[0]).all() and (again.goal[0] == stored.goal[0]).all()
-    assert again[0].scene == stored[0].scene
-
-
 def test_file_of_another_version_of_the_distribution_is_out_of_date(monkeypatch):
     load_queries("moving_boxes_hard")
     monkeypatch.setattr(moving_boxes, "AMPLITUDE", (0.1, 0.31))
     path = query_path("moving_boxes_hard").name
     with pytest.raises(OutOfDateError, match=f"{path}: out of date.*moving_boxes_hard"):
         load_queries("moving_boxes_hard")
+
+
+def test_query_file_repeats_the_tasks_own_for_any_number_of_workers(tmp_path):
+    task = "moving_boxes_easy"
+    for workers in (1, 2):
+        path = tmp_path / f"{workers}.h5"
+        make_queries(path, task, 0, 2, 1, num_workers=workers, progress=False)
+    assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()
+    queries = load_queries(tmp_path / "1.h5", task=task)
+    assert queries[1].scene == queries[:2][1].scene != queries[0].scene
+    stored = load_queries(task)
+    assert (queries.start[0] == stored.start[0]).all() and (queries.goal[0] == stored.goal[0]).all()
+    assert queries[0].scene == stored[0].scene
