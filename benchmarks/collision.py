@@ -135,7 +135,7 @@ def compare(env, scenes, num, rng, progress):
 
 
 def pybullet_check(env, configuration):
-    env.robot.set_configuration(env.client, env.body, configuration)
+    env.world.arm.set_configuration(configuration)
     p.performCollisionDetection(physicsClientId=env.client)
     contacts = p.getContactPoints(bodyA=env.body, physicsClientId=env.client)
     return any(contact[8] < 0.0 for contact in contacts)

@@ -68,7 +68,7 @@ def run_panda_gym(env, actions):
 
 def run_bare(env, start, targets):
     client, body = env.client, env.body
-    PANDA.set_configuration(client, body, start)
+    env.world.arm.set_configuration(start)
     forces = PANDA.effort.tolist()
     began = time.perf_counter()
     for target in targets:

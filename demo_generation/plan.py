@@ -179,7 +179,7 @@ def _check_end(flag, configuration, checker):
     link = int(near.distance.argmin())
     depth = -near.distance[link] - checker.scene.point_radius
     if near.geometry[link] == POINT and depth > 0:
-        name = robot.bullet_names[1][robot.collision_links[link]]
+        name = robot.link_names[robot.collision_links[link]]
         raise ValueError(f"{flag} is in collision: a point is {1000 * depth:.0f} mm inside {name}")
 
 

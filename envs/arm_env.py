@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from roboarm_nmp.envs.goals import GOAL_TYPES, GoalTypeName, Tolerances
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
-from roboarm_nmp.envs.robots.robot import Robot, rotation_angle, signed
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.rotations import rotation_angle, signed
 from roboarm_nmp.envs.scenes.primitives import Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.world import (

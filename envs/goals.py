@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from roboarm_nmp.envs.robots.robot import Robot, rotation_angle
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.rotations import rotation_angle
 
 GoalTypeName = Literal["ee", "config", "combined", "pose"]
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import (
@@ -105,6 +106,7 @@ class World:
     Attributes:
         client: PyBullet's number of the engine; None once it is closed.
         robot: the scene's `Robot`.
+        arm: the arm's `envs.robots.body.Body`.
         body: PyBullet's number of the arm's body.
         scene: the `Scene`, with its motions; `set_scene` changes it.
         has_window: whether PyBullet's window is open.
@@ -144,7 +146,8 @@ class World:
         )
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
         self.robot = scene.robot
-        self.body = self._load_robot()
+        self.arm = self._load_arm()
+        self.body = self.arm.id
         # PyBullet places a body by its centre of mass.
         self._in_place = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
         self._parts = []
@@ -164,8 +167,8 @@ class World:
             self._drawn = True
             self._make_again(self._snapshot())
 
-    def _load_robot(self):
-        return self.robot.load(self.client, self._drawn)
+    def _load_arm(self):
+        return Body(self.robot, self.client, self._drawn)
 
     # --- Copies
 
@@ -188,7 +191,7 @@ class World:
 
     def _snapshot(self):
         """Where the arm was placed, its commands since then, and its present state."""
-        joints = p.getJointStates(self.body, self.robot.reset_indices, physicsClientId=self.client)
+        joints = p.getJointStates(self.body, self.arm.movable, physicsClientId=self.client)
         joint_states = [joint[:2] for joint in joints]  # angles and velocities
         return self._start, self._events, self._target, self._substep, joint_states
 
@@ -211,7 +214,7 @@ class World:
         if self._snapshot()[-1] != joint_states:  # it was moved by other means
             p.resetJointStatesMultiDof(
                 self.body,
-                self.robot.reset_indices,
+                self.arm.movable,
                 [[angle] for angle, _ in joint_states],
                 [[velocity] for _, velocity in joint_states],
                 physicsClientId=self.client,
@@ -454,11 +457,11 @@ class World:
         body = self.body
         robot = self.robot
         p.resetBasePositionAndOrientation(body, FAR_AWAY, NO_TURN, physicsClientId=client)
-        robot.set_configuration(client, body, robot.contact_free)
+        self.arm.set_configuration(robot.contact_free)
         self._move_obstacles(round(time / TIME_STEP))
         p.performCollisionDetection(physicsClientId=client)
         p.resetBasePositionAndOrientation(body, *self._in_place, physicsClientId=client)
-        robot.set_configuration(client, body, configuration)
+        self.arm.set_configuration(configuration)
         self._start = tuple(np.asarray(configuration)), self.time
         self._events = []
 
@@ -466,7 +469,7 @@ class World:
         """Set the targets of the arm's position controllers: joint angles (list of n, rad)."""
         self.check_open()
         self._target = tuple(configuration)
-        self.robot.command(self.client, self.body, configuration)
+        self.arm.command(configuration)
 
     def simulate(self) -> bool:
         """Run the physics of one environment step. Returns whether the arm was in contact."""
@@ -507,8 +510,9 @@ class World:
         if velocities:
             speeds = np.array([joint[1] for joint in joints])
             velocity = 2.0 * speeds / (robot.upper - robot.lower)
-        read = robot.read_end_effector_pose if pose else robot.read_end_effector
-        return state, velocity, read(self.client, self.body)
+        if pose:
+            return state, velocity, self.arm.read_end_effector_pose()
+        return state, velocity, self.arm.read_end_effector()
 
     def mark_goal(self, position: np.ndarray, radius: float) -> None:
         """Show a green ball, visual only, at a position (3,), m. There is only one."""

@@ -27,9 +27,11 @@ from roboarm_nmp.envs.collision.kernels import (
     SPAN,
     SPHERE,
 )
-from roboarm_nmp.envs.robots.robot import matrix, temporary_file
+from roboarm_nmp.envs.robots.body import Body, collision_elements
+from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.primitives import ConvexHull, Cylinder, Sphere, to_array
 from roboarm_nmp.utils.bullet import pybullet as p
+from roboarm_nmp.utils.files import temporary_file
 
 MAX_MARGIN = 0.5
 """m. Margins and radii of points must be smaller."""
@@ -125,7 +127,7 @@ def link_shapes(robot):
     """
     client = p.connect(p.DIRECT)
     try:
-        body = robot.load(client, drawn=False)
+        body = Body(robot, client, drawn=False).id
         for link in robot.links:
             for mesh, rounding, surface in _shapes(client, robot, body, link.index):
                 for placement in link.placements:
@@ -140,7 +142,7 @@ def _shapes(client, robot, body, link):
     shapes = p.getCollisionShapeData(body, link, physicsClientId=client)
     if len(shapes) > 1 or any(len(_objects(shape[4].decode())) > 1 for shape in shapes):
         # PyBullet returns the vertices of all hulls as one, so each is loaded alone.
-        for element in robot.collision_elements(robot.bullet_names[1][link]):
+        for element in collision_elements(robot, robot.link_names[link]):
             for one in _one_by_one(element):
                 with temporary_file(_ONE_SHAPE.format(one), ".urdf") as urdf:
                     alone = p.loadURDF(urdf, physicsClientId=client)

@@ -29,7 +29,7 @@ import numpy as np
 from PIL import Image
 
 from roboarm_nmp.envs.collision.kernels import decompress_lzf
-from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.primitives import is_number, unit_quaternion
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}

@@ -25,6 +25,7 @@ from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes
     STATIC,
     RayCaster,
 )
+from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, is_number
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
@@ -377,7 +378,7 @@ class SensorWorld:
         if self._drawn is None:
             self._drawn = _DrawnWorld(self.scene)
         self._drawn.set_scene(self.scene)
-        self.robot.set_configuration(self._drawn.client, self._drawn.body, self.configuration)
+        self._drawn.arm.set_configuration(self.configuration)
         return self._drawn
 
     def close(self):
@@ -389,8 +390,8 @@ class SensorWorld:
 
 
 class _DrawnWorld(World):
-    def _load_robot(self):
-        return self.robot.load_coarse(self.client, ROBOT_COLOUR)
+    def _load_arm(self):
+        return Body.coarse(self.robot, self.client, ROBOT_COLOUR)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
 """How an arm is driven: the physics step, and the position controllers' gains."""
 
-import dataclasses
-
 import numpy as np
 
+from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.utils.bullet import pybullet as p
 
 # One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
@@ -32,37 +31,33 @@ def calibrate(robot, gains=GAINS, seed=0):
             fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=client
         )
         p.setGravity(0, 0, -9.81, physicsClientId=client)
-        body = robot.load(client, drawn=False)  # once: large meshes take a second
-        for link in range(-1, p.getNumJoints(body, physicsClientId=client)):
-            p.setCollisionFilterGroupMask(body, link, 0, 0, physicsClientId=client)
-        shares = [
-            _executed(
-                dataclasses.replace(robot, gains=(gain,) * robot.num_joints),
-                client,
-                body,
-                np.random.default_rng(seed),
-            )
-            for gain in gains
-        ]
+        body = Body(robot, client, drawn=False)  # once: large meshes take a second
+        for link in range(-1, p.getNumJoints(body.id, physicsClientId=client)):
+            p.setCollisionFilterGroupMask(body.id, link, 0, 0, physicsClientId=client)
+        shares = []
+        for gain in gains:
+            body.gains = [gain] * len(body.gains)
+            shares.append(_executed(body, np.random.default_rng(seed)))
     finally:
         p.disconnect(client)
     best = int(np.argmin(np.abs(np.array(shares) - 1.0)))
     return gains[best], shares[best]
 
 
-def _executed(robot, client, body, rng):
-    """The share of the commanded displacement that is executed with the robot's gains."""
+def _executed(body, rng):
+    """The share of the commanded displacement that is executed with the body's gains."""
+    robot, client = body.robot, body.client
     commanded = executed = 0.0
     for _ in range(NUM_POSES):
         state = rng.uniform(-0.7, 0.7, robot.num_joints)
         direction = rng.normal(size=robot.num_joints)
         direction *= STEP / np.linalg.norm(direction)
-        robot.set_configuration(client, body, robot.denormalise(state))
+        body.set_configuration(robot.denormalise(state))
         for step in range(NUM_STEPS):
-            robot.command(client, body, robot.denormalise(state + direction).tolist())
+            body.command(robot.denormalise(state + direction).tolist())
             for _ in range(SUBSTEPS):
                 p.stepSimulation(physicsClientId=client)
-            joints = p.getJointStates(body, robot.joint_indices, physicsClientId=client)
+            joints = p.getJointStates(body.id, robot.joint_indices, physicsClientId=client)
             after = robot.normalise([joint[0] for joint in joints])
             if step >= NUM_STEPS // 2:  # at speed
                 executed += (after - state) @ direction / STEP

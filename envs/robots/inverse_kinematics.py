@@ -14,7 +14,7 @@ joints that mimic another one. Speed and success: docs/benchmark/performance.md.
 import numpy as np
 
 from roboarm_nmp.envs.robots.kernels import CHAIN_COLUMNS, POSITION, ROTATION, solve_batch
-from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.robots.rotations import matrix
 
 MAX_DISTANCE, MAX_ANGLE = 1e-4, 1e-3
 """m and rad: errors of a solution are at most these."""

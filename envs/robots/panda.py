@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pybullet_data
 
 from roboarm_nmp.envs.robots.robot import Frame, Link, Robot
@@ -37,23 +38,39 @@ def _yaw(angle):
 
 _HAND = (0.0, 0.0, FLANGE_LENGTH), _yaw(HAND_YAW)
 _LEFT, _RIGHT = (((0.0, side * FINGER_OPENING, HAND_TO_FINGER), _yaw(0.0)) for side in (1.0, -1.0))
+_JOINTS = (
+    *(f"panda_joint{joint}" for joint in range(1, 9)),
+    *("panda_hand_joint", "panda_finger_joint1", "panda_finger_joint2", "panda_grasptarget_hand"),
+)
+_LINKS = (
+    *(f"panda_link{link}" for link in range(9)),
+    *("panda_hand", "panda_leftfinger", "panda_rightfinger", "panda_grasptarget"),
+)
+# Of the end effector; the URDF's angles have few digits.
+_AXES = [
+    [0.7071067695421219, 0.7071068540717813, -9.327597671130554e-08],
+    [-0.7071068540717818, 0.707107031179925, 1.189380493216533e-08],
+    [7.616287378725753e-09, 2.989713741086413e-08, 1.0000002616378],
+]
 _LOWER = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)
 _UPPER = (2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671)
 
 PANDA = Robot(
     name="panda",
     urdf=str(Path(pybullet_data.getDataPath(), "franka_panda", "panda.urdf")),
-    joint_names=tuple(f"panda_joint{joint}" for joint in range(1, 8)),
+    joint_names=_JOINTS[:7],
     joint_indices=(0, 1, 2, 3, 4, 5, 6),
+    bullet_joint_names=_JOINTS,
+    link_names=dict(enumerate(_LINKS, -1)),
     # Limits of positions and torques as in the URDF. Those of velocity, acceleration and jerk, and
     # `datasheet_lower` and `datasheet_upper`, as in Franka's documentation of the Panda ("Robot and
     # interface specifications", limits in the joint space; libfranka's `rate_limiting.h`).
-    lower=_LOWER,
-    upper=_UPPER,
-    velocity=(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
-    acceleration=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
-    jerk=(7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0),
-    effort=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
+    lower=np.array(_LOWER),
+    upper=np.array(_UPPER),
+    velocity=np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61]),
+    acceleration=np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0]),
+    jerk=np.array([7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0]),
+    effort=np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0]),
     held_indices=(9, 10),
     held_positions=(FINGER_OPENING, FINGER_OPENING),
     held_effort=(20.0, 20.0),
@@ -84,11 +101,12 @@ PANDA = Robot(
     end_effector_offset=(0.0, 0.0, 0.0),
     end_effector_frame=6,
     end_effector_position=(0.0, 0.0, FLANGE_LENGTH + HAND_TO_GRASP),
+    end_effector_rotation=np.array(_AXES),
     gains=(0.6,) * 7,
     observed_pose=(0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8),
     contact_free=tuple((low + high) / 2 for low, high in zip(_LOWER, _UPPER, strict=True)),
-    datasheet_lower=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),
-    datasheet_upper=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
+    datasheet_lower=np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973]),
+    datasheet_upper=np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973]),
 )
 
 

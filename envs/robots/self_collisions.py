@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from roboarm_nmp.envs.robots.body import body_alone
 from roboarm_nmp.envs.robots.untrusted import RobotError, read_xml
 from roboarm_nmp.utils.bullet import pybullet as p
 
@@ -66,22 +67,18 @@ def sample_pairs(robot, disabled, samples=SAMPLES, seed=0):
     configurations = rng.uniform(robot.lower, robot.upper, (samples, robot.num_joints))
     configurations[0] = (robot.lower + robot.upper) / 2
     counts, colliding = dict.fromkeys(candidates, 0), []
-    client = p.connect(p.DIRECT)
-    try:
-        body = robot.load(client, drawn=False)
+    with body_alone(robot) as body:
         for configuration in configurations:
-            robot.set_configuration(client, body, configuration.tolist())
-            p.performCollisionDetection(physicsClientId=client)
-            contacts = p.getContactPoints(body, body, physicsClientId=client)
-            found = {tuple(sorted(c[3:5])) for c in contacts if c[8] < 0.0}
-            for pair in found:
+            body.set_configuration(configuration.tolist())
+            p.performCollisionDetection(physicsClientId=body.client)
+            contacts = p.getContactPoints(body.id, body.id, physicsClientId=body.client)
+            overlapping = {tuple(sorted(c[3:5])) for c in contacts if c[8] < 0.0}
+            for pair in overlapping:
                 counts[pair] += 1
-            colliding.append(found)
-    finally:
-        p.disconnect(client)
+            colliding.append(overlapping)
     always = {pair for pair, count in counts.items() if count > ALWAYS * samples}
     pairs = tuple(pair for pair in candidates if counts[pair] and pair not in always)
-    for configuration, found in zip(configurations, colliding, strict=True):
-        if not found - always:
+    for configuration, overlapping in zip(configurations, colliding, strict=True):
+        if not overlapping - always:
             return pairs, tuple(configuration.tolist())
     raise RobotError(f"{robot.urdf}: collides with itself in each of {samples} configurations")

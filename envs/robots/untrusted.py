@@ -8,7 +8,7 @@ import sys
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from roboarm_nmp.envs.robots.robot import temporary_file
+from roboarm_nmp.utils.files import temporary_file
 
 MAX_FILE, MAX_DEPTH, MAX_ELEMENTS = 5_000_000, 30, 50_000  # bytes, nested elements, all elements
 MAX_HULL = 100_000  # vertices of the convex hulls of all collision meshes

@@ -1,7 +1,6 @@
 """A `Robot` from a URDF, which is untrusted input: everything in it is checked first."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 import math
@@ -12,9 +11,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from roboarm_nmp.envs.robots.attached_xml import LIGHT
+from roboarm_nmp.envs.robots.body import end_effector_rotation, resolve
 from roboarm_nmp.envs.robots.cache import cached
 from roboarm_nmp.envs.robots.control import GAINS, calibrate
-from roboarm_nmp.envs.robots.robot import Frame, Link, Robot, resolve
+from roboarm_nmp.envs.robots.placements import about, aligning, joint_axis, joint_origin, link_steps
+from roboarm_nmp.envs.robots.robot import Frame, Link, Robot
 from roboarm_nmp.envs.robots.self_collisions import SAMPLES, disabled_pairs, sample_pairs
 from roboarm_nmp.envs.robots.untrusted import RobotError, bullet_indices, read_xml
 
@@ -31,7 +33,6 @@ MOVABLE = ("revolute", "continuous", "prismatic")
 MAX_STEPS = 100  # of acceleration
 DEFAULT_EFFORT = 1_000.0  # N m or N, where a URDF has none
 WIDENED = "limits of joints, where the file has wider ones"  # since then, gains are others
-LIGHT = "0.001", "0.000001"  # kg, kg m^2: of frames, such as a tool's
 MAX_NUMBER, MAX_NORM_ERROR = 1e6, 0.01
 NUMBERS = ("xyz", "rpy", "size", "radius", "length", "scale", "value", "ixx", "iyy", "izz")
 NUMBERS += ("lower", "upper", "effort", "velocity", "multiplier", "offset", "ixy", "ixz", "iyz")
@@ -58,7 +59,41 @@ def robot_from_urdf(
     jerk=None,
     datasheet_limits=None,
 ):
-    """See `Robot.from_urdf`."""
+    """The arm that a URDF describes, as PyBullet loads it.
+
+    The kinematic chain, axes, limits and collision shapes are the URDF's. Joints that mimic
+    another one follow it.
+
+    Args:
+        path: of the URDF.
+        joints: names of the n actuated joints; by default all movable joints between the base
+            and the end effector.
+        end_effector: name of the link that has the end effector; by default the link at the end
+            of the longest chain of turning joints.
+        end_effector_position: m, (3,), in that link's frame.
+        fixed: dict from names of other joints, such as fingers, to where they are held (rad or
+            m); by default 0, or the limit that is nearest to it.
+        limits: dict from names of joints to (lower, upper), rad or m, where the URDF has none,
+            or others.
+        srdf: path of an SRDF, whose `disable_collisions` pairs of links do not collide. More
+            pairs are left out by sampling (`envs.robots.self_collisions`).
+        packages: dict from names of packages to folders, for `package://` paths of meshes.
+        name: of the robot; by default the URDF's.
+        base_position, base_orientation: pose of the base in the world, m and quaternion (xyzw).
+        gain: of the position controllers; by default from a calibration
+            (`envs.robots.control`).
+        acceleration_steps: environment steps, 1 to 100, in which the sub-goals of a plan reach
+            full speed after a waypoint, and slow down before the next.
+        velocity, acceleration, jerk: limits of trajectories, rad/s, rad/s^2, rad/s^3 (or m): a
+            number, or a dict from names of joints. By default the velocities are the URDF's, if
+            it has some, and the others are unknown.
+        datasheet_limits: dict from names of joints to (lower, upper), rad or m, inside the
+            position limits: those of the manufacturer's datasheet (`position_limits`). Joints
+            without have their position limits.
+
+    Raises:
+        RobotError: the file cannot be used; a ValueError that names it and the reason.
+    """
     _check_options(
         path,
         joints=joints or (),
@@ -132,7 +167,7 @@ def robot_from_urdf(
                 f"{path}: link {link!r}: PyBullet cannot use one of its collision shapes"
             )
     links = [
-        Link(link_index[link], placements[link][0], steps(placements[link]))
+        Link(link_index[link], placements[link][0], link_steps(*placements[link][1:]))
         for link in tree.links
         if tree.elements[link].find("collision") is not None
     ]
@@ -151,6 +186,8 @@ def robot_from_urdf(
         mesh_digest=tree.mesh_digest,
         joint_names=tuple(joints),
         joint_indices=tuple(index[joint] for joint in joints),
+        bullet_joint_names=tuple(index),
+        link_names={number: link for link, number in link_index.items()},
         lower=bounds[:, 0],
         upper=bounds[:, 1],
         velocity=_motion_limits(path, "velocity", velocity, joints, urdf_velocity),
@@ -172,6 +209,7 @@ def robot_from_urdf(
         end_effector_offset=tuple(map(float, end_effector_position)),
         end_effector_frame=frame,
         end_effector_position=tuple(position + rotation @ np.array(end_effector_position)),
+        end_effector_rotation=np.eye(3),  # see below
         gains=(gain or 0.6,) * len(joints),
         acceleration_steps=acceleration_steps,
         contact_free=tuple(bounds.mean(1)),
@@ -197,7 +235,8 @@ def robot_from_urdf(
     if gain is None:
         gain = cached("gain", robot, [GAINS, WIDENED], lambda: calibrate(robot)[0])
         robot = dataclasses.replace(robot, gains=(gain,) * len(joints))
-    return robot
+    axes = cached("end effector", robot, [], lambda: end_effector_rotation(robot).tolist())
+    return dataclasses.replace(robot, end_effector_rotation=np.array(axes))
 
 
 def _motion_limits(path, name, given, joints, own=None):
@@ -419,7 +458,7 @@ class _Tree:
 
     def axis(self, joint):
         """The direction (3,), of length 1, about or along which a joint moves."""
-        axis = _axis(self.joints[joint])
+        axis = joint_axis(self.joints[joint])
         norm = np.linalg.norm(axis)
         if axis.shape != (3,) or not norm > 1e-6:
             raise RobotError(f"{self.path}: joint {joint!r}: the axis {axis} has no direction")
@@ -531,116 +570,7 @@ class _Tree:
 
     def origin(self, joint):
         """Position (3,) and rotation (3, 3) of a joint in its parent link."""
-        return _origin(self.joints[joint])
-
-
-# --- Joints held elsewhere, and links at the end
-
-
-def followers(robot, positions):
-    """Where held joints are that mimic others: dict from names to positions, rad or m.
-
-    `positions`: those of others, a dict; joints in it are left out.
-    """
-    found = {}
-    for joint in robot.parsed_urdf().findall("joint"):
-        name, mimic = joint.get("name"), joint.find("mimic")
-        if mimic is None or name in positions or name not in robot.held:
-            continue
-        if (leader := mimic.get("joint")) in positions:
-            scale, offset = float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
-            found[name] = scale * positions[leader] + offset
-    return found
-
-
-@functools.lru_cache(64)
-def held_at(arm, positions):
-    """An arm with its held joints at other positions, a tuple; see `Robot.with_held`."""
-    if positions == arm.held_positions:
-        return arm
-    robot = dataclasses.replace(arm, held_positions=positions, described=arm)
-    by_child, held = _by_child(robot), robot.held
-    changed = {name for name, position in arm.held.items() if held[name] != position}
-    joints, names = robot.bullet_names
-    for index in (*robot.joint_indices, *(mimic[0] for mimic in robot.mimics)):
-        joint = next(one for one in by_child.values() if one.get("name") == joints[index])
-        if carriers := changed & set(_held_above(joint.find("parent").get("link"), by_child, held)):
-            raise ValueError(
-                f"{arm.name}: {min(carriers)} carries joints that move: hold it elsewhere in the "
-                f"robot's file"
-            )
-    links = list(robot.links)
-    for i, link in enumerate(links):
-        if changed & set(_held_above(names[link.index], by_child, held)):
-            placement = link_placement(robot, names[link.index])
-            links[i] = link._replace(placements=steps(placement))
-    end = names[robot.end_effector_link]
-    if changed & set(_held_above(end, by_child, held)):
-        _, rotation, position = link_placement(robot, end)
-        position = position + rotation @ np.array(robot.end_effector_offset)
-        robot = dataclasses.replace(robot, end_effector_position=tuple(position.tolist()))
-    return dataclasses.replace(robot, links=tuple(links))
-
-
-def link_placement(robot, link):
-    """Where a link is in the frame of the `Robot` that moves it.
-
-    Returns:
-        the name of the joint of that frame, None for the base; rotation (3, 3); position (3,), m.
-
-    Raises:
-        ValueError: the robot has no such link.
-    """
-    by_child, held = _by_child(robot), robot.held
-    if link not in robot.bullet_names[1].values():
-        raise ValueError(f"{robot.name} has no link {link!r}")
-    moving = {*robot.joint_names, *(robot.bullet_names[0][mimic[0]] for mimic in robot.mimics)}
-    rotation, position = np.eye(3), np.zeros(3)
-    while link in by_child:
-        joint = by_child[link]
-        name, kind = joint.get("name"), joint.get("type")
-        if name in moving:
-            aligned = _aligning(_axis(joint))
-            return name, aligned.T @ rotation, aligned.T @ position
-        if name in held and kind == "prismatic":
-            position = position + _axis(joint) * held[name]
-        elif name in held:
-            turn = _about(_axis(joint), held[name])
-            rotation, position = turn @ rotation, turn @ position
-        at, turn = _origin(joint)
-        rotation, position = turn @ rotation, at + turn @ position
-        link = joint.find("parent").get("link")
-    return None, rotation, position
-
-
-def _by_child(robot):
-    """The URDF's joints, XML elements, by the link that each moves."""
-    joints = robot.parsed_urdf().findall("joint")
-    return {joint.find("child").get("link"): joint for joint in joints}
-
-
-def _held_above(link, by_child, held):
-    """Names of the held joints between a link and the base."""
-    while link in by_child:
-        if by_child[link].get("name") in held:
-            yield by_child[link].get("name")
-        link = by_child[link].find("parent").get("link")
-
-
-def _axis(joint):
-    """The direction (3,) about or along which a joint, an XML element, moves."""
-    return np.array([float(x) for x in joint.find("axis").get("xyz", "1 0 0").split()])
-
-
-def _origin(joint):
-    """Position (3,) and rotation (3, 3) of a joint, an XML element, in its parent link."""
-    element = joint.find("origin")
-    xyz, rpy = "0 0 0", "0 0 0"
-    if element is not None:
-        xyz, rpy = element.get("xyz", xyz), element.get("rpy", rpy)
-    position = np.array([float(x) for x in xyz.split()])
-    roll, pitch, yaw = (float(x) for x in rpy.split())
-    return position, _rotation_z(yaw) @ _rotation_y(pitch) @ _rotation_x(roll)
+        return joint_origin(self.joints[joint])
 
 
 def _read(path):
@@ -697,37 +627,6 @@ def _blocks(text):
         start = end
 
 
-def _rotation_x(angle):
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-
-
-def _rotation_y(angle):
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-
-
-def _rotation_z(angle):
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _aligning(axis):
-    """A rotation matrix whose third column is `axis`."""
-    if np.allclose(axis, (0.0, 0.0, 1.0), atol=1e-12):
-        return np.eye(3)
-    other = np.eye(3)[np.abs(axis).argmin()]
-    x = np.cross(other, axis)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(axis, x), axis], axis=1)
-
-
-def _about(axis, angle):
-    """The rotation by an angle about an axis."""
-    aligned = _aligning(axis)
-    return aligned @ _rotation_z(angle) @ aligned.T
-
-
 def _frames(tree, joints, positions, mimics):
     """The robot's `Frame`s, and where each link is: (frame, rotation (3, 3), position (3,))."""
     frames, placements = [], {tree.links[0]: (-1, np.eye(3), np.zeros(3))}
@@ -740,7 +639,7 @@ def _frames(tree, joints, positions, mimics):
         axis = tree.axis(name) if kind in MOVABLE else None
         if name in joints or name in mimics:
             leader, multiplier, offset = mimics.get(name, (name, 1.0, 0.0))
-            aligned = _aligning(axis)
+            aligned = aligning(axis)
             frames.append(
                 Frame(
                     parent=frame,
@@ -757,14 +656,6 @@ def _frames(tree, joints, positions, mimics):
         if kind == "prismatic":
             position = position + rotation @ (axis * positions[name])
         elif kind != "fixed":
-            rotation = rotation @ _about(axis, positions[name])
+            rotation = rotation @ about(axis, positions[name])
         placements[link] = frame, rotation, position
     return frames, placements
-
-
-def steps(placement):
-    """`Link.placements` of one transform, as of `link_placement`."""
-    _, rotation, position = placement
-    if (rotation == np.eye(3)).all() and not position.any():
-        return ()
-    return ((tuple(position.tolist()), tuple(rotation.ravel().tolist())),)

@@ -58,10 +58,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from roboarm_nmp.envs.robots.attached import MAX_ATTACHED
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.variants import MAX_ATTACHED, with_attached, with_held
 from roboarm_nmp.envs.scenes.meshes import load_mesh, mesh_hulls
 from roboarm_nmp.envs.scenes.motions import (
     MAX_INTERVALS,
@@ -250,11 +250,11 @@ def _scene(node: Node, folder: Path) -> Scene:
         held = _fields(fields["held"], "held", optional=tuple(robot.held))
         positions = {joint: number(at, joint, MAX_LENGTH) for joint, at in held.items()}
         with errors_at(fields["held"]):
-            robot = robot.with_held(positions)
+            robot = with_held(robot, positions)
     if "attached" in fields:
         attached = _attached(fields["attached"], folder)
         with errors_at(fields["attached"]):
-            robot = robot.with_attached(attached)
+            robot = with_attached(robot, attached)
     if "table" in fields:
         scene["table"] = _table(fields["table"])
     if "floor" in fields:

@@ -14,9 +14,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from roboarm_nmp.envs.robots.attached import MAX_ATTACHED
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import Robot, matrix
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.rotations import matrix
+from roboarm_nmp.envs.robots.variants import MAX_ATTACHED, with_attached
 from roboarm_nmp.envs.scenes import meshes
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.numbers import Quaternion, Vector, multiply, unit_quaternion
@@ -190,7 +191,7 @@ class _AllowedCollisions:
         default = self._defaults.get(name, False)
         if not row and not default:
             return ()
-        return tuple(link for link in robot.arm.bullet_names[1].values() if row.get(link, default))
+        return tuple(link for link in robot.arm.link_names.values() if row.get(link, default))
 
 
 def with_attached_objects(
@@ -218,7 +219,7 @@ def with_attached_objects(
                 if attached not in objects:  # the scene and the start state may both have it
                     objects.append(attached)
     with errors_at(node):
-        return robot.with_attached(objects)
+        return with_attached(robot, objects)
 
 
 def checked_scene(node: Node, obstacles: Iterable[Obstacle], robot: Robot = PANDA) -> Scene:
@@ -258,7 +259,7 @@ def _check_identity(node: Node, what: str) -> None:
 def check_frame(node: Node, robot: Robot) -> None:
     """Raise Mistake unless a frame's name is that of the robot's base, `world`, or empty."""
     name = documents.text(node, "a frame")
-    base = robot.bullet_names[1][-1]
+    base = robot.link_names[-1]
     if name not in ("", "world", base, "/" + base):
         raise Mistake(node, f"the frame {shorten(name)!r} is neither {base}, the base, nor world")
 

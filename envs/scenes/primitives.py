@@ -15,6 +15,7 @@ import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.variants import with_attached, with_held
 from roboarm_nmp.envs.scenes.motions import (
     Motion,
     motion_from_numbers,
@@ -145,7 +146,7 @@ Obstacle = Box | Cylinder | Sphere | ConvexHull
 
 @dataclass(frozen=True)
 class Attached:
-    """An object that the arm carries, as a part of one of its links; see `Robot.with_attached`.
+    """An object that the arm carries, as a part of one of its links; see `envs.robots.variants`.
 
     Attributes:
         shape: a `Box`, `Cylinder`, `Sphere` or `ConvexHull`, in the frame of the link in the URDF.
@@ -627,7 +628,7 @@ def scene_from_json(text: str, robot: Robot = PANDA) -> Scene:
     """
     fields = json.loads(text)
     table: Any = fields["table"] and from_lists([fields["table"]])[0]
-    robot = robot.arm.with_held(fields["held"]) if "held" in fields else robot.arm
+    robot = with_held(robot.arm, fields["held"]) if "held" in fields else robot.arm
     attached = []
     for row, link, touch_links in fields.get("attached", ()):
         [shape] = from_lists([row])
@@ -637,7 +638,7 @@ def scene_from_json(text: str, robot: Robot = PANDA) -> Scene:
         table,
         fields["floor"],
         fields.get("friction", FRICTION),
-        robot.with_attached(attached),
+        with_attached(robot, attached),
     )
 
 

@@ -55,7 +55,7 @@ def test_forward_kinematics_equals_pybullets(env):
     configurations = rng.uniform(PANDA.lower, PANDA.upper, (30, 7))
     positions = PANDA.forward_kinematics(configurations)
     for c, position in zip(configurations, positions, strict=True):
-        PANDA.set_configuration(env.client, env.body, c)
+        env.world.arm.set_configuration(c)
         link = p.getLinkState(env.body, 11, computeForwardKinematics=1, physicsClientId=env.client)
         np.testing.assert_allclose(position, link[4], atol=1e-6)
 

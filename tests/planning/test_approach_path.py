@@ -8,7 +8,7 @@ from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.evaluation.rollout import rollout
 from roboarm_nmp.planning.approach_path import (

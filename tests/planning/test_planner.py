@@ -19,7 +19,7 @@ from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import rotation_angle
+from roboarm_nmp.envs.robots.rotations import rotation_angle
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.planning import planner as planning
@@ -518,7 +518,7 @@ def box():
 
 def distance(env, configuration):
     """Of the arm from the box, m, by PyBullet's query for closest points; at most 0.2."""
-    PANDA.set_configuration(env.client, env.body, configuration)
+    env.world.arm.set_configuration(configuration)
     (body,) = {0, 1} - {env.body}
     points = p.getClosestPoints(env.body, body, 0.2, physicsClientId=env.client)
     return min((point[8] for point in points), default=0.2)

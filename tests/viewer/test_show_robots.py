@@ -10,7 +10,7 @@ from PIL import Image
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import Query
-from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.urdf import robot_from_urdf
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.viewer import show
@@ -41,7 +41,7 @@ def arm_of_size(folder, size):
     )
     path = folder / f"{size}.urdf"
     path.write_text(f'<robot name="arm">{links}{joints}</robot>')
-    return Robot.from_urdf(path, end_effector="two", end_effector_position=(0, 0, size), gain=0.6)
+    return robot_from_urdf(path, end_effector="two", end_effector_position=(0, 0, size), gain=0.6)
 
 
 def test_image_of_an_arm_of_any_size_has_it_whole_and_large(tmp_path):

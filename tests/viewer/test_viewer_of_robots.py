@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from paths import ROOT
 
+from roboarm_nmp.envs.robots.body import Body  # noqa: E402
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.urdf import robot_from_urdf
+from roboarm_nmp.envs.robots.variants import with_attached
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.primitives import Attached, Box, Scene, Sphere, convex_hull
 from roboarm_nmp.utils.bullet import pybullet as p
@@ -72,7 +74,7 @@ def of_shapes(folder):
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("arm")
-    return Robot.from_urdf(of_shapes(folder), end_effector="five", base_position=(0.5, 0.0, 0.2))
+    return robot_from_urdf(of_shapes(folder), end_effector="five", base_position=(0.5, 0.0, 0.2))
 
 
 @pytest.fixture(scope="module", params=["panda", "xarm6", "iiwa", "shapes"])
@@ -89,22 +91,24 @@ def transform(position, wxyz):
 
 def test_links_are_drawn_where_pybullet_has_them(robot):
     client = p.connect(p.DIRECT)
-    body = robot.load(client, drawn=False)
-    base = p.getBasePositionAndOrientation(body, client)
+    body = Body(robot, client, drawn=False)
+    base = p.getBasePositionAndOrientation(body.id, client)
     for state in np.random.default_rng(0).uniform(-1, 1, (5, robot.num_joints)):
         configuration = robot.denormalise(state)
-        robot.set_configuration(client, body, configuration.tolist())
+        body.set_configuration(configuration.tolist())
         x, y, z, w = robot.base_orientation
         drawn = {-1: transform(robot.base_position, (w, x, y, z))}
         for joint in arm_joints(robot):
             at = drawn[joint.parent] @ transform(joint.position, joint.wxyz)
             drawn[joint.link] = at @ transform(*joint.pose(configuration))
-        for link in range(p.getNumJoints(body, client)):
-            state = p.getLinkState(body, link, computeForwardKinematics=1, physicsClientId=client)
+        for link in range(p.getNumJoints(body.id, client)):
+            state = p.getLinkState(
+                body.id, link, computeForwardKinematics=1, physicsClientId=client
+            )
             expected = np.reshape(p.getMatrixFromQuaternion(state[5]), (3, 3))
             np.testing.assert_allclose(drawn[link][:3, 3], state[4], atol=1e-5)
             np.testing.assert_allclose(drawn[link][:3, :3], expected, atol=1e-5)
-    assert p.getBasePositionAndOrientation(body, client) == base
+    assert p.getBasePositionAndOrientation(body.id, client) == base
     p.disconnect(client)
 
 
@@ -136,13 +140,13 @@ def test_link_without_visual_shapes_has_its_collision_shapes(tmp_path):
     text = path.read_text()
     start, end = text.index("<visual>"), text.index("</visual>") + len("</visual>")
     path.write_text(text[:start] + text[end:])
-    [(_, vertices, _)] = link_meshes(Robot.from_urdf(path, end_effector="five"), 0.005)[-1]
+    [(_, vertices, _)] = link_meshes(robot_from_urdf(path, end_effector="five"), 0.005)[-1]
     np.testing.assert_allclose(np.ptp(vertices, axis=0), (0.01, 0.01, 0.01), atol=1e-4)
 
 
 def test_mesh_that_cannot_be_drawn_is_named(tmp_path):
     path = of_shapes(tmp_path)
-    robot = Robot.from_urdf(path, end_effector="five", name="another")  # equal ones share meshes
+    robot = robot_from_urdf(path, end_effector="five", name="another")  # equal ones share meshes
     (tmp_path / "box.stl").write_bytes((tmp_path / "box.stl").read_bytes()[:100])
     with pytest.raises(ValueError, match="box.stl: the mesh cannot be drawn"):
         link_meshes(robot, 0.005)
@@ -233,7 +237,7 @@ def test_robots_that_cannot_be_viewed_give_one_line(capfd, monkeypatch, argument
 def test_attached_objects_are_drawn_where_their_links_are():
     hull = convex_hull(np.random.default_rng(0).uniform(-0.05, 0.05, (12, 3)), (0, 0, 0.1))
     shapes = (Sphere((0, 0, 0.1), 0.05), Box((0, 0, 0.15), (0.05, 0.1, 0.2)), hull)
-    robot = PANDA.with_attached([Attached(shape, "panda_hand") for shape in shapes])
+    robot = with_attached(PANDA, [Attached(shape, "panda_hand") for shape in shapes])
     links = [link.index for link in robot.links[-3:]]
     hand = {joint.link: joint.parent for joint in arm_joints(robot)}
     assert {hand[link] for link in links} == {8}

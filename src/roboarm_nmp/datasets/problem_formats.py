@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.urdf import link_placement
+from roboarm_nmp.envs.robots.placements import link_placement
+from roboarm_nmp.envs.robots.variants import with_held
 from roboarm_nmp.envs.scenes.formats import (
     check_frame,
     check_frames,
@@ -205,7 +206,7 @@ def _configuration(node, positions, robot, what, with_held=True):
 
 def _held(node, robot, positions):
     try:
-        return robot.with_held(positions)
+        return with_held(robot, positions)
     except ValueError as error:
         raise Mistake(node, str(error)) from error
 
@@ -251,7 +252,7 @@ def _goal_pose(node, robot):
         joint, rotation, at = link_placement(robot, frame)
     except ValueError as error:
         raise Mistake(node, str(error)) from error
-    end = robot.bullet_names[1][robot.end_effector_link]
+    end = robot.link_names[robot.end_effector_link]
     end_joint, end_rotation, end_at = link_placement(robot, end)
     if joint != end_joint:
         raise Mistake(node, f"the frame {shorten(frame)!r} does not move with the end effector")

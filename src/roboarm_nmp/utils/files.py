@@ -127,3 +127,12 @@ def check_archive(path):
         # uninitialised memory.
         if any(entry.external_attr for entry in archive.filelist):
             raise ValueError("an entry is not a plain file")
+
+
+@contextlib.contextmanager
+def temporary_file(text, suffix):
+    """A context: the path of a file with this text."""
+    with tempfile.NamedTemporaryFile("w", suffix=suffix) as file:
+        file.write(text)
+        file.flush()
+        yield file.name

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
+from roboarm_nmp.envs.robots.body import parsed_urdf
+
 # Visual meshes are reduced by merging the vertices in each cube of this size (m, of the Panda).
 # Ghosts and recordings have the larger one: browsers without a GPU render slowly.
 MESH_CELL, COARSE_MESH_CELL = 0.005, 0.013
@@ -56,7 +58,7 @@ def arm_joints(robot):
     follows |= {index: follower for index, *follower in robot.mimics}
     held = dict(zip(robot.held_indices, robot.held_positions, strict=True))
     found = []
-    for element in robot.parsed_urdf().findall("joint"):
+    for element in parsed_urdf(robot).findall("joint"):
         index = joints[element.get("name")]
         kind, axis = element.get("type"), np.array((1.0, 0.0, 0.0))
         if kind != "fixed":
@@ -95,7 +97,7 @@ def link_meshes(robot, cell):
         ValueError: a mesh cannot be read.
     """
     _, links = _bullet_indices(robot)
-    root, found = robot.parsed_urdf(), {}
+    root, found = parsed_urdf(robot), {}
     colours = {}
     for material in root.iter("material"):
         colours.setdefault(material.get("name"), _rgb(material))
@@ -199,7 +201,8 @@ def _rounded(vertices):
 
 def _bullet_indices(robot):
     """PyBullet's indices of joints and of links by their names, two dicts; -1 is the base."""
-    return [{name: index for index, name in names.items()} for names in robot.bullet_names]
+    joints = {name: index for index, name in enumerate(robot.bullet_joint_names)}
+    return joints, {name: index for index, name in robot.link_names.items()}
 
 
 def _numbers(element, name, default=None):

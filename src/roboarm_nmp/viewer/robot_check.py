@@ -76,7 +76,7 @@ def position_error(robot, rng, number=500):
     world = World(Scene(table=None, floor=None, robot=robot), drawn=False)
     worst = 0.0
     for configuration in rng.uniform(robot.lower, robot.upper, (number, robot.num_joints)):
-        robot.set_configuration(world.client, world.body, configuration.tolist())
+        world.arm.set_configuration(configuration.tolist())
         error = world.read_arm()[2] - robot.forward_kinematics(configuration)
         worst = max(worst, float(np.linalg.norm(error)))
     world.close()
@@ -141,7 +141,7 @@ def describe(robot):
     if robot.datasheet_lower is not None:
         pairs = zip(robot.datasheet_lower, robot.datasheet_upper, strict=True)
         lines.append(f"datasheet: {', '.join(f'{low:.3f} to {high:.3f}' for low, high in pairs)}")
-    _, names = robot.bullet_names
+    names = robot.link_names
     still = [names[link.index] for link in robot.links if link.frame < 0]
     offset = ", ".join(f"{x:g}" for x in robot.end_effector_offset)
     lines += [
@@ -188,7 +188,7 @@ def _behind(robot, rng):
 
 def draw_pairs(robot, size):
     """An image of the links as rows and columns: uint8 (height, width, 3)."""
-    _, names = robot.bullet_names
+    names = robot.link_names
     links = sorted(link.index for link in robot.links)
     image, font = Image.new("RGB", size, "white"), ImageFont.load_default(12)
     painter, left = ImageDraw.Draw(image), size[0] // 3

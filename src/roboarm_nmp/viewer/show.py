@@ -38,7 +38,7 @@ from roboarm_nmp.datasets.format import OutOfDateError
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import Query, load_queries, query_path
 from roboarm_nmp.envs.robots.panda import scale_of
-from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.primitives import ConvexHull, Scene, to_array
 from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.envs.world import image_array, why_no_window
@@ -203,10 +203,10 @@ def _render(env, goal, configurations, size, points, view, times):
     for configuration, seconds in zip(configurations, times, strict=True):
         env.world.set_time(seconds)
         if has_ghost and (ghost is None or not env.scene.is_static):
-            env.robot.set_configuration(env.client, env.body, goal)
+            env.world.arm.set_configuration(goal)
             ghost = _shoot(env, camera, size)
             tinted = ghost.colour.mean(-1, keepdims=True) * GHOST_COLOUR
-        env.robot.set_configuration(env.client, env.body, configuration)
+        env.world.arm.set_configuration(configuration)
         shot = _shoot(env, camera, size)
         pixels = shot.colour
         if has_ghost:
@@ -243,7 +243,7 @@ def _extent(env, configurations, times=(0.0,)):
     boxes = np.reshape(boxes, (-1, 2, 3))
     boxes = [*np.clip(boxes, *_around(env.robot, [LOWEST, HIGHEST]))]
     for configuration in configurations:
-        env.robot.set_configuration(env.client, env.body, configuration)
+        env.world.arm.set_configuration(configuration)
         for link in range(-1, p.getNumJoints(env.body, physicsClientId=env.client)):
             boxes.append(p.getAABB(env.body, link, physicsClientId=env.client))
     choices = np.array(list(itertools.product((0, 1), repeat=3)))
@@ -263,7 +263,7 @@ def _camera(env, points, slopes, view=None):
     distance = None
     if view is None:
         # So that all queries of a scene are rendered from the same side, whatever the arm hides.
-        env.robot.set_configuration(env.client, env.body, env.robot.contact_free)
+        env.world.arm.set_configuration(env.robot.contact_free)
         yaw, pitch = min(YAWS, key=lambda yaw: _hidden(env, yaw)), PITCH
     elif view in VIEWS:
         yaw, pitch = VIEWS[view]
@@ -601,7 +601,7 @@ def _window(args, env, queries, begin):
                 configurations = queries.replay(number)
                 for step, configuration in enumerate(configurations):
                     env.world.set_time(step * STEP_SECONDS)
-                    env.robot.set_configuration(client, env.body, configuration)
+                    env.world.arm.set_configuration(configuration)
                     time.sleep(1 / env.metadata["render_fps"])
             text = _outcome(args, env, queries, number, query, configurations, trajectory)
             print(text, flush=True)

@@ -46,7 +46,7 @@ def env():
 @pytest.fixture(scope="module")
 def hulls(env):
     """Vertices (n, 3) of each of `LINKS` at `STATE`, in the base's frame, by PyBullet."""
-    PANDA.set_configuration(env.client, env.body, PANDA.denormalise(STATE))
+    env.world.arm.set_configuration(PANDA.denormalise(STATE))
     hulls = []
     for link in LINKS:
         flags = p.MESH_DATA_SIMULATION_MESH
@@ -165,7 +165,7 @@ def test_distances_agree_with_pybullet(env):
         near = CollisionChecker(scene).signed_distances(states, self_collisions=False)
         assert (near.geometry == 0).all()
         for state, distances in zip(states, near.distance, strict=True):
-            PANDA.set_configuration(env.client, env.body, PANDA.denormalise(state))
+            env.world.arm.set_configuration(PANDA.denormalise(state))
             for link, distance in zip(LINKS, distances, strict=True):
                 points = p.getClosestPoints(
                     env.body, body, 2.0, linkIndexA=link, physicsClientId=env.client
@@ -317,7 +317,7 @@ def test_self_distances_agree_with_pybullet(env):
     checker = CollisionChecker(EMPTY)
     for state in rng.uniform(-1, 1, (60, 7)):
         near = checker.signed_distances(state)
-        PANDA.set_configuration(env.client, env.body, PANDA.denormalise(state))
+        env.world.arm.set_configuration(PANDA.denormalise(state))
         expected = dict.fromkeys(LINKS, 10.0)
         for a, b in PANDA.self_collision_pairs:
             points = p.getClosestPoints(env.body, env.body, 3.0, a, b, physicsClientId=env.client)

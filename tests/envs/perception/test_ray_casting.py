@@ -20,7 +20,7 @@ from roboarm_nmp.envs.perception.sensors import (
     deproject,
 )
 from roboarm_nmp.envs.robots.files import load_robot
-from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.urdf import robot_from_urdf
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere, convex_hull
 from roboarm_nmp.utils.bullet import pybullet as p
 
@@ -184,7 +184,7 @@ def test_arm_of_spheres_capsules_boxes_and_meshes_is_that_of_ray_tests(tmp_path)
     )
     urdf = tmp_path / "shapes.urdf"
     urdf.write_text(SHAPES_URDF.format(links=links))
-    robot = Robot.from_urdf(urdf)
+    robot = robot_from_urdf(urdf)
     scene, configuration = Scene(table=None, floor=None, robot=robot), np.full(5, 0.3)
     sensor = PointCloud((2.0, 0.5, 0.8), (0.0, 0.0, 0.8), field_of_view=45.0, num_samples=EDGE**2)
     depth, classes = cast(scene, configuration, sensor)

@@ -15,8 +15,10 @@ from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import ARM, CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import obstacle_points, prepare_cloud
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
+from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.variants import with_attached, with_held
 from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.motions import Oscillation
 from roboarm_nmp.envs.scenes.primitives import (
@@ -54,26 +56,26 @@ GOAL = np.array([0.6, -0.3, 0.1, -1.8, 0.1, 1.5, 0.6], np.float32)
 
 
 def test_arm_without_objects_is_the_same_object_and_keeps_its_fingerprint():
-    carrying = PANDA.with_attached([BOARD])
-    assert PANDA.with_attached([]) is PANDA and carrying.with_attached(()) is PANDA
+    carrying = with_attached(PANDA, [BOARD])
+    assert with_attached(PANDA, []) is PANDA and with_attached(carrying, ()) is PANDA
     assert PANDA.fingerprint.startswith("026faa3f2a77")
     assert carrying != PANDA and carrying.same_arm(PANDA) and carrying.arm is PANDA
-    assert carrying == PANDA.with_attached([BOARD]) == pickle.loads(pickle.dumps(carrying))
-    assert carrying != PANDA.with_attached([ROCK])
+    assert carrying == with_attached(PANDA, [BOARD]) == pickle.loads(pickle.dumps(carrying))
+    assert carrying != with_attached(PANDA, [ROCK])
     assert carrying.collision_links == PANDA.collision_links
     check_robot("policy.pt", {}, carrying)
 
 
 def test_objects_stay_when_the_gripper_is_held_elsewhere():
-    robot = PANDA.with_attached([BOARD]).with_held({"panda_finger_joint1": 0.01})
-    assert robot.attached == PANDA.with_attached([BOARD]).attached
+    robot = with_held(with_attached(PANDA, [BOARD]), {"panda_finger_joint1": 0.01})
+    assert robot.attached == with_attached(PANDA, [BOARD]).attached
     assert list(robot.held.values()) == [0.01] * 2
-    assert robot == PANDA.with_held({"panda_finger_joint1": 0.01}).with_attached([BOARD])
+    assert robot == with_attached(with_held(PANDA, {"panda_finger_joint1": 0.01}), [BOARD])
 
 
 @pytest.mark.parametrize("objects", [[BOARD], MANY], ids=["board", "many"])
 def test_compiled_checks_agree_with_pybullet(objects):
-    robot, rng, free = PANDA.with_attached(objects), np.random.default_rng(0), 0
+    robot, rng, free = with_attached(PANDA, objects), np.random.default_rng(0), 0
     for i in range(3):
         scene = replace(RandomBoxes(2, 4).sample(rng), robot=robot)
         if i == 0:
@@ -94,7 +96,7 @@ def test_distances_of_an_object_are_in_the_row_of_the_link_that_carries_it():
     position, rotation = PANDA.frame_poses(START)[6]
     below = position + 0.5 * rotation[:, 2]  # the fingertips are 0.21 m beyond joint 7
     ball = Sphere(tuple(below.tolist()), 0.02)
-    rod = PANDA.with_attached([Attached(Cylinder((0, 0, 0.1), 0.01, 0.2), "panda_hand")])
+    rod = with_attached(PANDA, [Attached(Cylinder((0, 0, 0.1), 0.01, 0.2), "panda_hand")])
     state = PANDA.normalise(START.astype(np.float64))
     plain, carrying = (
         CollisionChecker(Scene((ball,), None, None, robot=robot)) for robot in (PANDA, rod)
@@ -121,17 +123,17 @@ def test_object_collides_with_links_that_move_against_it_except_touch_links():
     def collisions(robot):
         return ~CollisionChecker(Scene(table=None, floor=None, robot=robot)).is_free(states)
 
-    alone, names = collisions(PANDA), PANDA.bullet_names[1].values()
-    carrying = collisions(PANDA.with_attached([Attached(long)]))
+    alone, names = collisions(PANDA), PANDA.link_names.values()
+    carrying = collisions(with_attached(PANDA, [Attached(long)]))
     assert carrying[alone].all() and carrying.sum() > alone.sum() + 3
-    touching = PANDA.with_attached([Attached(long, touch_links=tuple(names))])
+    touching = with_attached(PANDA, [Attached(long, touch_links=tuple(names))])
     np.testing.assert_array_equal(collisions(touching), alone)
-    checker = CollisionChecker(Scene((), None, None, robot=PANDA.with_attached([Attached(long)])))
+    checker = CollisionChecker(Scene((), None, None, robot=with_attached(PANDA, [Attached(long)])))
     assert ARM in checker.signed_distances(states[carrying & ~alone][0]).geometry
 
 
 def test_points_on_an_object_are_the_arms_own():
-    robot = PANDA.with_attached([Attached(Box((0, 0, 0.2), (0.05, 0.05, 0.3)))])
+    robot = with_attached(PANDA, [Attached(Box((0, 0, 0.2), (0.05, 0.05, 0.3)))])
     position, rotation = robot.frame_poses(START)[6]
     away = np.linspace(0.35, 0.5, 40)[:, None]  # behind the fingertips
     points = position + away * rotation[:, 2]
@@ -145,7 +147,7 @@ def test_sensors_see_an_object_as_the_arm_and_no_points_of_it():
     camera = Camera(tuple(place + [0.0, 0.5, 0.1]), tuple(place), size=(64, 64))
     wall = Box((0.4, -0.5, 0.4), (1.0, 0.1, 0.8))  # behind the object
     seen, world = [], SensorWorld()
-    for robot in (PANDA, PANDA.with_attached([Attached(Box((0, 0, 0.3), (0.05, 0.05, 0.2)))])):
+    for robot in (PANDA, with_attached(PANDA, [Attached(Box((0, 0, 0.3), (0.05, 0.05, 0.2)))])):
         world.show(Scene((wall,), robot=robot), START)
         depth, classes = world.cast(camera, camera.size)
         seen.append((classes[32, 32], depth[32, 32] < 0.5))
@@ -158,7 +160,7 @@ def test_sensors_see_an_object_as_the_arm_and_no_points_of_it():
 def test_safety_filter_keeps_an_object_from_the_table():
     low = START.copy()
     low[1], low[5] = 0.4, 2.5  # the fingertips are 0.16 m above the table
-    rod = PANDA.with_attached([Attached(Box((0, 0, 0.2), (0.03, 0.03, 0.3)))])
+    rod = with_attached(PANDA, [Attached(Box((0, 0, 0.2), (0.03, 0.03, 0.3)))])
     env = envs.make("no_obstacles", link_distances=True, geometry_source="ground_truth")
     table = Box((0, 0, -0.02), (3, 3, 0.04))
 
@@ -183,8 +185,8 @@ def test_safety_filter_keeps_an_object_from_the_table():
 
 def test_body_and_its_coarse_copy_have_the_object():
     client = p.connect(p.DIRECT)
-    for robot, links in ((PANDA, 12), (PANDA.with_attached([BOARD, ROCK]), 14)):
-        for body in (robot.load(client), robot.load_coarse(client, (1, 0, 0, 1))):
+    for robot, links in ((PANDA, 12), (with_attached(PANDA, [BOARD, ROCK]), 14)):
+        for body in (Body(robot, client).id, Body.coarse(robot, client, (1, 0, 0, 1)).id):
             assert p.getNumJoints(body, physicsClientId=client) == links
             drawn = {shape[1] for shape in p.getVisualShapeData(body, physicsClientId=client)}
             assert set(range(12, links)) <= drawn
@@ -193,7 +195,7 @@ def test_body_and_its_coarse_copy_have_the_object():
 
 def test_plan_with_an_object_is_followed_without_contact():
     env = envs.make("wall")
-    robot = PANDA.with_attached([Attached(Box((0.0, 0.0, 0.15), (0.03, 0.2, 0.3)))])
+    robot = with_attached(PANDA, [Attached(Box((0.0, 0.0, 0.15), (0.03, 0.2, 0.3)))])
     scene = replace(env.unwrapped.scene, robot=robot)
     start = np.array([1.2, -0.5, 0.0, -1.8, 0.0, 1.5, 0.0], np.float32)
     goal = np.array([-1.2, -0.3, 0.0, -1.8, 0.0, 1.7, 0.0], np.float32)
@@ -204,7 +206,7 @@ def test_plan_with_an_object_is_followed_without_contact():
 
 
 def test_episode_with_an_object_is_that_of_its_copy_and_of_a_new_environment():
-    scene = Scene(robot=PANDA.with_attached(MANY))
+    scene = Scene(robot=with_attached(PANDA, MANY))
 
     def episode(env):
         observation, _ = env.reset_specific(START, GOAL, scene)
@@ -224,14 +226,14 @@ def test_episode_with_an_object_is_that_of_its_copy_and_of_a_new_environment():
 
 def test_episode_has_the_arm_of_its_scene():
     env = RoboArmEnv()
-    scene = Scene(robot=PANDA.with_attached([BOARD]))
+    scene = Scene(robot=with_attached(PANDA, [BOARD]))
     assert Episode(env, Query(START, GOAL, scene)).trajectory().robot == scene.robot
     env.close()
 
 
 def test_files_keep_objects(tmp_path):
-    held = PANDA.with_held({"panda_finger_joint1": 0.02})
-    for robot in (PANDA.with_attached(MANY), held.with_attached([BOARD])):
+    held = with_held(PANDA, {"panda_finger_joint1": 0.02})
+    for robot in (with_attached(PANDA, MANY), with_attached(held, [BOARD])):
         scene = Scene((Box((0.5, 0, 0.3), (0.1, 0.1, 0.1)),), robot=robot)
         save_scene(scene, tmp_path / "a.yaml")
         assert load_scene(tmp_path / "a.yaml") == scene
@@ -243,7 +245,7 @@ def test_files_keep_objects(tmp_path):
     text = "attached:\n- box: {position: [0, 0, 0.1], size: [0.1, 0.1, 0.1], link: panda_hand}\n"
     (tmp_path / "b.yaml").write_text(text)
     expected = Attached(Box((0, 0, 0.1), (0.1, 0.1, 0.1)), "panda_hand")
-    assert load_scene(tmp_path / "b.yaml").robot == PANDA.with_attached([expected])
+    assert load_scene(tmp_path / "b.yaml").robot == with_attached(PANDA, [expected])
 
 
 @pytest.mark.parametrize(
@@ -267,9 +269,9 @@ def test_mistake_in_a_file_is_rejected_with_its_line(fields, reason, tmp_path):
 
 def test_objects_that_cannot_be_are_rejected():
     with pytest.raises(ValueError, match="at most 100 attached objects"):
-        PANDA.with_attached([BOARD] * 101)
+        with_attached(PANDA, [BOARD] * 101)
     with pytest.raises(TypeError, match="must be of the type Attached"):
-        PANDA.with_attached([BOARD.shape])
+        with_attached(PANDA, [BOARD.shape])
     with pytest.raises(TypeError, match="an attached shape must be Box"):
         Attached("box")
     with pytest.raises(ValueError, match="positive sizes"):
@@ -277,4 +279,4 @@ def test_objects_that_cannot_be_are_rejected():
     with pytest.raises(ValueError, match="an attached shape has no motion"):
         Attached(Sphere((0, 0, 0), 0.1, Oscillation((0.1, 0, 0))))
     with pytest.raises(ValueError, match="the arm collides with itself in each of"):
-        PANDA.with_attached([Attached(Sphere((0, 0, 0), 3.0))])
+        with_attached(PANDA, [Attached(Sphere((0, 0, 0), 3.0))])

@@ -11,7 +11,8 @@ from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.urdf import robot_from_urdf
+from roboarm_nmp.envs.robots.variants import with_held
 from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, scene_from_json, scene_to_json
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
@@ -20,27 +21,27 @@ from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.documents import DocumentError
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
-OPEN = PANDA.with_held(dict.fromkeys(FINGERS, 0.065))  # wider than the URDF's limit, 0.04
+OPEN = with_held(PANDA, dict.fromkeys(FINGERS, 0.065))  # wider than the URDF's limit, 0.04
 START = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8])
 GOAL = np.array([0.6, -0.3, 0.1, -1.8, 0.1, 1.5, 0.6])
 
 
 def test_arm_as_described_is_the_same_object_and_keeps_its_fingerprint():
-    assert PANDA.with_held({}) is PANDA and OPEN.with_held(PANDA.held) is PANDA
+    assert with_held(PANDA, {}) is PANDA and with_held(OPEN, PANDA.held) is PANDA
     assert PANDA.held == dict.fromkeys(FINGERS, 0.04)
     assert PANDA.fingerprint.startswith("026faa3f2a77")
     assert OPEN != PANDA and OPEN.same_arm(PANDA) and PANDA.same_arm(OPEN)
 
 
 def test_joint_that_mimics_another_one_follows_it_unless_it_is_named():
-    assert PANDA.with_held({FINGERS[0]: 0.065}) == OPEN
-    one = PANDA.with_held({FINGERS[0]: 0.03, FINGERS[1]: 0.01})
+    assert with_held(PANDA, {FINGERS[0]: 0.065}) == OPEN
+    one = with_held(PANDA, {FINGERS[0]: 0.03, FINGERS[1]: 0.01})
     assert one.held == {FINGERS[0]: 0.03, FINGERS[1]: 0.01}
 
 
 @pytest.mark.parametrize("opening", [0.065, 0.0])
 def test_compiled_checks_agree_with_pybullet(opening):
-    robot, rng, free = PANDA.with_held({FINGERS[0]: opening}), np.random.default_rng(0), 0
+    robot, rng, free = with_held(PANDA, {FINGERS[0]: opening}), np.random.default_rng(0), 0
     for _ in range(4):
         scene = replace(RandomBoxes(4, 8).sample(rng), robot=robot)
         world, states = World(scene, drawn=False), rng.uniform(-1, 1, (100, 7))
@@ -146,7 +147,7 @@ def test_query_file_of_a_scene_file_with_another_opening_is_read(tmp_path):
 )
 def test_positions_that_cannot_be_are_rejected(positions, reason):
     with pytest.raises(ValueError, match=reason):
-        PANDA.with_held(positions)
+        with_held(PANDA, positions)
 
 
 URDF = """<robot name="arm">
@@ -178,8 +179,8 @@ def urdf(tmp_path_factory):
 def test_arm_of_a_urdf_has_links_and_end_effector_as_if_described_so(urdf):
     options = {"joints": ["turn", "lift", "roll"], "end_effector": "tip", "gain": 0.6}
     options["end_effector_position"] = (0.0, 0.01, 0.05)
-    expected = Robot.from_urdf(urdf, fixed={"grip": 0.7}, **options)
-    moved = Robot.from_urdf(urdf, fixed={"grip": -0.2}, **options).with_held({"grip": 0.7})
+    expected = robot_from_urdf(urdf, fixed={"grip": 0.7}, **options)
+    moved = with_held(robot_from_urdf(urdf, fixed={"grip": -0.2}, **options), {"grip": 0.7})
     for name in ("end_effector_position", "held_positions"):
         np.testing.assert_allclose(getattr(moved, name), getattr(expected, name), atol=1e-12)
     [link], [other] = moved.links, expected.links
@@ -188,7 +189,7 @@ def test_arm_of_a_urdf_has_links_and_end_effector_as_if_described_so(urdf):
 
 
 def test_joint_that_carries_others_cannot_be_moved(urdf):
-    robot = Robot.from_urdf(urdf, joints=["turn", "roll"], end_effector="three", gain=0.6)
-    assert robot.with_held({"grip": 0.3}).held["grip"] == 0.3
+    robot = robot_from_urdf(urdf, joints=["turn", "roll"], end_effector="three", gain=0.6)
+    assert with_held(robot, {"grip": 0.3}).held["grip"] == 0.3
     with pytest.raises(ValueError, match="lift carries joints that move"):
-        robot.with_held({"lift": 0.1})
+        with_held(robot, {"lift": 0.1})

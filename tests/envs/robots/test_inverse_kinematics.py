@@ -11,7 +11,8 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.inverse_kinematics import MAX_ANGLE, MAX_DISTANCE, inverse_kinematics
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import Robot, quaternions, rotation_angle
+from roboarm_nmp.envs.robots.rotations import quaternions, rotation_angle
+from roboarm_nmp.envs.robots.urdf import robot_from_urdf
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.training.network_parts import JacobianTranspose
@@ -53,7 +54,7 @@ def robot(request, tmp_path_factory):
     path.write_text(URDF)
     base = {"base_position": (0.1, -0.2, 0.3), "base_orientation": (0.0, 0.6, 0.0, 0.8)}
     offset = (0.01, 0.02, 0.03)
-    return Robot.from_urdf(path, end_effector="tool", end_effector_position=offset, **base)
+    return robot_from_urdf(path, end_effector="tool", end_effector_position=offset, **base)
 
 
 def random_configurations(robot, number, seed=0):
@@ -65,7 +66,7 @@ def bullet_poses(robot, configurations):
     """Position and rotation of the end effector as PyBullet has them."""
     world = World(Scene(table=None, floor=None, robot=robot), drawn=False)
     for configuration in configurations:
-        robot.set_configuration(world.client, world.body, configuration.tolist())
+        world.arm.set_configuration(configuration.tolist())
         link = p.getLinkState(
             *(world.body, robot.end_effector_link),
             computeForwardKinematics=1,

@@ -14,10 +14,10 @@ import pytest
 import roboarm_nmp.envs.robots.urdf
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.hulls import arm_hulls
+from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import Robot
-from roboarm_nmp.envs.robots.urdf import RobotError
+from roboarm_nmp.envs.robots.urdf import RobotError, robot_from_urdf
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.motions.time_parameterisation import time_parameterise
@@ -97,7 +97,7 @@ def urdf(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def arm(urdf):
-    return Robot.from_urdf(urdf(ARM), end_effector="tool", fixed={"grip": 0.02})
+    return robot_from_urdf(urdf(ARM), end_effector="tool", fixed={"grip": 0.02})
 
 
 def test_joints_limits_and_held_joints_are_those_of_the_file(arm):
@@ -112,7 +112,7 @@ def test_joints_limits_and_held_joints_are_those_of_the_file(arm):
 def test_forward_kinematics_agree_with_pybullet(arm):
     world = World(Scene(table=None, floor=None, robot=arm), drawn=False)
     for configuration in np.random.default_rng(0).uniform(-1.5, 1.5, (50, 3)):
-        arm.set_configuration(world.client, world.body, configuration.tolist())
+        world.arm.set_configuration(configuration.tolist())
         position = world.read_arm()[2]
         np.testing.assert_allclose(arm.forward_kinematics(configuration), position, atol=1e-6)
     world.close()
@@ -181,7 +181,7 @@ def test_bodies_of_a_link_are_its_shapes(arm):
 
 
 def test_panda_from_its_urdf_is_the_panda():
-    robot = Robot.from_urdf(
+    robot = robot_from_urdf(
         PANDA.urdf, end_effector="panda_grasptarget", fixed={"panda_finger_joint1": 0.04}
     )
     configurations = np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (100, 7))
@@ -211,11 +211,11 @@ def test_srdf_disables_pairs(tmp_path):
     path, srdf = pybullet_file("kuka_iiwa/model.urdf"), tmp_path / "iiwa.srdf"
     disabled = "<robot name='iiwa'><disable_collisions link1='{}' link2='lbr_iiwa_link_0'/></robot>"
     srdf.write_text(disabled.format("lbr_iiwa_link_6"))
-    robot, less = load_robot(path), Robot.from_urdf(path, srdf=srdf)
+    robot, less = load_robot(path), robot_from_urdf(path, srdf=srdf)
     assert set(robot.self_collision_pairs) - set(less.self_collision_pairs) == {(-1, 5)}
     srdf.write_text(disabled.format("hand"))
     with pytest.raises(ValueError, match="the URDF has no link 'hand'"):
-        Robot.from_urdf(path, srdf=srdf)
+        robot_from_urdf(path, srdf=srdf)
 
 
 TWO = link("a", BAR) + link("b", BAR)
@@ -257,7 +257,7 @@ MESH = "0 0 0", "0 0 0", '<mesh filename="{}"/>'
 def test_unusable_urdf_is_rejected_with_its_reason(urdf, elements, reason):
     path = urdf(elements)
     with pytest.raises(RobotError, match=reason) as error:
-        Robot.from_urdf(path)
+        robot_from_urdf(path)
     assert str(path) in str(error.value)
 
 
@@ -279,14 +279,14 @@ def test_malformed_file_is_rejected_with_its_reason(tmp_path, contents, reason):
     path.write_bytes(contents)
     began = time.monotonic()
     with pytest.raises(RobotError, match=reason):
-        Robot.from_urdf(path)
+        robot_from_urdf(path)
     assert time.monotonic() - began < 5
 
 
 def test_pipe_is_rejected_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.urdf")
     with pytest.raises(RobotError, match="no regular file"):
-        Robot.from_urdf(tmp_path / "pipe.urdf")
+        robot_from_urdf(tmp_path / "pipe.urdf")
 
 
 @pytest.mark.parametrize("contents", [b"", b"solid", b"v 0 0 0", bytes(84), b"\xff" * 1000])
@@ -297,7 +297,7 @@ def test_mesh_without_triangles_is_rejected(urdf, contents, ending):
     path.write_text(text)
     (path.parent / f"x.{ending}").write_bytes(contents)
     with pytest.raises(RobotError, match="PyBullet cannot"):
-        Robot.from_urdf(path)
+        robot_from_urdf(path)
 
 
 def test_stl_file_of_text_is_named(urdf):
@@ -307,15 +307,15 @@ def test_stl_file_of_text_is_named(urdf):
     text = f"solid x\nfacet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\nendsolid\n"
     (path.parent / "x.stl").write_text(text)
     with pytest.raises(RobotError, match=r"x\.stl, an STL file of text"):
-        Robot.from_urdf(path)
+        robot_from_urdf(path)
 
 
 @pytest.mark.parametrize("text", ["0.05 0.06 0.2", "0 0 0.15", "0.1 0 0"])
 def test_arms_with_other_collision_shapes_differ(urdf, text):
     options = {"end_effector": "l1", "gain": 0.5}
-    arm = Robot.from_urdf(urdf(chain(2)), **options)
-    same = Robot.from_urdf(urdf(chain(2).replace(f'"{text}"', f'"{text}0"')), **options)
-    other = Robot.from_urdf(urdf(chain(2).replace(f'"{text}"', f'"{text}01"')), **options)
+    arm = robot_from_urdf(urdf(chain(2)), **options)
+    same = robot_from_urdf(urdf(chain(2).replace(f'"{text}"', f'"{text}0"')), **options)
+    other = robot_from_urdf(urdf(chain(2).replace(f'"{text}"', f'"{text}01"')), **options)
     assert arm == same != other
     assert arm.self_collision_pairs == other.self_collision_pairs
 
@@ -333,18 +333,18 @@ def test_face_with_a_missing_vertex_is_rejected(urdf, face, kind):
     )
     (path.parent / "x.obj").write_text(f"{tetrahedron}f {face}\n")
     with pytest.raises(RobotError, match="has a vertex that is not there"):
-        Robot.from_urdf(path)
+        robot_from_urdf(path)
     (path.parent / "x.obj").write_text(tetrahedron)
-    assert Robot.from_urdf(path).num_joints == 2
+    assert robot_from_urdf(path).num_joints == 2
 
 
 LOAD = """
 import re, resource, sys, time
-from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.urdf import robot_from_urdf
 from roboarm_nmp.envs.robots.untrusted import RobotError
 began = time.process_time()
 try:
-    Robot.from_urdf(sys.argv[1])
+    robot_from_urdf(sys.argv[1])
 except RobotError as error:
     print(error)
 print(time.process_time() - began)
@@ -370,17 +370,17 @@ def test_prefixes_of_other_programs_and_long_lines_are_accepted(urdf):
     path = urdf(ARM.replace('effort="50"', 'effort="50" drake:acceleration="1"'))
     text = path.read_text().replace("</robot>", "<drake:x y='1'/></robot>")
     path.write_text(text.replace("<link ", f"<!-- {'x' * 9000} --><link ", 1))
-    robot = Robot.from_urdf(path, end_effector="tool")
+    robot = robot_from_urdf(path, end_effector="tool")
     assert robot.effort.tolist() == [50] * 3 and len(arm_hulls(robot)[1]) == 9
 
 
 def test_frame_without_inertial_is_light(urdf):
     """PyBullet would take 1 kg."""
-    robot = Robot.from_urdf(
+    robot = robot_from_urdf(
         urdf(ARM.replace(link("tool"), '<link name="tool"/>')), end_effector="tool"
     )
     client = p.connect(p.DIRECT)
-    body = robot.load(client)
+    body = Body(robot, client).id
     assert p.getDynamicsInfo(body, robot.end_effector_link, physicsClientId=client)[0] < 0.01
     p.disconnect(client)
 
@@ -408,7 +408,7 @@ def test_frame_without_inertial_is_light(urdf):
 )
 def test_options_of_other_types_are_rejected(urdf, options):
     with pytest.raises(RobotError, match="these options cannot be used"):
-        Robot.from_urdf(urdf(ARM), end_effector="tool", **options)
+        robot_from_urdf(urdf(ARM), end_effector="tool", **options)
 
 
 def test_huge_mesh_is_rejected_before_it_is_read(urdf, tmp_path):
@@ -416,35 +416,35 @@ def test_huge_mesh_is_rejected_before_it_is_read(urdf, tmp_path):
     with open(path.parent / "huge.stl", "wb") as file:
         file.truncate(500_000_000)  # 10^7 vertices
     with pytest.raises(RobotError, match="more than 20 MB"):
-        Robot.from_urdf(path)
+        robot_from_urdf(path)
 
 
 def test_ambiguous_end_effector_lists_the_choices(urdf):
     elements = TWO + link("c") + joint("1", "a", "b") + joint("2", "a", "c")
     with pytest.raises(RobotError, match="name one: b, c"):
-        Robot.from_urdf(urdf(elements))
+        robot_from_urdf(urdf(elements))
 
 
 def test_options_that_do_not_fit_are_rejected(urdf):
     path = urdf(ARM)
     with pytest.raises(RobotError, match="no link 'hand'"):
-        Robot.from_urdf(path, end_effector="hand")
+        robot_from_urdf(path, end_effector="hand")
     with pytest.raises(RobotError, match="'grip' is no movable joint between"):
-        Robot.from_urdf(path, end_effector="tool", joints=["turn", "grip"])
+        robot_from_urdf(path, end_effector="tool", joints=["turn", "grip"])
     with pytest.raises(RobotError, match="fixed: 'turn' is none of the other joints"):
-        Robot.from_urdf(path, end_effector="tool", fixed={"turn": 0.0})
+        robot_from_urdf(path, end_effector="tool", fixed={"turn": 0.0})
     with pytest.raises(RobotError, match="limits: no joint 'trun', but turn"):
-        Robot.from_urdf(path, end_effector="tool", limits={"trun": (-1, 1)})
+        robot_from_urdf(path, end_effector="tool", limits={"trun": (-1, 1)})
     with pytest.raises(RobotError, match="acceleration: no limit of slide, roll"):
-        Robot.from_urdf(path, end_effector="tool", acceleration={"turn": 5})
+        robot_from_urdf(path, end_effector="tool", acceleration={"turn": 5})
     with pytest.raises(RobotError, match="velocity: 'grip' is none of the joints"):
-        Robot.from_urdf(path, end_effector="tool", velocity={"grip": 1})
+        robot_from_urdf(path, end_effector="tool", velocity={"grip": 1})
     with pytest.raises(RobotError, match="datasheet_limits: 'grip' is none of the joints"):
-        Robot.from_urdf(path, end_effector="tool", datasheet_limits={"grip": (0, 1)})
+        robot_from_urdf(path, end_effector="tool", datasheet_limits={"grip": (0, 1)})
     with pytest.raises(
         RobotError, match="'roll': datasheet_limits from -2.0 to 1.0 are not inside"
     ):
-        Robot.from_urdf(path, end_effector="tool", datasheet_limits={"roll": (-2, 1)})
+        robot_from_urdf(path, end_effector="tool", datasheet_limits={"roll": (-2, 1)})
 
 
 def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
@@ -465,7 +465,7 @@ def test_robot_file_says_what_the_urdf_lacks(urdf, tmp_path):
 
 def test_robot_file_adds_limits_of_trajectories_and_the_datasheet(urdf, tmp_path):
     path = urdf(ARM)
-    plain, file = Robot.from_urdf(path, end_effector="tool", gain=0.5), tmp_path / "arm.yaml"
+    plain, file = robot_from_urdf(path, end_effector="tool", gain=0.5), tmp_path / "arm.yaml"
     file.write_text(
         f"urdf: {path}\nname: arm\nend_effector: tool\ngain: 0.5\nvelocity: {{slide: 0.4}}\n"
         "acceleration: 3\njerk: {turn: 30, slide: 10, roll: 50}\n"
@@ -522,22 +522,22 @@ def test_malformed_robot_file_is_rejected_with_its_reason(tmp_path, text, reason
 def test_pairs_and_gain_are_cached_and_a_damaged_cache_is_made_again(urdf, tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path))
     arm = {"path": urdf(ARM), "end_effector": "tool"}
-    first = Robot.from_urdf(**arm)
+    first = robot_from_urdf(**arm)
     files = list((tmp_path / "robots").iterdir())
     assert len(files) == 2  # of the pairs and of the gain
     with monkeypatch.context() as patch:
         patch.setattr(roboarm_nmp.envs.robots.urdf, "sample_pairs", None)
         patch.setattr(roboarm_nmp.envs.robots.urdf, "calibrate", None)
-        again = Robot.from_urdf(**arm)
+        again = robot_from_urdf(**arm)
         # A box that has another size may collide elsewhere.
         wider = urdf(ARM.replace("0.05 0.06 0.2", "0.05 0.07 0.2"))
         with pytest.raises(TypeError):
-            Robot.from_urdf(wider, end_effector="tool")
+            robot_from_urdf(wider, end_effector="tool")
     assert again == first and again.self_collision_pairs == first.self_collision_pairs
     assert again.gains == first.gains and again.contact_free == first.contact_free
     for file in files:
         file.write_bytes(b"[[1, ")
-    assert Robot.from_urdf(**arm) == first
+    assert robot_from_urdf(**arm) == first
 
 
 @pytest.mark.parametrize("limit", ['<limit lower="-1" upper="1" effort="50"/>', ""])
@@ -545,13 +545,13 @@ def test_arm_moves_within_limits_that_replace_the_urdfs(urdf, limit):
     mimic = f'{limit}<mimic joint="j1" multiplier="-1"/>'
     joints = joint("j1", "l0", "l1", more=limit) + joint("j2", "l1", "l2", more=mimic)
     path = urdf("".join(link(f"l{i}", BAR) for i in range(3)) + joints)
-    robot = Robot.from_urdf(path, limits={"j1": (-3.0, 3.0)}, gain=0.6)
+    robot = robot_from_urdf(path, limits={"j1": (-3.0, 3.0)}, gain=0.6)
     client = p.connect(p.DIRECT)
-    body = robot.load(client, drawn=False)
+    body = Body(robot, client, drawn=False)
     for _ in range(200):
-        robot.command(client, body, [2.5])
+        body.command([2.5])
         p.stepSimulation(physicsClientId=client)
-    angles = [p.getJointState(body, index, physicsClientId=client)[0] for index in (0, 1)]
+    angles = [p.getJointState(body.id, index, physicsClientId=client)[0] for index in (0, 1)]
     p.disconnect(client)
     np.testing.assert_allclose(angles, [2.5, -2.5], atol=0.01)
 
@@ -561,13 +561,13 @@ def test_urdf_is_loaded_a_few_times_only(urdf, tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path))
     loads, load = [], p.loadURDF
     monkeypatch.setattr(p, "loadURDF", lambda *args, **more: loads.append(1) or load(*args, **more))
-    Robot.from_urdf(urdf(ARM), end_effector="tool")
-    assert len(loads) == 2  # for the pairs of links, and for the gain
+    robot_from_urdf(urdf(ARM), end_effector="tool")
+    assert len(loads) == 3  # for the pairs of links, the gain, and the axes of the end effector
 
 
 def test_pybullet_is_left_without_connections(urdf):
     before = [p.isConnected(client) for client in range(20)]
     with pytest.raises(RobotError):
-        Robot.from_urdf(urdf(LOOP))
-    Robot.from_urdf(urdf(ARM), end_effector="tool")
+        robot_from_urdf(urdf(LOOP))
+    robot_from_urdf(urdf(ARM), end_effector="tool")
     assert [p.isConnected(client) for client in range(20)] == before

@@ -27,7 +27,7 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, Camera, observe_scene
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import matrix
+from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes import meshes
 from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.formats import load_world
@@ -121,7 +121,7 @@ def test_checks_and_distances_agree_with_pybullet():
     assert (distances < -0.01).any()
     bodies = [b for b in range(p.getNumBodies(physicsClientId=env.client)) if b != env.body]
     for state, row in zip(states, distances, strict=False):
-        PANDA.set_configuration(env.client, env.body, PANDA.denormalise(state))
+        env.world.arm.set_configuration(PANDA.denormalise(state))
         for link, distance in zip(PANDA.collision_links, row, strict=True):
             options = {"linkIndexA": link, "physicsClientId": env.client}
             points = [p.getClosestPoints(env.body, body, 3.0, **options) for body in bodies]

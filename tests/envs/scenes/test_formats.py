@@ -13,6 +13,7 @@ from problem_files import (
 
 from roboarm_nmp.envs import make
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.variants import with_attached
 from roboarm_nmp.envs.scenes.formats import load_world
 from roboarm_nmp.envs.scenes.numbers import multiply
 from roboarm_nmp.envs.scenes.primitives import Attached, Box, Cylinder, Scene, Sphere
@@ -66,11 +67,11 @@ def test_attached_objects_and_allowed_collisions_are_those_of_the_file(tmp_path)
     scene = load_world(write_file(tmp_path / "scene.yaml", MOVEIT_TOUCHING))
     box = Box((0, 0, 0.15), (0.04, 0.05, 0.1))
     tool = Attached(box, "panda_hand", ("panda_link5", "panda_link6"))
-    assert scene.robot == PANDA.with_attached([tool])
+    assert scene.robot == with_attached(PANDA, [tool])
     assert [one.may_touch for one in scene.obstacles] == [("panda_hand",), (), ()]
     every = MOVEIT_TOUCHING.replace("default_entry_values: [false]", "default_entry_values: [true]")
     shelf = load_world(write_file(tmp_path / "scene.yaml", every)).obstacles[1]
-    assert set(shelf.may_touch) == set(PANDA.bullet_names[1].values())
+    assert set(shelf.may_touch) == set(PANDA.link_names.values())
 
 
 def test_own_scene_files_are_worlds_too(tmp_path):

@@ -12,6 +12,7 @@ from roboarm_nmp.envs.collision.moving import free_over_time
 from roboarm_nmp.envs.collision.timed_checker import TimedChecker
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.variants import with_attached
 from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence
 from roboarm_nmp.envs.scenes.primitives import (
@@ -47,7 +48,7 @@ def test_true_means_the_hand_and_its_fingers():
 
 def test_compiled_checks_agree_with_pybullet_in_one_scene_after_another():
     rng, free, robot = np.random.default_rng(0), 0, PANDA
-    rod = PANDA.with_attached([Attached(Box((0, 0, 0.1), (0.05, 0.05, 0.3)))])
+    rod = with_attached(PANDA, [Attached(Box((0, 0, 0.1), (0.05, 0.05, 0.3)))])
     world, choices = World(drawn=False), [(), True, ("panda_link5", "panda_link6"), ()]
     for i in range(4):
         robot = rod if i > 1 else PANDA
@@ -95,7 +96,7 @@ def test_link_distances_leave_the_object_out_for_the_hand_alone(source):
 
 def test_moving_obstacles_keep_the_links():
     rng, names = np.random.default_rng(0), ("panda_link5", "panda_link6")
-    robot = PANDA.with_attached([Attached(Box((0, 0, 0.1), (0.05, 0.05, 0.3)))])
+    robot = with_attached(PANDA, [Attached(Box((0, 0, 0.1), (0.05, 0.05, 0.3)))])
     boxes, choices = RandomBoxes(8, 8).sample(rng).obstacles, [True, names, (), True]
     obstacles = [
         replace(one, may_touch=choices[i % 4], motion=Oscillation((0.1, 0, 0.05), 3.0, i))

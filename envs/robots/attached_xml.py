@@ -1,0 +1,101 @@
+"""Objects attached to an arm's links, as XML of its URDF: links of their own on fixed joints."""
+
+import atexit
+import functools
+import hashlib
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from roboarm_nmp.envs.robots.rotations import matrix
+
+COLOUR = "0.85 0.55 0.2 1"
+LIGHT = "0.001", "0.000001"  # kg, kg m^2: of objects and of frames, such as a tool's
+
+
+def attached_name(number: int) -> str:
+    """The name of an object's link, which no URDF has by chance."""
+    return f"attached object {number}"
+
+
+def attached_elements(objects) -> Iterator[ElementTree.Element]:
+    """The links and joints of objects, XML elements."""
+    for number, one in enumerate(objects):
+        link = ElementTree.Element("link", name=attached_name(number))
+        inertial = ElementTree.SubElement(link, "inertial")
+        mass, moment = LIGHT
+        ElementTree.SubElement(inertial, "mass", value=mass)
+        moments = {"ixx": moment, "iyy": moment, "izz": moment, "ixy": "0", "ixz": "0", "iyz": "0"}
+        ElementTree.SubElement(inertial, "inertia", **moments)
+        for tag in ("visual", "collision"):
+            element = ElementTree.SubElement(link, tag)
+            _add_shape(element, one)
+            if tag == "visual":
+                material = ElementTree.SubElement(element, "material", name=attached_name(number))
+                ElementTree.SubElement(material, "color", rgba=COLOUR)
+        joint = ElementTree.Element("joint", name=attached_name(number), type="fixed")
+        ElementTree.SubElement(joint, "parent", link=one.link)
+        ElementTree.SubElement(joint, "child", link=attached_name(number))
+        yield from (link, joint)
+
+
+def _add_shape(element, one):
+    """Add origin and geometry of an object to a `visual` or `collision` element."""
+    shape = one.shape
+    orientation = getattr(shape, "orientation", (0.0, 0.0, 0.0, 1.0))
+    origin = {"xyz": _text(shape.position), "rpy": _text(_roll_pitch_yaw(orientation))}
+    ElementTree.SubElement(element, "origin", **origin)
+    geometry = ElementTree.SubElement(element, "geometry")
+    if hasattr(shape, "vertices"):
+        ElementTree.SubElement(geometry, "mesh", filename=_obj_file(shape.vertices, one.triangles))
+    elif hasattr(shape, "size"):
+        ElementTree.SubElement(geometry, "box", size=_text(shape.size))
+    elif hasattr(shape, "length"):
+        sizes = {"radius": _text([shape.radius]), "length": _text([shape.length])}
+        ElementTree.SubElement(geometry, "cylinder", **sizes)
+    else:
+        ElementTree.SubElement(geometry, "sphere", radius=_text([shape.radius]))
+
+
+def _text(numbers):
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def _roll_pitch_yaw(quaternion):
+    """Angles about the fixed x, then y, then z axis, rad, of a quaternion (xyzw)."""
+    m = matrix(np.array(quaternion) / np.linalg.norm(quaternion))
+    across = math.hypot(m[0, 0], m[1, 0])
+    pitch = math.atan2(-m[2, 0], across)
+    if across < 1e-9:  # roll and yaw are about the same axis
+        return math.atan2(-m[1, 2], m[1, 1]), pitch, 0.0
+    return math.atan2(m[2, 1], m[2, 2]), pitch, math.atan2(m[1, 0], m[0, 0])
+
+
+def _obj_file(vertices, triangles):
+    """The path of an OBJ file, which lasts as long as this process."""
+    lines = [f"v {_text(vertex)}" for vertex in vertices]
+    lines += [f"f {' '.join(str(corner + 1) for corner in corners)}" for corners in triangles]
+    text = "\n".join(lines) + "\n"
+    path = _folder(os.getpid()) / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.obj"
+    if not path.exists():
+        path.write_text(text)
+    return str(path)
+
+
+@functools.cache
+def _folder(process):
+    """A temporary folder of a process, which removes it at its end; forks have their own."""
+    folder = tempfile.mkdtemp(prefix="roboarm_nmp_")
+
+    def remove():
+        if os.getpid() == process:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
+    return Path(folder)
