@@ -22,7 +22,7 @@ box, by their faces; then GJK (Gilbert, Johnson, Keerthi, 1988) on the shapes th
 stops as soon as their distance is certain to be above or below the margin. Where shapes overlap,
 `signed_distances` needs the depth, which EPA (van den Bergen, 2001) computes.
 
-Numba compiles the functions in `kernels` at their first call, once per machine
+Numba compiles the functions in files called `…_kernels` at their first call, once per machine
 (docs/guide/environment.md, "Collision checks"). They compute in float64, and an answer does not
 depend on the batch around it.
 """
@@ -33,16 +33,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from roboarm_nmp.envs.collision.distance_kernels import link_distances_batch, signed_distances_batch
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, group_points, world_shapes
-from roboarm_nmp.envs.collision.kernels import (
-    free_batch,
-    link_distances_batch,
-    motion_batch,
-    rrt_connect,
-    shortcut,
-    signed_distances_batch,
-    single_motion,
-)
+from roboarm_nmp.envs.collision.motion_kernels import free_batch, motion_batch, single_motion
+from roboarm_nmp.envs.collision.search_kernels import rrt_connect, shortcut
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes import primitives
 from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scene, floor_box

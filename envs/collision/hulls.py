@@ -1,4 +1,4 @@
-"""The shapes of the arm and of a scene as the arrays that `kernels` takes."""
+"""The shapes of the arm and of a scene as the arrays that compiled functions take."""
 
 import functools
 import itertools
@@ -8,11 +8,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.kernels import (
+from roboarm_nmp.envs.collision.arm_kernels import (
     BEGIN,
     BODY_COLUMNS,
-    BULLET_MARGIN,
-    CELLS,
     CENTRE,
     FRAME,
     FRAME_COLUMNS,
@@ -27,6 +25,7 @@ from roboarm_nmp.envs.collision.kernels import (
     SPAN,
     SPHERE,
 )
+from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN, CELLS
 from roboarm_nmp.envs.robots.body import Body, collision_elements
 from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.primitives import ConvexHull, Cylinder, Sphere, to_array

@@ -22,7 +22,8 @@ from roboarm_nmp.envs.collision.hulls import (
     shape_rows,
     world_shapes,
 )
-from roboarm_nmp.envs.collision.kernels import (
+from roboarm_nmp.envs.collision.motion_kernels import free_batch
+from roboarm_nmp.envs.collision.moving_kernels import (
     AMPLITUDE,
     ANGLE,
     AXIS,
@@ -32,7 +33,6 @@ from roboarm_nmp.envs.collision.kernels import (
     PHASE,
     REPEAT,
     WAYPOINTS,
-    free_batch,
     moved_rows,
     obstacle_states,
 )
@@ -64,8 +64,8 @@ class MovingObstacles:
     """The obstacles of a `Scene` over time; those without a motion stand still.
 
     Attributes:
-        motions, centres, shapes: the arrays that `kernels.moved_rows` takes, for checks in a loop
-            over time. (`hulls.world_shapes` has convex hulls' bodies, and who may touch what.)
+        motions, centres, shapes: the arrays that `moving_kernels.moved_rows` takes, for checks in a
+            loop over time. (`hulls.world_shapes` has convex hulls' bodies, and who may touch what.)
     """
 
     def __init__(self, scene):
@@ -93,7 +93,7 @@ class MovingObstacles:
 
 
 def motion_arrays(obstacles):
-    """The motions of n obstacles as the compiled functions take them (`kernels`).
+    """The motions of n obstacles as the compiled functions take them (`moving_kernels`).
 
     Returns: float64 (n, `OWN_COLUMNS`), waypoints (w, 8), intervals (i, 2).
     """

@@ -16,8 +16,8 @@ from roboarm_nmp.envs.collision.hulls import (
     shape_centres,
     world_shapes,
 )
-from roboarm_nmp.envs.collision.kernels import first_departure, free_in_time, rows_in_time
 from roboarm_nmp.envs.collision.moving import motion_arrays
+from roboarm_nmp.envs.collision.timed_kernels import first_departure, free_in_time, rows_in_time
 from roboarm_nmp.envs.scenes.primitives import floor_box
 
 

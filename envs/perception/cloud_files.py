@@ -28,7 +28,7 @@ from tokenize import TokenError
 import numpy as np
 from PIL import Image
 
-from roboarm_nmp.envs.collision.kernels import decompress_lzf
+from roboarm_nmp.envs.perception.lzf_kernels import decompress_lzf
 from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.primitives import is_number, unit_quaternion
 

@@ -14,8 +14,8 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.kernels import AXES, EYE, edge_pixels, pixels_with_neighbours
 from roboarm_nmp.envs.perception.ray_casting import NOTHING
+from roboarm_nmp.envs.perception.ray_kernels import AXES, EYE, edge_pixels, pixels_with_neighbours
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.utils.names import suggest
 from roboarm_nmp.utils.random_streams import Stream
@@ -148,7 +148,7 @@ class NoiseOfSensor:
         self._turn = _rotation(math.radians(noise.calibration_degrees) * rng.standard_normal(3))
 
     def true_view(self, view):
-        """Where the camera really is (`kernels.VIEW`): its assumed view with the errors."""
+        """Where the camera really is (`ray_kernels.VIEW`): its assumed view with the errors."""
         noise = self._noise
         if not (noise.calibration_mm or noise.calibration_degrees):
             return view

@@ -18,7 +18,12 @@ import numpy as np
 
 from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
-from roboarm_nmp.envs.collision.kernels import OF_OBSTACLE, farthest, first_in_cells, label_points
+from roboarm_nmp.envs.perception.cloud_kernels import (
+    OF_OBSTACLE,
+    farthest,
+    first_in_cells,
+    label_points,
+)
 from roboarm_nmp.envs.perception.sensors import (
     OBSTACLE,
     PointCloud,

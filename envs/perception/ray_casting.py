@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from roboarm_nmp.envs.collision.hulls import arm_hulls, link_shapes
-from roboarm_nmp.envs.collision.kernels import (
+from roboarm_nmp.envs.perception.ray_kernels import (
     BALL,
     CLASS,
     MESH,
@@ -70,7 +70,7 @@ class RayCaster:
         """Depth, float32 (height, width), m along the viewing direction, and classes, uint8.
 
         Args:
-            view: float64 (`kernels.VIEW`,), see `envs.perception.sensors.view_of`.
+            view: float64 (`ray_kernels.VIEW`,), see `envs.perception.sensors.view_of`.
             size: (width, height) in pixels.
         """
         inverse = np.empty(size[::-1])
@@ -81,7 +81,7 @@ class RayCaster:
 
 
 def _surfaces(obstacles, first_hull):
-    """Obstacles as rows for `kernels.cast_rays`. `first_hull`: the polyhedron of the first hull."""
+    """Obstacles as rows for `cast_rays`. `first_hull`: the polyhedron of the first hull."""
     rows, given = np.zeros((len(obstacles), SURFACE_COLUMNS)), to_array(obstacles)
     rows[:, MOVED_BY], rows[:, CLASS] = -1, OBSTACLE
     rows[:, PLACE : PLACE + 3] = given[:, 1:4]

@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass, fields
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.envs.collision.kernels import AXES, EYE, VIEW, points_of_pixels
 from roboarm_nmp.envs.perception.noise import NO_NOISE, NoiseOfEpisode, SensorNoise
 from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes of pixels)
     NOTHING,
@@ -25,6 +24,7 @@ from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes
     STATIC,
     RayCaster,
 )
+from roboarm_nmp.envs.perception.ray_kernels import AXES, EYE, VIEW, points_of_pixels
 from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, is_number
@@ -252,7 +252,7 @@ def _check_view(sensor):
 
 
 def view_of(sensor, size):
-    """A sensor's place and directions as `kernels.cast_rays` takes them: float64 (`VIEW`,).
+    """A sensor's place and directions as `ray_kernels.cast_rays` takes them: float64 (`VIEW`,).
 
     `size`: (width, height) in pixels. Not to be changed.
     """

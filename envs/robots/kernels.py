@@ -1,6 +1,5 @@
 """What Numba compiles of inverse kinematics: Levenberg-Marquardt in the box of the joint limits.
 
-One file holds all of it, because Numba's cache on disk does not notice changes in other files.
 States are normalised configurations. `chain`: float64 (f, `CHAIN_COLUMNS`), the base, the frames
 from there to the end effector, in this order, and the end effector in the last of them. No joint
 moves the first and the last row (joint -1). Columns: joint, whether it is prismatic, the joint's

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from paths import ROOT
+from paths import LIBRARY, ROOT
 
 MODULE = """
 from roboarm_nmp.utils.numba_cache import compiled
@@ -138,10 +138,56 @@ def test_compilation_without_any_cache_folder_works(tmp_path):
     assert output == "12.0 12\n"
 
 
+INNER = """
+from roboarm_nmp.utils.numba_cache import compiled
+
+FACTOR = 2.0
+
+@compiled
+def scale(x):
+    return FACTOR * x
+"""
+OUTER = """
+from roboarm_nmp.envs.inner_kernels import FACTOR, scale
+from roboarm_nmp.utils.numba_cache import compiled
+
+@compiled
+def outer(x):
+    return scale(x) + FACTOR
+
+print(outer(3.0))
+"""
+
+
+def test_function_is_compiled_again_when_one_that_it_calls_changes_in_another_file(tmp_path):
+    package, cache = tmp_path / "roboarm_nmp", tmp_path / "cache"
+    (tmp_path / "envs").mkdir()  # a link in the package, as in a checkout
+    shutil.copytree(LIBRARY / "utils", package / "utils")
+    (package / "__init__.py").touch()
+    (package / "envs").symlink_to("../envs")
+    (tmp_path / "envs" / "inner_kernels.py").write_text(INNER)
+    (tmp_path / "outer_kernels.py").write_text(OUTER)
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import outer_kernels"
+    assert run(code, tmp_path, cache) == ("8.0", [])
+    entry = min(cache.rglob("*outer_kernels.outer*.nbc"))
+    compiled_at = entry.stat().st_mtime_ns
+    assert run(code, tmp_path, cache) == ("8.0", [])
+    assert entry.stat().st_mtime_ns == compiled_at
+    (tmp_path / "envs" / "inner_kernels.py").write_text(INNER.replace("2.0", "3.0"))
+    assert run(code, tmp_path, cache) == ("12.0", [])
+
+
+def test_compiled_functions_are_in_files_that_the_cache_watches():
+    for path in ROOT.rglob("*.py"):
+        if path.is_relative_to(ROOT / "tests") or "import compiled" not in path.read_text():
+            continue
+        assert path.name.endswith("kernels.py"), path
+
+
 def test_collision_checks_survive_a_damaged_cache(tmp_path):
     first = run(CHECKER, ROOT, tmp_path)
     assert 0 < int(first[0]) < 1000 and first[1] == []
-    for pattern in ("*free_batch*.nbi", "*_is_free*.nbc"):
+    for pattern in ("*free_batch*.nbi", "*.is_free*.nbc"):
         for path in tmp_path.rglob(pattern):
             path.write_bytes(path.read_bytes()[:50])
     result, lines = run(CHECKER, ROOT, tmp_path)

@@ -21,7 +21,7 @@ import math
 import numpy as np
 
 from roboarm_nmp.envs.collision.checker import self_distances
-from roboarm_nmp.envs.collision.kernels import project
+from roboarm_nmp.envs.collision.filter_kernels import project
 from roboarm_nmp.envs.robots.inverse_kinematics import kinematic_chain
 from roboarm_nmp.envs.robots.kernels import move_back
 

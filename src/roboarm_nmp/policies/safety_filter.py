@@ -44,7 +44,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roboarm_nmp.envs.collision.checker import self_distances
-from roboarm_nmp.envs.collision.kernels import project
+from roboarm_nmp.envs.collision.filter_kernels import project
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP

@@ -4,12 +4,17 @@ The cache is in the user's cache folder (`utils.files.cache_folder`), or in `NUM
 Numba trusts its cache. A truncated file raises `EOFError` in every process from then on, and a
 file with a few wrong bytes can crash the process. Here each entry has a checksum. A damaged file is
 named on stderr, ignored, and replaced by a new compilation.
+
+Numba compiles a function again when the file that it stands in changes, but not when functions or
+constants change that it uses from other files. Here an entry also counts as old when any of the
+package's compiled files changes, all of which have names that end in `kernels.py`.
 """
 
 import contextlib
 import fcntl
 import functools
 import hashlib
+import os
 import pickle
 import sys
 from pathlib import Path
@@ -20,6 +25,8 @@ from numba.core.serialize import dumps
 
 from roboarm_nmp.utils.files import cache_folder
 from roboarm_nmp.utils.progress import write_line
+
+PACKAGE = Path(__file__).parents[1]
 
 
 def uncounted(function):
@@ -71,10 +78,24 @@ class _CheckedResult(CompileResultCacheImpl):
         return super().rebuild(target_context, pickle.loads(payload))
 
 
+@functools.cache
+def _kernels_digest():
+    """SHA-256 (hex) of all of the package's files whose names end in `kernels.py`."""
+    paths = []
+    for folder, _, names in os.walk(PACKAGE, followlinks=True):
+        paths += [Path(folder, name) for name in names if name.endswith("kernels.py")]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(paths))).hexdigest()
+
+
 class _CheckedCache(FunctionCache):
     """The cache of one function: an index file, and a data file for each signature."""
 
     _impl_class = _CheckedResult
+
+    def __init__(self, function):
+        super().__init__(function)
+        file = self._cache_file
+        file._source_stamp = (file._source_stamp, _kernels_digest())
 
     def load_overload(self, sig, target_context):
         try:

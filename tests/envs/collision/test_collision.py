@@ -25,7 +25,7 @@ from roboarm_nmp.envs.collision.checker import (
     TABLE,
     CollisionChecker,
 )
-from roboarm_nmp.envs.collision.kernels import BULLET_MARGIN
+from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.utils.bullet import pybullet as p

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roboarm_nmp.envs.collision.hulls import shape_rows
-from roboarm_nmp.envs.collision.kernels import ABSENT, moved_rows
 from roboarm_nmp.envs.collision.moving import MovingObstacles
+from roboarm_nmp.envs.collision.moving_kernels import ABSENT, moved_rows
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere, convex_hull
 

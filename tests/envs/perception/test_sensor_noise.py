@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.collision.kernels import pixels_with_neighbours
 from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.perception.point_clouds import observed_points
+from roboarm_nmp.envs.perception.ray_kernels import pixels_with_neighbours
 from roboarm_nmp.envs.perception.sensors import (
     NOTHING,
     OBSTACLE,

@@ -524,7 +524,7 @@ def test_pairs_and_gain_are_cached_and_a_damaged_cache_is_made_again(urdf, tmp_p
     arm = {"path": urdf(ARM), "end_effector": "tool"}
     first = robot_from_urdf(**arm)
     files = list((tmp_path / "robots").iterdir())
-    assert len(files) == 2  # of the pairs and of the gain
+    assert len(files) == 3  # of the pairs, of the gain and of the end effector
     with monkeypatch.context() as patch:
         patch.setattr(roboarm_nmp.envs.robots.urdf, "sample_pairs", None)
         patch.setattr(roboarm_nmp.envs.robots.urdf, "calibrate", None)
