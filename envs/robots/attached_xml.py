@@ -28,11 +28,7 @@ def attached_elements(objects) -> Iterator[ElementTree.Element]:
     """The links and joints of objects, XML elements."""
     for number, one in enumerate(objects):
         link = ElementTree.Element("link", name=attached_name(number))
-        inertial = ElementTree.SubElement(link, "inertial")
-        mass, moment = LIGHT
-        ElementTree.SubElement(inertial, "mass", value=mass)
-        moments = {"ixx": moment, "iyy": moment, "izz": moment, "ixy": "0", "ixz": "0", "iyz": "0"}
-        ElementTree.SubElement(inertial, "inertia", **moments)
+        add_inertial(link, *LIGHT)
         for tag in ("visual", "collision"):
             element = ElementTree.SubElement(link, tag)
             _add_shape(element, one)
@@ -43,6 +39,14 @@ def attached_elements(objects) -> Iterator[ElementTree.Element]:
         ElementTree.SubElement(joint, "parent", link=one.link)
         ElementTree.SubElement(joint, "child", link=attached_name(number))
         yield from (link, joint)
+
+
+def add_inertial(link: ElementTree.Element, mass: str, moment: str) -> None:
+    """Give a link, an XML element, a mass (kg) and moments of inertia (kg m^2)."""
+    inertial = ElementTree.SubElement(link, "inertial")
+    ElementTree.SubElement(inertial, "mass", value=mass)
+    moments = {"ixx": moment, "iyy": moment, "izz": moment, "ixy": "0", "ixz": "0", "iyz": "0"}
+    ElementTree.SubElement(inertial, "inertia", moments)
 
 
 def _add_shape(element, one):

@@ -1,4 +1,4 @@
-"""Robots by name or file: `panda`, a URDF, or a YAML file that says what a URDF lacks.
+"""Robots by name or file: `panda`, a URDF, or a YAML file that adds what the URDF doesn't say.
 
 urdf: kuka_iiwa/model.urdf       # relative to this file, or package:pybullet_data/kuka_iiwa/…
 name: iiwa                       # everything below may be left out
@@ -27,33 +27,15 @@ from pathlib import Path
 import yaml
 
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.urdf import RobotError, robot_from_urdf
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.untrusted import RobotError
+from roboarm_nmp.envs.robots.urdf import check_options, robot_from_urdf
 
 ROBOT_FILES = (".urdf", ".yaml", ".yml")
 MAX_FILE = 100_000  # bytes
-NUMBER = (float, int)
-KEYS = {
-    "urdf": str,
-    "name": str,
-    "joints": list,
-    "end_effector": str,
-    "end_effector_position": list,
-    "fixed": dict,
-    "limits": dict,
-    "srdf": str,
-    "packages": dict,
-    "base_position": list,
-    "base_orientation": list,
-    "gain": NUMBER,
-    "acceleration_steps": int,
-    "velocity": (*NUMBER, dict),
-    "acceleration": (*NUMBER, dict),
-    "jerk": (*NUMBER, dict),
-    "datasheet_limits": dict,
-}
 
 
-def load_robot(name_or_path):
+def load_robot(name_or_path: str | Path) -> Robot:
     """The `Robot` called `panda`, or of a URDF, or of a YAML file. It is made once per process.
 
     Raises RobotError: there is none, or the file cannot be used.
@@ -81,10 +63,10 @@ def _load(path, _):
     if "srdf" in options:
         options["srdf"] = _located(path, options["srdf"])
     if "packages" in options:
-        if not all(isinstance(f, str) for f in options["packages"].values()):
-            raise RobotError(f"{path}: packages must name folders, got {options['packages']}")
-        options["packages"] = {n: _located(path, f) for n, f in options["packages"].items()}
-    return robot_from_urdf(urdf, **{"name": path.stem} | options)
+        folders = options["packages"].items()
+        options["packages"] = {name: _located(path, folder) for name, folder in folders}
+    options.setdefault("name", path.stem)
+    return robot_from_urdf(urdf, **options)
 
 
 def _read(path):
@@ -99,13 +81,8 @@ def _read(path):
         raise RobotError(f"{path}: no YAML: {error}".replace("\n", " ")) from error
     if not isinstance(options, dict):
         raise RobotError(f"{path}: must be a mapping with the key `urdf`")
-    for key, value in options.items():
-        if key not in KEYS:
-            raise RobotError(f"{path}: unknown key {key!r}: known are {', '.join(KEYS)}")
-        if not isinstance(value, KEYS[key]) or isinstance(value, bool):
-            kinds = KEYS[key] if isinstance(KEYS[key], tuple) else (KEYS[key],)
-            names = " or ".join(kind.__name__ for kind in kinds if kind in (kinds[0], dict))
-            raise RobotError(f"{path}: {key} must be a {names}, got {value!r}")
+    options = {name: value for name, value in options.items() if value is not None}
+    check_options(path, options)
     return options
 
 
@@ -113,8 +90,8 @@ def _located(path, file):
     """The path of a file that a robot's file names."""
     if file.startswith("package:"):  # of an installed Python package
         package, _, rest = file.removeprefix("package:").partition("/")
-        found = importlib.util.find_spec(package) if package.isidentifier() else None
-        if found is None or not found.submodule_search_locations:
+        spec = importlib.util.find_spec(package) if package.isidentifier() else None
+        if spec is None or not spec.submodule_search_locations:
             raise RobotError(f"{path}: the Python package {package!r} is not installed")
-        return Path(found.submodule_search_locations[0], rest)
+        return Path(spec.submodule_search_locations[0], rest)
     return path.parent / file
