@@ -29,17 +29,20 @@ depend on the batch around it.
 
 import functools
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from roboarm_nmp.envs.collision.distance_kernels import link_distances_batch, signed_distances_batch
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, group_points, world_shapes
 from roboarm_nmp.envs.collision.motion_kernels import free_batch, motion_batch, single_motion
 from roboarm_nmp.envs.collision.search_kernels import rrt_connect, shortcut
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes import primitives
-from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scene, floor_box
+from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, Box, ObservedScene, Scene, floor_box
 
 RESOLUTION = 0.021
 """Motions are checked at points at most this far apart, L2 in the normalised space: less than one
@@ -50,6 +53,8 @@ LINK_DISTANCE_RANGE = 0.3
 """m. Observed link distances are clipped to this, and beyond it their gradient is zero."""
 NOTHING, TABLE, FLOOR, ARM, POINT = -1, -2, -3, -4, -5
 """Values of `SignedDistances.geometry` that are not the index of an obstacle."""
+EndpointMargins = tuple[ArrayLike, ArrayLike, float]
+"""Smaller margins around endpoints: see `CollisionChecker.is_free`."""
 
 
 class SignedDistances(NamedTuple):
@@ -95,17 +100,19 @@ class CollisionChecker:
             another shape, not finite, or outside the limits; a margin out of its range.
     """
 
-    def __init__(self, scene, points=(), point_radius=0.0):
+    def __init__(self, scene: Scene, points: ArrayLike = (), point_radius: float = 0.0):
         if not isinstance(scene, Scene):
             raise TypeError(
                 f"a scene must be a roboarm_nmp.envs.scenes.primitives.Scene, got {scene!r}"
             )
         if not scene.is_static:
             raise ValueError("obstacles of this scene move: check scene.at(t), at a time t")
-        self.scene, self.robot = scene, scene.robot
+        self.scene = scene
+        self.robot = scene.robot
         if isinstance(scene, ObservedScene):
             points, point_radius = scene.points, scene.point_radius
-        shapes, geometries = list(scene.obstacles), list(range(len(scene.obstacles)))
+        shapes = list(scene.obstacles)
+        geometries = list(range(len(shapes)))
         if scene.table is not None:
             shapes.append(scene.table)
             geometries.append(TABLE)
@@ -119,12 +126,12 @@ class CollisionChecker:
     @classmethod
     def from_points(
         cls,
-        points,
-        radius=POINT_RADIUS,
-        robot=PANDA,
-        table=primitives.TABLE,
-        floor=primitives.FLOOR,
-    ):
+        points: ArrayLike,
+        radius: float = POINT_RADIUS,
+        robot: Robot = PANDA,
+        table: Box | None = primitives.TABLE,
+        floor: float | None = primitives.FLOOR,
+    ) -> "CollisionChecker":
         """The checker of a point cloud, as `envs.perception.point_clouds.prepare_cloud` returns it.
 
         Args:
@@ -137,7 +144,13 @@ class CollisionChecker:
         """
         return cls(Scene(table=table, floor=floor, robot=robot), points, radius)
 
-    def is_free(self, states, margin=0.0, clearance=0.0, endpoint_margins=None):
+    def is_free(
+        self,
+        states: ArrayLike,
+        margin: float = 0.0,
+        clearance: float = 0.0,
+        endpoint_margins: EndpointMargins | None = None,
+    ) -> np.ndarray:
         """Whether the arm keeps a margin from the scene and from itself: bool (...).
 
         Without a margin, the answer is that of `not RoboArmEnv.in_collision(...)`.
@@ -152,27 +165,23 @@ class CollisionChecker:
                 Each configuration, or motion, may have its own: (..., k, n) and (..., k).
         """
         states = self._states("states", states)
-        free = np.empty(states.shape[:-1], dtype=np.bool_)
-        rule = self._rule(margin, clearance, endpoint_margins, batch=states.shape[:-1])
-        free_batch(
-            states.reshape(-1, self.robot.num_joints),
-            *rule,
-            self._arm,
-            self._world,
-            free.reshape(-1),
-        )
+        batch = states.shape[:-1]
+        rule, endpoints = self._rule(margin, clearance, endpoint_margins, batch=batch)
+        free = np.empty(batch, dtype=np.bool_)
+        flat = states.reshape(-1, self.robot.num_joints)
+        free_batch(flat, rule, endpoints, self._arm, self._world, free.reshape(-1))
         return free
 
     def is_motion_free(
         self,
-        starts,
-        ends,
-        margin=0.0,
-        clearance=0.0,
-        endpoint_margins=None,
-        resolution=RESOLUTION,
-        ends_known=False,
-    ):
+        starts: ArrayLike,
+        ends: ArrayLike,
+        margin: float = 0.0,
+        clearance: float = 0.0,
+        endpoint_margins: EndpointMargins | None = None,
+        resolution: float = RESOLUTION,
+        ends_known: bool = False,
+    ) -> np.ndarray:
         """Whether straight motions are free: bool (...).
 
         The ends are checked first, then points between them that are at most `resolution` apart:
@@ -184,51 +193,66 @@ class CollisionChecker:
             resolution: L2, normalised, > 0.
             ends_known: both ends are known to be free, and are not checked.
         """
-        arguments = starts, ends, margin, clearance, endpoint_margins, resolution, ends_known
-        return self.motion_checks(*arguments) >= 0
+        checks = self.motion_checks(
+            starts, ends, margin, clearance, endpoint_margins, resolution, ends_known
+        )
+        return checks >= 0
 
     def motion_checks(
         self,
-        starts,
-        ends,
-        margin=0.0,
-        clearance=0.0,
-        endpoint_margins=None,
-        resolution=RESOLUTION,
-        ends_known=False,
-    ):
+        starts: ArrayLike,
+        ends: ArrayLike,
+        margin: float = 0.0,
+        clearance: float = 0.0,
+        endpoint_margins: EndpointMargins | None = None,
+        resolution: float = RESOLUTION,
+        ends_known: bool = False,
+    ) -> np.ndarray:
         """How many configurations `is_motion_free` checks, int64 (...); negative: not free."""
         starts, ends = np.broadcast_arrays(
             self._states("starts", starts), self._states("ends", ends)
         )
-        rule = self._rule(margin, clearance, endpoint_margins, resolution, batch=starts.shape[:-1])
-        checks = np.empty(starts.shape[:-1], dtype=np.int64)
-        flat = [np.ascontiguousarray(x.reshape(-1, self.robot.num_joints)) for x in (starts, ends)]
-        motion_batch(*flat, *rule, self._arm, self._world, ends_known, checks.reshape(-1))
+        batch = starts.shape[:-1]
+        rule, endpoints = self._rule(margin, clearance, endpoint_margins, resolution, batch)
+        checks = np.empty(batch, dtype=np.int64)
+        motion_batch(
+            np.ascontiguousarray(starts.reshape(-1, self.robot.num_joints)),
+            np.ascontiguousarray(ends.reshape(-1, self.robot.num_joints)),
+            rule,
+            endpoints,
+            self._arm,
+            self._world,
+            ends_known,
+            checks.reshape(-1),
+        )
         return checks
 
     def motion_checker(
-        self, margin=0.0, clearance=0.0, endpoint_margins=None, resolution=RESOLUTION
-    ):
+        self,
+        margin: float = 0.0,
+        clearance: float = 0.0,
+        endpoint_margins: EndpointMargins | None = None,
+        resolution: float = RESOLUTION,
+    ) -> Callable[[tuple, tuple], int]:
         """`motion_checks` of one motion, for planners: a function of two tuples of n floats.
 
         The function assumes that the start is free, and does not validate its arguments.
         """
-        rule, endpoint_margins = self._rule(margin, clearance, endpoint_margins, resolution)
-        return functools.partial(single_motion, rule, endpoint_margins[0], *self._arm, *self._world)
+        rule, endpoints = self._rule(margin, clearance, endpoint_margins, resolution)
+        return functools.partial(single_motion, rule, endpoints[0], *self._arm, *self._world)
 
     def find_path(
         self,
-        start,
-        goals,
-        rng,
-        margin=0.0,
-        clearance=0.0,
-        endpoint_margins=None,
-        reach=REACH,
-        max_checks=4_000,
-        chords=40,
-    ):
+        start: ArrayLike,
+        goals: ArrayLike,
+        rng: np.random.Generator,
+        margin: float = 0.0,
+        clearance: float = 0.0,
+        endpoint_margins: EndpointMargins | None = None,
+        reach: float = REACH,
+        max_checks: int = 4_000,
+        chords: int = 40,
+    ) -> tuple[np.ndarray | None, int]:
         """A path by RRT-Connect, within about `max_checks` checks, in milliseconds.
 
         The same arguments and generator give the same path. `planning.planner` plans more
@@ -246,9 +270,10 @@ class CollisionChecker:
         Returns:
             The path, float64 (k, n), None if none was found; and the number of checks.
         """
-        start, goals = self._states("start", start), np.atleast_2d(self._states("goals", goals))
-        rule, endpoint_margins = self._rule(margin, clearance, endpoint_margins)
-        rule = rule, endpoint_margins[0], self._arm, self._world
+        start = self._states("start", start)
+        goals = np.atleast_2d(self._states("goals", goals))
+        rule, endpoints = self._rule(margin, clearance, endpoint_margins)
+        rule = rule, endpoints[0], self._arm, self._world
         # Most samples take more than one check: there are as many as can be needed.
         samples = rng.uniform(-1.0, 1.0, (max_checks, len(start)))
         path, checks = rrt_connect(start, goals, samples, reach, max_checks, *rule)
@@ -257,7 +282,9 @@ class CollisionChecker:
         path, more = shortcut(path, rng.uniform(size=(chords, 2)), *rule)
         return path, checks + more
 
-    def signed_distances(self, states, self_collisions=True, within=math.inf):
+    def signed_distances(
+        self, states: ArrayLike, self_collisions: bool = True, within: float = math.inf
+    ) -> SignedDistances:
         """The `SignedDistances` of the robot's `collision_links` from the nearest geometry.
 
         Args:
@@ -266,13 +293,13 @@ class CollisionChecker:
             within: m; geometry farther away counts as `NOTHING`.
         """
         states = self._states("states", states)
-        links, numbers = self.robot.link_distances_shape
+        links, joints = len(self.robot.collision_links), self.robot.num_joints
         batch = (*states.shape[:-1], links)
         distance, geometry = np.empty(batch), np.empty(batch, dtype=np.int64)
         normal, witness = np.empty((*batch, 3)), np.empty((*batch, 3))
-        gradient = np.empty((*batch, numbers - 1))
+        gradient = np.empty((*batch, joints))
         signed_distances_batch(
-            states.reshape(-1, self.robot.num_joints),
+            states.reshape(-1, joints),
             bool(self_collisions),
             float(within),
             self._arm,
@@ -280,12 +307,17 @@ class CollisionChecker:
             distance.reshape(-1, links),
             normal.reshape(-1, links, 3),
             witness.reshape(-1, links, 3),
-            gradient.reshape(-1, links, numbers - 1),
+            gradient.reshape(-1, links, joints),
             geometry.reshape(-1, links),
         )
         return SignedDistances(distance, normal, witness, gradient, self._geometries[geometry])
 
-    def link_distances(self, states, self_collisions=False, within=LINK_DISTANCE_RANGE):
+    def link_distances(
+        self,
+        states: ArrayLike,
+        self_collisions: bool = False,
+        within: float = LINK_DISTANCE_RANGE,
+    ) -> np.ndarray:
         """The observation of `envs.wrappers.LinkDistancesWrapper`: float32 (..., l, 1 + n).
 
         Each of the robot's `collision_links` has a row: `SignedDistances.distance` in m, clipped to
@@ -296,11 +328,18 @@ class CollisionChecker:
                 clipped to the limits.
             self_collisions, within: as for `signed_distances`.
         """
-        states, shape = self._numbers("states", states), self.robot.link_distances_shape
+        states = self._numbers("states", states)
+        shape = self.robot.link_distances_shape
         rows = np.empty((*states.shape[:-1], *shape), dtype=np.float32)
-        flat = states.reshape(-1, self.robot.num_joints), rows.reshape(-1, *shape)
-        options = bool(self_collisions), float(within)
-        if not link_distances_batch(*flat, *options, self._arm, self._world):
+        are_numbers = link_distances_batch(
+            states.reshape(-1, self.robot.num_joints),
+            rows.reshape(-1, *shape),
+            bool(self_collisions),
+            float(within),
+            self._arm,
+            self._world,
+        )
+        if not are_numbers:
             raise ValueError("states must be normalised configurations, not NaN")
         return rows
 
@@ -309,12 +348,13 @@ class CollisionChecker:
         joints = self.robot.num_joints
         try:
             states = np.asarray(states)
-            if states.dtype.kind not in "fiu":
-                raise TypeError(f"they are of type {states.dtype}")
-        except (TypeError, ValueError) as error:
+        except ValueError as error:  # lists of different lengths
             raise ValueError(f"{name} must be numbers of shape (..., {joints})") from error
-        if states.shape[-1:] != (joints,):
-            raise ValueError(f"{name} must have shape (..., {joints}), got {states.shape}")
+        if states.dtype.kind not in "fiu" or states.shape[-1:] != (joints,):
+            raise ValueError(
+                f"{name} must be numbers of shape (..., {joints}), got {states.dtype} of shape "
+                f"{states.shape}"
+            )
         return np.ascontiguousarray(states, dtype=np.float64)
 
     def _states(self, name, states):
@@ -337,9 +377,8 @@ class CollisionChecker:
         if not 0 < resolution < math.inf:
             raise ValueError(f"resolution must be positive, got {resolution!r}")
         if endpoint_margins is None:
-            return np.array([margin, clearance, 0.0, resolution]), np.empty(
-                (1, 0, 1 + self.robot.num_joints)
-            )
+            no_endpoints = np.empty((1, 0, 1 + self.robot.num_joints))
+            return np.array([margin, clearance, 0.0, resolution]), no_endpoints
         states, distances, growth = endpoint_margins
         states = self._states("endpoint_margins states", states)
         distances = np.asarray(distances, dtype=np.float64)
@@ -352,14 +391,12 @@ class CollisionChecker:
             raise ValueError(
                 f"endpoint_margins: growth must be finite and not negative, got {growth!r}"
             )
-        endpoint_margins = np.concatenate([states, distances[..., None]], axis=-1)
-        endpoint_margins = endpoint_margins.reshape(
-            -1 if states.ndim > 2 else 1, *endpoint_margins.shape[-2:]
-        )
-        return np.array([margin, clearance, growth, resolution]), endpoint_margins
+        endpoints = np.concatenate([states, distances[..., None]], axis=-1)
+        endpoints = endpoints.reshape(-1 if states.ndim > 2 else 1, *endpoints.shape[-2:])
+        return np.array([margin, clearance, growth, resolution]), endpoints
 
 
-def self_distances(robot, states, within):
+def self_distances(robot: Robot, states: ArrayLike, within: float) -> np.ndarray:
     """Link distances of a `Robot` from its other links: float32 (..., l, 1 + n).
 
     `states`: (..., n), normalised. `within`: m, as for `CollisionChecker.link_distances`.

@@ -3,6 +3,7 @@
 import functools
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,6 +15,8 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     CENTRE,
     FRAME,
     FRAME_COLUMNS,
+    HALF,
+    JOINT,
     LINK,
     LINK_ROW,
     PARENT,
@@ -21,12 +24,14 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     PRISMATIC,
     RADIUS,
     ROTATION,
+    ROUNDING,
     ROW,
     SPAN,
     SPHERE,
 )
 from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN, CELLS
-from roboarm_nmp.envs.robots.body import Body, collision_elements
+from roboarm_nmp.envs.robots.body import body_alone, collision_elements
+from roboarm_nmp.envs.robots.robot import Link, Robot
 from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.primitives import ConvexHull, Cylinder, Sphere, to_array
 from roboarm_nmp.utils.bullet import pybullet as p
@@ -39,7 +44,7 @@ _GROUP_SIZE = 0.16
 
 
 @functools.lru_cache(64)
-def arm_hulls(robot):
+def arm_hulls(robot: Robot) -> tuple[np.ndarray, ...]:
     """The links' shapes as PyBullet makes them: `(chain, bodies, pairs, vertices, cells)`.
 
     A body is a convex hull, the points within its rounding included; a link may have several. With
@@ -60,33 +65,27 @@ def arm_hulls(robot):
     chain[0, ROTATION:] = _exact(matrix(robot.base_orientation)).ravel()
     span = robot.upper - robot.lower
     for row, frame in zip(chain[1:], robot.frames, strict=True):
-        low, scale, joint = robot.lower[frame.joint], frame.multiplier, frame.joint
-        row[:POSITION] = (
-            *(1 + frame.parent, joint, frame.is_prismatic),
-            *(scale * low + frame.offset, scale * span[joint]),
-        )
-        row[POSITION:] = *frame.position, *_exact(frame.rotation)
-    bodies, meshes, of_link = [], [], {link.index: [] for link in robot.links}
+        row[PARENT], row[JOINT], row[PRISMATIC] = 1 + frame.parent, frame.joint, frame.is_prismatic
+        row[BEGIN] = frame.multiplier * robot.lower[frame.joint] + frame.offset
+        row[SPAN] = frame.multiplier * span[frame.joint]
+        row[POSITION:ROTATION] = frame.position
+        row[ROTATION:] = _exact(frame.rotation)
+    bodies, meshes = [], []
+    of_link = {link.index: [] for link in robot.links}
     for link, mesh, rounding, _ in link_shapes(robot):
         centre = (mesh.min(0) + mesh.max(0)) / 2
         mesh = mesh - centre
-        radius = np.linalg.norm(mesh, axis=1).max()
-        body = (
-            1 + link.frame,
-            *centre,
-            radius,
-            *mesh.max(0),
-            rounding,
-            robot.link_rows.get(link.index, -1),
-        )
+        body = np.empty(BODY_COLUMNS)
+        body[FRAME], body[CENTRE:RADIUS] = 1 + link.frame, centre
+        body[RADIUS] = np.linalg.norm(mesh, axis=1).max()
+        body[HALF:ROUNDING], body[ROUNDING] = mesh.max(0), rounding
+        body[LINK_ROW] = robot.link_rows.get(link.index, -1)
         of_link[link.index].append(len(bodies))
         bodies.append(body)
         meshes.append(mesh)
-    pairs = [
-        pair
-        for a, b in robot.self_collision_pairs
-        for pair in itertools.product(of_link[a], of_link[b])
-    ]
+    pairs = []
+    for a, b in robot.self_collision_pairs:
+        pairs += itertools.product(of_link[a], of_link[b])
     pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     bodies = np.reshape(bodies, (-1, BODY_COLUMNS))
     bodies = np.concatenate([bodies, _levers(chain, bodies)], axis=1)
@@ -103,18 +102,18 @@ def _levers(chain, bodies):
     for body, row in zip(bodies, levers, strict=True):
         frame, position, beyond = int(body[FRAME]), body[CENTRE:RADIUS], body[RADIUS]
         while frame > 0:
-            given = chain[frame]
-            if given[PRISMATIC]:
+            numbers = chain[frame]
+            if numbers[PRISMATIC]:
                 row[frame] = 1.0
-                beyond += max(abs(given[BEGIN]), abs(given[BEGIN] + given[SPAN]))
+                beyond += max(abs(numbers[BEGIN]), abs(numbers[BEGIN] + numbers[SPAN]))
             else:
                 row[frame] = math.hypot(*position[:2]) + beyond
             beyond += np.linalg.norm(position)
-            frame, position = int(given[PARENT]), given[POSITION:ROTATION]
+            frame, position = int(numbers[PARENT]), numbers[POSITION:ROTATION]
     return levers
 
 
-def link_shapes(robot):
+def link_shapes(robot: Robot) -> Iterator[tuple[Link, np.ndarray, float, np.ndarray]]:
     """Each `Link` of a robot with each of its shapes.
 
     PyBullet is asked for them: it replaces a mesh, and a cylinder, by its convex hull.
@@ -124,16 +123,13 @@ def link_shapes(robot):
         vertices of its surface. The latter differ from the core's only for boxes. A sphere has one
         vertex, a capsule two.
     """
-    client = p.connect(p.DIRECT)
-    try:
-        body = Body(robot, client, drawn=False).id
+    with body_alone(robot) as body:
         for link in robot.links:
-            for mesh, rounding, surface in _shapes(client, robot, body, link.index):
-                for placement in link.placements:
-                    mesh, surface = _moved(mesh, *placement), _moved(surface, *placement)
+            for mesh, rounding, surface in _shapes(body.client, robot, body.id, link.index):
+                for position, rotation in link.placements:
+                    mesh = _moved(mesh, position, rotation)
+                    surface = _moved(surface, position, rotation)
                 yield link, mesh, rounding, surface
-    finally:
-        p.disconnect(physicsClientId=client)
 
 
 def _shapes(client, robot, body, link):
@@ -142,8 +138,8 @@ def _shapes(client, robot, body, link):
     if len(shapes) > 1 or any(len(_objects(shape[4].decode())) > 1 for shape in shapes):
         # PyBullet returns the vertices of all hulls as one, so each is loaded alone.
         for element in collision_elements(robot, robot.link_names[link]):
-            for one in _one_by_one(element):
-                with temporary_file(_ONE_SHAPE.format(one), ".urdf") as urdf:
+            for text in _one_by_one(element):
+                with temporary_file(_ONE_SHAPE.format(text), ".urdf") as urdf:
                     alone = p.loadURDF(urdf, physicsClientId=client)
                 yield from _shapes(client, robot, alone, -1)
                 p.removeBody(alone, physicsClientId=client)
@@ -156,13 +152,14 @@ def _shapes(client, robot, body, link):
             mesh = p.getMeshData(body, link, flags=flags, physicsClientId=client)[1]
             if not mesh:  # one of several, without triangles
                 continue
-            mesh, rounding = np.array(mesh), BULLET_MARGIN
-            surface = mesh
+            mesh = surface = np.array(mesh)
+            rounding = BULLET_MARGIN
         else:
             mesh, rounding, surface = _primitive(shape)
         if any(quaternion[:3]):
-            turn = (0.0, 0.0, 0.0), matrix(quaternion).ravel()
-            mesh, surface = _moved(mesh, *turn), _moved(surface, *turn)
+            rotation = matrix(quaternion).ravel()
+            mesh = _moved(mesh, (0.0, 0.0, 0.0), rotation)
+            surface = _moved(surface, (0.0, 0.0, 0.0), rotation)
         yield mesh + position, rounding, surface + position
 
 
@@ -192,7 +189,7 @@ def _one_by_one(element):
     """A URDF's `collision` element, or one for each object of its OBJ file, as text."""
     mesh = element.find("geometry/mesh")
     objects = [] if mesh is None else _objects(mesh.get("filename"))
-    if len(objects) < 2:
+    if mesh is None or len(objects) < 2:
         yield ElementTree.tostring(element, "unicode")
         return
     for text in objects:
@@ -207,22 +204,24 @@ def _primitive(shape):
     if kind == p.GEOM_BOX:
         rounding = min(BULLET_MARGIN, min(size) / 2)
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-        mesh, surface = (np.array(size) / 2 - rounding) * signs, np.array(size) / 2 * signs
+        mesh = (np.array(size) / 2 - rounding) * signs
+        surface = np.array(size) / 2 * signs
     elif kind == p.GEOM_SPHERE:
-        mesh, rounding = np.zeros((1, 3)), size[0]
-        surface = mesh
+        rounding = size[0]
+        mesh = surface = np.zeros((1, 3))
     elif kind == p.GEOM_CAPSULE:
-        mesh, rounding = np.array([(0.0, 0.0, -size[0] / 2), (0.0, 0.0, size[0] / 2)]), size[1]
-        surface = mesh
+        rounding = size[1]
+        mesh = surface = np.array([(0.0, 0.0, -size[0] / 2), (0.0, 0.0, size[0] / 2)])
     else:
         raise ValueError(f"a link has a collision shape of PyBullet's kind {kind}")
-    pose = position, matrix(quaternion).ravel()
-    return _moved(mesh, *pose), rounding, _moved(surface, *pose)
+    rotation = matrix(quaternion).ravel()
+    return _moved(mesh, position, rotation), rounding, _moved(surface, position, rotation)
 
 
 def _moved(mesh, position, rotation):
     """Vertices (v, 3) rotated by a row-major matrix (9,), then moved."""
-    (x, y, z), r = mesh.T, rotation
+    x, y, z = mesh.T
+    r = rotation
     rows = [r[i] * x + r[i + 1] * y + r[i + 2] * z + position[i // 3] for i in (0, 3, 6)]
     return np.stack(rows, axis=1)
 
@@ -246,35 +245,38 @@ def _cells(meshes):
     """
     steps = np.linspace(-1.0, 1.0, CELLS + 1)
     u, v = np.meshgrid(steps, steps, indexing="ij")
-    ends, candidates, first = [0], [], 0
+    counts, candidates, first = [], [], 0
     for mesh in meshes:
         for face in range(6):
-            directions = [None] * 3
-            directions[face // 2] = np.full_like(u, 1 - 2 * (face % 2))
-            directions[(face // 2 + 1) % 3], directions[(face // 2 + 2) % 3] = u, v
-            far = np.einsum("vi,iab->vab", mesh, np.stack(directions))
+            axis, sign = face // 2, 1 - 2 * (face % 2)
+            directions = np.empty((3, *u.shape))
+            directions[axis] = sign
+            directions[(axis + 1) % 3] = u
+            directions[(axis + 2) % 3] = v
+            far = np.einsum("vi,iab->vab", mesh, directions)
             corners = np.stack([far[:, :-1, :-1], far[:, 1:, :-1], far[:, :-1, 1:], far[:, 1:, 1:]])
             best = corners.min(0).argmax(0)
             bests = np.take_along_axis(corners, best[None, None], axis=1)
             possible = (corners >= bests).any(0)  # (v, cells, cells)
             cell, vertex = np.nonzero(possible.reshape(len(mesh), -1).T)
             candidates.append(vertex + first)
-            ends.append(ends[-1] + np.bincount(cell, minlength=CELLS**2).cumsum())
-            ends = [*ends[:-1], *ends[-1].tolist()]
+            counts.append(np.bincount(cell, minlength=CELLS**2))
         first += len(mesh)
-    return np.concatenate([np.array(ends) + len(ends), *candidates])
+    ends = np.concatenate([[0], *counts]).cumsum()
+    return np.concatenate([ends + len(ends), *candidates])
 
 
-def world_shapes(obstacles, robot):
+def world_shapes(obstacles: Sequence, robot: Robot) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     """Obstacles as `shape_rows`, and a robot's `arm_hulls` with their convex hulls as well.
 
     A convex hull is a row of the kind `LINK`, of a body that is not among the arm's `bodies`. If
     links may touch some of the obstacles, rows have a column more for each body: 1 if it may.
     """
-    rows, arm = shape_rows(obstacles), arm_hulls(robot)
+    rows = shape_rows(obstacles)
+    arm = arm_hulls(robot)
     if any(obstacle.may_touch for obstacle in obstacles):
         links = [robot.links_called(obstacle.may_touch) for obstacle in obstacles]
-        of_rows = [[link in found for link in robot.collision_links] for found in links]
+        of_rows = [[link in touching for link in robot.collision_links] for touching in links]
         # (The base, whose row is -1, touches nothing anyway.)
         touching = np.array(of_rows, dtype=np.float64)[:, arm[1][:, LINK_ROW].astype(int)]
         rows = np.concatenate([rows, touching], axis=1)
@@ -286,8 +288,8 @@ def world_shapes(obstacles, robot):
         len(bodies), len(bodies) + len(hulls)
     )
     for hull in hulls:
-        _, mesh, own = _hull(hull.vertices)
-        cells = _joined_cells(cells, own, len(vertices))
+        _, mesh, own_cells = _hull(hull.vertices)
+        cells = _concat_cells(cells, own_cells, len(vertices))
         vertices = np.concatenate([vertices, mesh])
     return rows, (chain, bodies, pairs, vertices, cells)
 
@@ -310,7 +312,7 @@ def _hull(vertices):
     return centre, mesh - centre, _cells([mesh - centre])
 
 
-def _joined_cells(cells, others, num_vertices):
+def _concat_cells(cells, others, num_vertices):
     """`_cells` of two lists of meshes as those of one; the first ones have `num_vertices`."""
     # The first entry says where indices begin: after all positions.
     a, b = cells[0], others[0]
@@ -318,7 +320,7 @@ def _joined_cells(cells, others, num_vertices):
     return np.concatenate([positions, cells[a:], others[b:] + num_vertices])
 
 
-def shape_rows(obstacles):
+def shape_rows(obstacles: Sequence) -> np.ndarray:
     """Obstacles -> float64 (n, `ROW`); `world_shapes` adds the bodies of convex hulls."""
     rows = np.zeros((len(obstacles), ROW))
     for obstacle, numbers, row in zip(obstacles, to_array(obstacles), rows, strict=True):
@@ -331,29 +333,26 @@ def shape_rows(obstacles):
         if isinstance(obstacle, Cylinder):
             half[:2] = obstacle.radius, obstacle.radius
         rounding = half[0] if isinstance(obstacle, Sphere) else min(BULLET_MARGIN, *half)
-        rotation = (
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-            *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-            *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-        )
+        rotation = matrix((x, y, z, w))
         if isinstance(obstacle, ConvexHull):
             centre, mesh, _ = _hull(obstacle.vertices)
             kind, rounding, half = LINK, BULLET_MARGIN, (mesh.max(0) + BULLET_MARGIN).tolist()
-            position = position + np.reshape(rotation, (3, 3)) @ centre
-        row[:] = (kind, *position, *rotation, *(edge - rounding for edge in half), rounding, 0)
+            position = position + rotation @ centre
+        row[0], row[1:4], row[4:13], row[16] = kind, position, rotation.ravel(), rounding
+        row[13:16] = [edge - rounding for edge in half]
     return rows
 
 
-def shape_centres(obstacles):
+def shape_centres(obstacles: Sequence) -> np.ndarray:
     """The centres of obstacles' shapes in their own frames: float64 (n, 3), m."""
-    hulls = [isinstance(obstacle, ConvexHull) for obstacle in obstacles]
     centres = np.zeros((len(obstacles), 3))
-    for i in np.flatnonzero(hulls):
-        centres[i] = _hull(obstacles[i].vertices)[0]
+    for centre, obstacle in zip(centres, obstacles, strict=True):
+        if isinstance(obstacle, ConvexHull):
+            centre[:] = _hull(obstacle.vertices)[0]
     return centres
 
 
-def group_points(points, radius):
+def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points in groups of neighbours, as the compiled functions take them. Raises ValueError.
 
     Returns:

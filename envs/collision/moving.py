@@ -11,10 +11,12 @@ number j there is row `np.flatnonzero(now.present)[j]`.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from roboarm_nmp.envs.collision.hulls import (
     group_points,
@@ -38,7 +40,7 @@ from roboarm_nmp.envs.collision.moving_kernels import (
 )
 from roboarm_nmp.envs.scenes.motions import REPEATS, Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.scenes.numbers import IDENTITY
-from roboarm_nmp.envs.scenes.primitives import to_array
+from roboarm_nmp.envs.scenes.primitives import Scene, to_array
 
 
 class ObstacleStates(NamedTuple):
@@ -68,18 +70,21 @@ class MovingObstacles:
             loop over time. (`hulls.world_shapes` has convex hulls' bodies, and who may touch what.)
     """
 
-    def __init__(self, scene):
+    def __init__(self, scene: Scene):
         self.motions = motion_arrays(scene.obstacles)
-        self.centres, self.shapes = shape_centres(scene.obstacles), shape_rows(scene.obstacles)
+        self.centres = shape_centres(scene.obstacles)
+        self.shapes = shape_rows(scene.obstacles)
 
-    def at(self, times):
+    def at(self, times: ArrayLike) -> ObstacleStates:
         """`ObstacleStates` at times (s), a number or an array. Raises ValueError: not finite."""
         times = np.asarray(times, dtype=np.float64)
         if not np.isfinite(times).all():
             raise ValueError("times must be finite numbers of seconds")
         shape = *times.shape, len(self.motions[0])
-        present, flat = np.empty(shape, np.bool_), np.ascontiguousarray(times.reshape(-1))
-        poses, velocities = np.empty((*shape, 7)), np.empty((*shape, 6))
+        flat = np.ascontiguousarray(times.reshape(-1))
+        present = np.empty(shape, np.bool_)
+        poses = np.empty((*shape, 7))
+        velocities = np.empty((*shape, 6))
         obstacle_states(
             self.motions,
             flat,
@@ -92,13 +97,14 @@ class MovingObstacles:
         )
 
 
-def motion_arrays(obstacles):
+def motion_arrays(obstacles: Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The motions of n obstacles as the compiled functions take them (`moving_kernels`).
 
     Returns: float64 (n, `OWN_COLUMNS`), waypoints (w, 8), intervals (i, 2).
     """
-    own, waypoints, intervals = np.zeros((len(obstacles), OWN_COLUMNS)), [], []
-    for row, numbers, obstacle in zip(own, to_array(obstacles), obstacles, strict=True):
+    rows = np.zeros((len(obstacles), OWN_COLUMNS))
+    waypoints, intervals = [], []
+    for row, numbers, obstacle in zip(rows, to_array(obstacles), obstacles, strict=True):
         row[:AMPLITUDE] = numbers[1:8]
         motion = obstacle.motion
         row[INTERVALS] = len(intervals)
@@ -108,18 +114,22 @@ def motion_arrays(obstacles):
         row[INTERVALS + 1] = len(intervals)
         row[WAYPOINTS] = len(waypoints)
         if isinstance(motion, Oscillation):
-            row[AMPLITUDE:FREQUENCY], row[FREQUENCY] = motion.amplitude, 2 * math.pi / motion.period
-            row[PHASE], row[AXIS:ANGLE], row[ANGLE] = motion.phase, motion.axis, motion.angle
+            row[AMPLITUDE:FREQUENCY] = motion.amplitude
+            row[FREQUENCY] = 2 * math.pi / motion.period
+            row[PHASE] = motion.phase
+            row[AXIS:ANGLE] = motion.axis
+            row[ANGLE] = motion.angle
         elif isinstance(motion, Waypoints):
             rotations = motion.rotations or (IDENTITY,) * len(motion.times)
-            ways = zip(motion.times, motion.displacements, rotations, strict=True)
-            waypoints += [(time, *displacement, *turn) for time, displacement, turn in ways]
+            for waypoint in zip(motion.times, motion.displacements, rotations, strict=True):
+                time, displacement, rotation = waypoint
+                waypoints.append((time, *displacement, *rotation))
             row[REPEAT] = REPEATS.index(motion.repeat)
         row[WAYPOINTS + 1] = len(waypoints)
-    return own, np.reshape(waypoints, (-1, 8)), np.reshape(intervals, (-1, 2))
+    return rows, np.reshape(waypoints, (-1, 8)), np.reshape(intervals, (-1, 2))
 
 
-def free_over_time(scene, states, times):
+def free_over_time(scene: Scene, states: ArrayLike, times: Sequence[float]) -> np.ndarray:
     """Whether configurations are free of a scene's moving obstacles.
 
     Args:
@@ -132,11 +142,12 @@ def free_over_time(scene, states, times):
     """
     moving = replace(scene, obstacles=[o for o in scene.obstacles if o.motion is not None])
     rows, arm = world_shapes(moving.obstacles, scene.robot)
-    own, shapes = MovingObstacles(moving), rows.copy()
+    obstacles, shapes = MovingObstacles(moving), rows.copy()
     world = rows, *group_points((), 0.0)
-    rule = np.zeros(4), np.empty((1, 0, scene.robot.num_joints + 1))
-    states, free = np.ascontiguousarray(states, float), np.empty((len(times), len(states)), bool)
+    rule, no_endpoints = np.zeros(4), np.empty((1, 0, scene.robot.num_joints + 1))
+    states = np.ascontiguousarray(states, float)
+    free = np.empty((len(times), len(states)), bool)
     for t, answers in zip(times, free, strict=True):
-        moved_rows(own.motions, own.centres, shapes, t, rows)
-        free_batch(states, *rule, arm, world, answers)
+        moved_rows(obstacles.motions, obstacles.centres, shapes, t, rows)
+        free_batch(states, rule, no_endpoints, arm, world, answers)
     return free.T

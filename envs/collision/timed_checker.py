@@ -9,8 +9,9 @@ is free then and one step later: a simulated arm is a little late.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.collision.checker import CollisionChecker, EndpointMargins
 from roboarm_nmp.envs.collision.hulls import (
     group_points,
     shape_centres,
@@ -18,7 +19,7 @@ from roboarm_nmp.envs.collision.hulls import (
 )
 from roboarm_nmp.envs.collision.moving import motion_arrays
 from roboarm_nmp.envs.collision.timed_kernels import first_departure, free_in_time, rows_in_time
-from roboarm_nmp.envs.scenes.primitives import floor_box
+from roboarm_nmp.envs.scenes.primitives import Scene, floor_box
 
 
 class TimedChecker:
@@ -34,29 +35,41 @@ class TimedChecker:
     """
 
     def __init__(
-        self, scene, num_steps, step_seconds, margin=0.0, clearance=0.0, endpoint_margins=None
+        self,
+        scene: Scene,
+        num_steps: int,
+        step_seconds: float,
+        margin: float = 0.0,
+        clearance: float = 0.0,
+        endpoint_margins: EndpointMargins | None = None,
     ):
         shapes = [*scene.obstacles]
-        shapes += [scene.table] if scene.table is not None else []
-        shapes += [floor_box(scene.floor)] if scene.floor is not None else []
+        if scene.table is not None:
+            shapes.append(scene.table)
+        if scene.floor is not None:
+            shapes.append(floor_box(scene.floor))
         rows, self._arm = world_shapes(shapes, scene.robot)
         times = step_seconds * np.arange(num_steps + 1)
         self._rows = np.empty((len(times), *rows.shape))
-        motions, centres = motion_arrays(scene.obstacles), shape_centres(scene.obstacles)
-        rows_in_time(motions, centres, rows, times, self._rows)
+        rows_in_time(
+            motion_arrays(scene.obstacles), shape_centres(scene.obstacles), rows, times, self._rows
+        )
         self._cloud = group_points((), 0.0)
         at_start = CollisionChecker(scene.at(0.0))
-        rule, endpoint_margins = at_start._rule(margin, clearance, endpoint_margins)
-        self._rule = rule, endpoint_margins[0]
+        rule, endpoints = at_start._rule(margin, clearance, endpoint_margins)
+        self._rule = rule, endpoints[0]
 
-    def is_free(self, states, steps):
+    def is_free(self, states: ArrayLike, steps: ArrayLike) -> np.ndarray:
         """Which normalised configurations (m, n) are free at steps (m,): bool (m,)."""
         states = np.ascontiguousarray(states, np.float64)
-        free, steps = np.empty(len(states), np.bool_), np.ascontiguousarray(steps, np.int64)
+        steps = np.ascontiguousarray(steps, np.int64)
+        free = np.empty(len(states), np.bool_)
         free_in_time(states, steps, *self._rule, self._arm, self._rows, self._cloud, free)
         return free
 
-    def first_departure(self, start, end, length, first, last):
+    def first_departure(
+        self, start: np.ndarray, end: np.ndarray, length: int, first: int, last: int
+    ) -> int | None:
         """The first step at which a straight motion may begin; None if there is none.
 
         Args:
@@ -64,6 +77,7 @@ class TimedChecker:
             length: steps that the motion takes, >= 1.
             first, last: the steps at which it may begin.
         """
-        rest = *self._rule, self._arm, self._rows, self._cloud
-        departure = first_departure(start, end, length, first, last, *rest)
+        departure = first_departure(
+            start, end, length, first, last, *self._rule, self._arm, self._rows, self._cloud
+        )
         return None if departure < 0 else departure
