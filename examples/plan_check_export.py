@@ -21,8 +21,8 @@ from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="double_walls")
     parser.add_argument("--query", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("path.csv"))

@@ -29,7 +29,12 @@ START = np.array([1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)
 GOAL = np.array([-1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)
 
 
-def box_surface(centre, size, number=5000, seed=0):
+def box_surface(
+    centre: tuple[float, float, float],
+    size: tuple[float, float, float],
+    number: int = 5000,
+    seed: int = 0,
+) -> np.ndarray:
     """Random points on the surface of a box: float32 (number, 3), m."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.5, 0.5, (number, 3))
@@ -38,12 +43,15 @@ def box_surface(centre, size, number=5000, seed=0):
     return (np.array(centre) + points * size).astype(np.float32)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", help="a point cloud's file, m")
     args = parser.parse_args()
-    read = load_cloud(args.points) if args.points else box_surface((0.55, 0, 0.3), (0.2, 0.1, 0.6))
-    points, _ = prepare_cloud(read, configuration=START)
+    if args.points:
+        cloud = load_cloud(args.points)
+    else:
+        cloud = box_surface(centre=(0.55, 0.0, 0.3), size=(0.2, 0.1, 0.6))
+    points, _ = prepare_cloud(cloud, configuration=START)
 
     # The simulated arm stands among nothing but table and floor: all obstacles are points.
     scene = ObservedScene(points=points)
@@ -54,7 +62,8 @@ def main():
     policy, arguments = find_policy(POLICY)
     env = roboarm_nmp.make(scene, **arguments)
 
-    query, begin = Query(START, GOAL, scene), make_policy(policy, env)  # its safety filter included
+    query = Query(START, GOAL, scene)
+    begin = make_policy(policy, env)  # its safety filter included
     observation, _ = env.reset_specific(*query)
     print("first action:", begin(0, query).act(observation).round(4).tolist())
     trajectory = rollout(env, query, begin(0, query).act)

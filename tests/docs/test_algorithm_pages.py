@@ -1,23 +1,15 @@
 """docs/algorithms: its tables are of docs/make_algorithm_pages.py, its defaults of the flags."""
 
 import importlib
-import importlib.util
 import re
 
 import pytest
+from docs_scripts import load
 from paths import ROOT
 
 from roboarm_nmp.__main__ import TRAINERS
 
 PAGES = ROOT / "docs" / "algorithms"
-
-
-def load(name):
-    """A script in docs as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize("name", ["sac", "td3", "bc", "dagger", "encoders"])

@@ -16,7 +16,6 @@ from roboarm_nmp.datasets.format import (
 )
 from roboarm_nmp.datasets.problems import ARRAYS as PROBLEM_ARRAYS
 from roboarm_nmp.envs.scenes.files import load_scene
-from roboarm_nmp.networks import operations
 
 PAGE = (ROOT / "docs/reference/file_formats.md").read_text()
 
@@ -65,12 +64,3 @@ def test_keys_of_an_evaluation_are_listed():
     result = roboarm_nmp.evaluate("go-to-goal", "no_obstacles", num_queries=1)
     listed = set(re.findall(r"`(\w+)`", section("Results")))
     assert {key for key in result if not key.endswith("_interval")} <= listed
-
-
-def test_limits_of_networks_are_those_of_the_code():
-    text = section("Networks")
-    assert f"| operations in a network | {operations.MAX_NODES:,} |" in text
-    assert f"arguments and metadata included | {operations.MAX_VALUES:,} |" in text
-    assert f"| nested lists or dicts | {operations.MAX_DEPTH} |" in text
-    assert (operations.MAX_ELEMENTS, operations.MAX_COMPUTED) == (2**26, 2**28)
-    assert "stored or computed | 2²⁶ |" in text and "in all computed tensors | 2²⁸ |" in text

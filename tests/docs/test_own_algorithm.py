@@ -4,7 +4,6 @@ import json
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 from paths import ROOT
@@ -58,8 +57,3 @@ def test_example_relabels_with_the_ends_of_episodes(tmp_path, monkeypatch):
         )
     assert set(np.unique(buffer.sample(200)["desired_goal"])) == {302.0, 706.0}
     env.close()
-
-
-def test_commands_of_the_page_name_existing_files():
-    for path in re.findall(r"(?:clean_rl_scripts|benchmarks|bc_script)/\w+\.\w+", PAGE):
-        assert Path(path).name == "sac_final_mp.py" or (ROOT / path).exists(), path

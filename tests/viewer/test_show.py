@@ -1,4 +1,4 @@
-"""envs.show: its images and animations, the policy in them, and its errors."""
+"""viewer.show: its images and animations, the policy in them, and its errors."""
 
 import os
 import re
