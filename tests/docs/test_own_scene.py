@@ -7,7 +7,6 @@ import json
 import math
 import re
 import shlex
-import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ import torch
 import tyro
 from paths import ROOT
 from PIL import Image
+from trainers import run_here
 
 from roboarm_nmp import __main__, envs
 from roboarm_nmp.datasets.demonstrations import load_demos
@@ -70,10 +70,6 @@ def run(command):
     words = [FEWER.get(word, word) for word in shlex.split(command)][1:]
     name = Path(words[0]).name
     arguments = words[1:] + TINY.get(name, [])
-    if name == "sac_her_mp.py":  # all that it does is in its `if __name__ == "__main__"`
-        script = [sys.executable, str(SCRIPTS / name), *arguments]
-        done = subprocess.run(script, capture_output=True, text=True, timeout=300)
-        return Result(done.returncode, done.stdout, done.stderr)
     out, error = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
         try:
@@ -87,7 +83,9 @@ def run(command):
 
 
 def main_of(name):
-    """The function of a subcommand of `roboarm`, which takes its arguments."""
+    """The function of a script or of a subcommand of `roboarm`, which takes its arguments."""
+    if name == "sac_her_mp.py":  # all that it does is in its `if __name__ == "__main__"`
+        return lambda arguments: run_here(SCRIPTS / name, *arguments)
     path = __main__.COMMANDS[name][0]
     module = importlib.import_module(f"roboarm_nmp.{path}" + ".__main__" * (name == "data"))
     if name in ("data", "show", "evaluate"):
