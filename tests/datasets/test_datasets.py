@@ -394,11 +394,11 @@ def test_simulation_finds_wrong_positions(path):
     with h5py.File(path, "r+") as file:
         file["test/goal_position"][4, 0] += np.float32(0.001)
         attributes = {
-            name: dataset_format.attribute(file, name) for name in dataset_format._ATTRIBUTES
+            name: dataset_format.attribute(file, name) for name in dataset_format.ATTRIBUTES
         }
         names = dataset_format.array_formats(dataset_format.QUERY_SCHEMA, file)
         arrays = {name: file[name][()] for name in names}
-        file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
+        file.attrs["checksum"] = np.bytes_(dataset_format.checksum(attributes, arrays))
     validate(path)
     with pytest.raises(DatasetError, match=r"test/goal_position\[4\]"):
         validate(path, simulate=True)

@@ -484,10 +484,10 @@ def sign_again(path):
     """Give a changed file the checksum it should have."""
     with h5py.File(path, "r+") as file:
         attributes = {
-            name: dataset_format.attribute(file, name) for name in dataset_format._ATTRIBUTES
+            name: dataset_format.attribute(file, name) for name in dataset_format.ATTRIBUTES
         }
         arrays = {name: file[name][()] for name in dataset_format.DEMO_ARRAYS}
-        file.attrs["checksum"] = np.bytes_(dataset_format._checksum(attributes, arrays))
+        file.attrs["checksum"] = np.bytes_(dataset_format.checksum(attributes, arrays))
 
 
 def a_row_too_many(path):

@@ -7,6 +7,8 @@ roboarm data describe no_obstacles --robot ur5.yaml
 
 import argparse
 import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from roboarm_nmp.datasets.demonstrations import demo_path, describe, load_demos
 from roboarm_nmp.datasets.format import locate
@@ -15,8 +17,32 @@ from roboarm_nmp.envs.tasks import get_task, is_task, task_with_robot
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command. Returns the exit code: 0, or 1 if a file is bad."""
+    options = _parser().parse_args(arguments)
+    try:
+        if options.task is not None:
+            options.task = task_with_robot(options.task, options.robot)
+            get_task(options.task)
+    except ValueError as error:
+        print(error_line(f"--task: {error}"), file=sys.stderr)
+        return 1
+    if options.command == "validate":
+        return _validate(options)
+    return _describe(options)
+
+
+def _parser():
+    files = argparse.ArgumentParser(add_help=False)
+    files.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
+    files.add_argument(
+        "--task", help="the task the files must be for; files of arms other than the Panda need it"
+    )
+    files.add_argument(
+        "--robot",
+        metavar="FILE",
+        help="another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md), as TASK@FILE",
+    )
     parser = argparse.ArgumentParser(
         prog="roboarm data",
         description="Files of the tasks: queries and demonstrations.",
@@ -25,48 +51,30 @@ def main(arguments=None):
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser(
         "validate",
+        parents=[files],
         help="check query files",
         description="Check query files. Each good file gives a line on stdout, each bad one a line "
         "on stderr that names the error. The exit code is 1 if any is bad. (For demonstrations: "
         "roboarm verify.)",
     )
-    _add_files(command)
     command.add_argument(
         "--simulate",
         action="store_true",
         help="also check in the simulator that every start and goal is feasible (about 140 queries "
         "a second)",
     )
-    command = commands.add_parser(
+    commands.add_parser(
         "describe",
+        parents=[files],
         help="statistics of demonstration files",
         description="Print statistics of demonstration files, one column per file.",
     )
-    _add_files(command)
-    options = parser.parse_args(arguments)
-    if options.task is not None:
-        try:
-            options.task = task_with_robot(options.task, options.robot)
-            get_task(options.task)
-        except ValueError as error:
-            print(error_line(f"--task: {error}"), file=sys.stderr)
-            return 1
-    return {"validate": _validate, "describe": _describe}[options.command](options)
+    return parser
 
 
-def _add_files(command):
-    command.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
-    command.add_argument(
-        "--task", help="the task the files must be for; files of arms other than the Panda need it"
-    )
-    command.add_argument(
-        "--robot",
-        metavar="FILE",
-        help="another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md), as TASK@FILE",
-    )
-
-
-def _locate(file, path_of_task, options):
+def _locate(
+    file: str, path_of_task: Callable[[str], Path], options: argparse.Namespace
+) -> tuple[Path, str | None]:
     """(path, task it must be for) of a file, or of a task with the robot of `--robot`."""
     if is_task(file):
         file = task_with_robot(file, options.robot)
@@ -77,33 +85,35 @@ def _locate(file, path_of_task, options):
 
 
 def _validate(options):
-    bad = False
+    exit_code = 0
     for file in options.files:
         try:
             path, task = _locate(file, query_path, options)
             queries = validate(path, task, options.simulate, progress=True)
         except ValueError as error:
             print(error_line(error), file=sys.stderr)
-            bad = True
-        else:
-            test, validation = queries["test"], queries["validation"]
-            counts = f"{len(test)} test and {len(validation)} validation queries"
-            print(f"{path}: good, {counts} for {test.task}, seed {test.seed}")
-    return int(bad)
+            exit_code = 1
+            continue
+        test, validation = queries["test"], queries["validation"]
+        counts = f"{len(test)} test and {len(validation)} validation queries"
+        print(f"{path}: good, {counts} for {test.task}, seed {test.seed}")
+    return exit_code
 
 
 def _describe(options):
+    columns = []
     try:
-        columns = [
-            describe(load_demos(*_locate(file, demo_path, options))) for file in options.files
-        ]
+        for file in options.files:
+            path, task = _locate(file, demo_path, options)
+            columns.append(describe(load_demos(path, task)))
     except ValueError as error:
         print(error_line(error), file=sys.stderr)
         return 1
     print(" | ".join(["", *options.files]))
     for name in columns[0]:
         values = [column.get(name, 0) for column in columns]
-        print(" | ".join([name, *(f"{v:.4g}" if isinstance(v, float) else str(v) for v in values)]))
+        cells = [f"{value:.4g}" if isinstance(value, float) else str(value) for value in values]
+        print(" | ".join([name, *cells]))
     return 0
 
 

@@ -10,8 +10,10 @@ The format of the files: `datasets.format`.
 
 import json
 import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 
@@ -23,6 +25,7 @@ from roboarm_nmp.datasets.format import (
     check_configurations,
     check_format,
     locate,
+    offsets_of,
     read_file,
     read_scenes,
     scene_arrays,
@@ -66,7 +69,7 @@ class Demo:
     digest: int
 
     @property
-    def configurations(self):
+    def configurations(self) -> np.ndarray:
         """The executed configurations: float64 (m, j), rad."""
         return self.scene.robot.denormalise(self.states)
 
@@ -110,17 +113,26 @@ class Demos:
     digest: np.ndarray
     collided: np.ndarray
     made_by: str
-    parameters: dict
+    parameters: dict[str, Any]
 
     @property
-    def quantum(self):
+    def quantum(self) -> float:
         """Resolution of `states`: their deviations from the plan are multiples of it."""
         return self.parameters.get("quantum", QUANTUM)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.start)
 
-    def __getitem__(self, index):
+    def __iter__(self) -> Iterator[Demo]:
+        return (self[i] for i in range(len(self)))
+
+    @overload
+    def __getitem__(self, index: int) -> Demo: ...
+
+    @overload
+    def __getitem__(self, index: slice | np.ndarray | list[int]) -> "Demos": ...
+
+    def __getitem__(self, index: int | slice | np.ndarray | list[int]) -> "Demo | Demos":
         try:
             i = np.arange(len(self))[index]
         except IndexError as error:
@@ -129,85 +141,84 @@ class Demos:
             return self._take(i)
         rows = slice(self.offsets[i], self.offsets[i + 1])
         return Demo(
-            self.start[i],
-            self.goal[i],
-            self.scenes[i],
-            self.plan[self.plan_offsets[i] : self.plan_offsets[i + 1]],
-            self.states[rows],
-            self.actions[rows][:-1],
-            int(self.digest[i]),
+            start=self.start[i],
+            goal=self.goal[i],
+            scene=self.scenes[int(i)],
+            plan=self.plan[self.plan_offsets[i] : self.plan_offsets[i + 1]],
+            states=self.states[rows],
+            actions=self.actions[rows][:-1],
+            digest=int(self.digest[i]),
         )
 
     def _take(self, chosen):
         """The demonstrations with these numbers, int64 (k,)."""
         rows, offsets = _rows(self.offsets, chosen)
         plan_rows, plan_offsets = _rows(self.plan_offsets, chosen)
-        columns = ("start", "goal", "plan_seed", "digest", "collided")
         return replace(
             self,
-            **{name: getattr(self, name)[chosen] for name in columns},
+            start=self.start[chosen],
+            goal=self.goal[chosen],
             scenes=self.scenes.take(chosen),
             states=self.states[rows],
             actions=self.actions[rows],
             offsets=offsets,
             plan=self.plan[plan_rows],
             plan_offsets=plan_offsets,
+            plan_seed=self.plan_seed[chosen],
+            digest=self.digest[chosen],
+            collided=self.collided[chosen],
         )
 
 
 def _rows(offsets, chosen):
     """The rows of the chosen demonstrations in a flat array, and their offsets among these."""
     lengths = np.diff(offsets)[chosen]
-    new = np.concatenate([[0], np.cumsum(lengths)])
+    new = offsets_of(lengths)
     return np.arange(new[-1]) + np.repeat(offsets[chosen] - new[:-1], lengths), new
 
 
-def demo_path(task):
+def demo_path(task: str | Path) -> Path:
     """Path of a task's demonstration file; for a scene file, `<name>_demos.h5` beside it.
 
-    That of `TASK@ROBOT` is `<task>@<robot>_demos.h5` beside the scene file, or, for a name, beside
-    the robot's file.
-
-    Raises ValueError: `task` is none of these.
+    For `TASK@ROBOT` it is `<task>@<robot>_demos.h5` beside the scene file, or, where TASK is a
+    name, beside the robot's file. Raises ValueError: `task` is none of these.
     """
     return task_file(task, "demos", "_demos.h5")
 
 
-def load_demos(task_or_path, task=None):
-    """The `Demos` of a task's pretrained file, or of any demonstration file.
+def load_demos(task_or_path: str | Path, task: str | Path | None = None) -> Demos:
+    """Load the demonstrations of a task, or of any demonstration file.
 
     Args:
         task_or_path: name of a task, path of a scene file, `TASK@ROBOT`, or path of a demonstration
             file.
-        task: the task that a demonstration file must be for. A robot's files need one, unless the
-            robot is the Panda.
+        task: the task that a demonstration file must be for. The files of other arms than the Panda
+            need it.
 
     Raises:
         DatasetError: the file is missing, corrupt, not a demonstration file, or made for another
             task, for another version of the task's scene, or for another robot.
     """
-    path, found = locate(task_or_path, demo_path)
-    task = task or found
-    attributes, arrays, base = read_file(path, DEMO_SCHEMA, task)
+    path, task_of_path = locate(task_or_path, demo_path)
+    attributes, arrays, base = read_file(path, DEMO_SCHEMA, task or task_of_path)
     robot = base.robot
-    offsets, plan_offsets = (
-        np.concatenate([[0], np.cumsum(arrays[name].astype(np.int64))])
-        for name in ("length", "plan_length")
-    )
-    if offsets[-1] != len(arrays["residual"]) or plan_offsets[-1] != len(arrays["plan"]):
+    offsets = offsets_of(arrays["length"])
+    plan = arrays["plan"]
+    plan_offsets = offsets_of(arrays["plan_length"])
+    if offsets[-1] != len(arrays["residual"]) or plan_offsets[-1] != len(plan):
         raise DatasetError(f"{path}: the lengths do not add up to the number of rows")
     if arrays["length"].min() < 2 or arrays["plan_length"].min() < 2:
         raise DatasetError(f"{path}: a demonstration has at least two configurations")
-    check_configurations(path, "plan", arrays["plan"], robot)
+    check_configurations(path, "plan", plan, robot)
     parameters = json.loads(attributes["parameters"])
-    before, here, after = schedule(arrays["plan"], plan_offsets, offsets, robot)
+    lag = parameters.get("lag")
+    if not isinstance(lag, list) or len(lag) != robot.num_joints or not all(map(_is_finite, lag)):
+        raise DatasetError(f"{path}: parameters: lag is not {robot.num_joints} finite numbers")
     quantum = parameters.get("quantum", QUANTUM)
-    numbers = parameters.get("lag"), [quantum]
-    counts = robot.num_joints, 1
-    for name, value, count in zip(("lag", "quantum"), numbers, counts, strict=True):
-        if not isinstance(value, list) or len(value) != count or not all(map(_is_finite, value)):
-            raise DatasetError(f"{path}: parameters: {name} is not {count} finite numbers")
-    states = here - parameters["lag"] * (here - before) + arrays["residual"] * quantum
+    if not _is_finite(quantum):
+        raise DatasetError(f"{path}: parameters: quantum is not 1 finite number")
+    before, here, after = schedule(plan, plan_offsets, offsets, robot)
+    states = here - lag * (here - before) + arrays["residual"] * quantum
     states = states.astype(np.float32)
     actions = after - states
     length = np.maximum(np.linalg.norm(actions, axis=1, keepdims=True), 1e-9)
@@ -216,13 +227,13 @@ def load_demos(task_or_path, task=None):
     return Demos(
         task=attributes["task"],
         seed=attributes["seed"],
-        start=arrays["plan"][plan_offsets[:-1]],
-        goal=arrays["plan"][plan_offsets[1:] - 1],
+        start=plan[plan_offsets[:-1]],
+        goal=plan[plan_offsets[1:] - 1],
         scenes=read_scenes(path, base, arrays),
         states=states,
         actions=actions.astype(np.float32),
         offsets=offsets,
-        plan=arrays["plan"],
+        plan=plan,
         plan_offsets=plan_offsets,
         plan_seed=arrays["plan_seed"],
         digest=arrays["digest"],
@@ -236,19 +247,29 @@ def _is_finite(value):
     return isinstance(value, (int, float)) and math.isfinite(value)
 
 
-def write_demos(path, task, seed, plans, executions, columns, made_by, parameters, scenes_of=None):
+def write_demos(
+    path: str | Path,
+    task: str | Path,
+    seed: int,
+    plans: Sequence[np.ndarray],
+    executions: Sequence[np.ndarray],
+    columns: dict[str, Sequence[int]],
+    made_by: str,
+    parameters: dict[str, Any],
+    scenes_of: Iterable[Scene] | None = None,
+) -> None:
     """Write a demonstration file, atomically, as `write_queries` does.
 
     Args:
         path: file to write; an existing one is replaced.
         task: name of the task, path of a scene file, or `TASK@ROBOT`.
-        seed: the seed they were made with, an int.
+        seed: the seed they were made with.
         plans: list of float32 (p, j) arrays, rad, from start to goal.
         executions: list of float32 (m, j) arrays, normalised configurations, starting at the start.
         columns: `{"plan_seed", "digest", "collided"}`: sequences of ints, one per demonstration.
         made_by: the command line that makes this file.
         parameters: JSON-ready dict of everything else that determined them.
-        scenes_of: sequence of n `Scene`s; None where all of them are the task's.
+        scenes_of: the `Scene` of each demonstration; None where all of them are the task's.
 
     Raises:
         DatasetError: invalid arrays, a query twice, or one of the task's test or validation
@@ -256,24 +277,28 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
         ValueError: unknown task.
         OSError: the file cannot be written; an old file stays as it is.
     """
-    path = Path(path)
     demo_path(task)  # rejects an unknown task
     base = get_task(task).base_scene
     robot = base.robot
-    lengths, plan_lengths = [len(one) for one in executions], [len(one) for one in plans]
+    lengths = [len(states) for states in executions]
+    plan_lengths = [len(plan) for plan in plans]
     if not plans or len(executions) != len(plans):
         raise DatasetError(f"{path}: {len(plans)} plans and {len(executions)} executions")
     if min(lengths + plan_lengths) < 2:
         raise DatasetError(f"{path}: a demonstration has at least two configurations")
-    plan, states = np.concatenate(plans), np.concatenate(executions)
-    joints = robot.num_joints
-    if (plan.shape[1:], states.shape[1:]) != ((joints,), (joints,)):
-        raise DatasetError(f"{path}: plans and executions must have {joints} numbers a row")
+    plan = np.concatenate(plans)
+    states = np.concatenate(executions)
+    if plan.shape[1:] != (robot.num_joints,) or states.shape[1:] != (robot.num_joints,):
+        raise DatasetError(
+            f"{path}: plans and executions must have {robot.num_joints} numbers a row"
+        )
     check_configurations(path, "plan", plan, robot)
     if not np.isfinite(states).all():
         raise DatasetError(f"{path}: executions have numbers that are not finite")
-    offsets, plan_offsets = np.cumsum([0, *lengths]), np.cumsum([0, *plan_lengths])
-    start, goal = plan[plan_offsets[:-1]], plan[plan_offsets[1:] - 1]
+    offsets = offsets_of(lengths)
+    plan_offsets = offsets_of(plan_lengths)
+    start = plan[plan_offsets[:-1]]
+    goal = plan[plan_offsets[1:] - 1]
     keys = query_keys(start, goal)
     if len(keys) < len(start):
         raise DatasetError(f"{path}: {len(start) - len(keys)} queries are in it twice")
@@ -289,14 +314,13 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
     lag = [round(value, 6) for value in lag.tolist()]
     quantum = QUANTUM if scenes_of is None else QUANTUM_IN_SCENES
     residual = np.round((states - (here - lag * moved)) / quantum)
-    arrays = {
-        **scene_arrays(path, scenes_of, base),
-        "plan": plan,
-        "plan_length": np.array(plan_lengths, np.uint32),
-        "residual": residual.astype(np.int16),
-        "length": np.array(lengths, np.uint32),
-        **{name: np.array(columns[name], DEMO_ARRAYS[name][0]) for name in columns},
-    }
+    arrays = scene_arrays(path, scenes_of, base)
+    arrays["plan"] = plan
+    arrays["plan_length"] = np.array(plan_lengths, np.uint32)
+    arrays["residual"] = residual.astype(np.int16)
+    arrays["length"] = np.array(lengths, np.uint32)
+    for name, values in columns.items():
+        arrays[name] = np.array(values, DEMO_ARRAYS[name][0])
     check_format(path, DEMO_SCHEMA, arrays, robot)
     parameters = {**parameters, "lag": lag}
     if quantum != QUANTUM:
@@ -304,8 +328,8 @@ def write_demos(path, task, seed, plans, executions, columns, made_by, parameter
     write_file(path, DEMO_SCHEMA, task, seed, arrays, made_by, parameters)
 
 
-def describe(demos):
-    """Statistics of `Demos`: a dict of numbers.
+def describe(demos: Demos) -> dict[str, float]:
+    """Statistics of demonstrations, by name.
 
     `steps`, `waypoints` and `path_length` (rad, sum of the joints' L2 displacements) are means;
     `steps_95` is the 95th percentile; `length_ratio` the mean of path length over the straight

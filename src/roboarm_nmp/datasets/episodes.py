@@ -5,15 +5,20 @@ observations, its achieved goals and the step that reaches the goal depend on th
 `config`, `combined` or `pose`. Trainers and the Minari export use these episodes.
 """
 
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.demonstrations import Demo, Demos, load_demos
 from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.envs.goals import GOAL_TYPES
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.subgoals import MAX_STEP
+
+if TYPE_CHECKING:
+    from roboarm_nmp.envs.arm_env import RoboArmEnv
 
 
 class Episode(NamedTuple):
@@ -30,7 +35,9 @@ class Episode(NamedTuple):
     reached: np.ndarray
 
 
-def observed(states, goal, goal_type, robot):
+def observed(
+    states: np.ndarray, goal: np.ndarray, goal_type: str, robot: Robot
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Observations at `states`, without velocities, in an episode with `goal`.
 
     Args:
@@ -55,11 +62,11 @@ def observed(states, goal, goal_type, robot):
     )
 
 
-def demo_episode(demo, env):
-    """A `Demo` as `env` would have recorded it, up to reaching its goal: an `Episode`.
+def demo_episode(demo: Demo, env: "RoboArmEnv") -> Episode:
+    """A demonstration as `env` would have recorded it, up to reaching its goal.
 
     Args:
-        demo: a `Demo`.
+        demo: the demonstration.
         env: an environment of `envs.make` without velocities. Its goal type, action mode, goal
             tolerances, encoder and appended link distances are those of the episode.
     """
@@ -70,21 +77,27 @@ def demo_episode(demo, env):
     if env.action_mode == "subgoal":
         action = demo.states[:-1] + demo.actions
     if getattr(env, "appends_link_distances", False):
-        near = env.link_distances_at(demo.states, demo.scene)
-        observation = np.hstack([observation, near.reshape(len(near), -1)])
+        link_distances = env.link_distances_at  # pyright: ignore[reportAttributeAccessIssue]
+        distances = link_distances(demo.states, demo.scene)
+        observation = np.hstack([observation, distances.reshape(len(distances), -1)])
     encoder = getattr(env, "encoder", None)
     if encoder is not None:
         latent = np.tile(encoder(demo.scene), (len(observation), 1))
         observation = np.hstack([observation, latent])
     reached = env.compute_terminated(achieved_goal, desired_goal, {})
     length = int(np.argmax(reached[1:])) + 1 if reached[1:].any() else len(action)
-    until = slice(length + 1)
     return Episode(
-        observation[until], achieved_goal[until], desired_goal, action[:length], reached[until]
+        observation=observation[: length + 1],
+        achieved_goal=achieved_goal[: length + 1],
+        desired_goal=desired_goal,
+        action=action[:length],
+        reached=reached[: length + 1],
     )
 
 
-def transition(before, action, after, collision):
+def transition(
+    before: dict[str, np.ndarray], action: np.ndarray, after: dict[str, np.ndarray], collision: bool
+) -> dict[str, Any]:
     """A replay buffer's entry: `action` led from the observation `before` (a dict) to `after`."""
     return {
         "observation": before["observation"],
@@ -96,15 +109,21 @@ def transition(before, action, after, collision):
     }
 
 
-def demo_transitions(demo, env):
+def demo_transitions(demo: Demo, env: "RoboArmEnv") -> list[dict[str, Any]]:
     """The episode of `demo_episode` as a list of such transitions."""
     episode = demo_episode(demo, env)
     observations = [
-        {"observation": one, "achieved_goal": achieved, "desired_goal": episode.desired_goal}
-        for one, achieved in zip(episode.observation, episode.achieved_goal, strict=True)
+        {
+            "observation": episode.observation[t],
+            "achieved_goal": episode.achieved_goal[t],
+            "desired_goal": episode.desired_goal,
+        }
+        for t in range(len(episode.observation))
     ]
-    steps = zip(observations[:-1], episode.action, observations[1:], strict=True)
-    return [transition(before, action, after, False) for before, action, after in steps]
+    return [
+        transition(observations[t], action, observations[t + 1], False)
+        for t, action in enumerate(episode.action)
+    ]
 
 
 class DemoQueriesWrapper(gym.Wrapper):
@@ -115,11 +134,14 @@ class DemoQueriesWrapper(gym.Wrapper):
         demos: the `Demos`.
     """
 
-    def __init__(self, env, demos):
-        super().__init__(env)
-        self.demos, self.demo = demos, None
+    env: "RoboArmEnv"
 
-    def reset(self, *, seed=None, options=None):
+    def __init__(self, env: "RoboArmEnv", demos: Demos):
+        super().__init__(env)
+        self.demos = demos
+        self.demo: Demo | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
         """As `RoboArmEnv.reset`."""
         if seed is not None:
             self.env.reset(seed=seed)
@@ -127,8 +149,8 @@ class DemoQueriesWrapper(gym.Wrapper):
         return self.env.reset_specific(self.demo.start, self.demo.goal, self.demo.scene)
 
 
-def load_demos_for(env, file, task):
-    """The `Demos` of a file or task, if they can be episodes of `env`.
+def load_demos_for(env: "RoboArmEnv", file: str | Path, task: str | Path) -> Demos:
+    """Load the demonstrations of a file or task, if they can be episodes of `env`.
 
     Args:
         env: an environment of `envs.make`.

@@ -18,22 +18,24 @@ import re
 import shlex
 import sys
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
 
-from roboarm_nmp.datasets.problems import Rejected, load_problems, write_problems
+from roboarm_nmp.datasets.problems import Problem, Rejected, load_problems, write_problems
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import check_writable
 from roboarm_nmp.utils.progress import progress_bar
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
-LISTED = 20  # rejected problems that are listed, at most
+MAX_LISTED = 20  # rejected problems, and reasons
 
 
 @dataclass
@@ -48,26 +50,28 @@ class Args:
     """Replace a file that exists."""
 
 
-def usable(problem, world):
-    """A `Problem` with those of its goals that are inside the limits and free, or a `Rejected`.
+def usable(problem: Problem, world: World) -> Problem | Rejected:
+    """A problem with those of its goals that are inside the limits and free, or why there is none.
 
     `world` is a `World` of the same arm; its scene is changed.
     """
     world.set_scene(problem.scene)
-    if reason := _fault(problem.start, world):
+    reason = _obstruction(problem.start, world)
+    if reason is not None:
         return Rejected(problem.name, f"start {reason}")
-    reasons = [_fault(goal, world) for goal in problem.goals]
+    reasons = [_obstruction(goal, world) for goal in problem.goals]
     goals = problem.goals[[reason is None for reason in reasons]]
     if len(goals) or problem.goal_pose is not None:
         return problem._replace(goals=goals)
     return Rejected(problem.name, f"goal {reasons[0]}")
 
 
-def _fault(configuration, world):
+def _obstruction(configuration, world):
     """Why an episode cannot begin or end there, in words; None if it can."""
-    robot, angles = world.robot, configuration.astype(np.float32)
-    beyond = np.maximum(robot.lower - configuration, configuration - robot.upper)
+    robot = world.robot
+    angles = configuration.astype(np.float32)
     if (np.abs(robot.normalise(angles)) > 1.0 + 1e-6).any():  # as of `RoboArmEnv.reset_specific`
+        beyond = np.maximum(robot.lower - configuration, configuration - robot.upper)
         joint = int(np.argmax(beyond))
         return f"outside the limits by {beyond[joint]:.3f} rad: joint {joint + 1}"
     if world.in_collision(angles.tolist()):
@@ -75,65 +79,75 @@ def _fault(configuration, world):
     return None
 
 
-def import_problems(paths, robot=PANDA, progress=False):
-    """The usable problems of files and folders.
+def import_problems(
+    paths: Iterable[str | Path], robot: Robot = PANDA, progress: bool = False
+) -> tuple[list[Problem], list[Rejected]]:
+    """The usable problems of files and folders, and those that cannot be used.
 
     Args:
         paths: of files and folders.
         robot: the `Robot` of the problems.
         progress: show a progress bar.
 
-    Returns:
-        list of `Problem`s, and list of `Rejected`.
-
     Raises:
         ValueError: a file cannot be used; the message names it.
     """
-    sets = [load_problems(path, robot) for path in paths]
-    found = [problem for problems in sets for problem in problems.all]
-    kept, rejected = [], [one for problems in sets for one in problems.rejected]
-    if not found:
+    candidates, kept, rejected = [], [], []
+    for path in paths:
+        problems = load_problems(path, robot)
+        candidates += problems.all
+        rejected += problems.rejected
+    if not candidates:
         return kept, rejected
-    world = World(found[0].scene, drawn=False)
-    with contextlib.closing(world), progress_bar(found, "import", disable=not progress) as bar:
-        for problem in bar:
-            result = usable(problem, world)
-            (rejected if isinstance(result, Rejected) else kept).append(result)
+    world = World(candidates[0].scene, drawn=False)
+    with contextlib.closing(world), progress_bar(candidates, "import", disable=not progress) as bar:
+        for candidate in bar:
+            problem = usable(candidate, world)
+            if isinstance(problem, Rejected):
+                rejected.append(problem)
+            else:
+                kept.append(problem)
     return kept, rejected
 
 
-def summary(kept, rejected):
+def summary(kept: Sequence[Problem], rejected: Sequence[Rejected]) -> str:
     """How many problems were imported, and why others were not, in lines of text."""
     lines = [f"imported {len(kept)} of {len(kept) + len(rejected)} problems"]
     sets = Counter(problem.name.rpartition("/")[0] for problem in kept)
-    lines += [f"  {name:<40}{count:>6}" for name, count in sets.items()]
+    for name, count in sets.items():
+        lines.append(f"  {name:<40}{count:>6}")
     openings = Counter(str(problem.scene.robot.held) for problem in kept)
-    if openings != {"{}": len(kept)}:
-        lines += [f"  held joints {held}: {count}" for held, count in openings.items()]
-    poses = sum(not len(problem.goals) for problem in kept)
-    if poses:
-        lines.append(f"  {poses} with a goal pose only")
-    attached = sum(bool(problem.scene.robot.attached) for problem in kept)
-    if attached:
-        lines.append(f"  {attached} with attached objects")
-    touching = sum(any(one.may_touch for one in problem.scene.obstacles) for problem in kept)
-    if touching:
-        lines.append(f"  {touching} with obstacles that links may touch")
-    kinds = Counter(re.sub(r"[\d.]+ rad", "... rad", _kind(one.reason)) for one in rejected)
-    lines += [f"not imported: {count}: {kind}" for kind, count in kinds.most_common(LISTED)]
-    lines += [f"  {one.name}: {one.reason}" for one in rejected[:LISTED]]
-    if len(rejected) > LISTED:
-        lines.append(f"  ... and {len(rejected) - LISTED} more")
+    for held, count in openings.items():
+        if held != "{}":
+            lines.append(f"  held joints {held}: {count}")
+    notes = {
+        "with a goal pose only": [not len(problem.goals) for problem in kept],
+        "with attached objects": [bool(problem.scene.robot.attached) for problem in kept],
+        "with obstacles that links may touch": [
+            any(obstacle.may_touch for obstacle in problem.scene.obstacles) for problem in kept
+        ],
+    }
+    for note, holds in notes.items():
+        if any(holds):
+            lines.append(f"  {sum(holds)} {note}")
+    kinds = Counter(_kind(problem.reason) for problem in rejected)
+    for kind, count in kinds.most_common(MAX_LISTED):
+        lines.append(f"not imported: {count}: {kind}")
+    for name, reason in rejected[:MAX_LISTED]:
+        lines.append(f"  {name}: {reason}")
+    if len(rejected) > MAX_LISTED:
+        lines.append(f"  ... and {len(rejected) - MAX_LISTED} more")
     return "\n".join(lines)
 
 
 def _kind(reason):
-    """A reason without what is of one problem only: file, line, links and joints."""
+    """A reason without what is of one problem only: file, line, links, joints and angles."""
     reason = re.sub(r"^\S*?:(\d+:)? ", "", reason)
-    return reason.split(":")[0]
+    return re.sub(r"[\d.]+ rad", "... rad", reason.split(":")[0])
 
 
-def main(args):
+def main(args: Args) -> None:
+    """Run the command. Raises SystemExit: nothing can be written."""
     try:
         flags.check(args)
         if not args.files:
@@ -147,7 +161,8 @@ def main(args):
         if not kept:
             raise ValueError("no problem can be used: nothing was written")
         command = ["roboarm", "import", *map(str, args.files), "--output", str(args.output)]
-        command += ["--robot", str(args.robot)] if args.robot else []
+        if args.robot is not None:
+            command += ["--robot", str(args.robot)]
         write_problems(args.output, kept, shlex.join(command))
     except (ValueError, OSError) as error:
         sys.exit(error_line(error))

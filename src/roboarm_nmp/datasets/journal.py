@@ -5,6 +5,9 @@ import json
 import os
 import sys
 import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 from roboarm_nmp.envs.scenes.primitives import scene_to_json
 from roboarm_nmp.envs.tasks import get_task
@@ -12,13 +15,13 @@ from roboarm_nmp.envs.tasks import get_task
 VERSION = 4
 
 
-def journal_of(path):
+def journal_of(path: Path) -> Path:
     """Path of the journal of a file."""
     return path.with_name(path.name + ".journal")
 
 
-def line_of(entry):
-    """A line of a journal, bytes: a checksum and a JSON-ready dict."""
+def line_of(entry: Mapping[str, Any]) -> bytes:
+    """A line of a journal: a checksum and a JSON-ready dict."""
     content = json.dumps(entry).encode()
     return b"%08x %s\n" % (zlib.crc32(content), content)
 
@@ -36,6 +39,9 @@ class Journal:
     journal drops an incomplete last line, and other lines whose checksum does not match with a
     message on stderr. One process at a time holds the journal.
 
+    Attributes:
+        entries: the results so far, by their index.
+
     Args:
         path: file to continue, or to begin.
         options: JSON-ready dict of what the results depend on, `task` among them. The task's scene
@@ -46,10 +52,9 @@ class Journal:
         OSError: the file cannot be written.
     """
 
-    def __init__(self, path, options):
+    def __init__(self, path: Path, options: Mapping[str, Any]):
         self.path = path
-        self.entries = {}
-        """Dict of index -> entry."""
+        self.entries: dict[int, dict[str, Any]] = {}
         scene = scene_to_json(get_task(options["task"]).base_scene)
         header = {"journal": VERSION, **options, "scene": scene}
         self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
@@ -68,14 +73,15 @@ class Journal:
         if not entries and not line_of(header).startswith(contents):
             raise ValueError(_difference(path, None, header))  # nor an incomplete header
         self.entries = {entry["index"]: entry for entry in entries[1:] if entry is not None}
-        if damaged := entries.count(None):
+        damaged = entries.count(None)
+        if damaged:
             print(f"{path}: damaged, {damaged} of its lines are made again", file=sys.stderr)
         good = len(contents) - len(lines[-1])
         self._file.truncate(good)
         if good == 0:
             self._write(header)
 
-    def append(self, entry):
+    def append(self, entry: dict[str, Any]) -> None:
         """Write a JSON-ready dict with an `index`. When this returns, a kill cannot lose it."""
         self._write(entry)
         self.entries[entry["index"]] = entry
@@ -90,22 +96,24 @@ class Journal:
             self._file.truncate(end)
             raise
 
-    def close(self):
+    def close(self) -> None:
         """Release the journal. One without entries is deleted."""
         if not self.entries:
             self.path.unlink(missing_ok=True)
         self._file.close()
 
 
-def _difference(path, found, wanted):
-    if not isinstance(found, dict) or found.get("journal") != VERSION:
+def _difference(path, stored, expected):
+    """Why a journal with this header, the stored one, is not that of the expected one."""
+    if not isinstance(stored, dict) or stored.get("journal") != VERSION:
         return f"{path}: not a journal that this version can continue; move or delete it"
-    names = [name for name in wanted if found.get(name) != wanted[name]]
-    differences = ", ".join(
-        "another scene" if name == "scene" else f"{name} {found.get(name)!r}, not {wanted[name]!r}"
-        for name in names
-    )
+    differences = []
+    for name, value in expected.items():
+        if name == "scene" and stored.get(name) != value:
+            differences.append("another scene")
+        elif stored.get(name) != value:
+            differences.append(f"{name} {stored.get(name)!r}, not {value!r}")
     return (
-        f"{path}: the journal of something else ({differences}): continue it with its flags, or "
-        f"delete it"
+        f"{path}: the journal of something else ({', '.join(differences)}): continue it with its "
+        f"flags, or delete it"
     )

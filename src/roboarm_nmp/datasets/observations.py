@@ -16,39 +16,36 @@ and the attributes `schema`, `schema_version`, `task`, `seed`, `first` (number o
 compressed one by one, with a checksum each, so each can be read alone.
 """
 
-import io
+from collections.abc import Sequence
 from pathlib import Path
 
-import h5py
 import numpy as np
 
-from roboarm_nmp.datasets import shards
-from roboarm_nmp.datasets.format import (
-    DatasetError,
-    QueryScenes,
-    attribute,
-    read_base_scene,
-)
+from roboarm_nmp.datasets.format import get_array, offsets_of, read_base_scene
 from roboarm_nmp.datasets.shards import (
+    ShardFormat,
+    common_attributes,
     read_array,
-    read_vertices,
+    read_obstacles,
+    scenes_from,
     shard_path,
-    shard_paths,
-    write_attributes,
 )
 from roboarm_nmp.envs.perception.sensors import (
+    Camera,
     PointCloud,
+    SensorWorld,
     sensors_from_json,
     sensors_to_json,
 )
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import hull_vertices, scene_to_json, to_array
-from roboarm_nmp.envs.tasks import get_task, task_name
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.primitives import Scene
 
-SCHEMA, SCHEMA_VERSION = "roboarm-nmp observations", 1
+FORMAT = ShardFormat("observations", "roboarm-nmp observations")
+open_shard = FORMAT.open
 
 
-def observe(world, sensors):
+def observe(world: SensorWorld, sensors: dict[str, Camera | PointCloud]) -> dict[str, np.ndarray]:
     """The observation of a `SensorWorld` by each sensor, in the form in which it is stored.
 
     Returns:
@@ -65,64 +62,50 @@ def observe(world, sensors):
     return arrays
 
 
-def shard_bytes(task, seed, first, sensors, scenes, configurations, observations, made_by):
+def shard_bytes(
+    task: str | Path,
+    seed: int,
+    first: int,
+    sensors: dict[str, Camera | PointCloud],
+    scenes: Sequence[Scene],
+    configurations: Sequence[np.ndarray],
+    observations: Sequence[dict[str, np.ndarray]],
+    made_by: str,
+) -> bytes:
     """The contents of a shard's file.
 
     Args:
-        task: name of the task, path of a scene file, or `TASK@ROBOT`.
-        seed: of the collection, an int.
-        first: number of the first scene.
-        sensors: dict of name -> sensor.
-        scenes: list of n `Scene`s.
+        task, seed, first, scenes, made_by: as of `shards.ShardFormat.to_bytes`, n scenes.
+        sensors: by name.
         configurations: float32 (n, j), rad.
-        observations: list of n dicts, those of `observe`.
-        made_by: the command line that makes the shards.
+        observations: n dicts, those of `observe`.
     """
-    if not all(scene.is_static for scene in scenes):
-        raise DatasetError("observations are of static scenes: obstacles of this task move")
-    obstacles = [o for scene in scenes for o in scene.obstacles]
-    if any(obstacle.may_touch for obstacle in obstacles):
-        raise DatasetError("files of observations cannot have random obstacles with may_touch")
-    arrays = {
-        "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
-        "obstacles": to_array(obstacles),
-        "configuration": np.asarray(configurations, np.float32),
-    }
-    if len(vertices := hull_vertices(obstacles)):
-        arrays["hull_vertices"] = vertices
-    attributes = {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "task": task_name(task),
-        "seed": int(seed),
-        "first": int(first),
-        "scene": scene_to_json(get_task(task).base_scene),
-        "sensors": sensors_to_json(sensors),
-        "made_by": made_by,
-    }
-    contents = io.BytesIO()
-    with h5py.File(contents, "w", libver=("v110", "v110")) as file:
-        write_attributes(file, attributes)
-        for name, array in arrays.items():
-            file.create_dataset(name, data=array, track_times=False, fletcher32=array.size > 0)
+
+    def images():  # made one after another: they are large
         for name in observations[0]:
-            array = np.stack([one[name] for one in observations])
-            file.create_dataset(
+            array = np.stack([observation[name] for observation in observations])
+            yield (
                 name,
-                data=array,
-                chunks=(1, *array.shape[1:]),
-                compression="gzip",
-                compression_opts=4,
-                shuffle=array.dtype == np.uint16,
-                fletcher32=True,
-                track_times=False,
+                array,
+                {
+                    "chunks": (1, *array.shape[1:]),
+                    "compression": "gzip",
+                    "compression_opts": 4,
+                    "shuffle": array.dtype == np.uint16,
+                    "fletcher32": True,
+                },
             )
-    return contents.getvalue()
 
-
-def open_shard(path):
-    """A context with the `h5py.File` of a shard. Raises DatasetError: as `shards.open_shard`."""
-    return shards.open_shard(path, "observations", SCHEMA, SCHEMA_VERSION)
+    return FORMAT.to_bytes(
+        task,
+        seed,
+        first,
+        scenes,
+        {"configuration": np.asarray(configurations, np.float32)},
+        made_by,
+        attributes={"sensors": sensors_to_json(sensors)},
+        images=images(),
+    )
 
 
 class Observations:
@@ -132,47 +115,47 @@ class Observations:
         folder: path.
         robot: the `Robot` that the scenes must have.
 
+    Attributes:
+        task: name of the scenes' task.
+        seed: of the collection.
+        sensors: dict of name -> sensor.
+        base_scene: the `Scene` without the obstacles that vary.
+        offsets: number of the first scene of each shard, and the number of all scenes: int64.
+
     Raises:
         DatasetError: there are no shards, or one is missing, damaged, or not of the same collection
             as the others; or they were made for another robot.
     """
 
-    def __init__(self, folder, robot=PANDA):
+    def __init__(self, folder: str | Path, robot: Robot = PANDA):
         self.folder = Path(folder)
-        paths = shard_paths(folder, "observations")
-        self.offsets = np.zeros(len(paths) + 1, np.int64)
-        """Number of the first scene of each shard, and the number of all scenes."""
-        first = None
-        for number, path in enumerate(paths):
+        first = {}
+        counts = []
+        for path in FORMAT.paths(folder):
             with open_shard(path) as file:
-                found = {name: attribute(file, name) for name in ("task", "seed", "sensors")}
-                found["scene"] = attribute(file, "scene")
-                self.offsets[number + 1] = self.offsets[number] + len(file["configuration"])
-            first = first or found
-            for name, value in found.items():
-                if value != first[name]:
-                    raise DatasetError(f"{path}: its {name} differs from that of the first shard")
-        self.task, self.seed = first["task"], first["seed"]
-        self.sensors = sensors_from_json(first["sensors"])
-        """Dict of name -> sensor."""
-        self.base_scene = read_base_scene(folder, first["scene"], robot)
+                names = ("task", "seed", "sensors", "scene")
+                attributes = common_attributes(file, path, names, first)
+                counts.append(len(get_array(path, file, "configuration")))
+            first = first or attributes
+        self.offsets = offsets_of(counts)
+        self.task: str = first["task"]
+        self.seed: int = first["seed"]
+        self.sensors: dict[str, Camera | PointCloud] = sensors_from_json(first["sensors"])
+        self.base_scene: Scene = read_base_scene(folder, first["scene"], robot)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return int(self.offsets[-1])
 
-    def read(self, number, name):
+    def read(self, number: int, name: str) -> np.ndarray:
         """One array of a shard, e.g. `read(3, "front/rgb")`. Raises DatasetError: it is damaged."""
         path = shard_path(self.folder, number)
         with open_shard(path) as file:
             return read_array(file, path, name)
 
-    def scenes(self, number):
-        """The `Scene`s of a shard, a list."""
+    def scenes(self, number: int) -> list[Scene]:
+        """The `Scene`s of a shard."""
         path = shard_path(self.folder, number)
         with open_shard(path) as file:
-            counts, rows = (read_array(file, path, n) for n in ("obstacle_count", "obstacles"))
-            vertices = read_vertices(file, path)
-        offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-        indices = np.arange(len(counts))
-        scenes = QueryScenes(self.base_scene, indices, offsets, rows, vertices)
-        return [scenes[i] for i in indices]
+            counts, rows, vertices = read_obstacles(file, path)
+        scenes = scenes_from(self.base_scene, counts, rows, vertices)
+        return [scenes[i] for i in range(len(counts))]

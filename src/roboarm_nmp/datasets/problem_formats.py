@@ -5,6 +5,7 @@ Each reader yields a `Problem`, or a `Rejected` with the reason, for every probl
 
 import functools
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.placements import link_placement
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.variants import with_held
 from roboarm_nmp.envs.scenes.formats import (
     check_frame,
@@ -40,10 +42,12 @@ from roboarm_nmp.utils.documents import (
     shorten,
 )
 
-MAX_PROBLEMS, MAX_GOALS, MAX_OBSTACLES = 100_000, 1_000, 1_000_000
-"""Limits of a file's problems, of a problem's goals, and of all obstacles of a file."""
-# Where the Panda's fingers are, m, in sets that do not say it: those of VAMP and robometrics.
-VAMP_OPENING, ROBOMETRICS_OPENING = 0.065, 0.025
+MAX_PROBLEMS = 100_000  # of a file
+MAX_GOALS = 1_000  # of a problem
+MAX_OBSTACLES = 1_000_000  # of a file
+# Where the Panda's fingers are, m, in sets that do not say it.
+VAMP_OPENING = 0.065
+ROBOMETRICS_OPENING = 0.025
 MAX_ANGLE = 1e4  # rad or m, of a joint
 
 
@@ -73,7 +77,7 @@ class Rejected(NamedTuple):
     reason: str
 
 
-def read_file(path, robot):
+def read_file(path: str | Path, robot: Robot) -> Iterator[Problem | Rejected]:
     """Yield a `Problem` or a `Rejected` for each problem of a YAML or JSON file.
 
     Raises DocumentError: the file is of no known format.
@@ -84,7 +88,8 @@ def read_file(path, robot):
         if is_world(root) or "obstacles" in fields:
             raise Mistake(root, "a world without starts and goals, which can be a task: --task")
         if "problems" in fields:
-            entries, reader = list(_vamp_entries(fields, Path(path).stem)), _vamp_problem
+            entries = list(_vamp_entries(fields, Path(path).stem))
+            reader = _vamp_problem
         else:
             entries = list(_robometrics_entries(fields))
             reader = functools.partial(_robometrics_problem, folder=Path(path).parent)
@@ -108,18 +113,26 @@ def read_file(path, robot):
 # --- MotionBenchMaker and MoveIt: pairs of files
 
 
-def request_files(folder):
-    """The pairs of a folder: dict from a number, as text, to (scene file, request file) or None."""
-    found = {}
-    for kind in (0, 1):
-        for path in sorted(Path(folder).glob(("scene*.y*ml", "request*.y*ml")[kind])):
-            digits = re.fullmatch(r"(?:scene|request)_?(\d{1,9})", path.stem)
-            if digits and path.suffix in (".yaml", ".yml"):
-                found.setdefault(digits[1], [None, None])[kind] = path
-    return dict(sorted(found.items()))
+def request_files(folder: str | Path) -> dict[str, tuple[Path | None, Path | None]]:
+    """The scene file and the request file of each number, as text, in a folder; None for none."""
+    scenes, requests = _numbered(folder, "scene"), _numbered(folder, "request")
+    return {
+        digits: (scenes.get(digits), requests.get(digits))
+        for digits in sorted({*scenes, *requests})
+    }
 
 
-def read_folder(folder, robot):
+def _numbered(folder, word):
+    """The YAML files `word####.yaml` of a folder, by their digits."""
+    paths = {}
+    for path in sorted(Path(folder).glob(f"{word}*")):
+        match = re.fullmatch(rf"{word}_?(\d{{1,9}})\.ya?ml", path.name)
+        if match:
+            paths[match[1]] = path
+    return paths
+
+
+def read_folder(folder: str | Path, robot: Robot) -> Iterator[Problem | Rejected]:
     """Yield a `Problem` or a `Rejected` for each `scene####.yaml` with its `request####.yaml`.
 
     Raises DocumentError: there is none in the folder.
@@ -128,23 +141,25 @@ def read_folder(folder, robot):
     pairs = request_files(folder)
     if not any(request for _, request in pairs.values()):
         raise DocumentError(f"{folder}: no request####.yaml with a scene####.yaml in this folder")
-    for digits, (scene, request) in pairs.items():
+    for digits, (scene_file, request_file) in pairs.items():
         name = f"{folder.resolve().name}/{digits}"
-        if scene is None or request is None:
-            missing = "scene" if scene is None else "request"
-            yield Rejected(name, f"{scene or request}: there is no {missing}{digits}.yaml")
+        if scene_file is None:
+            yield Rejected(name, f"{request_file}: there is no scene{digits}.yaml")
             continue
+        if request_file is None:
+            yield Rejected(name, f"{scene_file}: there is no request{digits}.yaml")
+            continue
+        path = request_file
         try:
-            path = request
-            start, goals, robot_of = _request(load_document(request), robot)
-            path = scene
-            found = moveit_scene(load_document(scene), robot_of)
+            start, goals, robot_of_request = _request(load_document(request_file), robot)
+            path = scene_file
+            scene = moveit_scene(load_document(scene_file), robot_of_request)
         except Mistake as mistake:
             yield Rejected(name, f"{path}:{mistake.line}: {mistake.reason}")
         except DocumentError as error:
             yield Rejected(name, str(error))
         else:
-            yield Problem(name, start, goals, None, found)
+            yield Problem(name, start, goals, None, scene)
 
 
 def _request(root, robot):
@@ -164,21 +179,22 @@ def _request(root, robot):
     for name, value in zip(names, values, strict=True):
         joint = documents.text(name, "the name of a joint")
         positions[joint] = number(value, f"the position of {joint[:40]}", MAX_ANGLE)
-    start, robot = _configuration(joints, positions, robot, "the start")
-    robot = with_attached_objects(state, robot)
+    start, held = _configuration(joints, positions, robot, "the start")
+    robot = with_attached_objects(state, _with_held(joints, robot, held))
     constraints = get(root, "goal_constraints", "a request")
     goals = []
-    for one in sequence(constraints, "goal_constraints", MAX_GOALS):
-        goal = mapping(one, "a goal")
+    for node in sequence(constraints, "goal_constraints", MAX_GOALS):
+        goal = mapping(node, "a goal")
         for key in ("position_constraints", "orientation_constraints", "visibility_constraints"):
             if not is_nothing(goal.get(key)):
                 raise Mistake(goal[key], f"{key} are not supported: only joint_constraints")
         angles = {}
-        for joint in sequence(get(one, "joint_constraints", "a goal"), "joint_constraints", 1000):
+        for joint in sequence(get(node, "joint_constraints", "a goal"), "joint_constraints", 1000):
             name = documents.text(get(joint, "joint_name", "a joint constraint"), "joint_name")
             value = get(joint, "position", "a joint constraint")
             angles[name] = number(value, f"the position of {name[:40]}", MAX_ANGLE)
-        goals.append(_configuration(one, angles, robot, "the goal", with_held=False)[0])
+        configuration, _ = _configuration(node, angles, robot, "the goal")
+        goals.append(configuration)
     if not goals:
         raise Mistake(constraints, "no goal")
     return start, np.array(goals), robot
@@ -192,19 +208,19 @@ def _is_empty(node):
     return all(map(_is_empty, inner))
 
 
-def _configuration(node, positions, robot, what, with_held=True):
-    """Joint angles (n,) from a dict of names, and the robot with its held joints as there."""
+def _configuration(node, positions, robot, what):
+    """Joint angles (n,) from a dict of names, and the positions of held joints, a dict."""
     missing = [name for name in robot.joint_names if name not in positions]
     if missing:
         raise Mistake(node, f"{what} lacks {', '.join(missing)}")
     held = {name: at for name, at in positions.items() if name not in robot.joint_names}
-    if unknown := sorted(name for name in held if name not in robot.held):
+    unknown = sorted(name for name in held if name not in robot.held)
+    if unknown:
         raise Mistake(node, f"{robot.name} has no joint {shorten(unknown[0])!r}")
-    angles = np.array([positions[name] for name in robot.joint_names])
-    return angles, _held(node, robot, held) if with_held else robot
+    return np.array([positions[name] for name in robot.joint_names]), held
 
 
-def _held(node, robot, positions):
+def _with_held(node, robot, positions):
     try:
         return with_held(robot, positions)
     except ValueError as error:
@@ -229,8 +245,8 @@ def _robometrics_problem(name, node, robot, folder):
     start = _angles(get(node, "start", "a problem"), "start", robot)
     goals = []
     if "goal_ik" in fields:
-        goals = sequence(fields["goal_ik"], "goal_ik", MAX_GOALS)
-        goals = [_angles(goal, "a goal of goal_ik", robot) for goal in goals]
+        nodes = sequence(fields["goal_ik"], "goal_ik", MAX_GOALS)
+        goals = [_angles(goal, "a goal of goal_ik", robot) for goal in nodes]
     pose = None
     if not is_nothing(fields.get("goal_pose")):
         pose = _goal_pose(fields["goal_pose"], robot)
@@ -243,10 +259,12 @@ def _robometrics_problem(name, node, robot, folder):
 
 def _goal_pose(node, robot):
     """The end effector's pose where a link, such as the hand, has the pose of a file: (7,)."""
+    from scipy.spatial.transform import Rotation  # here: it takes half a second
+
     frame = documents.text(get(node, "frame", "goal_pose"), "frame")
     position = numbers(get(node, "position_xyz", "goal_pose"), "position_xyz", 3, MAX_LENGTH)
-    turn = get(node, "quaternion_wxyz", "goal_pose")
-    w, x, y, z = numbers(turn, "quaternion_wxyz", 4, MAX_LENGTH)
+    orientation = get(node, "quaternion_wxyz", "goal_pose")
+    w, x, y, z = numbers(orientation, "quaternion_wxyz", 4, MAX_LENGTH)
     try:
         quaternion = unit_quaternion((x, y, z, w))
         joint, rotation, at = link_placement(robot, frame)
@@ -257,23 +275,9 @@ def _goal_pose(node, robot):
     if joint != end_joint:
         raise Mistake(node, f"the frame {shorten(frame)!r} does not move with the end effector")
     end_at = end_at + end_rotation @ np.array(robot.end_effector_offset)
-    inner = rotation.T @ (end_at - at), _quaternion(rotation.T @ end_rotation)
-    return np.concatenate(compose_poses(position, quaternion, *inner))
-
-
-def _quaternion(rotation):
-    """The quaternion (xyzw) of a rotation matrix (3, 3): by Bar-Itzhack's method (2000)."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    square = np.array(
-        [
-            [a - e - i, b + d, c + g, h - f],
-            [b + d, e - a - i, f + h, c - g],
-            [c + g, f + h, i - a - e, d - b],
-            [h - f, c - g, d - b, a + e + i],
-        ]
-    )
-    quaternion = np.linalg.eigh(square)[1][:, -1]
-    return quaternion if quaternion[3] >= 0 else -quaternion
+    turn = Rotation.from_matrix(rotation.T @ end_rotation).as_quat(canonical=True)
+    pose = compose_poses(position, quaternion, rotation.T @ (end_at - at), turn)
+    return np.concatenate(pose)
 
 
 # --- VAMP
@@ -285,9 +289,10 @@ def _vamp_entries(fields, stem):
     sets = problems.value if isinstance(problems.value, dict) else {stem: problems}
     for name, nodes in sets.items():
         for index, node in enumerate(sequence(nodes, "problems", MAX_PROBLEMS)):
-            number_of = mapping(node, "a problem").get("index")
-            number_of = None if number_of is None else documents.text(number_of, "index")
-            yield f"{name[:60]}/{(number_of or str(index))[:20]}", node
+            number_in_file = mapping(node, "a problem").get("index")
+            if number_in_file is not None:
+                index = documents.text(number_in_file, "index") or index
+            yield f"{name[:60]}/{str(index)[:20]}", node
 
 
 def _vamp_problem(name, node, robot):
@@ -295,14 +300,14 @@ def _vamp_problem(name, node, robot):
     robot = _with_opening(node, robot, VAMP_OPENING)
     if "fingers" in fields:
         fingers = numbers(fields["fingers"], "fingers", len(robot.held_indices), MAX_ANGLE)
-        robot = _held(node, robot, dict(zip(robot.held, fingers, strict=True)))
+        robot = _with_held(node, robot, dict(zip(robot.held, fingers, strict=True)))
     start = _angles(get(node, "start", "a problem"), "start", robot)
-    goals = get(node, "goals", "a problem")
-    found = [_angles(goal, "a goal", robot) for goal in sequence(goals, "goals", MAX_GOALS)]
-    if not found:
-        raise Mistake(goals, "no goal")
+    nodes = get(node, "goals", "a problem")
+    goals = [_angles(goal, "a goal", robot) for goal in sequence(nodes, "goals", MAX_GOALS)]
+    if not goals:
+        raise Mistake(nodes, "no goal")
     obstacles = vamp_obstacles(fields.get("obstacles", node))
-    return Problem(name, start, np.array(found), None, checked_scene(node, obstacles, robot))
+    return Problem(name, start, np.array(goals), None, checked_scene(node, obstacles, robot))
 
 
 def _angles(node, what, robot):
@@ -313,4 +318,4 @@ def _with_opening(node, robot, opening):
     """The Panda with its fingers at an opening (m); other arms as they are."""
     if robot.arm != PANDA:
         return robot
-    return _held(node, robot, dict.fromkeys(robot.held, opening))
+    return _with_held(node, robot, dict.fromkeys(robot.held, opening))

@@ -21,20 +21,30 @@ uint8, the names and the scenes (`envs.scenes.primitives.scene_to_json`) as JSON
 """
 
 import hashlib
-import io
 import json
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import overload
 
-import h5py
 import numpy as np
 
 from roboarm_nmp.datasets.format import (
-    JOINTS,
     QUERY_SCHEMA,
     DatasetError,
     attribute,
+    check_checksum,
     check_plain,
+    check_robot,
+    check_schema,
+    checksum,
+    get_array,
+    hdf5_bytes,
+    json_array,
+    offsets_of,
+    open_hdf5,
+    read_attributes,
+    read_base_scene,
 )
 from roboarm_nmp.datasets.problem_formats import (
     MAX_GOALS,
@@ -47,22 +57,25 @@ from roboarm_nmp.datasets.problem_formats import (
 )
 from roboarm_nmp.datasets.queries import Query, validate
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import scene_from_json, scene_to_json, unit_quaternion
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.primitives import Scene, scene_to_json, unit_quaternion
 from roboarm_nmp.utils.documents import DocumentError
 from roboarm_nmp.utils.files import write_atomically
 
-SCHEMA, SCHEMA_VERSION = "roboarm-nmp problems", 1
+SCHEMA = "roboarm-nmp problems"
+SCHEMA_VERSION = 1
 MAX_ARRAY = 30_000_000  # bytes, of an array of a file: as JSON it needs twenty times as much
-ARRAYS = {
-    "start": ("<f8", JOINTS, "start"),
-    "goal_count": ("<u4", None, "start"),
-    "goals": ("<f8", JOINTS, "goals"),
-    "goal_pose": ("<f8", 7, "start"),
-    "scene": ("<u4", None, "start"),
-    "names": ("<u1", None, "names"),
-    "scenes": ("<u1", None, "scenes"),
+DTYPES = {
+    "start": "<f8",
+    "goal_count": "<u4",
+    "goals": "<f8",
+    "goal_pose": "<f8",
+    "scene": "<u4",
+    "names": "<u1",
+    "scenes": "<u1",
 }
-"""As those of `datasets.format`."""
+"""Of the arrays of a file."""
+ATTRIBUTES = {"schema": str, "schema_version": int, "robot": str, "made_by": str}
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,23 +89,31 @@ class Problems:
         path, digest: the file or folder they were read from, and the SHA-256 (hex) of its contents.
     """
 
-    all: tuple
-    robot: object = PANDA
-    rejected: list = field(default_factory=list)
+    all: tuple[Problem, ...]
+    robot: Robot = PANDA
+    rejected: list[Rejected] = field(default_factory=list)
     path: Path | None = None
     digest: str | None = None
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.all)
 
-    def __getitem__(self, index):
-        found = self.all[index]
-        if isinstance(index, slice):
-            return Problems(found, self.robot, [], self.path, self.digest)
-        return found
+    def __iter__(self) -> Iterator[Problem]:
+        return iter(self.all)
 
-    def query(self, index):
-        """Problem `index` with its first goal configuration, as an `datasets.queries.Query`.
+    @overload
+    def __getitem__(self, index: int) -> Problem: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "Problems": ...
+
+    def __getitem__(self, index: int | slice) -> "Problem | Problems":
+        if isinstance(index, slice):
+            return Problems(self.all[index], self.robot, [], self.path, self.digest)
+        return self.all[index]
+
+    def query(self, index: int) -> Query:
+        """Problem `index` with its first goal configuration.
 
         Raises ValueError: its goal is a pose only.
         """
@@ -103,28 +124,28 @@ class Problems:
         return Query(start, goal, problem.scene)
 
     @property
-    def names(self):
-        """The problems' names, a tuple."""
+    def names(self) -> tuple[str, ...]:
+        """The problems' names."""
         return tuple(problem.name for problem in self.all)
 
     @property
-    def start(self):
+    def start(self) -> np.ndarray:
         """float32 (m, n), rad."""
         return np.array([problem.start for problem in self.all], np.float32)
 
     @property
-    def goal(self):
+    def goal(self) -> np.ndarray:
         """float32 (m, n), rad: the first goal of each. Raises ValueError as `query` does."""
         return np.array([self.query(index).goal for index in range(len(self))], np.float32)
 
     @property
-    def scenes(self):
-        """The problems' scenes, a tuple."""
+    def scenes(self) -> tuple[Scene, ...]:
+        """The problems' scenes."""
         return tuple(problem.scene for problem in self.all)
 
 
-def load_problems(path, robot=PANDA):
-    """The `Problems` in a file or folder; the formats are those of the module.
+def load_problems(path: str | Path, robot: Robot = PANDA) -> Problems:
+    """Load the problems in a file or folder; the formats are those of the module.
 
     Problems are as the file has them: starts and goals may be in collision or beyond the limits.
 
@@ -138,15 +159,14 @@ def load_problems(path, robot=PANDA):
             are in `rejected`.
     """
     path = Path(path)
+    files = [path]
     if path.is_dir():
-        found = list(read_folder(path, robot))
-        pairs = request_files(path).values()
-        digest = _digest(*(one for pair in pairs for one in pair if one is not None))
+        results = list(read_folder(path, robot))
+        files = [file for pair in request_files(path).values() for file in pair if file is not None]
     elif path.suffix in (".yaml", ".yml", ".json"):
-        found = list(read_file(path, robot))
-        digest = _digest(path)
+        results = list(read_file(path, robot))
     elif path.suffix in (".h5", ".hdf5"):
-        found, digest = _read_hdf5(path, robot), _digest(path)
+        results = _read_hdf5(path, robot)
     elif not path.exists():
         raise DocumentError(f"{path}: no such file or folder")
     else:
@@ -154,17 +174,20 @@ def load_problems(path, robot=PANDA):
             f"{path}: problems are in .yaml, .json and .h5 files, and in folders with request "
             f"files (docs/customise/problems.md)"
         )
-    problems = tuple(one for one in found if isinstance(one, Problem))
-    rejected = [one for one in found if isinstance(one, Rejected)]
-    return Problems(problems, robot.arm, rejected, path, digest)
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.read_bytes())
+    problems = tuple(result for result in results if isinstance(result, Problem))
+    rejected = [result for result in results if isinstance(result, Rejected)]
+    return Problems(problems, robot.arm, rejected, path, digest.hexdigest())
 
 
-def write_problems(path, problems, made_by=""):
+def write_problems(path: str | Path, problems: Iterable[Problem], made_by: str = "") -> None:
     """Write `problems.h5`, atomically: at every moment `path` is the old file or the new one.
 
     Args:
         path: file to write; an existing one is replaced.
-        problems: sequence of `Problem`s of one arm.
+        problems: of one arm.
         made_by: the command line that makes this file.
 
     Raises:
@@ -174,117 +197,72 @@ def write_problems(path, problems, made_by=""):
     problems = list(problems)
     if not problems:
         raise DatasetError(f"{path}: no problems to write")
-    arm, numbers = problems[0].scene.robot.arm, {}
-    index = [numbers.setdefault(problem.scene, len(numbers)) for problem in problems]
-    poses = [np.full(7, np.nan) if one.goal_pose is None else one.goal_pose for one in problems]
+    arm = problems[0].scene.robot.arm
+    number_of = {}  # scene -> its number, in the order of their first use
+    index = [number_of.setdefault(problem.scene, len(number_of)) for problem in problems]
+    no_pose = np.full(7, np.nan)
+    poses = [no_pose if problem.goal_pose is None else problem.goal_pose for problem in problems]
     arrays = {
         "start": np.array([problem.start for problem in problems]),
         "goal_count": np.array([len(problem.goals) for problem in problems]),
         "goals": np.concatenate([problem.goals for problem in problems]),
         "goal_pose": np.array(poses),
         "scene": np.array(index),
-        "names": _as_bytes([problem.name for problem in problems]),
-        "scenes": _as_bytes([json.loads(scene_to_json(scene)) for scene in numbers]),
+        "names": json_array([problem.name for problem in problems]),
+        "scenes": json_array([json.loads(scene_to_json(scene)) for scene in number_of]),
     }
-    arrays = {name: arrays[name].astype(dtype) for name, (dtype, *_) in ARRAYS.items()}
+    arrays = {name: arrays[name].astype(dtype) for name, dtype in DTYPES.items()}
+    for name, array in arrays.items():
+        _check_size(path, name, array)
+    _problems_of(path, arrays, arm)
     attributes = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
         "robot": json.dumps([arm.name, arm.fingerprint]),
         "made_by": made_by,
     }
-    for name, array in arrays.items():
-        _check_size(path, name, array)
-    _problems_of(path, arrays, arm)
-    contents = io.BytesIO()  # as of datasets.format.write_file
-    with h5py.File(contents, "w", libver=("v110", "v110")) as file:
-        for name, value in {**attributes, "checksum": _checksum(attributes, arrays)}.items():
-            file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
-        for name, array in arrays.items():
-            packing = {"compression": "gzip", "shuffle": True} if array.size else {}
-            file.create_dataset(name, data=array, track_times=False, **packing)
-    write_atomically(path, contents.getbuffer())
-
-
-def _as_bytes(value):
-    return np.frombuffer(json.dumps(value).encode(), np.uint8)
-
-
-def _digest(*paths):
-    digest = hashlib.sha256()
-    for path in paths:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def _checksum(attributes, arrays):
-    digest = hashlib.sha256(json.dumps(attributes, sort_keys=True).encode())
-    for name, array in arrays.items():
-        digest.update(f"{name} {array.shape}".encode() + array.tobytes())
-    return digest.hexdigest()
+    attributes["checksum"] = checksum(attributes, arrays)
+    packing = {"compression": "gzip", "shuffle": True}
+    datasets = [(name, array, packing) for name, array in arrays.items()]
+    write_atomically(path, hdf5_bytes(attributes, datasets))
 
 
 # --- Reading HDF5
 
 
 def _read_hdf5(path, robot):
-    try:
-        with open(path, "rb"):
-            pass
-        if not h5py.is_hdf5(path):
-            raise DatasetError(f"{path}: not an HDF5 file")
-        with h5py.File(path, "r") as file:
-            schema = attribute(file, "schema")
-            if schema == SCHEMA:
-                return _read_open(path, file, robot)
-    except DatasetError:
-        raise
-    except OSError as error:
-        raise DatasetError(f"{path}: {error.strerror or 'truncated or corrupt HDF5'}") from error
-    except Exception as error:  # damaged HDF5 raises all kinds of exceptions
-        raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
+    with open_hdf5(path) as file:
+        schema = attribute(file, "schema")
+        if schema == SCHEMA:
+            return _read_open(path, file, robot)
     if schema != QUERY_SCHEMA:
         raise DatasetError(
             f"{path}: neither problems nor queries (schema {schema!r}, not {SCHEMA!r})"
         )
     if robot.arm != PANDA:
         raise DatasetError(f"{path}: queries are read as problems of the Panda only")
-    return [
-        Problem(f"{split}/{index}", *_as_float64(query), None, query.scene)
-        for split, queries in validate(path).items()
-        for index, query in enumerate(queries)
-    ]
-
-
-def _as_float64(query):
-    return query.start.astype(np.float64), query.goal.astype(np.float64)[None]
+    problems = []
+    for split, queries in validate(path).items():
+        for index, (start, goal, scene) in enumerate(queries):
+            start, goals = start.astype(np.float64), goal.astype(np.float64)[None]
+            problems.append(Problem(f"{split}/{index}", start, goals, None, scene))
+    return problems
 
 
 def _read_open(path, file, robot):
-    attributes = {}
-    for name, kind in {"schema": str, "schema_version": int, "robot": str, "made_by": str}.items():
-        attributes[name] = attribute(file, name)
-        if not isinstance(attributes[name], kind):
-            raise DatasetError(f"{path}: attribute {name} is missing or damaged")
-    if attributes["schema_version"] != SCHEMA_VERSION:
-        version = attributes["schema_version"]
-        raise DatasetError(f"{path}: schema version {version}, this code reads {SCHEMA_VERSION}")
+    check_schema(path, file, "problems", SCHEMA, SCHEMA_VERSION)
+    attributes = read_attributes(path, file, ATTRIBUTES)
     check_plain(path, file)
     arrays = {}
-    for name, (dtype, *_) in ARRAYS.items():
-        dataset = file.get(name)
-        if not isinstance(dataset, h5py.Dataset) or dataset.dtype != np.dtype(dtype):
+    for name, dtype in DTYPES.items():
+        dataset = get_array(path, file, name)
+        if dataset.dtype != np.dtype(dtype):
             raise DatasetError(f"{path}: array {name} is missing or damaged")
         _check_size(path, name, dataset)
         arrays[name] = dataset[()]
-    if attribute(file, "checksum") != _checksum(attributes, arrays):
-        raise DatasetError(f"{path}: corrupt (the checksum does not match the contents)")
+    check_checksum(path, file, attributes, arrays)
     name, fingerprint = json.loads(attributes["robot"])
-    if fingerprint != robot.arm.fingerprint:
-        raise DatasetError(
-            f"{path}: made for the robot {name!r} ({fingerprint[:12]}), not for "
-            f"{robot.arm.name!r} ({robot.arm.fingerprint[:12]}): name the robot's file (--robot)"
-        )
+    check_robot(path, name, fingerprint, robot.arm)
     return _problems_of(path, arrays, robot.arm)
 
 
@@ -295,58 +273,59 @@ def _check_size(path, name, array):
 
 def _problems_of(path, arrays, arm):
     """The list of `Problem`s in a file's arrays. Raises DatasetError: they are no problems."""
-    joints, count = arm.num_joints, len(arrays["start"])
-    shapes = {"start": (count, joints), "goal_count": (count,), "goal_pose": (count, 7)}
-    shapes |= {"scene": (count,), "goals": (int(arrays["goal_count"].sum()), joints)}
+    count = len(arrays["start"])
+    if not 1 <= count <= MAX_PROBLEMS:
+        raise DatasetError(f"{path}: {count:,} problems, must be 1 to {MAX_PROBLEMS:,}")
+    shapes = {
+        "start": (count, arm.num_joints),
+        "goal_count": (count,),
+        "goals": (int(arrays["goal_count"].sum()), arm.num_joints),
+        "goal_pose": (count, 7),
+        "scene": (count,),
+    }
     for name, shape in shapes.items():
-        if arrays[name].shape != shape or not 1 <= count <= MAX_PROBLEMS:
-            raise DatasetError(
-                f"{path}: {name} must have shape {shape}, has {arrays[name].shape}, for 1 to "
-                f"{MAX_PROBLEMS:,} problems"
-            )
-    names, scenes = (_json_of(path, name, arrays[name]) for name in ("names", "scenes"))
-    if len(names) != count or not all(isinstance(name, str) for name in names):
-        raise DatasetError(f"{path}: {count} problems have other names than text, or {len(names)}")
-    if arrays["scene"].max() >= len(scenes):
-        raise DatasetError(f"{path}: scene does not fit the number of scenes")
-    if arrays["goal_count"].max() > MAX_GOALS:
-        raise DatasetError(f"{path}: a problem has more than {MAX_GOALS:,} goals")
-    poses, has_pose = arrays["goal_pose"], ~np.isnan(arrays["goal_pose"]).all(axis=1)
-    for name, numbers in (("start", arrays["start"]), ("goals", arrays["goals"]),
-                          ("goal_pose", poses[has_pose])):  # fmt: skip
+        if arrays[name].shape != shape:
+            raise DatasetError(f"{path}: {name} must have shape {shape}, has {arrays[name].shape}")
+    poses = arrays["goal_pose"]
+    has_pose = ~np.isnan(poses).all(axis=1)
+    finite = {"start": arrays["start"], "goals": arrays["goals"], "goal_pose": poses[has_pose]}
+    for name, numbers in finite.items():
         if not np.isfinite(numbers).all():
             raise DatasetError(f"{path}: {name} has numbers that are not finite")
+    if arrays["goal_count"].max() > MAX_GOALS:
+        raise DatasetError(f"{path}: a problem has more than {MAX_GOALS:,} goals")
     if not (has_pose | (arrays["goal_count"] > 0)).all():
         raise DatasetError(f"{path}: a problem has no goal")
+    names = _json_list(path, "names", arrays)
+    if len(names) != count or not all(isinstance(name, str) for name in names):
+        raise DatasetError(f"{path}: {count} problems have other names than text, or {len(names)}")
+    scenes = _json_list(path, "scenes", arrays)
+    if arrays["scene"].max() >= len(scenes):
+        raise DatasetError(f"{path}: scene does not fit the number of scenes")
     try:
         for pose in poses[has_pose]:
             unit_quaternion(pose[3:].tolist())
-        scenes = [_scene_of(scene, arm) for scene in scenes]
+        scenes = [read_base_scene(path, json.dumps(scene), arm) for scene in scenes]
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: a scene or a pose that cannot be: {error}") from error
-    ends = np.cumsum(arrays["goal_count"], dtype=np.int64)
-    goals = np.split(arrays["goals"], ends[:-1])
+    ends = offsets_of(arrays["goal_count"]).tolist()
     return [
-        Problem(name, start, goal, pose if has else None, scenes[index])
-        for name, start, goal, pose, has, index in zip(
-            names, arrays["start"], goals, poses, has_pose, arrays["scene"], strict=True
+        Problem(
+            name=names[i],
+            start=arrays["start"][i],
+            goals=arrays["goals"][ends[i] : ends[i + 1]],
+            goal_pose=poses[i] if has_pose[i] else None,
+            scene=scenes[arrays["scene"][i]],
         )
+        for i in range(count)
     ]
 
 
-def _json_of(path, name, array):
+def _json_list(path, name, arrays):
     try:
-        value = json.loads(array.tobytes())
+        value = json.loads(arrays[name].tobytes())
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: {name} is no JSON: {error}") from error
     if not isinstance(value, list):
         raise DatasetError(f"{path}: {name} is no list")
     return value
-
-
-def _scene_of(fields, arm):
-    """A `Scene` of JSON; its robot, which the file's attribute names, is the arm."""
-    name, fingerprint = fields.get("robot", (PANDA.name, PANDA.fingerprint))
-    if fingerprint != arm.fingerprint:
-        raise ValueError(f"a scene is that of another robot, {name!r}")
-    return scene_from_json(json.dumps(fields), arm)

@@ -7,15 +7,15 @@ The format of the files: `datasets.format`.
 
 import contextlib
 import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
 from roboarm_nmp.datasets.format import (
     ORIGINAL,
-    QUERY_ARRAYS,
     QUERY_SCHEMA,
     SPLITS,
     AnimatedScenes,
@@ -31,6 +31,8 @@ from roboarm_nmp.datasets.format import (
     task_file,
     write_file,
 )
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.moving_boxes import MovingScenes
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.envs.world import HOLD_STEPS, World
@@ -74,36 +76,50 @@ class Queries:
     goal_position: np.ndarray
     scenes: QueryScenes | AnimatedScenes
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.start)
 
-    def __getitem__(self, index):
-        start, goal, position = self.start[index], self.goal[index], self.goal_position[index]
-        if start.ndim == 1:
-            return Query(start, goal, self.scenes[index])
-        scenes_of = self.scenes.take(index)
-        return Queries(self.task, self.split, self.seed, start, goal, position, scenes_of)
+    def __iter__(self) -> Iterator[Query]:
+        return (self[i] for i in range(len(self)))
+
+    @overload
+    def __getitem__(self, index: int) -> Query: ...
+
+    @overload
+    def __getitem__(self, index: slice | np.ndarray) -> "Queries": ...
+
+    def __getitem__(self, index: int | slice | np.ndarray) -> "Query | Queries":
+        start, goal = self.start[index], self.goal[index]
+        if isinstance(index, (int, np.integer)):
+            return Query(start, goal, self.scenes[int(index)])
+        return replace(
+            self,
+            start=start,
+            goal=goal,
+            goal_position=self.goal_position[index],
+            scenes=self.scenes.take(index),
+        )
 
 
-def query_path(task):
+def query_path(task: str | Path) -> Path:
     """Path of a task's query file; for a scene file, `<name>_queries.h5` beside it.
 
-    That of `TASK@ROBOT` is `<task>@<robot>_queries.h5` beside the scene file, or, for a name,
-    beside the robot's file.
-
-    Raises ValueError: `task` is none of these.
+    For `TASK@ROBOT` it is `<task>@<robot>_queries.h5` beside the scene file, or, where TASK is a
+    name, beside the robot's file. Raises ValueError: `task` is none of these.
     """
     return task_file(task, "data", "_queries.h5")
 
 
-def load_queries(task_or_path, split="test", task=None):
-    """The `Queries` of a task's pretrained file, or of any query file.
+def load_queries(
+    task_or_path: str | Path, split: str = "test", task: str | Path | None = None
+) -> Queries:
+    """Load the queries of a task, or of any query file.
 
     Args:
         task_or_path: name of a task, path of a scene file, `TASK@ROBOT`, or path of a query file.
         split: `test`, `validation`, or, where a task has it, `original`.
-        task: the task that a query file must be for. A robot's files need one, unless the robot is
-            the Panda.
+        task: the task that a query file must be for. The files of other arms than the Panda need
+            it.
 
     Raises:
         DatasetError: the file is missing, corrupt, not a query file, or made for another task, for
@@ -112,14 +128,21 @@ def load_queries(task_or_path, split="test", task=None):
     """
     if split not in (*SPLITS, ORIGINAL):
         raise ValueError(f"unknown split {split!r}: {suggest(split, (*SPLITS, ORIGINAL))}")
-    path, found = locate(task_or_path, query_path)
-    queries = _read_queries(path, task or found)[0]
+    path, task_of_path = locate(task_or_path, query_path)
+    queries, _ = _read_queries(path, task or task_of_path)
     if split not in queries:
         raise DatasetError(f"{path}: has no {split} queries")
     return queries[split]
 
 
-def write_queries(path, task, seed, splits, made_by, parameters):
+def write_queries(
+    path: str | Path,
+    task: str | Path,
+    seed: int,
+    splits: Mapping[str, tuple],
+    made_by: str,
+    parameters: dict[str, Any],
+) -> None:
     """Write a query file, atomically: at every moment `path` is the old file or the whole new one.
 
     The same arguments give the same bytes (same build of h5py; before 3.15 it adds time stamps).
@@ -127,7 +150,7 @@ def write_queries(path, task, seed, splits, made_by, parameters):
     Args:
         path: file to write; an existing one is replaced.
         task: name of the task, path of a scene file, or `TASK@ROBOT`.
-        seed: the seed the queries were made with, an int.
+        seed: the seed the queries were made with.
         splits: `{"test": (start, goal, scenes), "validation": (start, goal, scenes)}`, and
             `original` where there are some; start and goal float32 (n, j), rad; scenes a sequence
             of n `Scene`s, left out where all of them are the task's, or `AnimatedScenes`.
@@ -139,26 +162,32 @@ def write_queries(path, task, seed, splits, made_by, parameters):
         ValueError: unknown task, or other splits.
         OSError: the file cannot be written; an old file is left as it was.
     """
-    path = Path(path)
     base = get_task(task).base_scene  # refuses an unknown task
     if set(splits) - {ORIGINAL} != set(SPLITS):
         raise ValueError(f"splits must be {', '.join(SPLITS)}, got {', '.join(splits)}")
     arrays = {}
-    for split, (start, goal, *scenes_of) in splits.items():
-        start, goal = np.asarray(start), np.asarray(goal)
-        arrays |= scene_arrays(path, scenes_of[0] if scenes_of else None, base, f"{split}/")
-        arrays |= {f"{split}/start": start, f"{split}/goal": goal}
+    for split, queries in splits.items():
+        start, goal = np.asarray(queries[0]), np.asarray(queries[1])
+        scenes = queries[2] if len(queries) > 2 else None
+        arrays.update(scene_arrays(path, scenes, base, f"{split}/"))
+        arrays[f"{split}/start"] = start
+        arrays[f"{split}/goal"] = goal
         if goal.ndim == 2 and goal.shape[1] == base.robot.num_joints:
             position = base.robot.forward_kinematics(goal).astype(np.float32)
             arrays[f"{split}/goal_position"] = position
+        if split == "test" and isinstance(scenes, AnimatedScenes):
+            parameters = {**parameters, "first_scene": scenes.summary()}
     check_format(path, QUERY_SCHEMA, arrays, base.robot)
     _check_queries(path, arrays, base.robot)
-    if len(scenes := splits["test"][2:]) and isinstance(scenes[0], AnimatedScenes):
-        parameters = {**parameters, "first_scene": scenes[0].summary()}
     write_file(path, QUERY_SCHEMA, task, seed, arrays, made_by, parameters)
 
 
-def validate(path, task=None, simulate=False, progress=False):
+def validate(
+    path: str | Path,
+    task: str | Path | None = None,
+    simulate: bool = False,
+    progress: bool = False,
+) -> dict[str, Queries]:
     """Check a query file; returns its splits, a dict of split -> `Queries`.
 
     Args:
@@ -173,6 +202,7 @@ def validate(path, task=None, simulate=False, progress=False):
     """
     queries, parameters = _read_queries(path, task)
     if simulate:
+        _check_positions(path, queries)
         _simulate(path, queries, parameters.get("hold_steps", HOLD_STEPS), progress)
     return queries
 
@@ -182,16 +212,22 @@ def _read_queries(path, task):
     attributes, arrays, base = read_file(path, QUERY_SCHEMA, task)
     _check_queries(path, arrays, base.robot)
     queries = {}
-    for split in (*SPLITS, ORIGINAL):
-        if f"{split}/start" not in arrays:
-            continue
-        columns = {name: arrays[f"{split}/{name}"] for name in QUERY_ARRAYS}
+    for split in _splits_in(arrays):
+        start, goal = arrays[f"{split}/start"], arrays[f"{split}/goal"]
         if f"{split}/scene_seed" in arrays:
-            seeds = arrays[f"{split}/scene_seed"]
-            columns["scenes"] = _animated(path, task or attributes["task"], seeds, columns)
+            distribution = _moving_scenes(path, task or attributes["task"])
+            scenes = AnimatedScenes(distribution, arrays[f"{split}/scene_seed"], start, goal)
         else:
-            columns["scenes"] = read_scenes(path, base, arrays, f"{split}/")
-        queries[split] = Queries(attributes["task"], split, attributes["seed"], **columns)
+            scenes = read_scenes(path, base, arrays, f"{split}/")
+        queries[split] = Queries(
+            task=attributes["task"],
+            split=split,
+            seed=attributes["seed"],
+            start=start,
+            goal=goal,
+            goal_position=arrays[f"{split}/goal_position"],
+            scenes=scenes,
+        )
     parameters = json.loads(attributes["parameters"])
     scenes = queries["test"].scenes
     if isinstance(scenes, AnimatedScenes) and not np.allclose(
@@ -204,60 +240,62 @@ def _read_queries(path, task):
     return queries, parameters
 
 
-def _animated(path, task, seeds, columns):
-    """The `AnimatedScenes` of a split. Raises DatasetError: the task has none."""
+def _moving_scenes(path, task):
+    """The distribution of a task's scenes. Raises DatasetError: their obstacles do not move."""
     distribution = get_task(task).scene
-    if not hasattr(distribution, "animate"):
+    if not isinstance(distribution, MovingScenes):
         raise DatasetError(f"{path}: has seeds of moving scenes, and the task {task!r} has none")
-    return AnimatedScenes(distribution, seeds, columns["start"], columns["goal"])
+    return distribution
 
 
-def query_keys(start, goal):
+def _splits_in(arrays):
+    """The splits of a file's arrays."""
+    return [split for split in (*SPLITS, ORIGINAL) if f"{split}/start" in arrays]
+
+
+def query_keys(start: np.ndarray, goal: np.ndarray) -> set[bytes]:
     """The set of queries as bytes: start and goal, each float32 (n, j), exactly."""
     return {row.tobytes() for row in np.hstack([start, goal])}
 
 
-def _check_queries(path, arrays, robot):
+def _check_queries(path, arrays, robot: Robot):
     """Joint limits, finite numbers, and no query in both splits."""
-    for split in (*SPLITS, ORIGINAL):
-        if f"{split}/start" not in arrays:
-            continue
+    for split in _splits_in(arrays):
         for name in ("start", "goal"):
             check_configurations(path, f"{split}/{name}", arrays[f"{split}/{name}"], robot)
         if not np.isfinite(arrays[f"{split}/goal_position"]).all():
             raise DatasetError(f"{path}: {split}/goal_position has numbers that are not finite")
-    test, validation = (
-        query_keys(arrays[f"{split}/start"], arrays[f"{split}/goal"]) for split in SPLITS
-    )
+    test = query_keys(arrays["test/start"], arrays["test/goal"])
+    validation = query_keys(arrays["validation/start"], arrays["validation/goal"])
     if test & validation:
         raise DatasetError(f"{path}: {len(test & validation)} queries are in both splits")
 
 
-def _simulate(path, queries, hold_steps, progress):
-    robot = queries["test"].scenes.base.robot
-    for split in queries:
-        position = robot.forward_kinematics(queries[split].goal)
-        off = np.linalg.norm(position - queries[split].goal_position, axis=1) > _POSITION_TOLERANCE
-        if off.any():
-            row = int(np.argmax(off))
+def _check_positions(path, splits):
+    """Raise DatasetError unless every `goal_position` is that of the goal."""
+    for split, queries in splits.items():
+        position = queries.scenes.base.robot.forward_kinematics(queries.goal)
+        wrong = np.linalg.norm(position - queries.goal_position, axis=1) > _POSITION_TOLERANCE
+        if wrong.any():
             raise DatasetError(
-                f"{path}: {split}/goal_position[{row}] is not the position of the goal"
+                f"{path}: {split}/goal_position[{wrong.argmax()}] is not the position of the goal"
             )
-    world = World(queries["test"].scenes.base)
-    total = sum(len(queries[split]) for split in queries)
-    with (
-        contextlib.closing(world),
-        progress_bar(None, Path(path).name, total, "query", disable=not progress) as bar,
-    ):
-        for split in queries:
-            for row, (start, goal, scene) in enumerate(queries[split]):
-                still = [obstacle for obstacle in scene.obstacles if obstacle.motion is None]
+
+
+def _simulate(path, splits, hold_steps, progress):
+    """Raise DatasetError unless every start and goal is feasible in the simulator."""
+    world = World(splits["test"].scenes.base)
+    total = sum(map(len, splits.values()))
+    bar = progress_bar(None, Path(path).name, total, "query", disable=not progress)
+    with contextlib.closing(world), bar:
+        for split, queries in splits.items():
+            for row, (start, goal, scene) in enumerate(queries):
                 # Moving obstacles may be at the goal.
-                for name, configuration, around in (
-                    ("start", start, scene),
-                    ("goal", goal, replace(scene, obstacles=still)),
-                ):
-                    world.set_scene(around)
+                still = [obstacle for obstacle in scene.obstacles if obstacle.motion is None]
+                at_goal = replace(scene, obstacles=still)
+                ends = {"start": (start, scene), "goal": (goal, at_goal)}
+                for name, (configuration, surroundings) in ends.items():
+                    world.set_scene(surroundings)
                     if not world.is_feasible(configuration, hold_steps):
                         raise DatasetError(f"{path}: {split}/{name}[{row}] is not feasible")
                 bar.update()

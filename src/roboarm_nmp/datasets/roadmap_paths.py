@@ -18,32 +18,27 @@ of a robot with j joints, and the attributes `schema`, `schema_version`, `task`,
 (number of the first scene), `scene` (JSON: the scene without the obstacles that vary), `made_by`.
 """
 
-import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
-from roboarm_nmp.datasets import shards
-from roboarm_nmp.datasets.format import (
-    DatasetError,
-    QueryScenes,
-    attribute,
-    read_base_scene,
-)
+from roboarm_nmp.datasets.format import QueryScenes, offsets_of, read_base_scene
 from roboarm_nmp.datasets.shards import (
+    ShardFormat,
+    common_attributes,
     read_array,
-    read_vertices,
-    shard_paths,
-    write_attributes,
+    read_obstacles,
+    scenes_from,
 )
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import hull_vertices, scene_to_json, to_array
-from roboarm_nmp.envs.tasks import get_task, task_name
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.tasks import get_task
 
-SCHEMA, SCHEMA_VERSION = "roboarm-nmp roadmap paths", 1
-_ARRAYS = ("obstacle_count", "obstacles", "path_count", "length", "points")
+FORMAT = ShardFormat("roadmap paths", "roboarm-nmp roadmap paths")
+open_shard = FORMAT.open
 
 
 @dataclass(frozen=True)
@@ -61,73 +56,49 @@ class RoadmapPaths:
 
     task: str
     seed: int
-    scenes: QueryScenes | list
+    scenes: QueryScenes | list[Scene]
     path_offsets: np.ndarray
     points: np.ndarray
     offsets: np.ndarray
 
-    def __len__(self):
+    def __len__(self) -> int:
         """The number of scenes."""
         return len(self.path_offsets) - 1
 
-    def of_scene(self, i):
+    def of_scene(self, i: int) -> list[np.ndarray]:
         """The paths of scene i: a list of float32 (k, j)."""
         first, last = self.path_offsets[i : i + 2]
         ends = self.offsets[first : last + 1]
         return [self.points[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
-def shard_bytes(task, seed, first, scenes, paths, made_by):
+def shard_bytes(
+    task: str | Path,
+    seed: int,
+    first: int,
+    scenes: Sequence[Scene],
+    paths: Sequence[Sequence[np.ndarray]],
+    made_by: str,
+) -> bytes:
     """The contents of a shard's file.
 
-    Args:
-        task: name of the task, path of a scene file, or `TASK@ROBOT`.
-        seed: of the collection, an int.
-        first: number of the first scene.
-        scenes: list of n `Scene`s.
-        paths: list of n lists of float32 (k, j), normalised.
-        made_by: the command line that makes the shards.
+    `paths` has the paths of each scene, float32 (k, j), normalised. The rest is as of
+    `shards.ShardFormat.to_bytes`.
     """
     flat = [path for of_scene in paths for path in of_scene]
-    base = get_task(task).base_scene
-    if not all(scene.is_static for scene in scenes):
-        raise DatasetError("roadmap paths are of static scenes: obstacles of this task move")
-    obstacles = [o for scene in scenes for o in scene.obstacles]
-    if any(obstacle.may_touch for obstacle in obstacles):
-        raise DatasetError("files of roadmap paths cannot have random obstacles with may_touch")
+    no_points = np.empty((0, get_task(task).base_scene.robot.num_joints), np.float32)
     arrays = {
-        "obstacle_count": np.array([len(scene.obstacles) for scene in scenes], np.uint32),
-        "obstacles": to_array(obstacles),
         "path_count": np.array([len(of_scene) for of_scene in paths], np.uint32),
         "length": np.array([len(path) for path in flat], np.uint16),
-        "points": np.concatenate([np.empty((0, base.robot.num_joints), np.float32), *flat]),
+        "points": np.concatenate([no_points, *flat]),
     }
-    if len(vertices := hull_vertices(obstacles)):
-        arrays["hull_vertices"] = vertices
-    attributes = {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "task": task_name(task),
-        "seed": int(seed),
-        "first": int(first),
-        "scene": scene_to_json(base),
-        "made_by": made_by,
-    }
-    contents = io.BytesIO()
-    with h5py.File(contents, "w", libver=("v110", "v110")) as file:
-        write_attributes(file, attributes)
-        for name, array in arrays.items():
-            file.create_dataset(name, data=array, track_times=False, fletcher32=array.size > 0)
-    return contents.getvalue()
+    return FORMAT.to_bytes(task, seed, first, scenes, arrays, made_by)
 
 
-def open_shard(path):
-    """A context with the `h5py.File` of a shard. Raises DatasetError: as `shards.open_shard`."""
-    return shards.open_shard(path, "roadmap paths", SCHEMA, SCHEMA_VERSION)
-
-
-def load_roadmap_paths(folder, robot=PANDA):
-    """All of a folder's `RoadmapPaths`, which must be those of `robot`.
+def load_roadmap_paths(
+    folder: str | Path | Sequence[str | Path], robot: Robot = PANDA
+) -> RoadmapPaths:
+    """Load all roadmap paths of a folder, which must be those of `robot`.
 
     Of several folders (a sequence), the scenes of one come after those of another, and `task` and
     `seed` are those of the first.
@@ -137,37 +108,38 @@ def load_roadmap_paths(folder, robot=PANDA):
             as the others; or they were made for another robot.
     """
     if not isinstance(folder, (str, Path)):
-        return _joined([load_roadmap_paths(one, robot) for one in folder])
-    parts, vertices, first = {name: [] for name in _ARRAYS}, [], None
-    for path in shard_paths(folder, "roadmap paths"):
+        return _concat([load_roadmap_paths(one, robot) for one in folder])
+    first = {}
+    parts = []
+    for path in FORMAT.paths(folder):
         with open_shard(path) as file:
-            found = {name: attribute(file, name) for name in ("task", "seed", "scene")}
-            for name, part in parts.items():
-                part.append(read_array(file, path, name))
-            vertices.append(read_vertices(file, path))
-        first = first or found
-        for name, value in found.items():
-            if value != first[name]:
-                raise DatasetError(f"{path}: its {name} differs from that of the first shard")
-    arrays = {name: np.concatenate(part) for name, part in parts.items()}
-    obstacles, paths, offsets = (
-        np.concatenate([[0], np.cumsum(arrays[name], dtype=np.int64)])
-        for name in ("obstacle_count", "path_count", "length")
+            attributes = common_attributes(file, path, ("task", "seed", "scene"), first)
+            paths = [read_array(file, path, name) for name in ("path_count", "length", "points")]
+            parts.append([*read_obstacles(file, path), *paths])
+        first = first or attributes
+    counts, rows, vertices, path_counts, lengths, points = map(
+        np.concatenate, zip(*parts, strict=True)
     )
     base = read_base_scene(folder, first["scene"], robot)
-    indices = np.arange(len(arrays["path_count"]))
-    scenes = QueryScenes(base, indices, obstacles, arrays["obstacles"], np.concatenate(vertices))
-    return RoadmapPaths(first["task"], first["seed"], scenes, paths, arrays["points"], offsets)
+    return RoadmapPaths(
+        task=first["task"],
+        seed=first["seed"],
+        scenes=scenes_from(base, counts, rows, vertices),
+        path_offsets=offsets_of(path_counts),
+        points=points,
+        offsets=offsets_of(lengths),
+    )
 
 
-def _joined(parts):
+def _concat(parts):
     """One `RoadmapPaths` of several."""
     if len(parts) == 1:
         return parts[0]
-    scenes = [part.scenes[i] for part in parts for i in range(len(part))]
-    path_offsets, offsets = (
-        np.concatenate([[0], np.cumsum(np.concatenate([np.diff(one) for one in of_parts]))])
-        for of_parts in ([part.path_offsets for part in parts], [part.offsets for part in parts])
+    return RoadmapPaths(
+        task=parts[0].task,
+        seed=parts[0].seed,
+        scenes=[part.scenes[i] for part in parts for i in range(len(part))],
+        path_offsets=offsets_of(np.concatenate([np.diff(part.path_offsets) for part in parts])),
+        points=np.concatenate([part.points for part in parts]),
+        offsets=offsets_of(np.concatenate([np.diff(part.offsets) for part in parts])),
     )
-    points = np.concatenate([part.points for part in parts])
-    return RoadmapPaths(parts[0].task, parts[0].seed, scenes, path_offsets, points, offsets)
