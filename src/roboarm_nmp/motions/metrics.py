@@ -10,17 +10,27 @@ al., Journal of NeuroEngineering and Rehabilitation 12(112), 2015). Planning tim
 there) is the caller's to measure; `evaluation.evaluate` has it as `planning_seconds`.
 """
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from roboarm_nmp.motions.trajectories import STEP_SECONDS, JointTrajectory
+from roboarm_nmp.motions.trajectories import STEP_SECONDS, EpisodeTrajectory, JointTrajectory
 
-# Of SPARC, as in its publication: zero padding (powers of 2), largest frequency (Hz), and the share
-# of the largest amplitude below which frequencies at the end of the spectrum do not count.
-PADDING, MAX_FREQUENCY, THRESHOLD = 4, 10.0, 0.05
+if TYPE_CHECKING:
+    from roboarm_nmp.envs.collision.checker import CollisionChecker
+
+# Of SPARC, as in its publication.
+PADDING = 4  # zeros after the speeds, so many powers of 2
+MAX_FREQUENCY = 10.0  # Hz
+THRESHOLD = 0.05  # share of the largest amplitude; weaker frequencies at the end do not count
 
 
-def motion_metrics(trajectory, checker=None):
-    """Metrics of a motion, a dict of floats.
+def motion_metrics(
+    trajectory: JointTrajectory | EpisodeTrajectory,
+    checker: "CollisionChecker | Sequence[CollisionChecker] | None" = None,
+) -> dict[str, float | None]:
+    """Compute the metrics of a motion.
 
     Args:
         trajectory: a `JointTrajectory`, or an episode, an `evaluation.rollout.Trajectory`, with
@@ -41,33 +51,31 @@ def motion_metrics(trajectory, checker=None):
           checker.
     """
     robot = trajectory.robot
+    configurations = trajectory.configurations
     if isinstance(trajectory, JointTrajectory):
-        configurations, times = trajectory.positions, trajectory.times
-        # Speeds at equal intervals.
-        even = trajectory.at(np.linspace(times[0], times[-1], len(times)))
-        duration, accelerations = trajectory.duration, trajectory.accelerations
+        times = trajectory.times
+        duration = trajectory.duration
+        even = trajectory.at(np.linspace(times[0], times[-1], len(times)))  # equal intervals
     else:
-        configurations = even = trajectory.configurations
-        duration, accelerations = len(trajectory) * STEP_SECONDS, None
+        duration = len(trajectory) * STEP_SECONDS
+        even = configurations
     interval = duration / max(len(even) - 1, 1)
-    if accelerations is None:
-        jerk = np.diff(even, n=3, axis=0) / max(interval, 1e-9) ** 3
+    if isinstance(trajectory, JointTrajectory) and trajectory.accelerations is not None:
+        jerk = np.diff(trajectory.accelerations, axis=0) / np.diff(trajectory.times)[:, None]
     else:
-        jerk = np.diff(accelerations, axis=0) / np.diff(times)[:, None]
+        jerk = np.diff(even, n=3, axis=0) / max(interval, 1e-9) ** 3
     positions, rotations = robot.frame_poses(configurations)[robot.end_effector_frame]
     positions = positions + rotations @ np.array(robot.end_effector_position)
-    turns = np.einsum("tij,tij->t", rotations[1:], rotations[:-1])  # traces of the rotations
-    angles = np.arccos(np.clip((turns - 1) / 2, -1.0, 1.0))
+    traces = np.einsum("tij,tij->t", rotations[1:], rotations[:-1])
+    angles = np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0))
     clearance = None
     if checker is not None:
         states = np.clip(robot.normalise(configurations), -1.0, 1.0)
-        pairs = (
-            zip(checker, states, strict=True) if isinstance(checker, list) else [(checker, states)]
-        )
-        clearance = min(
-            float(one.signed_distances(at, self_collisions=False).distance.min())
-            for one, at in pairs
-        )
+        if isinstance(checker, Sequence):
+            pairs = zip(checker, states, strict=True)
+            clearance = min(_clearance(one, state) for one, state in pairs)
+        else:
+            clearance = _clearance(checker, states)
     return {
         "duration": float(duration),
         "path_length": path_length(configurations),
@@ -81,17 +89,22 @@ def motion_metrics(trajectory, checker=None):
     }
 
 
-def path_length(points):
+def _clearance(checker, states):
+    """The smallest signed distance of a link from the scene, m."""
+    return float(checker.signed_distances(states, self_collisions=False).distance.min())
+
+
+def path_length(points: np.ndarray) -> float:
     """Sum of the L2 distances between successive points (m, n), for example configurations, rad."""
     return float(speeds(points).sum())
 
 
-def speeds(points):
+def speeds(points: np.ndarray) -> np.ndarray:
     """L2 distances (m - 1,) between successive points (m, n)."""
     return np.linalg.norm(np.diff(points, axis=0), axis=1)
 
 
-def smoothness(configurations):
+def smoothness(configurations: np.ndarray) -> float:
     """Mean L2 norm of the second differences, rad per step^2, of configurations (T + 1, n), rad.
 
     Zero for fewer than three configurations.
@@ -101,7 +114,7 @@ def smoothness(configurations):
     return float(np.linalg.norm(np.diff(configurations, n=2, axis=0), axis=1).mean())
 
 
-def sparc(speed, interval):
+def sparc(speed: np.ndarray, interval: float) -> float:
     """Spectral arc length of speeds (m,) at equal intervals (s); 0 where there is no motion."""
     if len(speed) == 0 or np.allclose(speed, 0.0):
         return 0.0

@@ -12,6 +12,7 @@ collisions, and corners whose rounding collides are rounded less. Needs the extr
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -54,7 +55,7 @@ class Args:
     """s, between two samples, in [0.001, 1]"""
 
 
-def retime(args):
+def retime(args: Args) -> str:
     """Write the trajectory. Returns what was written, in words. Raises ValueError, OSError."""
     flags.check(args)
     # Here, so that --help does not wait for Numba.
@@ -67,20 +68,17 @@ def retime(args):
         DEVIATION,
         time_parameterise,
     )
-    from roboarm_nmp.motions.trajectories import (
-        check_ending,
-        load_trajectory,
-        save_trajectory,
-    )
+    from roboarm_nmp.motions.trajectories import check_ending, load_trajectory, save_trajectory
 
     check_ending(args.output)
     check_writable(args.output)
     checker = None
+    robot = PANDA
     if args.task is not None:
         checker = _checker(args)
         robot = checker.robot
-    else:
-        robot = PANDA if args.robot is None else load_robot(args.robot)
+    elif args.robot is not None:
+        robot = load_robot(args.robot)
     velocity = DEFAULT_VELOCITY if robot.velocity is None else robot.velocity
     acceleration = DEFAULT_ACCELERATION if robot.acceleration is None else robot.acceleration
     path = load_trajectory(args.file, robot).positions
@@ -100,11 +98,14 @@ def retime(args):
         raise ValueError(f"{args.file}: {error}") from error
     save_trajectory(args.output, trajectory)
     metrics = motion_metrics(trajectory, checker)
-    text = f"{args.output}: written, {len(trajectory)} samples, {metrics['duration']:.2f} s, "
-    text += f"path {metrics['path_length']:.2f} rad, end effector {metrics['ee_path_length']:.2f} m"
-    if checker is None:
+    text = (
+        f"{args.output}: written, {len(trajectory)} samples, {metrics['duration']:.2f} s, path "
+        f"{metrics['path_length']:.2f} rad, end effector {metrics['ee_path_length']:.2f} m"
+    )
+    clearance = metrics["min_clearance"]
+    if clearance is None:
         return f"{text}; collisions were not checked (--task)"
-    return f"{text}, smallest clearance {1000 * metrics['min_clearance']:.1f} mm"
+    return f"{text}, smallest clearance {1000 * clearance:.1f} mm"
 
 
 def _checker(args):
@@ -128,7 +129,7 @@ def _checker(args):
     return CollisionChecker(scene)
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """The command. Returns the exit code: 0; 1 without toppra; 2 where nothing can be written."""
     args = flags.parse(Args, arguments, others="trajectory")
     try:

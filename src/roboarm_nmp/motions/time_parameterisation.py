@@ -20,10 +20,12 @@ the arm stops at the corner, and is exactly on the path before and after it.
 """
 
 import math
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.checker import RESOLUTION
+from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.motions.trajectories import JointTrajectory
 
 DEVIATION = 0.1
@@ -31,8 +33,10 @@ DEVIATION = 0.1
 `TimeOptimalTrajectoryGeneration` (`path_tolerance`)."""
 STEP = 0.01  # s
 MAX_SAMPLES = 1_000_000
-DEFAULT_VELOCITY, DEFAULT_ACCELERATION = 1.0, 1.0
-"""rad/s and rad/s^2 (or m), of joints without limits, as in MoveIt."""
+DEFAULT_VELOCITY = 1.0
+"""rad/s (or m/s), of joints without a limit, as in MoveIt."""
+DEFAULT_ACCELERATION = 1.0
+"""rad/s^2 (or m/s^2), likewise."""
 LIMIT_TOLERANCE = 0.01
 """rad: the simulated arm of an episode exceeds its limits by up to this; it is clipped."""
 CHECK_RESOLUTION = RESOLUTION / 16  # of collision checks; the planner's own checks are coarser
@@ -41,28 +45,38 @@ SAME = 1e-6  # rad: waypoints nearer than that are one
 STRAIGHT = 1e-4  # rad: waypoints that the line between their neighbours misses by less are left out
 SHORTEST = 1e-3  # rad: shorter lines between two rounded corners have no cell of their own
 SHARPEST = 2 * math.sin(math.radians(75))  # change of direction; at sharper corners the arm stops
-SHRINK, LEAST = 1 / 4, 1 / 20  # of a rounding that collides; a smaller one is none
-LINE_CELL, LEAST_CELLS = 0.05, 4  # of TOPP-RA's grid: longest cell (rad), cells of a piece at least
+SHRINK = 1 / 4  # of a rounding that collides
+LEAST = 1 / 20  # share of a rounding; with less, the arm stops at the corner
+LINE_CELL = 0.05  # rad, the longest cell of TOPP-RA's grid
+LEAST_CELLS = 4  # of each piece
 
 
 class MissingToppraError(ImportError):
     """toppra is not installed."""
 
 
+class Bounds(NamedTuple):
+    """The largest velocity, acceleration and jerk of each joint, (n,)."""
+
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    jerk: np.ndarray
+
+
 def time_parameterise(
-    path,
-    robot,
+    path: np.ndarray,
+    robot: Robot,
     *,
-    deviation=DEVIATION,
-    checker=None,
-    margin=0.0,
-    limits="urdf",
-    velocity=None,
-    acceleration=None,
-    jerk=None,
-    step=STEP,
-):
-    """A `JointTrajectory` along a path, from rest to rest, as fast as the limits allow.
+    deviation: float = DEVIATION,
+    checker: CollisionChecker | None = None,
+    margin: float = 0.0,
+    limits: Literal["urdf", "datasheet"] = "urdf",
+    velocity: float | np.ndarray | None = None,
+    acceleration: float | np.ndarray | None = None,
+    jerk: float | np.ndarray | None = None,
+    step: float = STEP,
+) -> JointTrajectory:
+    """Make a trajectory along a path, from rest to rest, as fast as the limits allow.
 
     Its first and last configuration are the path's. The same arguments give the same trajectory.
 
@@ -88,8 +102,9 @@ def time_parameterise(
         raise ValueError(f"deviation must be 0 or positive, got {deviation!r}")
     if not 0.001 <= step <= 1:
         raise ValueError(f"step must be in [0.001, 1] s, got {step!r}")
-    path, step = _checked_path(path, robot, limits), round(1e9 * step) / 1e9
-    bounds = (
+    path = _checked_path(path, robot, limits)
+    step = round(1e9 * step) / 1e9
+    bounds = Bounds(
         _bound("velocity", velocity, robot.velocity, DEFAULT_VELOCITY, robot),
         _bound("acceleration", acceleration, robot.acceleration, DEFAULT_ACCELERATION, robot),
         _bound("jerk", jerk, robot.jerk, math.inf, robot),
@@ -102,10 +117,11 @@ def time_parameterise(
         return _spline(np.repeat(polyline.points, 4, axis=0), step, robot, path)
     half_widths = polyline.half_widths(deviation)
     if checker is None:
-        return _spline(_controls(polyline, half_widths, bounds, step)[0], step, robot, path)
+        controls, _ = _controls(polyline, half_widths, bounds, step)
+        return _spline(controls, step, robot, path)
     try:
-        free = margin + GRAZE
-        return _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, free)
+        wide = margin + GRAZE
+        return _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, wide)
     except ValueError:  # the path itself is nearer than that
         return _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, margin)
 
@@ -117,13 +133,15 @@ def _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, 
         controls, at = _controls(polyline, half_widths, bounds, step)
         trajectory = _spline(controls, step, robot, path)
         states = np.clip(robot.normalise(trajectory.positions), -1.0, 1.0)
-        options = {"margin": margin, "resolution": CHECK_RESOLUTION}
-        free = checker.is_motion_free(states[:-1], states[1:], **options)
+        free = checker.is_motion_free(
+            states[:-1], states[1:], margin=margin, resolution=CHECK_RESOLUTION
+        )
         if free.all():
             return trajectory
         # The motion after sample i depends on these control points, at these places of the path.
-        colliding, window = np.flatnonzero(~free), len(at) - len(free)
-        first, last = at[colliding], at[colliding + window]
+        colliding = np.flatnonzero(~free)
+        first = at[colliding]
+        last = at[colliding + len(at) - len(free)]
         corner = polyline.lengths[1:-1]
         near = (corner + half_widths >= first[:, None]) & (corner - half_widths <= last[:, None])
         near = (near & (half_widths > 0)).any(0)
@@ -138,10 +156,10 @@ def _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, 
 
 def _checked_path(path, robot, limits):
     """The path, float64 (k, n), inside the limits. Raises ValueError."""
-    joints, (lower, upper) = robot.num_joints, robot.position_limits(limits)
+    lower, upper = robot.position_limits(limits)
     path = np.asarray(path, dtype=np.float64)
-    if path.ndim != 2 or path.shape[1] != joints or not len(path):
-        raise ValueError(f"a path has shape (k, {joints}), got {path.shape}")
+    if path.ndim != 2 or path.shape[1] != robot.num_joints or not len(path):
+        raise ValueError(f"a path has shape (k, {robot.num_joints}), got {path.shape}")
     if not np.isfinite(path).all():
         raise ValueError("the path has joint angles that are not finite")
     beyond = np.maximum(lower - path, path - upper)
@@ -155,9 +173,11 @@ def _checked_path(path, robot, limits):
     return np.clip(path, lower, upper)
 
 
-def _bound(name, given, own, default, robot):
-    """A limit (n,), float64: the given one, the robot's own or the default. Raises ValueError."""
-    values = next(one for one in (given, own, default) if one is not None)
+def _bound(name, argument, of_robot, default, robot):
+    """A limit (n,), float64: the argument, the robot's or the default. Raises ValueError."""
+    values = default if of_robot is None else of_robot
+    if argument is not None:
+        values = argument
     values = np.asarray(values, dtype=np.float64)
     if values.shape not in ((), (robot.num_joints,)) or not (values > 0).all():
         raise ValueError(f"{name} must be positive, a number or ({robot.num_joints},)")
@@ -176,14 +196,14 @@ class Polyline:
         directions: unit vectors (k - 1, n).
     """
 
-    def __init__(self, path):
+    def __init__(self, path: np.ndarray):
         self.points = _without_collinear(path)
         moves = np.diff(self.points, axis=0)
         sizes = np.linalg.norm(moves, axis=1)
         self.lengths = np.concatenate([[0.0], np.cumsum(sizes)])
         self.directions = moves / sizes[:, None]
 
-    def half_widths(self, deviation):
+    def half_widths(self, deviation: float) -> np.ndarray:
         """Lengths (k - 2,) before and after each corner from which on it is rounded.
 
         A parabola leaves the corner by a quarter of that, times the change of direction. Neighbours
@@ -195,12 +215,13 @@ class Polyline:
         widths = np.minimum(widths, 4 * deviation / np.maximum(turns, 1e-9))
         return np.where(turns > SHARPEST, 0.0, widths)
 
-    def positions(self, s, half_widths):
+    def positions(self, s: np.ndarray, half_widths: np.ndarray) -> np.ndarray:
         """Configurations (m, n), rad, at lengths (m,), corners rounded."""
         widths = np.concatenate([[0.0], half_widths, [0.0]])
         segment = np.searchsorted((self.lengths + widths)[1:-1], s, side="right")
         end = segment + 1
-        before, width = (s - self.lengths[end])[:, None], widths[end][:, None]
+        before = (s - self.lengths[end])[:, None]
+        width = widths[end][:, None]
         u = self.directions[segment]
         v = self.directions[np.minimum(end, len(self.directions) - 1)]
         rounded = (width > 0) & (before > -width)
@@ -208,15 +229,18 @@ class Polyline:
         parabola = parabola / (4 * np.where(rounded, width, 1.0))
         return self.points[end] + np.where(rounded, parabola, u * before)
 
-    def pieces(self, half_widths):
+    def pieces(self, half_widths: np.ndarray) -> list[list[tuple]]:
         """Lines and parabolas, in lists from one stop to the next.
 
         A piece is (s at its start, s at its end, derivative there and there, second derivative).
         """
-        sections, pieces, at = [], [], 0.0
+        sections = []
+        pieces = []
+        at = 0.0
         for segment, direction in enumerate(self.directions):
             last = segment == len(self.directions) - 1
-            corner, width = self.lengths[segment + 1], 0.0 if last else half_widths[segment]
+            corner = self.lengths[segment + 1]
+            width = 0.0 if last else half_widths[segment]
             if corner - width - at > SHORTEST or not (pieces and width):
                 pieces.append((at, corner - width, direction, direction, 0.0 * direction))
             if width > 0:
@@ -234,11 +258,13 @@ def _without_collinear(path):
     """A path (k, n) without waypoints that are on the line between their neighbours."""
     moved = np.linalg.norm(np.diff(path, axis=0), axis=1) > SAME
     path = path[np.concatenate([[True], moved])]
-    keep, stack = np.zeros(len(path), dtype=bool), [(0, len(path) - 1)]
+    keep = np.zeros(len(path), dtype=bool)
     keep[[0, -1]] = True
+    stack = [(0, len(path) - 1)]
     while stack:  # Douglas and Peucker (1973)
         first, last = stack.pop()
-        inner, chord = path[first + 1 : last] - path[first], path[last] - path[first]
+        inner = path[first + 1 : last] - path[first]
+        chord = path[last] - path[first]
         if not len(inner):
             continue
         share = np.clip(inner @ chord / max(chord @ chord, SAME**2), 0.0, 1.0)
@@ -260,7 +286,9 @@ class _Grid:
     """
 
     def __init__(self, pieces, cell):
-        s, first, second = [], [], []
+        s = []
+        first = []
+        second = []
         for start, end, before, after, bend in pieces:
             cells = max(LEAST_CELLS, math.ceil((end - start) / cell))
             share = np.linspace(0.0, 1.0, cells + 1)
@@ -272,16 +300,18 @@ class _Grid:
         s = np.concatenate(s)
         self.length = s[-1] - s[0]
         self.s = (s - s[0]) / self.length
-        self._derivatives = None, np.concatenate(first), self.length * np.concatenate(second)
+        self._derivatives = {1: np.concatenate(first), 2: self.length * np.concatenate(second)}
         self.path_interval = np.array([0.0, 1.0])
-        self.dof = len(before)
+        self.dof = first[0].shape[1]
 
     def __call__(self, s, order=0):
         """The derivative at the grid's points."""
         return self._derivatives[order]
 
 
-def fastest(pieces, velocity, acceleration, cell=LINE_CELL):
+def fastest(
+    pieces: list[tuple], velocity: np.ndarray, acceleration: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """TOPP-RA's profile of a section: s (m,), its derivative by time (m,), and times (m,), s.
 
     The times begin with 0. The arm rests at both ends. Between two points, the second derivative
@@ -296,7 +326,7 @@ def fastest(pieces, velocity, acceleration, cell=LINE_CELL):
             f"time parameterisation needs toppra: pip install 'roboarm-nmp[trajectories]' ({error})"
         ) from error
     toppra.setup_logging("ERROR")
-    grid = _Grid(pieces, cell)
+    grid = _Grid(pieces, LINE_CELL)
     # Its tolerances are absolute: lengths are in units of the section's, and times so that
     # accelerations stay what they are.
     unit = math.sqrt(grid.length)
@@ -305,7 +335,7 @@ def fastest(pieces, velocity, acceleration, cell=LINE_CELL):
         JointAccelerationConstraint(np.stack([-acceleration, acceleration], axis=1)),
     ]
     problem = TOPPRA(constraints, grid, gridpoints=grid.s, solver_wrapper="seidel")
-    _, speeds, _ = problem.compute_parameterization(0.0, 0.0)
+    speeds = problem.compute_parameterization(0.0, 0.0)[1]
     if speeds is None or not np.isfinite(speeds).all():
         raise ValueError("TOPP-RA finds no parameterisation: the path has motions that are tiny")
     durations = unit * 2 * np.diff(grid.s) / (speeds[:-1] + speeds[1:])
@@ -315,10 +345,12 @@ def fastest(pieces, velocity, acceleration, cell=LINE_CELL):
 
 def _controls(polyline, half_widths, bounds, step):
     """Control points (m, n), rad, of a spline within the bounds, and the s of each (m,)."""
-    velocity, acceleration, jerk = bounds
-    sections = [fastest(p, velocity, acceleration) for p in polyline.pieces(half_widths)]
+    sections = [
+        fastest(pieces, bounds.velocity, bounds.acceleration)
+        for pieces in polyline.pieces(half_widths)
+    ]
     # The mean over so many control points bounds the jerk.
-    width = max(1, math.ceil((2 * acceleration / (jerk * step)).max() - 1e-9))
+    width = max(1, math.ceil((2 * bounds.acceleration / (bounds.jerk * step)).max() - 1e-9))
     stretch = 1.0
     while True:
         at = [np.zeros(width + 1)]
@@ -347,22 +379,23 @@ def _controls(polyline, half_widths, bounds, step):
 def _s_at(times, s, speeds, grid_times):
     """s (m,) at times (m,)."""
     cell = np.clip(np.searchsorted(grid_times, times, side="right") - 1, 0, len(s) - 2)
-    passed, duration = times - grid_times[cell], np.diff(grid_times)[cell]
-    change = (speeds[cell + 1] - speeds[cell]) / duration
-    found = s[cell] + passed * (speeds[cell] + passed * change / 2)
-    return np.clip(found, s[0], s[-1])
+    passed = times - grid_times[cell]
+    change = (speeds[cell + 1] - speeds[cell]) / np.diff(grid_times)[cell]
+    return np.clip(s[cell] + passed * (speeds[cell] + passed * change / 2), s[0], s[-1])
 
 
 def _spline(controls, step, robot, path):
     """The `JointTrajectory` of control points (m, n)."""
-    before, here, after = controls[:-2], controls[1:-1], controls[2:]
+    before = controls[:-2]
+    here = controls[1:-1]
+    after = controls[2:]
     positions = np.clip((before + 4 * here + after) / 6, path.min(0), path.max(0))  # rounding
     positions[0], positions[-1] = path[0], path[-1]
     nanoseconds = np.arange(len(here)) * round(1e9 * step)  # times that files have exactly
     return JointTrajectory(
-        nanoseconds / 1e9,
-        positions,
-        (after - before) / (2 * step),
-        (before - 2 * here + after) / step**2,
-        robot,
+        times=nanoseconds / 1e9,
+        positions=positions,
+        velocities=(after - before) / (2 * step),
+        accelerations=(before - 2 * here + after) / step**2,
+        robot=robot,
     )

@@ -31,8 +31,10 @@ import io
 import json
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import yaml
@@ -47,10 +49,18 @@ ENDINGS = (".csv", ".npz", ".json", ".yaml")
 LIMIT_TOLERANCE = 0.1  # rad. The simulated arm may exceed its limits a little; degrees exceed them.
 MAX_DURATION = 100_000  # s: images of longer ones would need all of a machine's memory
 MAX_TEXT = {".csv": 100_000_000, ".json": 100_000_000, ".yaml": 10_000_000}  # bytes
-# What readers raise for a file that is damaged, or of another kind: NotImplementedError is
-# zipfile's for an unknown compression.
-DAMAGE = (ValueError, ArithmeticError, RecursionError, EOFError, NotImplementedError, MemoryError)
-DAMAGE += (csv.Error, zipfile.BadZipFile, zlib.error)
+# What readers raise for a file that is damaged, or of another kind.
+DAMAGE = (
+    ArithmeticError,
+    EOFError,
+    MemoryError,
+    NotImplementedError,  # zipfile's, for an unknown compression
+    RecursionError,
+    ValueError,
+    csv.Error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 # A loader in C is ten times as fast, where PyYAML has it.
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -77,21 +87,21 @@ class JointTrajectory:
     accelerations: np.ndarray | None
     robot: Robot
 
-    def __len__(self):
+    def __len__(self) -> int:
         """The number of samples."""
         return len(self.times)
 
     @property
-    def configurations(self):
+    def configurations(self) -> np.ndarray:
         """`positions`, by the name that episodes have for them."""
         return self.positions
 
     @property
-    def duration(self):
+    def duration(self) -> float:
         """s."""
         return float(self.times[-1] - self.times[0])
 
-    def at(self, times):
+    def at(self, times: np.ndarray | Sequence[float]) -> np.ndarray:
         """Positions (k, n), rad, at times (k,), s; before the first and after the last those.
 
         By cubic polynomials, or on straight lines where velocities are unknown.
@@ -102,7 +112,8 @@ class JointTrajectory:
         i = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self) - 2)
         span = np.diff(self.times)[i][:, None]
         share = (times - self.times[i])[:, None] / span
-        here, there = self.positions[i], self.positions[i + 1]
+        here = self.positions[i]
+        there = self.positions[i + 1]
         straight = here + share * (there - here)
         if self.velocities is None:
             return straight
@@ -111,7 +122,7 @@ class JointTrajectory:
         after = self.velocities[i + 1] * span - (there - here)
         return straight + share * (1 - share) * ((1 - share) * before - share * after)
 
-    def frames(self):
+    def frames(self) -> np.ndarray:
         """Positions (k, n), rad, every `STEP_SECONDS`, to show; the last one is the end."""
         steps = max(1, round(self.duration / STEP_SECONDS))
         positions = self.at(self.times[0] + np.arange(steps + 1) * STEP_SECONDS)
@@ -119,13 +130,33 @@ class JointTrajectory:
         return positions
 
 
-def check_ending(path):
+class EpisodeTrajectory(Protocol):
+    """An episode of T steps, as `evaluation.rollout.Trajectory` has it."""
+
+    @property
+    def states(self) -> np.ndarray: ...
+    @property
+    def actions(self) -> np.ndarray: ...
+    @property
+    def contacts(self) -> np.ndarray: ...
+    @property
+    def times(self) -> np.ndarray: ...
+    @property
+    def success(self) -> bool: ...
+    @property
+    def robot(self) -> Robot: ...
+    @property
+    def configurations(self) -> np.ndarray: ...
+    def __len__(self) -> int: ...
+
+
+def check_ending(path: str | Path) -> None:
     """Raise ValueError unless a path ends in .csv, .npz, .json or .yaml."""
     if Path(path).suffix.lower() not in ENDINGS:
         raise ValueError(f"a trajectory's file must end in .csv, .npz, .json or .yaml, got {path}")
 
 
-def timed(path, robot):
+def timed(path: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """A path at the speed of the environment, one sub-goal per step.
 
     Args:
@@ -139,7 +170,12 @@ def timed(path, robot):
     return np.arange(len(configurations)) * STEP_SECONDS, configurations
 
 
-def save_joint_path(path, configurations, times, robot=None):
+def save_joint_path(
+    path: str | Path,
+    configurations: np.ndarray,
+    times: np.ndarray | Sequence[float],
+    robot: Robot | None = None,
+) -> None:
     """Write a joint path, atomically.
 
     Args:
@@ -152,46 +188,41 @@ def save_joint_path(path, configurations, times, robot=None):
         ValueError: another ending, or other shapes.
         OSError: the file cannot be written.
     """
-    configurations, times = np.asarray(configurations), np.asarray(times)
+    configurations = np.asarray(configurations)
+    times = np.asarray(times)
     if configurations.ndim != 2 or times.shape != configurations.shape[:1]:
         raise ValueError(
             f"configurations must be (n, joints) and times (n,), got {configurations.shape} and "
             f"{times.shape}"
         )
-    _write(path, {"time": times}, configurations, {"times": times}, robot)
+    _write(path, {"configurations": configurations, "times": times}, robot)
 
 
-def save_trajectory(path, trajectory):
+def save_trajectory(path: str | Path, trajectory: JointTrajectory | EpisodeTrajectory) -> None:
     """Write a `JointTrajectory`, or an episode, a `Trajectory`, as `save_joint_path` does.
 
     The first time of an episode is 0.
     """
     if isinstance(trajectory, JointTrajectory):
-        times, arrays = trajectory.times, {"times": trajectory.times}
-        columns = {"time": times}
-        for name in ("velocities", "accelerations"):
-            values = getattr(trajectory, name)
-            if values is not None:
-                arrays[name] = values
-                columns |= {f"{name[0]}{i + 1}": column for i, column in enumerate(values.T)}
-        _write(path, columns, trajectory.positions, arrays, trajectory.robot)
-        return
-    times = np.arange(len(trajectory.states)) * STEP_SECONDS
-    columns = {"time": times}
-    columns |= {f"action{i + 1}": column for i, column in enumerate(trajectory.actions.T)}
-    columns |= {"contact": trajectory.contacts.astype(int), "policy_seconds": trajectory.times}
-    arrays = {
-        "times": times,
-        "states": trajectory.states,
-        "actions": trajectory.actions,
-        "contacts": trajectory.contacts,
-        "policy_seconds": trajectory.times,
-        "success": trajectory.success,
-    }
-    _write(path, columns, trajectory.configurations, arrays, trajectory.robot)
+        arrays = {"configurations": trajectory.positions, "times": trajectory.times}
+        if trajectory.velocities is not None:
+            arrays["velocities"] = trajectory.velocities
+        if trajectory.accelerations is not None:
+            arrays["accelerations"] = trajectory.accelerations
+    else:
+        arrays = {
+            "configurations": trajectory.configurations,
+            "times": np.arange(len(trajectory.states)) * STEP_SECONDS,
+            "states": trajectory.states,
+            "actions": trajectory.actions,
+            "contacts": trajectory.contacts,
+            "policy_seconds": trajectory.times,
+            "success": np.array(trajectory.success),
+        }
+    _write(path, arrays, trajectory.robot)
 
 
-def load_joint_path(path, robot):
+def load_joint_path(path: str | Path, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """The times (n,), s, and configurations (n, j), rad, in a file, whoever made it.
 
     Without times, the configurations are waypoints: the result is `timed`. The `Robot` has j
@@ -203,26 +234,26 @@ def load_joint_path(path, robot):
     return trajectory.times, trajectory.positions
 
 
-def load_trajectory(path, robot):
-    """The `JointTrajectory` in a file, whoever made it.
+def load_trajectory(path: str | Path, robot: Robot) -> JointTrajectory:
+    """Load the trajectory in a file, whoever made it.
 
     Velocities and accelerations are None where the file has none. Without times, the configurations
     are waypoints: times and positions are `timed`.
 
     Raises DatasetError: no such file, or not a trajectory of this robot.
     """
-    joints = robot.num_joints
     try:
         check_ending(path)
-        times, configurations, *others = _READERS[Path(path).suffix.lower()](path, robot)
+        arrays = _READERS[Path(path).suffix.lower()](path, robot)
     except OSError as error:
         raise DatasetError(f"{path}: {error.strerror or error}") from error
     except DAMAGE as error:
         reason = str(error).replace("\n", " ") or "it is damaged"
         raise DatasetError(f"{path}: not a joint path: {reason}") from error
-    if configurations.shape[1:] != (joints,) or not len(configurations):
+    configurations = arrays["configurations"]
+    if configurations.shape[1:] != (robot.num_joints,) or not len(configurations):
         raise DatasetError(
-            f"{path}: configurations must be (n, {joints}), are {configurations.shape}"
+            f"{path}: configurations must be (n, {robot.num_joints}), are {configurations.shape}"
         )
     if not np.isfinite(configurations).all():
         raise DatasetError(f"{path}: it has joint angles that are not finite")
@@ -232,36 +263,43 @@ def load_trajectory(path, robot):
             f"{path}: q{beyond.argmax() + 1} exceeds its limits by {beyond.max():.2f} rad (are "
             f"the angles in rad?)"
         )
-    if times is None:
+    if "times" not in arrays:
         return JointTrajectory(*timed(configurations, robot), None, None, robot)
+    times = arrays["times"]
     if times.shape != (len(configurations),) or not np.isfinite(times).all():
         raise DatasetError(f"{path}: it needs one finite time per configuration")
     if (np.diff(times) <= 0).any():
         raise DatasetError(f"{path}: its times do not increase")
     if times[-1] - times[0] > MAX_DURATION:
         raise DatasetError(f"{path}: it takes more than {MAX_DURATION:,} s")
-    for name, values in zip(("velocities", "accelerations"), others, strict=True):
-        if values is not None and (
-            values.shape != configurations.shape or not np.isfinite(values).all()
-        ):
+    velocities = arrays.get("velocities")
+    accelerations = arrays.get("accelerations")
+    for name, values in {"velocities": velocities, "accelerations": accelerations}.items():
+        if values is None:
+            continue
+        if values.shape != configurations.shape or not np.isfinite(values).all():
             raise DatasetError(f"{path}: {name} must be finite, {configurations.shape}")
-    return JointTrajectory(times, configurations, *others, robot)
+    return JointTrajectory(times, configurations, velocities, accelerations, robot)
 
 
-# --- Writing
+# --- Writing: arrays by the names that .npz has for them
 
 
-def _write(path, columns, configurations, arrays, robot):
+def _write(path, arrays, robot):
     check_ending(path)
-    arrays = {"configurations": configurations} | arrays
-    contents = _CONTENTS[Path(path).suffix.lower()](columns, arrays, robot)
+    contents = _CONTENTS[Path(path).suffix.lower()](arrays, robot)
     write_atomically(path, contents)
 
 
-def _csv(columns, arrays, robot):
-    time, *others = columns.items()
-    joints = ((f"q{i + 1}", column) for i, column in enumerate(arrays["configurations"].T))
-    columns = dict([time, *joints, *others])
+def _csv(arrays, robot):
+    columns = {"time": arrays["times"]}
+    for name, letter in CSV_LETTERS.items():
+        if name in arrays:
+            for i, column in enumerate(arrays[name].T):
+                columns[f"{letter}{i + 1}"] = column
+    if "contacts" in arrays:
+        columns["contact"] = arrays["contacts"].astype(int)
+        columns["policy_seconds"] = arrays["policy_seconds"]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -270,41 +308,39 @@ def _csv(columns, arrays, robot):
     return text.getvalue().encode()
 
 
-def _npz(columns, arrays, robot):
+def _npz(arrays, robot):
     contents = io.BytesIO()
     np.savez(contents, **arrays)
     return contents.getvalue()
 
 
-def _json(columns, arrays, robot):
-    content = {"robot": None if robot is None else robot.name}
-    content["joint_names"] = _joint_names(arrays["configurations"], robot)
-    content |= {name: np.asarray(array).tolist() for name, array in arrays.items()}
+def _json(arrays, robot):
+    content = {
+        "robot": None if robot is None else robot.name,
+        "joint_names": _joint_names(arrays, robot),
+    }
+    for name, array in arrays.items():
+        content[name] = array.tolist()
     rows = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in content.items()]
     return ("{\n" + ",\n".join(rows) + "\n}\n").encode()
 
 
-def _yaml(columns, arrays, robot):
-    names = _joint_names(arrays["configurations"], robot)
-    fields = {
-        ros: np.asarray(arrays[name]).tolist() if name in arrays else None
-        for ros, name in ROS_FIELDS.items()
-    }
+def _yaml(arrays, robot):
+    fields = {ros: arrays[name].tolist() for ros, name in ROS_FIELDS.items() if name in arrays}
     lines = [
         "header:",
         "  stamp: {sec: 0, nanosec: 0}",
         "  frame_id: ''",
-        f"joint_names: {json.dumps(names)}",
+        f"joint_names: {json.dumps(_joint_names(arrays, robot))}",
         "points:",
     ]
-    for row, time in enumerate(np.asarray(arrays["times"]).tolist()):
+    for row, time in enumerate(arrays["times"].tolist()):
         seconds, nanoseconds = divmod(round(time * 1e9), 10**9)
-        first = "-"
+        indent = "-"
         for ros, values in fields.items():
-            if values is not None:
-                numbers = ", ".join(_yaml_number(x) for x in values[row])
-                lines.append(f"{first} {ros}: [{numbers}]")
-                first = " "
+            numbers = ", ".join(_yaml_number(x) for x in values[row])
+            lines.append(f"{indent} {ros}: [{numbers}]")
+            indent = " "
         lines.append(f"  time_from_start: {{sec: {seconds}, nanosec: {nanoseconds}}}")
     return ("\n".join(lines) + "\n").encode()
 
@@ -315,13 +351,20 @@ def _yaml_number(number):
     return text if "." in text or "e" not in text else text.replace("e", ".0e")
 
 
-def _joint_names(configurations, robot):
+def _joint_names(arrays, robot):
     if robot is not None:
         return list(robot.joint_names)
-    return [f"q{i + 1}" for i in range(configurations.shape[1])]
+    return [f"q{i + 1}" for i in range(arrays["configurations"].shape[1])]
 
 
 _CONTENTS = {".csv": _csv, ".npz": _npz, ".json": _json, ".yaml": _yaml}
+CSV_LETTERS = {
+    "configurations": "q",
+    "velocities": "v",
+    "accelerations": "a",
+    "actions": "action",
+}
+"""Before the numbers of joints in the header."""
 ROS_FIELDS = {
     "positions": "configurations",
     "velocities": "velocities",
@@ -329,39 +372,41 @@ ROS_FIELDS = {
 }
 
 
-# --- Reading: times or None, configurations, velocities or None, accelerations or None
+# --- Reading: a dict of arrays, `configurations` and those others of `ARRAYS` that are there
+
+ARRAYS = ("times", "configurations", "velocities", "accelerations")
 
 
 def _read_csv(path, robot):
     _check_size(path)
-    joints = robot.num_joints
-    wanted = [f"q{joint}" for joint in range(1, joints + 1)]
+    joints = range(1, robot.num_joints + 1)
+    columns = {"times": ["time"]}
+    for name in ARRAYS[1:]:
+        columns[name] = [f"{CSV_LETTERS[name]}{joint}" for joint in joints]
     with open(path, newline="", encoding="utf-8-sig") as file:  # of Excel, too
         rows = csv.DictReader(file, skipinitialspace=True)
-        found = rows.fieldnames or ()
-        missing = [name for name in wanted if name not in found]
-        if missing:
+        header = rows.fieldnames or ()
+        for name in columns["configurations"]:
+            if name not in header:
+                raise ValueError(
+                    f"it has no column {name}; the header names q1 to q{joints[-1]}, rad"
+                )
+        if f"q{len(joints) + 1}" in header:
             raise ValueError(
-                f"it has no column {missing[0]}; the header names q1 to {wanted[-1]}, rad"
+                f"it has a column q{len(joints) + 1}, and the arm {len(joints)} joints"
             )
-        if f"q{joints + 1}" in found:
-            raise ValueError(f"it has a column q{joints + 1}, and the arm {joints} joints")
-        groups = [["time"], wanted]
-        groups += [[f"{letter}{joint}" for joint in range(1, joints + 1)] for letter in "va"]
-        groups = [group if all(name in found for name in group) else [] for group in groups]
-        names = [name for group in groups for name in group]
+        columns = {key: names for key, names in columns.items() if set(names) <= set(header)}
+        table = {key: [] for key in columns}
         try:
-            table = [[float(row[name]) for name in names] for row in rows]
+            for row in rows:
+                for key, names in columns.items():
+                    table[key].append([float(row[name]) for name in names])
         except (TypeError, ValueError, csv.Error) as error:
             raise ValueError(f"line {rows.line_num}: not a number") from error
-    table = np.array(table).reshape(-1, len(names))
-    ends = np.cumsum([len(group) for group in groups])
-    time, *others = np.split(table, ends[:-1], axis=1)
-    others = [values if values.shape[1] else None for values in others]
-    return time[:, 0] if time.shape[1] else None, *others
-
-
-ARRAYS = ("times", "configurations", "velocities", "accelerations")
+    arrays = {key: np.reshape(table[key], (-1, len(names))) for key, names in columns.items()}
+    if "times" in arrays:
+        arrays["times"] = arrays["times"][:, 0]
+    return arrays
 
 
 def _read_npz(path, robot):
@@ -369,7 +414,7 @@ def _read_npz(path, robot):
         if sum(entry.file_size for entry in archive.filelist) > MAX_ARRAY_BYTES:
             raise ValueError("it is too large")
     with np.load(path, allow_pickle=False) as file:
-        return _arrays({name: file[name] for name in ARRAYS if name in file}, list(file))
+        return _numbers(file)
 
 
 def _read_json(path, robot):
@@ -377,8 +422,7 @@ def _read_json(path, robot):
     content = json.loads(Path(path).read_bytes())
     if not isinstance(content, dict):
         raise ValueError("it is no JSON object")
-    arrays = _arrays({name: content[name] for name in ARRAYS if name in content}, list(content))
-    return _in_order(arrays, content.get("joint_names"), robot)
+    return _in_order(_numbers(content), content.get("joint_names"), robot)
 
 
 def _read_yaml(path, robot):
@@ -393,52 +437,51 @@ def _read_yaml(path, robot):
     points = content.get("points") if isinstance(content, dict) else None
     if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
         raise ValueError("it is no trajectory_msgs/JointTrajectory: no list `points`")
-    arrays = {}
+    arrays = {"times": [_seconds(point.get("time_from_start")) for point in points]}
     for ros, name in ROS_FIELDS.items():
         rows = [point.get(ros) for point in points]
         if name == "configurations" or any(rows):  # ROS writes [] where there are none
             arrays[name] = rows
-    arrays["times"] = [_seconds(point.get("time_from_start")) for point in points]
-    return _in_order(_arrays(arrays, list(arrays)), content.get("joint_names"), robot)
+    return _in_order(_numbers(arrays), content.get("joint_names"), robot)
 
 
 def _seconds(duration):
     """s, of a message of ROS 2, or of ROS 1, where its fields are called `secs` and `nsecs`."""
     if not isinstance(duration, dict):
         raise ValueError("a point has no `time_from_start`")
-    parts = [
-        duration.get(name, duration.get(ros1, 0))
-        for name, ros1 in (("sec", "secs"), ("nanosec", "nsecs"))
-    ]
-    if any(isinstance(part, bool) or not isinstance(part, int) for part in parts):
+    seconds = duration.get("sec", duration.get("secs", 0))
+    nanoseconds = duration.get("nanosec", duration.get("nsecs", 0))
+    if type(seconds) is not int or type(nanoseconds) is not int:
         raise ValueError("a `time_from_start` is no duration in whole sec and nanosec")
-    return (parts[0] * 10**9 + parts[1]) / 1e9
+    return (seconds * 10**9 + nanoseconds) / 1e9
 
 
-def _arrays(arrays, found):
-    """The arrays of `ARRAYS` as float64, in that order; None for each that is not there."""
-    if "configurations" not in arrays:
-        raise ValueError(f"it has no array configurations, but {', '.join(found) or 'none'}")
-    arrays = {name: np.asarray(array) for name, array in arrays.items()}
+def _numbers(content):
+    """Those of `ARRAYS` that are there, as float64."""
+    if "configurations" not in content:
+        names = ", ".join(content) or "none"
+        raise ValueError(f"it has no array configurations, but {names}")
+    arrays = {name: np.asarray(content[name]) for name in ARRAYS if name in content}
     if any(array.dtype.kind not in "fiu" for array in arrays.values()):
         raise ValueError("it has something other than numbers")
-    arrays = {name: array.astype(np.float64) for name, array in arrays.items()}
-    return [arrays.get(name) for name in ARRAYS]
+    return {name: array.astype(np.float64) for name, array in arrays.items()}
 
 
 def _in_order(arrays, names, robot):
     """Arrays whose columns are named, with the columns in the robot's order."""
-    wanted = list(robot.joint_names)
-    if names in (None, wanted, [f"q{i + 1}" for i in range(len(wanted))]):
+    expected = list(robot.joint_names)
+    if names in (None, expected, [f"q{i + 1}" for i in range(len(expected))]):
         return arrays
     known = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    if not known or sorted(names) != sorted(wanted):
-        raise ValueError(f"its joints are {str(names)[:200]}, those of the arm {wanted}")
-    times, *others = arrays
-    order = [names.index(name) for name in wanted]
-    if any(array is not None and array.shape[1:] != (len(wanted),) for array in others):
-        raise ValueError(f"a point has not {len(wanted)} numbers, one per joint")
-    return [times, *(None if array is None else array[:, order] for array in others)]
+    if not known or sorted(names) != sorted(expected):
+        raise ValueError(f"its joints are {str(names)[:200]}, those of the arm {expected}")
+    order = [names.index(name) for name in expected]
+    ordered = {}
+    for name, array in arrays.items():
+        if name != "times" and array.shape[1:] != (len(expected),):
+            raise ValueError(f"a point has not {len(expected)} numbers, one per joint")
+        ordered[name] = array if name == "times" else array[:, order]
+    return ordered
 
 
 def _check_size(path):

@@ -48,8 +48,11 @@ import pickle
 import re
 import warnings
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch.utils import _pytree as pytree
 
@@ -78,7 +81,12 @@ _MAX_CHECKED = 1_000
 MAX_REASON = 300  # characters of PyTorch's reason in an error
 
 
-def save_network(path, module, example_inputs, metadata):
+def save_network(
+    path: str | Path,
+    module: torch.nn.Module,
+    example_inputs: Mapping[str, torch.Tensor],
+    metadata: Mapping[str, Any],
+) -> None:
     """Write a network as a network file, atomically. The module itself is not touched.
 
     The network is exported in eval mode, on the CPU, for any batch size; the default dtype is
@@ -118,7 +126,7 @@ def save_network(path, module, example_inputs, metadata):
     write_atomically(path, buffer.getbuffer())
 
 
-def to_float16(path, output):
+def to_float16(path: str | Path, output: str | Path) -> None:
     """Write a network file again with float32 tensors rounded to float16: half as large.
 
     The network still computes in float32, from the rounded numbers (11 significant bits). So its
@@ -145,8 +153,8 @@ def to_float16(path, output):
     write_atomically(Path(output), buffer.getbuffer())
 
 
-def load_network(path, device="cpu"):
-    """The `ExportedNetwork` in a file, its tensors on `device`.
+def load_network(path: str | Path, device: str | torch.device = "cpu") -> "ExportedNetwork":
+    """Load the network in a file, its tensors on `device`.
 
     Raises:
         NetworkError: no such file, not a network, damaged, or with contents that are not allowed.
@@ -191,7 +199,12 @@ class ExportedNetwork:
         inputs: names of the inputs.
     """
 
-    def __init__(self, content, path="network", device="cpu"):
+    def __init__(
+        self,
+        content: dict[str, Any],
+        path: str | Path = "network",
+        device: str | torch.device = "cpu",
+    ):
         self._content = content
         self._path = path
         try:
@@ -201,7 +214,7 @@ class ExportedNetwork:
         except Exception as error:  # whatever a file with parts missing leads to
             raise NetworkError(f"{path}: damaged network: {error!r}") from error
 
-    def parameters(self):
+    def parameters(self) -> list[torch.Tensor]:
         """The parameters of the module that was saved, in its order, as `nn.Module.parameters`."""
         return [
             tensor
@@ -209,15 +222,15 @@ class ExportedNetwork:
             if name.startswith("p_")  # torch.export's prefix
         ]
 
-    def to(self, device):
+    def to(self, device: str | torch.device) -> "ExportedNetwork":
         """The same network on another device."""
         return ExportedNetwork(self._content, self._path, device)
 
     def _build(self, content, device):
         network_operations.check_file(content)
         self._checked = set()  # shapes of inputs
-        self.metadata = dict(copy.deepcopy(content["metadata"]))
-        self.inputs = list(content["inputs"])
+        self.metadata: dict[str, Any] = dict(copy.deepcopy(content["metadata"]))
+        self.inputs: list[str] = list(content["inputs"])
         # While it runs, its values lie in one list: tensors, inputs, the results of the nodes.
         float16 = set(content.get("halved", ()))  # names of tensors that are stored in float16
         self._tensors = [
@@ -240,27 +253,29 @@ class ExportedNetwork:
             slots["node", name] = _Slot(len(slots))
         self._outputs = _decode(content["outputs"], slots, device)
 
-    def __call__(self, *args, **inputs):
-        given = dict(zip(self.inputs, args, strict=False)) | inputs
-        if len(given) != len(args) + len(inputs) or set(given) != set(self.inputs):
+    def __call__(self, *args: torch.Tensor, **inputs: torch.Tensor) -> Any:
+        by_name = {**dict(zip(self.inputs, args, strict=False)), **inputs}
+        if len(by_name) != len(args) + len(inputs) or set(by_name) != set(self.inputs):
             raise NetworkError(
                 f"{self._path}: its inputs are {', '.join(self.inputs)}; it got {len(args)} "
                 f"without a name and {', '.join(inputs) or 'none'} by name"
             )
-        inputs = [given[name] for name in self.inputs]
-        if not all(isinstance(tensor, torch.Tensor) for tensor in inputs):
+        tensors = [by_name[name] for name in self.inputs]
+        if not all(isinstance(tensor, torch.Tensor) for tensor in tensors):
             raise NetworkError(f"{self._path}: its inputs are tensors")
-        shapes = tuple((tensor.shape, tensor.dtype) for tensor in inputs)
+        shapes = tuple((tensor.shape, tensor.dtype) for tensor in tensors)
         with torch.no_grad(), _float32_by_default():
             if shapes not in self._checked:
                 check = network_operations.ShapeCheck()
-                self.to("meta")._run([tensor.to("meta") for tensor in inputs], check)
+                self.to("meta")._run([tensor.to("meta") for tensor in tensors], check)
                 if len(self._checked) == _MAX_CHECKED:
                     self._checked.clear()
                 self._checked.add(shapes)
-            return self._run(inputs)
+            return self._run(tensors)
 
-    def predict_one(self, inputs, size=None):
+    def predict_one(
+        self, inputs: dict[str, torch.Tensor], size: int | None | tuple[int | None, ...] = None
+    ) -> Any:
         """The output for a batch of one: NumPy float32 (size,).
 
         Args:
@@ -276,9 +291,9 @@ class ExportedNetwork:
             return self._one(outputs, size)
         if not isinstance(outputs, list) or len(outputs) != len(size):
             raise NetworkError(f"{self._path}: its output is not a sequence of {len(size)}")
-        return [self._one(output, one) for output, one in zip(outputs, size, strict=True)]
+        return [self._one(output, width) for output, width in zip(outputs, size, strict=True)]
 
-    def _one(self, output, size):
+    def _one(self, output, size) -> np.ndarray:
         if (
             not isinstance(output, torch.Tensor)
             or output.dtype != torch.float32
@@ -385,20 +400,25 @@ def _export(module, inputs):
     targets = {spec.arg.name: spec.target for spec in signature.input_specs}
     names = dict(zip(signature.user_inputs, inputs, strict=True))
     python_names = {getattr(operator, n.partition(".")[2]): n for n in network_operations.PYTHON}
-    references, tensors, nodes = {}, {}, []
+    references = {}
+    tensors = {}
+    nodes = []
+    outputs = None
     for node in exported.graph.nodes:
         if node.op == "output":
-            outputs = pytree.tree_unflatten(node.args[0], exported.call_spec.out_spec)
+            structure = exported.call_spec.out_spec
+            assert structure is not None
+            outputs = pytree.tree_unflatten(node.args[0], structure)
         elif node.name in names:
             references[node] = {"input": names[node.name]}
         elif node in needed and node.op == "placeholder":
             # A copy, because a view would be saved with all of the storage it is a view of.
-            tensors[node.name] = stored[targets[node.name]].detach().clone().contiguous()
+            tensors[node.name] = stored[str(targets[node.name])].detach().clone().contiguous()
             references[node] = {"tensor": node.name}
         elif node in needed:
             name = python_names.get(node.target, str(node.target))
-            args, kwargs = _encode(node.args, references), dict(node.kwargs)
-            kwargs = {key: _encode(value, references) for key, value in kwargs.items()}
+            args = _encode(node.args, references)
+            kwargs = {key: _encode(value, references) for key, value in node.kwargs.items()}
             nodes.append([node.name, name, args, kwargs])
             references[node] = {"node": node.name}
     outputs = _encode(outputs, references)
@@ -409,10 +429,11 @@ def _compare(network, module, inputs):
     """Raise NetworkError unless both compute the same for all `_BATCH_SIZES`."""
     for size in _BATCH_SIZES:
         batch = {name: tensor[:size] for name, tensor in inputs.items()}
-        saved, expected = pytree.tree_leaves(network(**batch)), pytree.tree_leaves(module(**batch))
+        saved = pytree.tree_leaves(network(**batch))
+        expected = pytree.tree_leaves(module(**batch))
         try:
-            for one, other in zip(saved, expected, strict=True):
-                torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5, equal_nan=True)
+            for ours, theirs in zip(saved, expected, strict=True):
+                torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5, equal_nan=True)
         except (AssertionError, ValueError) as error:
             raise NetworkError(
                 "saved, it would behave differently; does its forward depend on values or on the "
@@ -425,9 +446,9 @@ def _encode(value, references):
     if isinstance(value, torch.fx.Node):
         return references[value]
     if isinstance(value, (list, tuple)):
-        return [_encode(one, references) for one in value]
+        return [_encode(item, references) for item in value]
     if isinstance(value, dict):
-        return {"dict": {key: _encode(one, references) for key, one in value.items()}}
+        return {"dict": {key: _encode(item, references) for key, item in value.items()}}
     if isinstance(value, torch.device):
         return {"device": "of the program"}
     if isinstance(value, (torch.dtype, torch.layout, torch.memory_format)):
@@ -446,12 +467,12 @@ class _Slot(int):
 
 def _decode(value, slots, device):
     if isinstance(value, list):
-        return [_decode(one, slots, device) for one in value]
+        return [_decode(item, slots, device) for item in value]
     if not isinstance(value, dict):
         return value
     ((kind, content),) = value.items()
     if kind == "dict":
-        return {key: _decode(one, slots, device) for key, one in content.items()}
+        return {key: _decode(item, slots, device) for key, item in content.items()}
     if kind == "device":
         return device
     if kind == "torch":
@@ -466,13 +487,13 @@ def _has_slots(value):
     return any(map(_has_slots, value)) if isinstance(value, list) else isinstance(value, _Slot)
 
 
-def _fill(value, values):
+def _fill(value: Any, values: list) -> Any:
     """A decoded argument or output, with the values its slots stand for."""
     kind = type(value)
     if kind is _Slot:
         return values[value]
     if kind is list:
-        return [_fill(one, values) for one in value]
+        return [_fill(item, values) for item in value]
     if kind is dict:
-        return {key: _fill(one, values) for key, one in value.items()}
+        return {key: _fill(item, values) for key, item in value.items()}
     return value

@@ -12,13 +12,17 @@ number of groups. A network file (`networks.exported_networks`) may come from a 
 """
 
 import operator
+from collections.abc import Callable
+from typing import Any
 
 import torch
 
 MAX_NODES = 20_000
 """Operations in a network."""
-MAX_VALUES, MAX_DEPTH = 1_000_000, 32
-"""Values in a file, arguments and metadata included, and nested lists or dicts."""
+MAX_VALUES = 1_000_000
+"""Values in a file, arguments and metadata included."""
+MAX_DEPTH = 32
+"""Nested lists or dicts."""
 MAX_ELEMENTS = 2**26
 """Numbers in a tensor, stored or computed."""
 MAX_COMPUTED = 2**28
@@ -63,7 +67,7 @@ class NetworkError(ValueError):
     """A network that cannot be saved, or a network file that cannot be loaded or run."""
 
 
-def allow(name):
+def allow(name: str) -> None:
     """Allow one more operation, such as `aten.erf.default`, in networks of your own.
 
     Raises ValueError: there is none of that name, or it does more than compute (random operations,
@@ -83,7 +87,7 @@ def allow(name):
     ALLOWED.add(name)
 
 
-def find(name):
+def find(name: Any) -> Any:
     """The function of an operation's name. Raises NetworkError: it is not allowed."""
     if isinstance(name, str):
         if name in PYTHON:
@@ -105,15 +109,17 @@ def _aten(name):
     return None
 
 
-def check_file(content):
+def check_file(content: dict[str, Any]) -> None:
     """Raise NetworkError unless the content of a file is plain data, and not too much of it.
 
     `weights_only` still makes a few kinds of objects; a network has fewer.
     """
-    left, count = [(content, 0)], 0
+    left: list[tuple[Any, int]] = [(content, 0)]
+    count = 0
     while left:
         value, depth = left.pop()
-        kind, count = type(value), count + 1
+        kind = type(value)
+        count += 1
         if count + len(left) > MAX_VALUES or depth > MAX_DEPTH:
             raise NetworkError(
                 f"it has more than {MAX_VALUES:,} values, or more than {MAX_DEPTH} nested lists"
@@ -133,7 +139,7 @@ def check_file(content):
         raise NetworkError(f"it has more than {MAX_NODES:,} operations")
 
 
-def constant(name):
+def constant(name: Any) -> Any:
     """The dtype, layout or memory format of a name. Raises NetworkError: not one of those."""
     if not isinstance(name, str) or name not in _CONSTANTS:
         raise NetworkError(f"torch.{name} is not allowed in a network")
@@ -146,12 +152,12 @@ class ShapeCheck:
     def __init__(self):
         self.computed = 0
 
-    def before(self, name, args):
+    def before(self, name: str, args: list) -> None:
         """Raise NetworkError if a kernel would trust these arguments and should not."""
         if name in _RULES and not _RULES[name](*args):
             raise NetworkError(f"{name}: its arguments are out of range")
 
-    def after(self, function, result):
+    def after(self, function: Callable, result: Any) -> None:
         """Raise NetworkError if a result is no plain tensor, or too large."""
         schema = getattr(function, "_schema", None)
         view = schema is not None and any(one.alias_info is not None for one in schema.returns)

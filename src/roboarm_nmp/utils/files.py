@@ -7,18 +7,20 @@ import os
 import tempfile
 import uuid
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 
-def cache_folder():
+def cache_folder() -> Path:
     """The folder for files that can be made again. It may not exist yet.
 
     `$ROBOARM_NMP_CACHE`, by default `roboarm-nmp` in `$XDG_CACHE_HOME`, by default `~/.cache`.
     Raises OSError: there is no home folder.
     """
-    own, base = os.environ.get("ROBOARM_NMP_CACHE"), os.environ.get("XDG_CACHE_HOME", "")
-    if own:
-        return Path(own).absolute()
+    folder = os.environ.get("ROBOARM_NMP_CACHE")
+    if folder:
+        return Path(folder).absolute()
+    base = os.environ.get("XDG_CACHE_HOME", "")
     if os.path.isabs(base):  # a relative path counts as none (XDG Base Directory Specification)
         return Path(base, "roboarm-nmp")
     try:
@@ -27,7 +29,7 @@ def cache_folder():
         raise OSError(f"{error}; ROBOARM_NMP_CACHE may name a cache folder") from error
 
 
-def write_atomically(path, contents):
+def write_atomically(path: str | Path, contents: bytes | memoryview) -> None:
     """Write bytes: at every moment, whatever happens, `path` is the old file or the whole new one.
 
     A device or a pipe, such as `/dev/stdout`, is written to directly. Raises OSError if the file
@@ -43,7 +45,7 @@ def write_atomically(path, contents):
 
 
 @contextlib.contextmanager
-def new_contents(path):
+def new_contents(path: str | Path) -> Iterator[Path]:
     """A context whose value is the path of an empty file, which replaces `path` at its end.
 
     The contents are first flushed to the disk: after a power cut too, `path` is the old file or the
@@ -68,12 +70,13 @@ def new_contents(path):
         raise
 
 
-def clear_leftovers(folder, name="*"):
+def clear_leftovers(folder: str | Path, name: str | None = None) -> None:
     """Delete temporary files that killed processes left in a folder, of the file `name` or of all.
 
     A process that is still writing holds a lock.
     """
-    for temporary in Path(folder).glob(f".{name if name == '*' else glob.escape(name)}.*.tmp"):
+    pattern = "*" if name is None else glob.escape(name)
+    for temporary in Path(folder).glob(f".{pattern}.*.tmp"):
         with contextlib.suppress(OSError), open(temporary, "rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             temporary.unlink()
@@ -83,7 +86,7 @@ def _is_device(path):
     return path.exists() and (not path.is_file() or path.absolute().parts[1] in ("dev", "proc"))
 
 
-def check_writable(path):
+def check_writable(path: str | Path) -> None:
     """Raise ValueError if no file can be written at `path`. Call it before long work."""
     path = Path(path)
     if path.is_dir():
@@ -97,18 +100,20 @@ def check_writable(path):
         raise ValueError(f"cannot write {path}: {error.strerror}") from error
 
 
-def check_folder(path):
+def check_folder(path: str | Path) -> None:
     """Raise ValueError unless files can be written in a folder, which need not exist yet."""
     path = Path(path)
     try:
-        folder = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+        folder = path.absolute()
+        while not folder.exists():
+            folder = folder.parent
     except OSError as error:
         raise ValueError(f"cannot write {path}: {error.strerror}") from error
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
         raise ValueError(f"{path}: {folder} is not a folder that can be written")
 
 
-def check_archive(path):
+def check_archive(path: Path) -> None:
     """Detect damage in a file of `torch.save` that `torch.load` ignores.
 
     Raises:

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import sys
+from collections.abc import Iterable
 
 from tqdm import tqdm
 
@@ -26,15 +27,15 @@ class _LogFile:
 
 
 def progress_bar(
-    iterable=None,
-    description="",
-    total=None,
-    unit="step",
-    initial=0,
-    transient=False,
-    disable=False,
-    smoothing=0.3,
-):
+    iterable: Iterable | None = None,
+    description: str = "",
+    total: int | None = None,
+    unit: str = "step",
+    initial: int = 0,
+    transient: bool = False,
+    disable: bool = False,
+    smoothing: float = 0.3,
+) -> tqdm:
     """A `tqdm` bar.
 
     Args:
@@ -48,21 +49,31 @@ def progress_bar(
         disable: show nothing.
         smoothing: of the rate, as in tqdm: 0 for the mean, 1 for the latest.
     """
-    options = {"total": total, "initial": initial, "unit": unit, "smoothing": smoothing}
-    options |= {"leave": not transient, "disable": disable}
+    common = {
+        "total": total,
+        "initial": initial,
+        "unit": unit,
+        "smoothing": smoothing,
+        "leave": not transient,
+        "disable": disable,
+    }
     if sys.stderr.isatty():
-        return tqdm(iterable, desc=description, mininterval=0.2, **options)
-    form = (
-        "{desc}{percentage:.0f}%, {n_fmt}/{total_fmt}, {elapsed}<{remaining}, {rate_fmt}{postfix}"
+        return tqdm(iterable, desc=description, mininterval=0.2, **common)
+    return _LogBar(
+        iterable,
+        desc=f"{description}: " if description else "",
+        bar_format="{desc}{percentage:.0f}%, {n_fmt}/{total_fmt}, {elapsed}<{remaining}, "
+        "{rate_fmt}{postfix}",
+        file=_LogFile(),
+        mininterval=LOG_INTERVAL,
+        maxinterval=LOG_INTERVAL,  # tqdm draws slow bars at least so often
+        delay=LOG_INTERVAL if transient else 0,
+        position=0,  # at another one, tqdm moves the cursor
+        **common,
     )
-    options |= {"desc": f"{description}: " if description else "", "mininterval": LOG_INTERVAL}
-    # (tqdm moves the cursor to a bar at another position, and draws slow bars every `maxinterval`.)
-    options |= {"position": 0, "maxinterval": LOG_INTERVAL}
-    options |= {"delay": LOG_INTERVAL if transient else 0, "file": _LogFile(), "bar_format": form}
-    return _LogBar(iterable, **options)
 
 
-def write_line(text):
+def write_line(text: str) -> None:
     """Write a line on stderr, above a bar."""
     if multiprocessing.parent_process() is not None and sys.stderr.isatty():
         text = f"\r\x1b[K{text}"  # replaces the bar of the parent, which will draw it again

@@ -12,6 +12,7 @@ import select
 import signal
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 
 def program() -> str:
@@ -29,7 +30,7 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM arrived. Raised in the main thread, like the KeyboardInterrupt of Ctrl-C."""
 
 
-def end_with_one_line(advice):
+def end_with_one_line(advice: str) -> None:
     """From now on, Ctrl-C and SIGTERM unwind the program and end it as `exit_interrupted` does.
 
     Call it in the main thread of a command, not in a library: it replaces `sys.excepthook`.
@@ -62,7 +63,7 @@ def _output_is_closed():
     return True
 
 
-def exit_interrupted(interrupt, advice):
+def exit_interrupted(interrupt: KeyboardInterrupt, advice: str) -> NoReturn:
     """Print one line on stderr and end the process.
 
     Args:
@@ -70,6 +71,8 @@ def exit_interrupted(interrupt, advice):
             shells report a process that the signal has ended.
         advice: how to continue, or what was kept.
     """
-    terminated = isinstance(interrupt, Terminated)
-    print(f"{'terminated' if terminated else 'interrupted'}; {advice}", file=sys.stderr)
-    sys.exit(143 if terminated else 130)
+    if isinstance(interrupt, Terminated):
+        print(f"terminated; {advice}", file=sys.stderr)
+        sys.exit(128 + signal.SIGTERM)
+    print(f"interrupted; {advice}", file=sys.stderr)
+    sys.exit(128 + signal.SIGINT)

@@ -15,13 +15,24 @@ import re
 import signal
 import socket
 import threading
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
+from typing import Any, TypeVar
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 MAX_DEATHS = 5  # without a single result between them
 
 
-def run(make_worker, arguments, jobs, workers, warn=print):
+def run(
+    make_worker: Callable[..., Callable[[Job], Result]],
+    arguments: tuple,
+    jobs: Iterable[Job],
+    workers: int,
+    warn: Callable[[str], Any] = print,
+) -> Generator[Result, None, None]:
     """Yield the results of all jobs in the order of completion, from `workers` processes.
 
     A process that dies is replaced, its job is repeated, and `warn` is called with a sentence. If
@@ -32,7 +43,8 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             between.
         Exception: the exception of a job.
     """
-    waiting, deaths = collections.deque(jobs), 0
+    waiting = collections.deque(jobs)
+    deaths = 0
     while waiting:
         with starting_processes():
             executor = concurrent.futures.ProcessPoolExecutor(
@@ -68,7 +80,9 @@ def run(make_worker, arguments, jobs, workers, warn=print):
             executor.shutdown(cancel_futures=True)
 
 
-def in_order(work, jobs, workers):
+def in_order(
+    work: Callable[[Job], Result], jobs: Iterable[Job], workers: int
+) -> Generator[Result, None, None]:
     """Yield `work(job)` of every job, in their order; `workers` processes work ahead.
 
     Args:
@@ -83,13 +97,15 @@ def in_order(work, jobs, workers):
     if workers == 0:
         yield from map(work, jobs)
         return
-    context, jobs, running = multiprocessing.get_context("spawn"), iter(jobs), collections.deque()
+    waiting = iter(jobs)
+    running = collections.deque()
     # Not ended by the SIGTERM of a process group (`timeout`): the caller finishes its step first.
-    begin = (_same, (work,), False)
-    executor = concurrent.futures.ProcessPoolExecutor(workers, context, _start, begin)
+    executor = concurrent.futures.ProcessPoolExecutor(
+        workers, multiprocessing.get_context("spawn"), _start, (_same, (work,), False)
+    )
     try:
         while True:
-            for job in itertools.islice(jobs, 2 * workers - len(running)):
+            for job in itertools.islice(waiting, 2 * workers - len(running)):
                 with starting_processes():
                     running.append(executor.submit(_work, job))
             if not running:
@@ -109,17 +125,19 @@ def _same(work):
 
 
 @contextlib.contextmanager
-def starting_processes():
+def starting_processes() -> Iterator[None]:
     """A context for starting processes: SIGINT and SIGTERM, also of a terminal, wait for its end.
 
     Neither this process is interrupted between two of its steps, nor a new one killed while this
     one writes to it, which would wait for ever. New processes begin with both signals blocked.
     """
-    numbers, arrived, handlers = {signal.SIGINT, signal.SIGTERM}, [], {}
+    numbers = {signal.SIGINT, signal.SIGTERM}
+    arrived = []
+    handlers = {}
     if threading.current_thread() is threading.main_thread():
         for number in numbers:  # not only blocked: another thread may receive them
             if callable(signal.getsignal(number)):
-                handlers[number] = signal.signal(number, lambda one, frame: arrived.append(one))
+                handlers[number] = signal.signal(number, lambda sent, frame: arrived.append(sent))
     resource_tracker.ensure_running()  # before: its start unblocks both signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
@@ -132,7 +150,7 @@ def starting_processes():
             signal.raise_signal(number)
 
 
-def begin_worker(is_terminable=True):
+def begin_worker(is_terminable: bool = True) -> None:
     """What a process of `starting_processes` does first. It ends when its parent was killed.
 
     Args:
@@ -152,7 +170,9 @@ def _start(make_worker, arguments, is_terminable=True):
 
 def _follow_parent():
     """End this worker when its parent was killed. Otherwise it would wait for work for ever."""
-    multiprocessing.parent_process().join()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
     os._exit(1)
 
 
@@ -160,36 +180,44 @@ def _work(job):
     return _worker(job)
 
 
-def check_ray(address):
+def check_ray(address: str | None) -> None:
     """Raise ValueError unless an address may be that of a Ray cluster, or is None: no cluster."""
     if address is None:
         return
-    match = re.fullmatch(r"([^/\s:]+):(\d{1,5})", address)
-    if address != "auto" and (not match or int(match[2]) > 65_535):
+    host, _, port = address.rpartition(":")
+    if address != "auto" and not (
+        re.fullmatch(r"[^/\s:]+", host) and re.fullmatch(r"\d{1,5}", port) and int(port) < 2**16
+    ):
         raise ValueError(f"--ray-address must be `auto` or HOST:PORT, got {address!r}")
     if importlib.util.find_spec("ray") is None:
         raise ValueError('--ray-address needs the extra `cluster`: pip install -e ".[cluster]"')
     if address == "auto":
         return
     try:  # without an answer, Ray would wait
-        socket.create_connection((match[1], int(match[2])), timeout=5).close()
+        socket.create_connection((host, int(port)), timeout=5).close()
     except OSError as error:
         raise ValueError(f"no Ray cluster at {address}: {error}") from error
 
 
-def run_on_ray(address, make_worker, arguments, jobs):
+def run_on_ray(
+    address: str,
+    make_worker: Callable[..., Callable[[Job], Result]],
+    arguments: tuple,
+    jobs: Iterable[Job],
+) -> Generator[Result, None, None]:
     """Like `run`, on the Ray cluster at `address`. Ray repeats the jobs of lost workers and nodes.
 
     The cluster's machines need this project installed. Raises ConnectionError if there is no
     cluster at the address.
     """
-    import ray
+    import ray  # pyright: ignore[reportMissingImports]
 
     ray.init(address=address, log_to_driver=False, logging_level="warning")
     try:
         # Spread over all nodes. Retried without end, because nodes may be lost.
         work = ray.remote(num_cpus=1, max_retries=-1, scheduling_strategy="SPREAD")(_work_on_ray)
-        waiting, running = collections.deque(jobs), []
+        waiting = collections.deque(jobs)
+        running = []
         while waiting or running:
             capacity = 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
             while waiting and len(running) < capacity:
