@@ -172,7 +172,7 @@ def test_damaged_shard_is_rejected_by_name(whole, tmp_path):
     at = good.index(Observations(whole).read(1, "configuration").tobytes())
     bad[at + 5] ^= 16
     (tmp_path / "shard_00001.h5").write_bytes(bad)
-    with pytest.raises(DatasetError, match=r"shard_00001\.h5: array configuration is corrupt"):
+    with pytest.raises(DatasetError, match=r"shard_00001\.h5: configuration is missing or corrupt"):
         Observations(tmp_path).read(1, "configuration")
 
 

@@ -306,7 +306,8 @@ def _vamp_problem(name, node, robot):
     goals = [_angles(goal, "a goal", robot) for goal in sequence(nodes, "goals", MAX_GOALS)]
     if not goals:
         raise Mistake(nodes, "no goal")
-    obstacles = vamp_obstacles(fields.get("obstacles", node))
+    inner = fields.get("obstacles")
+    obstacles = vamp_obstacles(node if inner is None else inner)
     return Problem(name, start, np.array(goals), None, checked_scene(node, obstacles, robot))
 
 

@@ -140,7 +140,7 @@ def read_array(file: h5py.File, path: str | Path, name: str) -> np.ndarray:
     try:
         return np.asarray(get_array(path, file, name)[()])
     except OSError as error:
-        raise DatasetError(f"{path}: array {name} is corrupt ({error})") from error
+        raise DatasetError(f"{path}: {name} is missing or corrupt ({error})") from error
 
 
 def read_obstacles(file: h5py.File, path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
