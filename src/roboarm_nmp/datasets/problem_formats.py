@@ -276,8 +276,8 @@ def _goal_pose(node, robot):
         raise Mistake(node, f"the frame {shorten(frame)!r} does not move with the end effector")
     end_at = end_at + end_rotation @ np.array(robot.end_effector_offset)
     turn = Rotation.from_matrix(rotation.T @ end_rotation).as_quat(canonical=True)
-    pose = compose_poses(position, quaternion, rotation.T @ (end_at - at), turn)
-    return np.concatenate(pose)
+    x, y, z = (rotation.T @ (end_at - at)).tolist()
+    return np.concatenate(compose_poses(position, quaternion, (x, y, z), turn))
 
 
 # --- VAMP
