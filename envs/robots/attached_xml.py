@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -24,21 +24,23 @@ def attached_name(number: int) -> str:
     return f"attached object {number}"
 
 
-def attached_elements(objects) -> Iterator[ElementTree.Element]:
+def attached_elements(objects: Iterable) -> Iterator[ElementTree.Element]:
     """The links and joints of objects, XML elements."""
-    for number, one in enumerate(objects):
-        link = ElementTree.Element("link", name=attached_name(number))
+    for number, attached in enumerate(objects):
+        name = attached_name(number)
+        link = ElementTree.Element("link", name=name)
         add_inertial(link, *LIGHT)
         for tag in ("visual", "collision"):
             element = ElementTree.SubElement(link, tag)
-            _add_shape(element, one)
+            _add_shape(element, attached)
             if tag == "visual":
-                material = ElementTree.SubElement(element, "material", name=attached_name(number))
+                material = ElementTree.SubElement(element, "material", name=name)
                 ElementTree.SubElement(material, "color", rgba=COLOUR)
-        joint = ElementTree.Element("joint", name=attached_name(number), type="fixed")
-        ElementTree.SubElement(joint, "parent", link=one.link)
-        ElementTree.SubElement(joint, "child", link=attached_name(number))
-        yield from (link, joint)
+        joint = ElementTree.Element("joint", name=name, type="fixed")
+        ElementTree.SubElement(joint, "parent", link=attached.link)
+        ElementTree.SubElement(joint, "child", link=name)
+        yield link
+        yield joint
 
 
 def add_inertial(link: ElementTree.Element, mass: str, moment: str) -> None:
@@ -49,20 +51,21 @@ def add_inertial(link: ElementTree.Element, mass: str, moment: str) -> None:
     ElementTree.SubElement(inertial, "inertia", moments)
 
 
-def _add_shape(element, one):
+def _add_shape(element, attached):
     """Add origin and geometry of an object to a `visual` or `collision` element."""
-    shape = one.shape
-    orientation = getattr(shape, "orientation", (0.0, 0.0, 0.0, 1.0))
-    origin = {"xyz": _text(shape.position), "rpy": _text(_roll_pitch_yaw(orientation))}
-    ElementTree.SubElement(element, "origin", **origin)
+    shape = attached.shape
+    angles = _roll_pitch_yaw(getattr(shape, "orientation", (0.0, 0.0, 0.0, 1.0)))
+    ElementTree.SubElement(element, "origin", xyz=_text(shape.position), rpy=_text(angles))
     geometry = ElementTree.SubElement(element, "geometry")
     if hasattr(shape, "vertices"):
-        ElementTree.SubElement(geometry, "mesh", filename=_obj_file(shape.vertices, one.triangles))
+        ElementTree.SubElement(
+            geometry, "mesh", filename=_obj_file(shape.vertices, attached.triangles)
+        )
     elif hasattr(shape, "size"):
         ElementTree.SubElement(geometry, "box", size=_text(shape.size))
     elif hasattr(shape, "length"):
-        sizes = {"radius": _text([shape.radius]), "length": _text([shape.length])}
-        ElementTree.SubElement(geometry, "cylinder", **sizes)
+        radius, length = _text([shape.radius]), _text([shape.length])
+        ElementTree.SubElement(geometry, "cylinder", radius=radius, length=length)
     else:
         ElementTree.SubElement(geometry, "sphere", radius=_text([shape.radius]))
 

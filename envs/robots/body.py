@@ -2,7 +2,7 @@
 
 import contextlib
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -236,7 +236,9 @@ def _readable_urdf(robot):
         yield urdf
 
 
-def resolve(filename: str, urdf, packages=None) -> str:
+def resolve(
+    filename: str, urdf: str | Path, packages: Mapping[str, str | Path] | None = None
+) -> str:
     """The absolute path of a mesh in a URDF, `package://name/...` or relative to the URDF.
 
     Args:
@@ -249,7 +251,7 @@ def resolve(filename: str, urdf, packages=None) -> str:
     for scheme in ("package://", "model://"):
         if filename.startswith(scheme):
             name, _, rest = filename.removeprefix(scheme).partition("/")
-            if name in (packages or {}):
+            if packages and name in packages:
                 return str(Path(packages[name]).absolute() / rest)
             above = [up for up in (folder, *folder.parents) if up.name == name]
             candidates = [*(up / rest for up in above), folder / name / rest, folder / rest]

@@ -8,11 +8,13 @@ import hashlib
 import importlib.metadata
 import json
 import re
+from collections.abc import Callable
 
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.utils.files import cache_folder, write_atomically
 
 
-def cached(name, robot, settings, compute):
+def cached(name: str, robot: Robot, settings: list, compute: Callable):
     """The result of `compute()`, from the cache where it has it.
 
     Args:
@@ -26,12 +28,12 @@ def cached(name, robot, settings, compute):
     xml = re.sub(r'filename="[^"]*"', "", robot.xml)
     version = importlib.metadata.version("pybullet")
     key = json.dumps([name, robot.fingerprint, xml, settings, version])
-    name = f"{hashlib.sha256(key.encode()).hexdigest()}.json"
+    file = f"{hashlib.sha256(key.encode()).hexdigest()}.json"
     with contextlib.suppress(OSError, ValueError):
-        (result,) = json.loads((cache_folder() / "robots" / name).read_bytes())
+        (result,) = json.loads((cache_folder() / "robots" / file).read_bytes())
         return result
     result = compute()
     with contextlib.suppress(OSError):  # without a folder to write to, it is computed each time
         (cache_folder() / "robots").mkdir(parents=True, exist_ok=True)
-        write_atomically(cache_folder() / "robots" / name, json.dumps([result]).encode())
+        write_atomically(cache_folder() / "robots" / file, json.dumps([result]).encode())
     return result

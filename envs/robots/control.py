@@ -1,8 +1,11 @@
 """How an arm is driven: the physics step, and the position controllers' gains."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from roboarm_nmp.envs.robots.body import Body
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.utils.bullet import pybullet as p
 
 # One environment step is SUBSTEPS physics steps of TIME_STEP seconds under PyBullet's position
@@ -16,11 +19,11 @@ GAINS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 NUM_POSES, NUM_STEPS, STEP = 16, 12, 0.03  # of a calibration; length of a step (normalised)
 
 
-def calibrate(robot, gains=GAINS, seed=0):
-    """Gains with which an arm executes commanded steps best, one for all joints.
+def calibrate(robot: Robot, gains: Sequence[float] = GAINS, seed: int = 0) -> tuple[float, float]:
+    """The gain, one for all joints, with which an arm executes commanded steps best.
 
-    From random configurations, without contacts, the arm is
-    commanded steps of 0.03 (normalised) in random directions, as in an environment.
+    From random configurations, without contacts, the arm is commanded steps of 0.03 (normalised)
+    in random directions, as in an environment.
 
     Returns:
         gain, and the share of the commanded displacement that was executed with it (1: all of it).

@@ -11,9 +11,13 @@ wrist, and those with iterations (Robotics Toolbox, TRAC-IK) return one solution
 joints that mimic another one. Speed and success: docs/benchmark/performance.md.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from roboarm_nmp.envs.robots.kernels import CHAIN_COLUMNS, POSITION, ROTATION, solve_batch
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import matrix
 
 MAX_DISTANCE, MAX_ANGLE = 1e-4, 1e-3
@@ -27,8 +31,14 @@ _SAME = 1e-2
 
 
 def inverse_kinematics(
-    robot, pose, seed=0, num_seeds=NUM_SEEDS, checker=None, margin=0.0, near=None
-):
+    robot: Robot,
+    pose: ArrayLike,
+    seed: int | Sequence[int] = 0,
+    num_seeds: int = NUM_SEEDS,
+    checker=None,
+    margin: float = 0.0,
+    near: ArrayLike | None = None,
+) -> np.ndarray | list[np.ndarray]:
     """Configurations whose end effector has a pose, within `MAX_DISTANCE` and `MAX_ANGLE`.
 
     They are inside the joint limits, and at least 0.01 apart (L2, normalised). Arms with more than
@@ -56,7 +66,8 @@ def inverse_kinematics(
     poses, joints = np.asarray(pose, dtype=np.float64), robot.num_joints
     if poses.ndim not in (1, 2) or poses.shape[-1] != 7:
         raise ValueError(f"a pose is 7 numbers, position and quaternion, got shape {poses.shape}")
-    single, poses = poses.ndim == 1, poses.reshape(-1, 7)
+    is_single = poses.ndim == 1
+    poses = poses.reshape(-1, 7)
     norms = np.linalg.norm(poses[:, 3:], axis=1)
     if not np.isfinite(poses).all() or not (norms > 1e-6).all():
         raise ValueError(f"a pose must be finite, with a quaternion that is not zero, got {pose}")
@@ -69,32 +80,39 @@ def inverse_kinematics(
         if near.shape[-1:] != (joints,) or not np.isfinite(near).all():
             raise ValueError(f"near must be {joints} finite numbers, got {near}")
         states[:, 0] = np.clip(robot.normalise(near), -1.0, 1.0)
-    origin = states[:, 0].copy()
+    origins = states[:, 0].copy()
     rotations = [matrix(quaternion) for quaternion in poses[:, 3:] / norms[:, None]]
     targets = np.hstack([poses[:, :3], np.reshape(rotations, (-1, 9))])
     solved = np.empty(states.shape[:2], dtype=np.bool_)
-    limits = _STOP * MAX_DISTANCE, _STOP * MAX_ANGLE
-    solve_batch(states, kinematic_chain(robot), targets, *limits, ITERATIONS, solved)
-    found = []
-    for good, own, start in zip(solved, states, origin, strict=True):
-        own = own[good]
-        if checker is not None and len(own):
-            own = own[checker.is_free(own, margin=margin)]
-        own = own[np.argsort(np.linalg.norm(own - start, axis=1), kind="stable")]
-        found.append(robot.denormalise(_distinct(own)))
-    return found[0] if single else found
+    solve_batch(
+        states,
+        kinematic_chain(robot),
+        targets,
+        _STOP * MAX_DISTANCE,
+        _STOP * MAX_ANGLE,
+        ITERATIONS,
+        solved,
+    )
+    solutions = []
+    for is_solved, of_pose, origin in zip(solved, states, origins, strict=True):
+        of_pose = of_pose[is_solved]
+        if checker is not None and len(of_pose):
+            of_pose = of_pose[checker.is_free(of_pose, margin=margin)]
+        order = np.argsort(np.linalg.norm(of_pose - origin, axis=1), kind="stable")
+        solutions.append(robot.denormalise(_distinct(of_pose[order])))
+    return solutions[0] if is_single else solutions
 
 
 def _distinct(states):
     """The states (k, n) that are not near an earlier one."""
-    kept = []
+    distinct = []
     for state in states:
-        if all(np.linalg.norm(state - other) > _SAME for other in kept):
-            kept.append(state)
-    return np.reshape(kept, (-1, states.shape[1]))
+        if all(np.linalg.norm(state - other) > _SAME for other in distinct):
+            distinct.append(state)
+    return np.reshape(distinct, (-1, states.shape[1]))
 
 
-def kinematic_chain(robot):
+def kinematic_chain(robot: Robot) -> np.ndarray:
     """The frames between base and end effector, as `kernels` has them."""
     frames, index = [], robot.end_effector_frame
     while index >= 0:
@@ -110,7 +128,8 @@ def kinematic_chain(robot):
         joint, scale = frame.joint, frame.multiplier
         value = scale * middle[joint] + frame.offset
         row[:POSITION] = joint, frame.is_prismatic, value, scale * half[joint]
-        row[POSITION:] = *frame.position, *frame.rotation
+        row[POSITION:ROTATION] = frame.position
+        row[ROTATION:] = frame.rotation
     chain[-1, POSITION:ROTATION] = robot.end_effector_position
     chain[-1, ROTATION:] = robot.end_effector_rotation.ravel()
     return chain

@@ -37,7 +37,8 @@ def _yaw(angle):
 
 
 _HAND = (0.0, 0.0, FLANGE_LENGTH), _yaw(HAND_YAW)
-_LEFT, _RIGHT = (((0.0, side * FINGER_OPENING, HAND_TO_FINGER), _yaw(0.0)) for side in (1.0, -1.0))
+_LEFT = (0.0, FINGER_OPENING, HAND_TO_FINGER), _yaw(0.0)
+_RIGHT = (0.0, -FINGER_OPENING, HAND_TO_FINGER), _yaw(0.0)
 _JOINTS = (
     *(f"panda_joint{joint}" for joint in range(1, 9)),
     *("panda_hand_joint", "panda_finger_joint1", "panda_finger_joint2", "panda_grasptarget_hand"),
@@ -110,6 +111,6 @@ PANDA = Robot(
 )
 
 
-def scale_of(robot):
+def scale_of(robot: Robot) -> float:
     """A robot's reach as a share of the Panda's: what its random scenes and sensors scale with."""
     return 1.0 if robot.arm == PANDA else robot.reach / PANDA.reach

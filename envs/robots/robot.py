@@ -261,7 +261,7 @@ class Robot:
 
     def is_within(
         self, configuration: np.ndarray, limits: Literal["urdf", "datasheet"] = "urdf"
-    ) -> np.ndarray:
+    ) -> np.ndarray | np.bool_:
         """Whether joint angles (..., n) are inside the `position_limits`: bool (...)."""
         lower, upper = self.position_limits(limits)
         return ((configuration >= lower) & (configuration <= upper)).all(-1)

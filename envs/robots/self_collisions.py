@@ -6,11 +6,13 @@ shapes overlap by design), or that never do.
 
 import dataclasses
 import itertools
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from roboarm_nmp.envs.robots.body import body_alone
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.untrusted import RobotError, read_xml
 from roboarm_nmp.utils.bullet import pybullet as p
 
@@ -19,7 +21,7 @@ SAMPLES = 20_000
 ALWAYS = 0.95
 
 
-def disabled_pairs(srdf, link_index):
+def disabled_pairs(srdf: str | Path, link_index: Mapping[str, int]) -> set[tuple[int, int]]:
     """Pairs (low, high) of PyBullet's link indices that an SRDF disables.
 
     Args:
@@ -32,15 +34,18 @@ def disabled_pairs(srdf, link_index):
     path = Path(srdf)
     pairs = set()
     for element in read_xml(path).iter("disable_collisions"):
-        names = element.get("link1"), element.get("link2")
+        names = element.get("link1", ""), element.get("link2", "")
         for name in names:
             if name not in link_index:
                 raise RobotError(f"{path}: disable_collisions: the URDF has no link {name!r}")
-        pairs.add(tuple(sorted(link_index[name] for name in names)))
+        a, b = sorted((link_index[names[0]], link_index[names[1]]))
+        pairs.add((a, b))
     return pairs
 
 
-def sample_pairs(robot, disabled, samples=SAMPLES, seed=0):
+def sample_pairs(
+    robot: Robot, disabled: set[tuple[int, int]], samples: int = SAMPLES, seed: int = 0
+) -> tuple[tuple[tuple[int, int], ...], tuple[float, ...]]:
     """The pairs that collide in some random configurations, and a configuration without contacts.
 
     Args:
@@ -66,7 +71,8 @@ def sample_pairs(robot, disabled, samples=SAMPLES, seed=0):
     rng = np.random.default_rng(seed)
     configurations = rng.uniform(robot.lower, robot.upper, (samples, robot.num_joints))
     configurations[0] = (robot.lower + robot.upper) / 2
-    counts, colliding = dict.fromkeys(candidates, 0), []
+    counts = dict.fromkeys(candidates, 0)
+    colliding = []
     with body_alone(robot) as body:
         for configuration in configurations:
             body.set_configuration(configuration.tolist())

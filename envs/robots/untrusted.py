@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -46,7 +47,7 @@ class RobotError(ValueError):
     """A robot's description cannot be used; the message names the file and the reason."""
 
 
-def read_xml(path):
+def read_xml(path: Path) -> ElementTree.Element:
     """The first element of an XML file. Raises RobotError: it cannot be read, or is hostile."""
     try:
         size = path.stat().st_size
@@ -62,26 +63,29 @@ def read_xml(path):
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise RobotError(f"{path}: has a document type or entities, which no robot needs")
     # Some URDFs have extensions of other programs, with prefixes that they do not declare.
-    parser, builder, depth, number = expat.ParserCreate(), ElementTree.TreeBuilder(), 0, 0
+    parser, builder = expat.ParserCreate(), ElementTree.TreeBuilder()
+    depth = number = 0
 
     def start(tag, attributes):
         nonlocal depth, number
-        depth, number = depth + 1, number + 1
+        depth += 1
+        number += 1
         if tag.startswith("xacro:") and tag not in XACRO_LEFTOVERS:
             raise RobotError(f"{path}: has the element {tag}: run `xacro` on it first")
         if number > MAX_ELEMENTS:
             raise RobotError(f"{path}: more than {MAX_ELEMENTS:,} elements")
         if depth > MAX_DEPTH:
             raise RobotError(f"{path}: elements are nested more than {MAX_DEPTH} deep")
-        own = {n: value for n, value in attributes.items() if ":" not in n and n != "xmlns"}
-        builder.start(tag.replace(":", "_"), own)
+        plain = {n: value for n, value in attributes.items() if ":" not in n and n != "xmlns"}
+        builder.start(tag.replace(":", "_"), plain)
 
     def end(tag):
         nonlocal depth
         depth -= 1
         builder.end(tag.replace(":", "_"))
 
-    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
     try:
         parser.Parse(text, True)
         return builder.close()
@@ -89,7 +93,9 @@ def read_xml(path):
         raise RobotError(f"{path}: malformed XML: {error}") from error
 
 
-def bullet_indices(path, xml):
+def bullet_indices(
+    path: str | Path, xml: str
+) -> tuple[dict[str, int], dict[str, int], dict[str, int]]:
     """PyBullet's indices of joints and of links, and links' numbers of collision shapes.
 
     Three dicts from names. The base's index is -1.
@@ -117,6 +123,8 @@ def bullet_indices(path, xml):
             f"{path}: the convex hulls of the collision meshes have {vertices:,} vertices, at most "
             f"{MAX_HULL:,}: simplify the meshes"
         )
-    joints = {joint: index for index, (joint, _) in enumerate(names)}
-    links = {base: -1} | {link: index for index, (_, link) in enumerate(names)}
+    joints, links = {}, {base: -1}
+    for index, (joint, link) in enumerate(names):
+        joints[joint] = index
+        links[link] = index
     return joints, links, dict(zip(links, shapes, strict=True))

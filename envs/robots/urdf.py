@@ -202,6 +202,7 @@ def robot_from_urdf(
     urdf_velocity = velocities if min(velocities) > 0 else None
     datasheet = _datasheet_limits(tree, joints, bounds, datasheet_limits)
     middle = tuple(bounds.mean(1))
+    turn = np.array(base_orientation)
     robot = Robot(
         name=name or tree.root.get("name") or Path(path).stem,
         urdf=str(path),
@@ -238,13 +239,14 @@ def robot_from_urdf(
         contact_free=middle,
         observed_pose=middle,
         base_position=tuple(map(float, base_position)),
-        base_orientation=tuple((base_orientation / np.linalg.norm(base_orientation)).tolist()),
+        base_orientation=tuple((turn / np.linalg.norm(turn)).tolist()),
         datasheet_lower=datasheet[:, 0] if datasheet_limits else None,
         datasheet_upper=datasheet[:, 1] if datasheet_limits else None,
     )
     disabled = disabled_pairs(srdf, link_index) if srdf else set()
-    for a, b in tree.neighbours():
-        disabled.add(tuple(sorted((link_index[a], link_index[b]))))
+    for before, link in tree.neighbours():
+        a, b = sorted((link_index[before], link_index[link]))
+        disabled.add((a, b))
     pairs, contact_free = cached(
         "pairs", robot, [SAMPLES, sorted(disabled)], lambda: sample_pairs(robot, disabled)
     )

@@ -50,7 +50,7 @@ class UrdfTree:
         RobotError: the file cannot be used. Methods raise it, too.
     """
 
-    def __init__(self, path: Path, packages: Mapping[str, str] | None = None):
+    def __init__(self, path: Path, packages: Mapping[str, str | Path] | None = None):
         self.path = path
         self.root = read_xml(path)
         if self.root.tag != "robot":

@@ -9,6 +9,8 @@ Numba compiles a function again when the file that it stands in changes, but not
 constants change that it uses from other files. Here an entry also counts as old when any of the
 package's compiled files changes, all of which have names that end in `kernels.py`.
 """
+# pyright: reportAttributeAccessIssue=false
+# (Numba's settings and dispatchers have attributes that their types lack.)
 
 import contextlib
 import fcntl
@@ -20,6 +22,7 @@ import sys
 from pathlib import Path
 
 import numba
+from numba.core import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.serialize import dumps
 
@@ -40,14 +43,14 @@ def uncounted(function):
 def compiled(function, **options):
     """Numba's `njit`, cached on disk where a folder for that can be written to."""
     dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
-    given = numba.config.CACHE_DIR
+    folder = config.CACHE_DIR
     # (RuntimeError: no folder can be written to. OSError: there is no home folder.)
     with contextlib.suppress(RuntimeError, OSError):
         try:  # Numba's own setting, for this function only
-            numba.config.CACHE_DIR = given or str(cache_folder() / "numba")
+            config.CACHE_DIR = folder or str(cache_folder() / "numba")
             dispatcher._cache = _CheckedCache(function)
         finally:
-            numba.config.CACHE_DIR = given
+            config.CACHE_DIR = folder
     return dispatcher
 
 
@@ -99,10 +102,10 @@ class _CheckedCache(FunctionCache):
 
     def load_overload(self, sig, target_context):
         try:
-            found = super().load_overload(sig, target_context)
-            if found is None:
+            overload = super().load_overload(sig, target_context)
+            if overload is None:
                 _announce_compilation(self.cache_path)
-            return found
+            return overload
         except Exception:  # unpickling wrong bytes raises exceptions of many types
             path = self._damaged_path(sig, target_context)
             print(f"{path}: damaged, the function is compiled again", file=sys.stderr)
