@@ -1,19 +1,14 @@
 """Compiled collision checks: PyBullet's answers, distances by hand, motions, invalid input."""
 
-import hashlib
 import math
-import os
-import shutil
 import subprocess
 import sys
-import textwrap
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from paths import LIBRARY, ROOT
+from paths import ROOT
 
-import roboarm_nmp
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.collision import checker as collision
@@ -91,8 +86,8 @@ def turn(rng):
 
 def near_contact(checker, rng, number):
     """States with a smallest distance from -5 mm to 5 mm: (number, 7)."""
-    found = np.empty((0, 7))
-    while len(found) < number:
+    states = np.empty((0, 7))
+    while len(states) < number:
         a, b = rng.uniform(-1, 1, (2, 200, 7))
         low, high = np.zeros(200), np.ones(200)
         wanted = rng.uniform(-0.005, 0.005, 200)
@@ -106,17 +101,17 @@ def near_contact(checker, rng, number):
             middle = (low + high) / 2
             same = beyond(middle) == below
             low, high = np.where(same, middle, low), np.where(same, high, middle)
-        found = np.concatenate([found, (a + low[:, None] * (b - a))[crosses]])
-    return found[:number]
+        states = np.concatenate([states, (a + low[:, None] * (b - a))[crosses]])
+    return states[:number]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_random_scenes_agree_with_pybullet(env, seed):
     rng = np.random.default_rng(seed)
     scene = random_scene(rng)
     env.set_scene(scene)
     checker = CollisionChecker(scene)
-    for states in (rng.uniform(-1, 1, (300, 7)), near_contact(checker, rng, 300)):
+    for states in (rng.uniform(-1, 1, (200, 7)), near_contact(checker, rng, 200)):
         theirs = [not env.in_collision(c) for c in PANDA.denormalise(states)]
         np.testing.assert_array_equal(checker.is_free(states), theirs)
         assert 0.05 < np.mean(theirs) < 0.95
@@ -127,26 +122,10 @@ def test_random_scenes_agree_with_pybullet(env, seed):
     env.set_scene(EMPTY)
 
 
-@pytest.mark.parametrize(
-    "task", ["narrow_shelves", "benchmaker_bookshelf_thin", "random_boxes_hard"]
-)
-def test_tasks_agree_with_pybullet(task):
-    env, rng = envs.make(task), np.random.default_rng(5)
-    queries = load_queries(task, "validation")
-    for i in (0, 50):
-        scene = queries[i].scene
-        env.set_scene(scene)
-        checker = CollisionChecker(scene)
-        states = np.concatenate([rng.uniform(-1, 1, (150, 7)), near_contact(checker, rng, 150)])
-        theirs = [not env.in_collision(c) for c in PANDA.denormalise(states)]
-        np.testing.assert_array_equal(checker.is_free(states), theirs)
-    env.close()
-
-
 def test_starts_and_goals_of_queries_are_free():
     for task in envs.TASKS:
         queries = load_queries(task, "validation")
-        for i in range(0, 40, 4):
+        for i in (0, 20):
             if not queries[i].scene.is_static:  # tests/envs/scenes/test_moving_boxes.py
                 continue
             checker = CollisionChecker(queries[i].scene)
@@ -161,7 +140,7 @@ def test_distances_agree_with_pybullet(env):
         scene = Scene((obstacle,), table=None, floor=None)
         env.set_scene(scene)
         (body,) = env.world._bodies
-        states = rng.uniform(-1, 1, (40, 7))
+        states = rng.uniform(-1, 1, (25, 7))
         near = CollisionChecker(scene).signed_distances(states, self_collisions=False)
         assert (near.geometry == 0).all()
         for state, distances in zip(states, near.distance, strict=True):
@@ -175,7 +154,7 @@ def test_distances_agree_with_pybullet(env):
                 elif distance < -1e-3:
                     assert points[0][8] < 0
     # Both are distances of two points, so the smaller one is the better; Bullet stops earlier.
-    assert len(further) > 1000 and min(further) > -1e-7
+    assert len(further) > 600 and min(further) > -1e-7
     assert np.median(further) < 1e-8 and max(further) < 5e-5
     env.set_scene(EMPTY)
 
@@ -189,7 +168,7 @@ def outermost(hulls):
     return link, hulls[link][hulls[link][:, 0].argmax()]
 
 
-@pytest.mark.parametrize("gap", [0.001, 0.0001, -0.0005, 0.2])
+@pytest.mark.parametrize("gap", [0.0001, -0.0005, 0.2])
 def test_distance_normal_and_witness_of_a_sphere_in_front(hulls, gap):
     link, tip = outermost(hulls)
     radius = 0.05
@@ -205,40 +184,17 @@ def test_distance_normal_and_witness_of_a_sphere_in_front(hulls, gap):
     assert checker.is_free(STATE, clearance=0.0005) == (gap > 0.0005)
 
 
-def test_distance_from_the_rounded_edge_of_a_box(hulls):
-    """The box is turned by 45 degrees, with an edge towards the tip."""
-    link, tip = outermost(hulls)
-    gap, edge = 0.003, 0.2
-    centre = tip + [gap + edge / math.sqrt(2), 0, 0]
-    turn = (0.0, 0.0, math.sin(math.pi / 8), math.cos(math.pi / 8))
-    box = Box(tuple(centre), (edge, edge, edge), turn)
-    near = CollisionChecker(Scene((box,), table=None, floor=None)).signed_distances(STATE)
-    rounded_off = (math.sqrt(2) - 1) * BULLET_MARGIN
-    assert near.distance[link] == pytest.approx(gap + rounded_off - BULLET_MARGIN, abs=2e-6)
-    np.testing.assert_allclose(near.normal[link], [-1, 0, 0], atol=1e-4)
-
-
-@pytest.mark.parametrize("kind", ["box", "sphere", "cylinder"])
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
 def test_depth_is_the_way_to_the_nearest_face(hulls, kind):
     """The whole arm is inside of a large obstacle."""
     size = 4.0
-    obstacle = {
-        "box": Box((0.1, 0.0, 0.2), (size, size, size)),
-        "sphere": Sphere((0.0, 0.0, 0.0), 2.0),
-        "cylinder": Cylinder((0.0, 0.0, 0.2), 30.0, size),  # its bases are much nearer
-    }[kind]
+    obstacle = Box((0.1, 0.0, 0.2), (size, size, size))
+    if kind == "cylinder":
+        obstacle = Cylinder((0.0, 0.0, 0.2), 30.0, size)  # its bases are much nearer
     checker = CollisionChecker(Scene((obstacle,), table=None, floor=None))
     near = checker.signed_distances(STATE, self_collisions=False)
     assert not checker.is_free(STATE)
     for hull, distance, normal in zip(hulls, near.distance, near.normal, strict=True):
-        if kind == "sphere":  # by random directions around the normal
-            ways = normal + np.random.default_rng(0).normal(0, 0.1, (2000, 3))
-            ways = np.concatenate([normal[None], ways])
-            ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-            depths = 2.0 - (hull @ ways.T).min(0)
-            assert depths[0] <= depths.min() + 1e-5
-            assert distance == pytest.approx(-depths[0] - BULLET_MARGIN, abs=1e-4)
-            continue
         low, high = hull.min(0) - obstacle.position, hull.max(0) - obstacle.position
         ways = np.concatenate([size / 2 - low, size / 2 + high])  # out by +x +y +z, -x -y -z
         axes = np.concatenate([np.eye(3), -np.eye(3)])
@@ -253,14 +209,11 @@ def test_nearest_or_deepest_of_several_obstacles_counts():
     scene = Scene(tuple(o for _ in range(5) for o in random_scene(rng).obstacles), None, None)
     states = rng.uniform(-1, 1, (1000, 7))
     together = CollisionChecker(scene).signed_distances(states, self_collisions=False)
-    alone = np.stack(
-        [
-            CollisionChecker(replace(scene, obstacles=(one,)))
-            .signed_distances(states, False)
-            .distance
-            for one in scene.obstacles
-        ]
-    )
+    alone = []
+    for obstacle in scene.obstacles:
+        checker = CollisionChecker(replace(scene, obstacles=(obstacle,)))
+        alone.append(checker.signed_distances(states, self_collisions=False).distance)
+    alone = np.stack(alone)
     assert ((alone < -0.02).sum(0) > 1).sum() > 100  # in two of them at once
     np.testing.assert_allclose(together.distance, alone.min(0), atol=1e-6)
 
@@ -274,11 +227,10 @@ def test_coinciding_centres_have_a_depth(hulls):
         assert near.distance[link] < -0.005
 
 
-def test_distance_grows_along_the_normal(env):
+def test_distance_grows_along_the_normal():
     """Moving the obstacle against the normal moves it away by as much."""
     rng, step = np.random.default_rng(3), 1e-4
-    for _ in range(30):
-        (obstacle, *_) = rng.permutation(np.array(random_scene(rng).obstacles, dtype=object))
+    for obstacle in random_scene(rng).obstacles:
         scene = Scene((obstacle,), table=None, floor=None)
         state = rng.uniform(-1, 1, 7)
         near = CollisionChecker(scene).signed_distances(state, self_collisions=False)
@@ -315,7 +267,7 @@ def test_self_distances_agree_with_pybullet(env):
     """Distances of both links of a pair."""
     rng, seen = np.random.default_rng(11), 0
     checker = CollisionChecker(EMPTY)
-    for state in rng.uniform(-1, 1, (60, 7)):
+    for state in rng.uniform(-1, 1, (40, 7)):
         near = checker.signed_distances(state)
         env.world.arm.set_configuration(PANDA.denormalise(state))
         expected = dict.fromkeys(LINKS, 10.0)
@@ -330,7 +282,7 @@ def test_self_distances_agree_with_pybullet(env):
                 seen += 1
             elif expected[link] == 10.0:
                 assert distance == math.inf
-    assert seen > 200
+    assert seen > 130
 
 
 # --- Margins
@@ -403,6 +355,7 @@ def test_motion_through_a_thin_board_is_not_free():
     assert not checker.is_motion_free(RIGHT, LEFT)
     assert checker.is_motion_free(LEFT, LEFT)
     assert CollisionChecker(Scene()).is_motion_free(LEFT, RIGHT)
+    assert checker.is_motion_free(LEFT, [LEFT, RIGHT, LEFT + 0.01]).tolist() == [True, False, True]
     # The board is in the middle, which is checked after the start and the end.
     assert checker.motion_checks(LEFT, RIGHT) == -3
 
@@ -433,30 +386,12 @@ def test_known_ends_are_not_checked():
     assert checker.is_motion_free(*before, ends_known=True)
 
 
-def test_every_point_of_a_motion_is_checked():
-    """A motion is free if all of its points are."""
-    checker, rng = CollisionChecker(envs.TASKS["boxes"].scene), np.random.default_rng(4)
-    starts = rng.uniform(-1, 1, (300, 7))
-    ends = np.clip(starts + rng.normal(0, 0.15, (300, 7)), -1, 1)
-    expected = []
-    for start, end in zip(starts, ends, strict=True):
-        pieces = math.ceil(np.linalg.norm(end - start) / collision.RESOLUTION)
-        points = start + np.arange(pieces + 1)[:, None] / pieces * (end - start)
-        expected.append(checker.is_free(points).all())
-    np.testing.assert_array_equal(checker.is_motion_free(starts, ends), expected)
-    assert 0.05 < np.mean(expected) < 0.6
-    one = checker.motion_checker()
-    pairs = zip(map(tuple, starts), map(tuple, ends), strict=True)
-    free = [one(*pair) > 0 and checker.is_free(pair[0]) for pair in pairs]
-    np.testing.assert_array_equal(free, expected)
-
-
 @pytest.mark.parametrize("robot", ["panda", "iiwa"])
 def test_motion_is_free_where_all_its_states_are(robot):
     """What is remembered along a motion does not change an answer, of any length of motion."""
     file = "" if robot == "panda" else f"@{ROOT / 'examples' / 'robots' / 'iiwa.yaml'}"
     rng = np.random.default_rng(5)
-    for _ in range(4):
+    for _ in range(2):
         scene = envs.get_task(f"random_boxes_hard{file}").scene.sample(rng)
         points = rng.uniform(0.3, 0.9, (20, 3)) * rng.choice([-1.0, 1.0], (20, 3)) * [1, 1, 0.5]
         checker = CollisionChecker(scene, points, 0.01)
@@ -469,102 +404,35 @@ def test_motion_is_free_where_all_its_states_are(robot):
         options = {"margin": 0.003, "clearance": 0.005, "endpoint_margins": near}
         free = checker.is_motion_free(starts, ends, **options)
         assert 0.1 < free.mean() < 0.95
+        one = checker.motion_checker(**options)
         for start, end, is_free in zip(starts, ends, free, strict=True):
+            assert (one(tuple(start), tuple(end)) > 0) == is_free
             pieces = max(math.ceil(np.linalg.norm(end - start) / RESOLUTION), 1)
             states = start + np.arange(pieces + 1)[:, None] / pieces * (end - start)
             assert checker.is_free(states.clip(-1.0, 1.0), **options).all() == is_free
 
 
-def test_one_start_is_broadcast_to_many_ends():
-    checker = CollisionChecker(BOARD)
-    free = checker.is_motion_free(LEFT, np.stack([LEFT, RIGHT, LEFT + 0.01]))
-    assert free.tolist() == [True, False, True]
+# --- The same answer whatever the batch
 
 
-# --- The same answer whatever the batch, the process, the thread
-
-
-def digest(checker, states):
-    near = checker.signed_distances(states)
-    parts = *near, checker.is_free(states)
-    return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
-
-
-def test_batches_of_one_and_of_ten_thousand_agree():
+def test_batches_of_one_and_of_two_thousand_agree():
     checker = CollisionChecker(envs.TASKS["boxes"].scene)
-    states = np.random.default_rng(0).uniform(-1, 1, (10_000, 7))
+    states = np.random.default_rng(0).uniform(-1, 1, (2_000, 7))
     near, free = checker.signed_distances(states), checker.is_free(states)
-    for i in range(0, 10_000, 97):
+    for i in range(0, 2_000, 97):
         one = checker.signed_distances(states[i])
         for all_, single in zip(near, one, strict=True):
             assert all_[i].tobytes() == np.asarray(single).tobytes()
         assert checker.is_free(states[i]) == free[i]
         assert checker.is_free(states[i : i + 1]).shape == (1,)
-    shaped = checker.signed_distances(states.reshape(10, 1000, 7))
+    shaped = checker.signed_distances(states.reshape(10, 200, 7))
     np.testing.assert_array_equal(shaped.distance.reshape(-1, len(LINKS)), near.distance)
 
 
-ELSEWHERE = """
-    import sys
-    sys.path[:0] = ["tests/helpers", "tests/envs/collision"]
-    import numpy as np
-    import roboarm_nmp
-    from roboarm_nmp import envs
-    from roboarm_nmp.envs.collision.checker import CollisionChecker
-    from test_collision import digest
-    checker = CollisionChecker(envs.TASKS["boxes"].scene)
-    print("package:", roboarm_nmp.__file__)
-    print("digest:", digest(checker, np.random.default_rng(0).uniform(-1, 1, (2000, 7))))
-"""
-
-
-def run(code, cwd, **variables):
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        env=os.environ | variables,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_another_process_agrees():
-    checker = CollisionChecker(envs.TASKS["boxes"].scene)
-    states = np.random.default_rng(0).uniform(-1, 1, (2000, 7))
-    output = run(ELSEWHERE, ROOT)
-    assert f"package: {roboarm_nmp.__file__}\n" in output
-    assert f"digest: {digest(checker, states)}\n" in output
-
-
-def test_read_only_installation_compiles_in_each_process(tmp_path):
-    """Neither the package nor the home folder can hold a cache."""
-    package = tmp_path / "roboarm_nmp"
-    shutil.copytree(LIBRARY, package, ignore=shutil.ignore_patterns("*.h5", "*.pt", "__py*"))
-    for name in ("roboarm_nmp/envs/collision/__pycache__", "home"):
-        (tmp_path / name).write_text("")  # root may write to any folder, but not to a file
-    code = """
-        import roboarm_nmp
-        from roboarm_nmp.envs.collision.checker import CollisionChecker
-        from roboarm_nmp.envs.scenes.primitives import Scene
-        print("package:", roboarm_nmp.__file__)
-        print("free:", CollisionChecker(Scene()).is_free([[0.0] * 7]).tolist())
-    """
-    home = str(tmp_path / "home")
-    variables = {"HOME": home, "XDG_CACHE_HOME": home, "PYTHONPATH": str(tmp_path)}
-    output = run(code, tmp_path, **variables)
-    assert f"package: {package / '__init__.py'}\n" in output and "free: [True]\n" in output
-
-
 def test_importing_envs_imports_no_numba():
-    code = """
-        import sys
-        import roboarm_nmp
-        roboarm_nmp.make("wall").reset(seed=0)
-        print("numba imported:", "numba" in sys.modules)
-    """
-    assert "numba imported: False" in run(code, ROOT)
+    code = "import sys, roboarm_nmp as r; r.make('wall').reset(); print('numba' in sys.modules)"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout
+    assert output == "False\n"
 
 
 # --- Invalid input
@@ -579,14 +447,10 @@ def wall():
     ("states", "message"),
     [
         (np.full((3, 7), np.nan), "finite"),
-        (np.full((3, 7), np.inf), "finite"),
         (np.full(7, 1.001), r"in \[-1, 1\]"),
-        (np.zeros((3, 6)), r"shape \(..., 7\), got \(3, 6\)"),
-        (0.0, r"shape \(..., 7\), got \(\)"),
-        (np.zeros((7, 3)), "got"),
+        (np.zeros((3, 6)), r"shape \(..., 7\), got float64 of shape \(3, 6\)"),
         ("free", "must be numbers"),
         ([[0.0] * 7, [0.0] * 6], "must be numbers"),
-        (np.zeros(7, dtype=complex) + 1j, "must be numbers"),
     ],
 )
 def test_bad_states_are_rejected(wall, states, message):
@@ -600,42 +464,26 @@ def test_bad_states_are_rejected(wall, states, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"margin": -0.001}, "margin must be in"),
+        ({"resolution": np.nan}, "resolution must be positive"),
         ({"margin": np.nan}, "margin must be in"),
         ({"clearance": 0.5}, "clearance must be in"),
-        ({"clearance": np.inf}, "clearance must be in"),
         ({"endpoint_margins": (np.zeros((2, 7)), np.zeros(3), 0.1)}, "endpoint_margins"),
-        ({"endpoint_margins": (np.zeros((2, 6)), np.zeros(2), 0.1)}, "endpoint_margins states"),
         ({"endpoint_margins": (np.zeros((2, 7)), [0.0, np.nan], 0.1)}, "endpoint_margins"),
         ({"endpoint_margins": (np.zeros((2, 7)), np.zeros(2), -1.0)}, "growth"),
     ],
 )
-def test_bad_margins_are_rejected(wall, options, message):
-    with pytest.raises(ValueError, match=message):
-        wall.is_free(np.zeros(7), **options)
+def test_bad_margins_and_resolutions_are_rejected(wall, options, message):
     with pytest.raises(ValueError, match=message):
         wall.is_motion_free(np.zeros(7), np.zeros(7), **options)
-
-
-@pytest.mark.parametrize("resolution", [0.0, -1.0, np.nan, np.inf])
-def test_bad_resolutions_are_rejected(wall, resolution):
-    with pytest.raises(ValueError, match="resolution must be positive"):
-        wall.is_motion_free(np.zeros(7), np.zeros(7), resolution=resolution)
 
 
 @pytest.mark.parametrize(
     "obstacle",
     [
         Box((0.5, 0, 0), (0.1, 0.0, 0.1)),
-        Box((0.5, 0, 0), (0.1, -0.1, 0.1)),
-        Box((0.5, 0, 0), (0.1, np.nan, 0.1)),
         Box((0.5, np.nan, 0), (0.1, 0.1, 0.1)),
-        Box((0.5, 0, np.inf), (0.1, 0.1, 0.1)),
-        Box((0.5, 0, 0), (0.1, 0.1, np.inf)),
-        Cylinder((0.5, 0, 0), 0.0, 0.1),
         Cylinder((0.5, 0, 0), 0.1, -0.1),
-        Sphere((0.5, 0, 0), 0.0),
-        Sphere((0.5, 0, 0), -1.0),
+        Sphere((0.5, 0, 0), np.inf),
     ],
 )
 def test_degenerate_obstacles_are_rejected(obstacle):
@@ -668,21 +516,15 @@ def test_empty_batches_have_empty_answers(wall):
 def test_link_distances_are_clipped_signed_distances(wall, self_collisions):
     states = np.random.default_rng(3).uniform(-1.1, 1.1, (4, 25, 7)).astype(np.float32)
     states[0, 0, 0] = np.inf
-    found = wall.link_distances(states, self_collisions, within=0.2)
+    rows = wall.link_distances(states, self_collisions, within=0.2)
     near = wall.signed_distances(np.clip(states, -1.0, 1.0), self_collisions, within=0.2)
     distances = np.minimum(near.distance, 0.2)[..., None]
     assert 0.1 < (distances < 0.2).mean() < 0.9
-    wanted = np.concatenate([distances, near.gradient], axis=-1).astype(np.float32)
-    assert found.dtype == np.float32 and (found == wanted).all()
-    assert (wall.link_distances(states[1, 2], self_collisions, within=0.2) == found[1, 2]).all()
+    expected = np.concatenate([distances, near.gradient], axis=-1).astype(np.float32)
+    assert rows.dtype == np.float32 and (rows == expected).all()
     for bad in (np.full(7, np.nan), np.zeros(6), "near"):
         with pytest.raises(ValueError, match="states must"):
             wall.link_distances(bad)
-
-
-def test_limits_rounded_to_float32_are_accepted(wall):
-    states = np.float32(PANDA.normalise(np.float32([PANDA.lower, PANDA.upper])))
-    assert wall.is_free(states).shape == (2,)
 
 
 def test_distances_from_very_thin_and_very_large_boxes(hulls):

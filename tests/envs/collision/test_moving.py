@@ -45,7 +45,7 @@ def oscillation():
     return Oscillation((0.1, 0.2, 0.0), 3.0, 0.7, axis=(1, 2, 3), angle=0.9)
 
 
-@pytest.mark.parametrize("t", [0.0, 0.5, 0.9, 1.0, 1.25, 1.7, 2.5, 3.2, 3.5, 4.1, 5.0, 6.6, 98.765])
+@pytest.mark.parametrize("t", [0.0, 0.5, 1.0, 1.7, 3.5, 4.1, 98.765])
 def test_arrays_are_those_of_the_scene_at_a_time(t):
     scene = moving_scene()
     moving = MovingObstacles(scene)

@@ -10,12 +10,10 @@ import pytest
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.problem_formats import Problem
 from roboarm_nmp.datasets.problems import load_problems, write_problems
-from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import ARM, CollisionChecker
-from roboarm_nmp.envs.perception.point_clouds import obstacle_points, prepare_cloud
+from roboarm_nmp.envs.perception.point_clouds import obstacle_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
-from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.variants import with_attached, with_held
@@ -33,11 +31,8 @@ from roboarm_nmp.envs.scenes.primitives import (
 )
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.world import World
-from roboarm_nmp.evaluation.rollout import Episode
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
-from roboarm_nmp.policies.safety_filter import SafetyFilter
-from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.documents import DocumentError
 
 TURN = (0.3, -0.1, 0.4, np.sqrt(0.74))
@@ -132,15 +127,6 @@ def test_object_collides_with_links_that_move_against_it_except_touch_links():
     assert ARM in checker.signed_distances(states[carrying & ~alone][0]).geometry
 
 
-def test_points_on_an_object_are_the_arms_own():
-    robot = with_attached(PANDA, [Attached(Box((0, 0, 0.2), (0.05, 0.05, 0.3)))])
-    position, rotation = robot.frame_poses(START)[6]
-    away = np.linspace(0.35, 0.5, 40)[:, None]  # behind the fingertips
-    points = position + away * rotation[:, 2]
-    assert len(prepare_cloud(points, PANDA, START, min_points=0)[0]) > 3
-    assert not len(prepare_cloud(points, robot, START, min_points=0)[0])
-
-
 def test_sensors_see_an_object_as_the_arm_and_no_points_of_it():
     position, rotation = PANDA.frame_poses(START)[6]
     place = position + 0.5 * rotation[:, 2]  # behind the fingertips
@@ -155,42 +141,6 @@ def test_sensors_see_an_object_as_the_arm_and_no_points_of_it():
         assert len(points) > 1000 and points[:, 1].max() < -0.449
     assert seen == [(OBSTACLE, False), (ROBOT, True)]
     world.close()
-
-
-def test_safety_filter_keeps_an_object_from_the_table():
-    low = START.copy()
-    low[1], low[5] = 0.4, 2.5  # the fingertips are 0.16 m above the table
-    rod = with_attached(PANDA, [Attached(Box((0, 0, 0.2), (0.03, 0.03, 0.3)))])
-    env = envs.make("no_obstacles", link_distances=True, geometry_source="ground_truth")
-    table = Box((0, 0, -0.02), (3, 3, 0.04))
-
-    def lowered(robot, filtered):
-        observation, _ = env.reset_specific(START, START, Scene((), table, robot=robot))
-        act = lambda seen: 0.04 * (PANDA.normalise(low) - seen["observation"][:7])  # noqa: E731
-        contact, safe = False, SafetyFilter(escape=False)
-        if filtered:
-            act = safe.filter_policy(act, env, np.random.default_rng(0))
-        for _ in range(120):
-            observation, *_, info = env.step(act(observation))
-            contact |= info["collision"]
-        return contact, np.abs(PANDA.denormalise(observation["observation"][:7]) - low).max()
-
-    assert lowered(rod, filtered=False)[0]
-    contact, away = lowered(rod, filtered=True)
-    assert not contact and away > 0.1
-    contact, away = lowered(PANDA, filtered=True)
-    assert not contact and away < 0.05
-    env.close()
-
-
-def test_body_and_its_coarse_copy_have_the_object():
-    client = p.connect(p.DIRECT)
-    for robot, links in ((PANDA, 12), (with_attached(PANDA, [BOARD, ROCK]), 14)):
-        for body in (Body(robot, client).id, Body.coarse(robot, client, (1, 0, 0, 1)).id):
-            assert p.getNumJoints(body, physicsClientId=client) == links
-            drawn = {shape[1] for shape in p.getVisualShapeData(body, physicsClientId=client)}
-            assert set(range(12, links)) <= drawn
-    p.disconnect(client)
 
 
 def test_plan_with_an_object_is_followed_without_contact():
@@ -224,13 +174,6 @@ def test_episode_with_an_object_is_that_of_its_copy_and_of_a_new_environment():
     assert not np.array_equal(expected[0], expected[-1])
 
 
-def test_episode_has_the_arm_of_its_scene():
-    env = RoboArmEnv()
-    scene = Scene(robot=with_attached(PANDA, [BOARD]))
-    assert Episode(env, Query(START, GOAL, scene)).trajectory().robot == scene.robot
-    env.close()
-
-
 def test_files_keep_objects(tmp_path):
     held = with_held(PANDA, {"panda_finger_joint1": 0.02})
     for robot in (with_attached(PANDA, MANY), with_attached(held, [BOARD])):
@@ -253,7 +196,6 @@ def test_files_keep_objects(tmp_path):
     [
         ("link: thumb", "2: panda has no link 'thumb'"),
         ("link: panda_link0", "2: panda: 'panda_link0' does not move"),
-        ("touch_links: [thumb]", "2: panda has no link 'thumb'"),
         ("touch_links: 1", "2: touch_links must be a list of links' names, got 1"),
         ("may_touch: true", "2: unknown key may_touch in sphere"),
     ],

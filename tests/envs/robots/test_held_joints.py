@@ -31,6 +31,7 @@ def test_arm_as_described_is_the_same_object_and_keeps_its_fingerprint():
     assert PANDA.held == dict.fromkeys(FINGERS, 0.04)
     assert PANDA.fingerprint.startswith("026faa3f2a77")
     assert OPEN != PANDA and OPEN.same_arm(PANDA) and PANDA.same_arm(OPEN)
+    check_robot("policy.pt", {}, OPEN)
 
 
 def test_joint_that_mimics_another_one_follows_it_unless_it_is_named():
@@ -42,28 +43,14 @@ def test_joint_that_mimics_another_one_follows_it_unless_it_is_named():
 @pytest.mark.parametrize("opening", [0.065, 0.0])
 def test_compiled_checks_agree_with_pybullet(opening):
     robot, rng, free = with_held(PANDA, {FINGERS[0]: opening}), np.random.default_rng(0), 0
-    for _ in range(4):
+    for _ in range(2):
         scene = replace(RandomBoxes(4, 8).sample(rng), robot=robot)
         world, states = World(scene, drawn=False), rng.uniform(-1, 1, (100, 7))
         expected = [not world.in_collision(robot.denormalise(s).tolist()) for s in states]
         np.testing.assert_array_equal(CollisionChecker(scene).is_free(states), expected)
         free += sum(expected)
         world.close()
-    assert 50 < free < 350
-
-
-def test_box_beside_the_hand_collides_with_the_wider_gripper_only():
-    position, rotation = PANDA.frame_poses(START)[6]
-    # The finger opens along the hand's y axis; its tip is 0.21 m beyond joint 7.
-    side = rotation @ (np.sqrt(0.5) * np.array([1.0, 1.0, 0.0]))
-    centre = position + 0.2 * rotation[:, 2] + 0.08 * side
-    box = Box(tuple(centre.tolist()), (0.005,) * 3)
-    for robot, is_free in ((PANDA, True), (OPEN, False)):
-        scene = Scene((box,), table=None, floor=None, robot=robot)
-        world = World(scene, drawn=False)
-        assert world.in_collision(START.tolist()) != is_free
-        assert CollisionChecker(scene).is_free(robot.normalise(START)) == is_free
-        world.close()
+    assert 25 < free < 175
 
 
 def test_fingers_are_held_beyond_their_limit_while_the_arm_moves():
@@ -109,10 +96,6 @@ def test_scene_of_another_arm_is_rejected():
     env = RoboArmEnv()
     with pytest.raises(ValueError, match="the scene's robot is 'other', not 'panda'"):
         env.set_scene(Scene(robot=other))
-
-
-def test_network_of_the_arm_is_accepted_with_any_gripper_opening():
-    check_robot("policy.pt", {}, OPEN)
 
 
 def test_scene_files_keep_the_opening(tmp_path):

@@ -110,14 +110,6 @@ def test_jacobian_transpose_is_the_change_of_the_pose(robot):
     np.testing.assert_allclose(linear, expected - angular, atol=2e-5)
 
 
-def test_end_effector_of_the_panda_is_turned_as_its_hand():
-    # At zero, the hand points down, and its fingers open at 45 degrees to the base's y.
-    configuration = np.zeros(7)
-    axes = Rotation.from_quat(PANDA.end_effector_pose(configuration)[3:]).as_matrix()
-    np.testing.assert_allclose(axes[:, 2], (0, 0, -1), atol=1e-6)
-    np.testing.assert_allclose(np.abs(axes[:2, 1]), [np.sqrt(0.5)] * 2, atol=1e-6)
-
-
 def test_quaternions_and_angles_are_those_of_scipy():
     one, other = (Rotation.random(500, random_state=seed) for seed in (1, 2))
     np.testing.assert_allclose(
@@ -130,16 +122,15 @@ def test_quaternions_and_angles_are_those_of_scipy():
 
 
 def test_solutions_have_the_pose_within_the_limits(robot):
-    poses = robot.end_effector_pose(random_configurations(robot, 200))
-    found = inverse_kinematics(robot, poses)
-    assert np.mean([len(one) > 0 for one in found]) > 0.97
-    for pose, solutions in zip(poses, found, strict=True):
+    poses = robot.end_effector_pose(random_configurations(robot, 60))
+    batch = inverse_kinematics(robot, poses)
+    assert np.mean([len(solutions) > 0 for solutions in batch]) > 0.96
+    for pose, solutions in zip(poses, batch, strict=True):
         reached = robot.end_effector_pose(solutions.astype(np.float32))
         assert (np.linalg.norm(reached[:, :3] - pose[:3], axis=1) <= MAX_DISTANCE).all()
         assert (rotation_angle(reached[:, 3:], pose[3:]) <= MAX_ANGLE).all()
         assert ((solutions >= robot.lower) & (solutions <= robot.upper)).all()
-    solutions = next(one for one in found if len(one))
-    pose = poses[[len(one) > 0 for one in found].index(True)]
+    pose, solutions = next(pair for pair in zip(poses, batch, strict=True) if len(pair[1]))
     for position, rotation in bullet_poses(robot, solutions):
         assert np.linalg.norm(position - pose[:3]) <= MAX_DISTANCE
         assert (rotation * Rotation.from_quat(pose[3:]).inv()).magnitude() <= MAX_ANGLE
@@ -165,26 +156,25 @@ def test_pose_has_the_same_solutions_alone_and_in_a_batch_and_for_the_negative_q
         turned = np.r_[pose[:3], -2.0 * pose[3:]]
         np.testing.assert_array_equal(inverse_kinematics(PANDA, pose, seed=3), solutions)
         np.testing.assert_allclose(inverse_kinematics(PANDA, turned, seed=3), solutions, atol=1e-9)
-    assert batch[0].shape != inverse_kinematics(PANDA, poses[0], seed=4).shape or not np.allclose(
-        batch[0], inverse_kinematics(PANDA, poses[0], seed=4)
-    )
+    others = inverse_kinematics(PANDA, poses[0], seed=4)
+    assert batch[0].shape != others.shape or not np.allclose(batch[0], others)
 
 
 def test_solutions_are_free_of_collisions():
     scene = envs.get_task("double_walls").scene
     checker, removed = CollisionChecker(scene), 0
-    for pose in PANDA.end_effector_pose(random_configurations(PANDA, 20)):
+    for pose in PANDA.end_effector_pose(random_configurations(PANDA, 10)):
         every = inverse_kinematics(PANDA, pose)
         free = inverse_kinematics(PANDA, pose, checker=checker, margin=0.01)
         assert checker.is_free(PANDA.normalise(free), margin=0.01).all()
         removed += len(every) - len(free)
-    assert removed > 50
+    assert removed > 25
 
 
 def test_pose_out_of_reach_has_no_solution():
     pose = np.array([2.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
     assert inverse_kinematics(PANDA, pose).shape == (0, 7)
-    assert [len(one) for one in inverse_kinematics(PANDA, np.empty((0, 7)))] == []
+    assert inverse_kinematics(PANDA, np.empty((0, 7))) == []
 
 
 @pytest.mark.parametrize(
