@@ -111,7 +111,9 @@ def pybullet_distance(env):
 
 def compare(env, scenes, num, rng, progress):
     """Number of configurations, `num` over all scenes, and depths (m) of the disagreements."""
-    compared, depths, joints = 0, [], env.robot.num_joints
+    compared = 0
+    depths = []
+    joints = env.robot.num_joints
     shares = np.diff(np.linspace(0, num, len(scenes) + 1).round().astype(int))
     for scene, count in zip(scenes, shares.tolist(), strict=True):
         env.set_scene(scene)
@@ -154,7 +156,9 @@ def timed(function, *arguments):
 
 def speed(rounds, rng, robot):
     """Microseconds of processor time per configuration: dict name -> median over rounds."""
-    env, batch, joints = envs.RoboArmEnv(Scene(robot=robot)), 10_000, robot.num_joints
+    env = envs.RoboArmEnv(Scene(robot=robot))
+    batch = 10_000
+    joints = robot.num_joints
     if robot == PANDA:
         scenes = scenes_of(SPEED_TASK, "validation")[:SCENES]
     else:
@@ -164,12 +168,15 @@ def speed(rounds, rng, robot):
     middle = np.zeros(joints)
     checkers[0].is_free(middle)  # compiles
     checkers[0].signed_distances(middle)
+    sources = ["ground_truth", "point_cloud"]
+    if robot == PANDA:
+        sources.append("field")
     per_source = {
         f"link_distances, {name}": [find_geometry_source(name)(scene) for scene in scenes]
-        for name in ("ground_truth", "point_cloud", *["field"] * (robot == PANDA))
+        for name in sources
     }
-    for ones in per_source.values():
-        ones[0].link_distances(middle)
+    for source_checkers in per_source.values():
+        source_checkers[0].link_distances(middle)
     names = "is_free", "signed_distances", *per_source, "pybullet", "in_collision"
     seconds = {name: [] for name in names}
     for _ in range(rounds):
@@ -179,8 +186,9 @@ def speed(rounds, rng, robot):
             total["is_free"] += timed(checker.is_free, states) / batch
             total["signed_distances"] += timed(checker.signed_distances, states[:500]) / 500
             free = states[:1000][checker.is_free(states[:1000])][:100]
-            for name, ones in per_source.items():
-                total[name] += timed(run, ones[i].link_distances, free) / max(len(free), 1)
+            for name, source_checkers in per_source.items():
+                seconds_of_all = timed(run, source_checkers[i].link_distances, free)
+                total[name] += seconds_of_all / max(len(free), 1)
             env.set_scene(scene)
             configurations = env.robot.denormalise(states[:100]).tolist()
             total["pybullet"] += timed(run, partial(pybullet_check, env), configurations) / 100
@@ -206,16 +214,18 @@ def main():
     rng = np.random.default_rng(args.seed)
     robot = load_robot(args.robot) if args.robot else PANDA
     groups = list(groups_of(robot, args.scenes, rng) if args.robot else groups_of_panda())
-    env, compared, depths = envs.RoboArmEnv(Scene(robot=robot)), 0, []
+    env = envs.RoboArmEnv(Scene(robot=robot))
+    compared = 0
+    depths = []
     print(f"{'scenes':42}{'configurations':>15}{'disagree':>10}{'deepest':>12}")
     with tqdm(total=args.num, unit=" configurations") as progress:
         for i, (name, scenes) in enumerate(groups):
             share = args.num * (i + 1) // len(groups) - args.num * i // len(groups)
-            count, found = compare(env, scenes, share, rng, progress)
-            deepest = f"{1e3 * max(found):.3f} mm" if found else "-"
-            progress.write(f"{name:42}{count:15,}{len(found):10}{deepest:>12}")
+            count, deep = compare(env, scenes, share, rng, progress)
+            deepest = f"{1e3 * max(deep):.3f} mm" if deep else "-"
+            progress.write(f"{name:42}{count:15,}{len(deep):10}{deepest:>12}")
             compared += count
-            depths += found
+            depths += deep
     env.close()
     micros = speed(args.rounds, rng, robot)
     print()

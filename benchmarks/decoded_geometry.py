@@ -129,7 +129,8 @@ def probe(latents, cells, test_latents, is_set=False, seed=0, epochs=60):
     if is_set:
         network = AnyObstacle(network)
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=0.1)
-    best, probabilities = np.inf, None
+    best = np.inf
+    probabilities = None
     for _ in range(epochs):
         for rows in torch.randperm(split).split(128):
             loss = F.binary_cross_entropy_with_logits(network(latents[rows]), cells[rows])
@@ -139,7 +140,8 @@ def probe(latents, cells, test_latents, is_set=False, seed=0, epochs=60):
         with torch.no_grad():
             error = F.binary_cross_entropy_with_logits(network(latents[split:]), cells[split:])
             if error < best:
-                best, probabilities = error, torch.sigmoid(network(test_latents))
+                best = error
+                probabilities = torch.sigmoid(network(test_latents))
     return probabilities.numpy()
 
 
@@ -172,20 +174,20 @@ def decoded(name, training, cells, testing, test_cells, test_data):
     guesses = {reach: [] for reach in REACHES}
     for scene in tqdm(training[:200], desc="decoded, to select"):
         points = encoder.decoded_points(scene)
-        for reach, found in guesses.items():
-            found.append(cells_of(nearer(scene, points, reach)))
+        for reach, grids in guesses.items():
+            grids.append(cells_of(nearer(scene, points, reach)))
     best = max(REACHES, key=lambda reach: iou(np.stack(guesses[reach]), cells[:200]))
-    found, errors = [], []
+    grids, errors = [], []
     distances, states = test_data
     for scene, truth, batch in zip(tqdm(testing, desc="decoded"), distances, states, strict=True):
         points = encoder.decoded_points(scene)
-        found.append(cells_of(nearer(scene, points, best)))
+        grids.append(cells_of(nearer(scene, points, best)))
         bare = replace(scene, obstacles=(), table=None, floor=None)
         checker = CollisionChecker(bare, points, DECODED_RADIUS)
         error = np.abs(checker.link_distances(batch, within=FAR)[..., 0] - truth)
         errors.append(error[truth < NEAR])
     mean = 100 * float(np.concatenate(errors).mean())
-    return {"decoded_iou": iou(np.stack(found), test_cells), "decoded_cm": mean}
+    return {"decoded_iou": iou(np.stack(grids), test_cells), "decoded_cm": mean}
 
 
 def latents(names, scenes):
@@ -195,18 +197,19 @@ def latents(names, scenes):
     """
     groups = []  # of encoders
     for encoder in map(make_encoder, names):
-        group = next((one for one in groups if one[0].sensors == encoder.sensors), None)
-        if group is None:
-            groups.append([encoder])
+        for group in groups:
+            if group[0].sensors == encoder.sensors:
+                group.append(encoder)
+                break
         else:
-            group.append(encoder)
-    found = {name: [] for name in names}
+            groups.append([encoder])
+    codes = {name: [] for name in names}
     for scene in tqdm(scenes, desc="observing"):
         for group in groups:
             observed = group[0].observe(scene)
             for encoder in group:
-                found[encoder.name].append(encoder.encode(observed))
-    return {name: np.stack(z) for name, z in found.items()}
+                codes[encoder.name].append(encoder.encode(observed))
+    return {name: np.stack(z) for name, z in codes.items()}
 
 
 def cross_entropy(probabilities, cells):

@@ -144,13 +144,16 @@ class Cell:
         # Goal minus configuration is an input of all runs but the oldest.
         if has_configuration and not args.get("relative_configuration", "plain_networks" in args):
             return False
-        given, values = iter(self.flags()), {}
-        for flag in given:
+        args = EARLIER_DEFAULTS | args
+        flags = iter(self.flags())
+        expected = {}
+        for flag in flags:
             name = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
-            values[name] = "False" if flag.startswith("--no-") else next(given)
-        for name, value in values.items():
-            had = (EARLIER_DEFAULTS | args).get(name)
-            if str(had) != value and not (isinstance(had, float) and had == float(value)):
+            expected[name] = "False" if flag.startswith("--no-") else next(flags)
+        for name, value in expected.items():
+            actual = args.get(name)
+            is_same_number = isinstance(actual, float) and actual == float(value)
+            if str(actual) != value and not is_same_number:
                 return False
         return True
 
@@ -169,7 +172,8 @@ def read_cells(path=CELLS):
 
 def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
     """Train, evaluate and keep one cell's policy with one seed; what was done is not done again."""
-    script, name = SCRIPTS[cell.algorithm], f"{cell.name}-s{seed}"
+    script = SCRIPTS[cell.algorithm]
+    name = f"{cell.name}-s{seed}"
     runs_dir.mkdir(parents=True, exist_ok=True)
     kept = POLICIES / f"{name}.json"
     if kept.exists():
@@ -270,7 +274,7 @@ def commit():
     head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
     code = ("*.py", "constraints.txt")  # not the page and its figures, which the last cell wrote
     changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", *code]).returncode
-    return head.stdout.strip() + "+" * (changed != 0)
+    return head.stdout.strip() + ("+" if changed else "")
 
 
 def curve(run):
@@ -296,7 +300,8 @@ def load_results(folders):
 
 def load_references():
     """Baselines' results, and those in unseen scenes: dicts of task -> name -> result."""
-    baselines, unseen = (json.loads(path.read_text()) for path in (BASELINES, UNSEEN))
+    baselines = json.loads(BASELINES.read_text())
+    unseen = json.loads(UNSEEN.read_text())
     for task, found in unseen.items():
         if REACTIVE in found:
             baselines.setdefault(task, {})[REACTIVE] = found[REACTIVE]
@@ -327,15 +332,17 @@ def success_of(cell, results):
     return pooled(of_recipe(cell, results))[0]
 
 
-def seeds_of(found):
+def seeds_of(results):
     """The number of a cell's seeds, and the lowest and highest success."""
-    rates = [result["success_rate"] for result in found]
-    return str(len(found)) + f" ({share(min(rates))} to {share(max(rates))})" * (len(found) > 1)
+    rates = [result["success_rate"] for result in results]
+    if len(results) == 1:
+        return "1"
+    return f"{len(results)} ({share(min(rates))} to {share(max(rates))})"
 
 
-def steps_of(found):
+def steps_of(results):
     """How long a cell's results were trained."""
-    return " or ".join(f"{steps:,}" for steps in sorted({result["steps"] for result in found}))
+    return " or ".join(f"{steps:,}" for steps in sorted({result["steps"] for result in results}))
 
 
 def method_of(cell):
@@ -386,7 +393,8 @@ def hindsight_table(cells, results):
 
 def missing(cells, results):
     """A sentence that names the paper's cells that were not run."""
-    tasks, absent = list(dict.fromkeys(cell.task for cell in cells)), {}
+    tasks = list(dict.fromkeys(cell.task for cell in cells))
+    absent = {}
     is_compared = any(cell.hindsight == "no" for cell in cells)
     for cell in cells:
         if cell.mean is not None and cell.name not in results:
@@ -554,10 +562,13 @@ def run_side_by_side(policies, args):
 
     `policies`: dict of (name, seed) -> the policy's cells. Where one fails, the others go on.
     """
-    waiting, running, failed = list(policies), {}, []
+    waiting = list(policies)
+    running = {}
+    failed = []
     options = ["--steps", str(args.steps), "--num-queries", str(args.num_queries)]
     options += ["--runs-dir", args.runs_dir, "--no-tables"]
-    options += [] if args.keep_policies else ["--no-keep-policies"]
+    if not args.keep_policies:
+        options.append("--no-keep-policies")
     try:
         while waiting or running:
             while waiting and len(running) < args.workers:
@@ -570,7 +581,8 @@ def run_side_by_side(policies, args):
             time.sleep(0.2)
             for name in [name for name, process in running.items() if process.poll() is not None]:
                 code = running.pop(name).returncode
-                failed += [name] * (code != 0)
+                if code != 0:
+                    failed.append(name)
                 print(f"{name}: {'ends' if code == 0 else f'exit code {code}'}", flush=True)
     finally:
         for process in running.values():
@@ -598,7 +610,8 @@ def main():
             reached = f"ours {pooled(found)[0]:.3f}, seeds: {len(found)}" if found else "not run"
             print(f"{cell.name:60} paper {share(cell.mean)}   {reached}")
         seeds = [len(of_recipe(cell, results)) for cell in cells]
-        done, thrice = (sum(number >= least for number in seeds) for least in (1, 3))
+        done = sum(number >= 1 for number in seeds)
+        thrice = sum(number >= 3 for number in seeds)
         print(f"{len(cells)} cells: {done} were run, {thrice} of them with three seeds or more")
         return
     policies = {}  # trained once, and evaluated on one task after the other

@@ -41,7 +41,8 @@ def results_table():
         rows.append([f"`{task}`", method, observation, safety_filter, *numbers, share(paper)])
 
     best = unseen_obstacles.papers_best()[HARD]
-    code, privileged = "latent code", "ground truth (privileged)"
+    code = "latent code"
+    privileged = "ground truth (privileged)"
     add(HARD, "go-to-goal", "none", "no", [hard["go-to-goal"]], papers[HARD])
     add(HARD, "paper's best learned policy", f"{code} (VQ-VAE)", "no", [], best)
     add(HARD, "BC", f"{code} (VAE)", "no", paper_tables.of_recipe(cells[bc], results),

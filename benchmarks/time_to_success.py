@@ -99,9 +99,13 @@ class Clock:
     """Seconds of training; solves the fresh queries now and then, while the clock stands still."""
 
     def __init__(self, task, limit):
-        self.goal, self.limit, self.queries = GOALS[task], limit, fresh_queries(task)
+        self.goal = GOALS[task]
+        self.limit = limit
+        self.queries = fresh_queries(task)
         self.envs = protocol.make_eval_envs(task, QUERIES)
-        self.curve, self.paused, self.began = [], 0.0, None
+        self.curve = []
+        self.paused = 0.0  # s
+        self.began = 0.0
 
     def start(self):
         self.began = time.perf_counter()

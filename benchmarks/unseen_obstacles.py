@@ -318,14 +318,14 @@ def policies_table(hard):
     rows = []
     for method, observation, source, cell in ROWS:
         if cell in hard:
-            one = hard[cell]
-            rows.append([method, observation, source, "no", *_numbers(one)])
-            rows[-1] += [f"{one['ms_per_action']:.1f}", NOTHING]
+            result = hard[cell]
+            row = [method, observation, source, "no", *_numbers(result)]
+            rows.append([*row, f"{result['ms_per_action']:.1f}", NOTHING])
     for method, source, cell in SEARCHING:
         if cell in hard:
-            one = hard[cell]
-            rows.append([method, source, NOTHING, "yes", *_numbers(one)])
-            rows[-1] += [NOTHING, f"{one['planning_seconds']:.3f}"]
+            result = hard[cell]
+            row = [method, source, NOTHING, "yes", *_numbers(result)]
+            rows.append([*row, NOTHING, f"{result['planning_seconds']:.3f}"])
     head = ["method", "observation", "source of link distances", "search", "success"]
     head += ["95 % interval", "collision-free", "queries", "ms per action", "planning time (s)"]
     return table(head, rows)
@@ -362,12 +362,13 @@ def matrix(results, key, columns, tasks, papers=None):
     """Markdown: a row per task, and one quantity of each policy that was evaluated there."""
     rows = []
     for task in tasks:
-        found = [results[task].get(name) for name in columns]
-        shown = [share(one[key]) + _mark(one) if one else NOTHING for one in found]
+        cells = [results[task].get(name) for name in columns]
+        shown = [share(cell[key]) + _mark(cell) if cell else NOTHING for cell in cells]
         paper = [share(papers.get(task))] if papers else []
         rows.append([f"`{task}`", *paper, *shown])
     names = [SHOWN.get(name, name) for name in columns]
-    return table(["task", *["paper's best"] * bool(papers), *names], rows)
+    head = ["task", "paper's best"] if papers else ["task"]
+    return table([*head, *names], rows)
 
 
 def with_footnotes(text):
@@ -386,7 +387,7 @@ def _numbers(result):
 def _mark(result):
     """Says that a result was measured with an earlier safety filter or encoder."""
     mark = FILTER_MARKS.get(version_of_filter(result), "")
-    return mark + ENCODER_MARK * had_other_encoder(result)
+    return mark + ENCODER_MARK if had_other_encoder(result) else mark
 
 
 def main():

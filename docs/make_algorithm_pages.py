@@ -85,7 +85,8 @@ def interval(result):
 
 def reinforcement(algorithm):
     """Goal `ee`, seed 1, with and without demonstrations."""
-    rows, of_paper = [], paper()
+    rows = []
+    of_paper = paper()
     for task in TASKS:
         for p in ("0", "1"):
             for result in runs(f"{algorithm}-ee-{task}-p{p}")[:1]:
@@ -100,7 +101,8 @@ def reinforcement(algorithm):
 
 def behavioural_cloning():
     """The means over all seeds."""
-    rows, of_paper = [], paper()
+    rows = []
+    of_paper = paper()
     for goal in ("combined", "config", "ee"):
         for task in TASKS:
             found = runs(f"bc-{goal}-{task}")

@@ -56,7 +56,8 @@ def save_gallery(tiles):
     grid = Image.new("RGB", (GALLERY_COLUMNS * width, rows * (height + LABEL)), "white")
     draw, font = ImageDraw.Draw(grid), ImageFont.load_default(15)
     for i, (name, tile) in enumerate(tiles.items()):
-        left, top = i % GALLERY_COLUMNS * width, i // GALLERY_COLUMNS * (height + LABEL)
+        left = i % GALLERY_COLUMNS * width
+        top = i // GALLERY_COLUMNS * (height + LABEL)
         grid.paste(Image.fromarray(tile), (left, top))
         draw.text((left + width // 2, top + height + 3), name, "black", font, anchor="ma")
     save(np.asarray(grid), "task_gallery.png")
@@ -67,7 +68,8 @@ def main():
     for task in tqdm([*envs.TASKS, "mixed_scenes", "containers"], unit="task"):
         env = envs.make(task, render_mode="rgb_array", goal_type="combined")
         if not isinstance(envs.get_task(task).scene, Scene):
-            pixels, rng = [], np.random.default_rng(0)
+            pixels = []
+            rng = np.random.default_rng(0)
             for _ in range(ROWS * COLUMNS):
                 env.sample_scene(rng)
                 query = Query(*env.sample_query(rng), env.scene)

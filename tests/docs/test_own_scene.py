@@ -87,7 +87,9 @@ def main_of(name):
     if name == "sac_her_mp.py":  # all that it does is in its `if __name__ == "__main__"`
         return lambda arguments: run_here(SCRIPTS / name, *arguments)
     path = __main__.COMMANDS[name][0]
-    module = importlib.import_module(f"roboarm_nmp.{path}" + ".__main__" * (name == "data"))
+    module = importlib.import_module(f"roboarm_nmp.{path}")
+    if hasattr(module, "__path__"):
+        module = importlib.import_module(f"roboarm_nmp.{path}.__main__")
     if name in ("data", "show", "evaluate"):
         return module.main
     return lambda arguments: module.main(tyro.cli(module.Args, args=arguments))
