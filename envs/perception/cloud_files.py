@@ -12,8 +12,8 @@
 
 Sizes in a file's header are compared with the file's length before memory is allocated.
 
-The readers are the project's own: no light library reads PLY and PCD, and bounds what a damaged
-file may cost.
+The readers of PLY and PCD are the project's own. The libraries that were tried read every element
+of a file, row by row in Python, or take minutes for a damaged header.
 """
 
 import io
@@ -22,15 +22,17 @@ import struct
 import warnings
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from tokenize import TokenError
+from typing import IO
 
 import numpy as np
 from PIL import Image
 
 from roboarm_nmp.envs.perception.lzf_kernels import decompress_lzf
 from roboarm_nmp.envs.robots.rotations import matrix
-from roboarm_nmp.envs.scenes.primitives import is_number, unit_quaternion
+from roboarm_nmp.envs.scenes.numbers import is_number, unit_quaternion
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """m per unit of length, by name."""
@@ -38,7 +40,8 @@ ENDINGS = (".ply", ".pcd", ".npy", ".npz", ".png")
 MAX_POINTS = 20_000_000
 MAX_BYTES = 2**30
 """Of a file."""
-_MAX_LINE, _MAX_HEADER = 10_000, 1000  # bytes of a line, lines of a header
+_MAX_LINE = 10_000  # bytes
+_MAX_HEADER = 1000  # lines
 _BLOCK = 2**22  # bytes, or rows, that are converted at once
 _PLY_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -58,7 +61,12 @@ class CloudError(ValueError):
     """A point cloud's file that cannot be used; the message is one line with its path."""
 
 
-def load_cloud(path, units=None, frame=None, intrinsics=None):
+def load_cloud(
+    path: str | Path,
+    units: str | float | None = None,
+    frame: np.ndarray | Sequence | None = None,
+    intrinsics: Sequence[float] | None = None,
+) -> np.ndarray:
     """The points in a file: float32 (n, 3), m, in the frame of the robot's base.
 
     Points without a measurement stay, as NaN; pixels without a depth (0 or not finite) do not.
@@ -81,11 +89,12 @@ def load_cloud(path, units=None, frame=None, intrinsics=None):
     ending = path.suffix.lower()
     if units is None:
         units = "mm" if ending == ".png" else "m"
-    scale = UNITS.get(units) if isinstance(units, str) else units
-    if not is_number(scale) or not 0 < scale < math.inf:
+    scale = UNITS.get(units, math.nan) if isinstance(units, str) else units
+    if not is_number(scale) or scale <= 0:
         raise ValueError(f"units must be {', '.join(UNITS)} or m per unit, got {units!r}")
     rotation, position = _pose(frame)
-    intrinsics = None if intrinsics is None else _checked_intrinsics(intrinsics)
+    if intrinsics is not None:
+        _check_intrinsics(intrinsics)
     try:
         if ending not in ENDINGS:
             raise ValueError(f"a point cloud's file must end in {', '.join(ENDINGS)}")
@@ -110,7 +119,7 @@ def load_cloud(path, units=None, frame=None, intrinsics=None):
     return _placed(points.reshape(-1, 3), float(scale), rotation, position)
 
 
-def _pose(frame):
+def _pose(frame: np.ndarray | Sequence | None) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) and position (3,), m, of a pose. Raises ValueError if it is none."""
     if frame is None:
         return np.eye(3), np.zeros(3)
@@ -130,18 +139,18 @@ def _pose(frame):
     return rotation, numbers[:3, 3]
 
 
-def _checked_intrinsics(intrinsics):
-    numbers = tuple(map(float, intrinsics))
-    if len(numbers) != 4 or not all(map(is_number, numbers)) or min(numbers[:2]) <= 0:
-        raise ValueError(f"intrinsics must be fx > 0, fy > 0, cx, cy (pixels), got {numbers}")
-    return numbers
+def _check_intrinsics(intrinsics: Sequence[float]) -> None:
+    if len(intrinsics) != 4 or not all(map(is_number, intrinsics)) or min(intrinsics[:2]) <= 0:
+        raise ValueError(f"intrinsics must be fx > 0, fy > 0, cx, cy (pixels), got {intrinsics}")
 
 
-def _placed(points, scale, rotation, position):
+def _placed(
+    points: np.ndarray, scale: float, rotation: np.ndarray, position: np.ndarray
+) -> np.ndarray:
     """Points in units of `scale` (m) as float32, m, rotated and moved."""
     with np.errstate(over="ignore", invalid="ignore"):  # infinite ones are dropped later
         if scale == 1.0 and (rotation == np.eye(3)).all() and not position.any():
-            return np.require(points, np.float32, "CW")
+            return np.require(points, np.float32, ("C", "W"))
         placed = np.empty(points.shape, np.float32)
         for begin in range(0, len(points), _BLOCK):
             block = points[begin : begin + _BLOCK].astype(np.float64)
@@ -149,7 +158,7 @@ def _placed(points, scale, rotation, position):
     return placed
 
 
-def _back_projected(depth, fx, fy, cx, cy):
+def _back_projected(depth: np.ndarray, fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """The points (n, 3) of a depth image (h, w), in its unit; pixels without depth are left out."""
     if depth.ndim != 2:
         raise ValueError(f"a depth image has the shape (h, w), this array {depth.shape}")
@@ -162,19 +171,22 @@ def _back_projected(depth, fx, fy, cx, cy):
 # --- Arrays. `np.load` would allocate whatever a header in an archive announces.
 
 
-def _read_npy(file, size):
+def _read_npy(file: IO[bytes], size: int) -> np.ndarray:
     """The numbers in an open .npy file of `size` bytes. Raises ValueError."""
     magic = file.read(8)
     if len(magic) < 8 or not magic.startswith(b"\x93NUMPY"):
         raise ValueError("not a .npy file (pickled arrays are not read)")
-    readers = {(1, 0): np.lib.format.read_array_header_1_0}
-    readers[2, 0] = np.lib.format.read_array_header_2_0
-    if tuple(magic[6:]) not in readers:
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    version = (magic[6], magic[7])
+    if version not in readers:
         raise ValueError(f"version {magic[6]}.{magic[7]} of .npy is unknown")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)  # a header of Python 2
-            shape, columns_first, dtype = readers[tuple(magic[6:])](file)
+            shape, columns_first, dtype = readers[version](file)
     except (SyntaxError, TypeError, RecursionError, UserWarning, TokenError) as error:
         raise ValueError(f"its header is damaged: {error}") from error
     if dtype.hasobject:
@@ -197,7 +209,7 @@ def _read_npy(file, size):
     return array
 
 
-def _read_npz(file, _):
+def _read_npz(file: IO[bytes], _: int) -> np.ndarray:
     with zipfile.ZipFile(file) as archive:
         entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.filelist}
         if len(entries) != 1 and "points" not in entries:
@@ -213,7 +225,7 @@ def _read_npz(file, _):
             return array
 
 
-def _read_png(file, _):
+def _read_png(file: IO[bytes], _: int) -> np.ndarray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -233,10 +245,11 @@ def _read_png(file, _):
 class _Header:
     """The words of a header's lines, one line after another; counts lines."""
 
-    def __init__(self, file):
-        self.file, self.line = file, 0
+    def __init__(self, file: IO[bytes]):
+        self.file = file
+        self.line = 0
 
-    def words(self):
+    def words(self) -> list[str]:
         """The words of the next line. Raises ValueError: there is none, or it is too long."""
         self.line += 1
         text = self.file.readline(_MAX_LINE)
@@ -244,11 +257,11 @@ class _Header:
             raise ValueError(f"line {self.line}: the header does not end")
         return text.decode("latin-1").split()
 
-    def error(self, reason):
+    def error(self, reason: str) -> ValueError:
         """A ValueError about the last line."""
         return ValueError(f"line {self.line}: {reason}")
 
-    def number(self, word):
+    def number(self, word: str) -> int:
         """A count from 0 on. Raises ValueError."""
         if not (word.isascii() and word.isdigit() and len(word) < 12):
             raise self.error(f"{word!r} is not a number")
@@ -263,34 +276,41 @@ class _Table:
         order: "<" or ">", of bytes.
     """
 
-    def __init__(self, fields, order="<"):
+    def __init__(self, fields: list[tuple[str, str, int]], order: str = "<"):
         names = [name for name, _, _ in fields]
         if any(names.count(axis) != 1 for axis in "xyz"):
             raise ValueError(f"it has the fields {' '.join(names)}, but no x, y, z")
-        sizes = [int(kind[1]) * count for _, kind, count in fields]
-        at = [names.index(axis) for axis in "xyz"]
-        if any(fields[i][2] != 1 for i in at):
-            raise ValueError("x, y and z must be single numbers")
-        self.kinds = [order + fields[i][1] for i in at]
-        self.row_size, self.width = sum(sizes), sum(count for _, _, count in fields)
-        self.offsets = [sum(sizes[:i]) for i in at]
-        self.columns = [sum(count for _, _, count in fields[:i]) for i in at]
+        self.row_size = 0  # bytes
+        self.width = 0  # words
+        self.kinds = {}
+        self.offsets = {}
+        self.columns = {}
+        for name, kind, count in fields:
+            if name in ("x", "y", "z"):
+                if count != 1:
+                    raise ValueError("x, y and z must be single numbers")
+                self.kinds[name] = order + kind
+                self.offsets[name] = self.row_size
+                self.columns[name] = self.width
+            self.row_size += int(kind[1]) * count
+            self.width += count
+        formats = [self.kinds[axis] for axis in "xyz"]
         self.dtype = np.dtype(
             {
                 "names": list("xyz"),
-                "formats": self.kinds,
-                "offsets": self.offsets,
+                "formats": formats,
+                "offsets": [self.offsets[axis] for axis in "xyz"],
                 "itemsize": self.row_size,
             }
         )
-        self.result = np.result_type(*(np.dtype(kind) for kind in self.kinds), np.float32)
+        self.result = np.result_type(*formats, np.float32)
 
-    def check(self, number, room):
+    def check(self, number: int, room: int) -> None:
         """Raise ValueError unless there is room (bytes) for so many points."""
         if number > min(room, MAX_POINTS):
             raise ValueError(f"it announces {number:,} points, and has room for {room:,}")
 
-    def from_binary(self, file, number, room):
+    def from_binary(self, file: IO[bytes], number: int, room: int) -> np.ndarray:
         """The points (number, 3) in the next rows; `room`: bytes left in the file."""
         self.check(number, room // self.row_size)
         points = np.empty((number, 3), self.result)
@@ -300,27 +320,29 @@ class _Table:
             contents = file.read(len(block) * self.row_size)
             if len(contents) < len(block) * self.row_size:
                 raise ValueError("it ends too early")
-            read = np.frombuffer(contents, self.dtype)
-            for axis in range(3):
-                block[:, axis] = read["xyz"[axis]]
+            table = np.frombuffer(contents, self.dtype)
+            for column, axis in enumerate("xyz"):
+                block[:, column] = table[axis]
         return points
 
-    def from_text(self, header, number, room):
+    def from_text(self, header: _Header, number: int, room: int) -> np.ndarray:
         """The points (number, 3) in the next lines."""
         self.check(number, (room + 1) // (2 * self.width))
-        points, done, file = np.empty((number, 3)), 0, header.file
+        points = np.empty((number, 3))
+        columns = [self.columns[axis] for axis in "xyz"]
+        done = 0
         while done < number:
-            text = file.read(_BLOCK) + file.readline(_MAX_LINE)
+            text = header.file.read(_BLOCK) + header.file.readline(_MAX_LINE)
             if not text:
                 raise ValueError(f"it ends after {done:,} of {number:,} points")
-            rows = _numbers(text.decode("latin-1"), self.columns, number - done, header.line)
+            rows = _numbers(text.decode("latin-1"), columns, number - done, header.line)
             points[done : done + len(rows)] = rows
             done += len(rows)
             header.line += text.count(b"\n")
         return points
 
 
-def _numbers(text, columns, most, line):
+def _numbers(text: str, columns: list[int], most: int, line: int) -> np.ndarray:
     """The columns of a text's lines: float64 (at most `most`, 3). `line`: those before the text."""
     rows = [row for row in text.split("\n") if row and not row.isspace()][:most]
     if not rows:
@@ -337,11 +359,12 @@ def _numbers(text, columns, most, line):
         raise
 
 
-def _read_ply(file, size):
+def _read_ply(file: IO[bytes], size: int) -> np.ndarray:
     header = _Header(file)
     if header.words() != ["ply"]:
         raise ValueError("not a PLY file")
-    form, elements = None, []  # of these: name, number of rows, fields
+    form = None
+    elements = []  # of each: name, number of rows, fields
     while (words := header.words()) != ["end_header"]:
         match words:
             case [("comment" | "obj_info"), *_] | []:
@@ -358,19 +381,18 @@ def _read_ply(file, size):
                 raise header.error(f"not understood: {' '.join(words)[:60]!r}")
     if form is None:
         raise ValueError("its header has no known format")
-    skipped_rows = skipped_bytes = 0
+    skipped_rows = 0
+    skipped_bytes = 0
     for name, number, fields in elements:
         has_list = any(kind == "list" for _, kind, _ in fields)
+        if has_list and (name == "vertex" or form != "ascii"):
+            raise ValueError(f"the element {name} has a list")
         if name == "vertex":
             break
-        if has_list and form != "ascii":
-            raise ValueError(f"the element {name}, with a list, precedes vertex")
         skipped_rows += number
         skipped_bytes += number * sum(int(kind[1]) for _, kind, _ in fields if kind != "list")
     else:
         raise ValueError("it has no element vertex")
-    if has_list:
-        raise ValueError("its vertices have a list")
     table = _Table(fields, _PLY_FORMATS[form] or "<")
     if form == "ascii":
         for _ in range(min(skipped_rows, size)):
@@ -382,15 +404,17 @@ def _read_ply(file, size):
     return table.from_binary(file, number, max(size - file.tell(), 0))
 
 
-def _read_pcd(file, size):
-    header, found = _Header(file), {}
-    while "DATA" not in found:
+def _read_pcd(file: IO[bytes], size: int) -> np.ndarray:
+    header = _Header(file)
+    entries: dict[str, list[str]] = {}
+    while "DATA" not in entries:
         words = header.words()
         if words and not words[0].startswith("#"):
-            found[words[0].upper()] = words[1:]
-    names = found.get("FIELDS", found.get("COLUMNS", []))
-    sizes, types = found.get("SIZE", []), found.get("TYPE", [])
-    counts = found.get("COUNT", ["1"] * len(names))
+            entries[words[0].upper()] = words[1:]
+    names = entries.get("FIELDS", entries.get("COLUMNS", []))
+    sizes = entries.get("SIZE", [])
+    types = entries.get("TYPE", [])
+    counts = entries.get("COUNT", ["1"] * len(names))
     if not (names and len(names) == len(sizes) == len(types) == len(counts)):
         raise ValueError("FIELDS, SIZE, TYPE and COUNT must have as many words")
     fields = []
@@ -398,25 +422,26 @@ def _read_pcd(file, size):
         if len(bytes_each) != 1 or bytes_each not in _PCD_TYPES.get(kind, ""):
             raise ValueError(f"field {name}: TYPE {kind} of SIZE {bytes_each} is unknown")
         fields.append((name, kind.lower() + bytes_each, header.number(count)))
-    number = found.get("POINTS")
-    if number is None:
-        edges = [*found.get("WIDTH", []), *found.get("HEIGHT", ["1"])]
-        number = [str(math.prod(map(header.number, edges)))] if len(edges) == 2 else []
-    if len(number) != 1:
+    if "POINTS" in entries:
+        edges = entries["POINTS"]
+    else:
+        edges = [*entries.get("WIDTH", []), *entries.get("HEIGHT", [])]
+    if not edges:
         raise ValueError("its header has no POINTS")
-    number, table = header.number(number[0]), _Table(fields)
+    number = math.prod([header.number(edge) for edge in edges])
+    table = _Table(fields)
     room = size - file.tell()
-    match found["DATA"]:
+    match entries["DATA"]:
         case ["ascii"]:
             return table.from_text(header, number, room)
         case ["binary"]:
             return table.from_binary(file, number, room)
         case ["binary_compressed"]:
             return _decompressed(file, number, table, room)
-    raise header.error(f"DATA {' '.join(found['DATA'])[:60]!r} is unknown")
+    raise header.error(f"DATA {' '.join(entries['DATA'])[:60]!r} is unknown")
 
 
-def _decompressed(file, number, table, room):
+def _decompressed(file: IO[bytes], number: int, table: _Table, room: int) -> np.ndarray:
     """The points of a PCD's `binary_compressed` data: one field after another, all points of it."""
     sizes = file.read(8)
     if len(sizes) < 8:
@@ -431,8 +456,9 @@ def _decompressed(file, number, table, room):
     if decompress_lzf(contents, unpacked) != uncompressed:
         raise ValueError("its compressed points are damaged")
     points = np.empty((number, 3), table.result)
-    for axis, (kind, offset) in enumerate(zip(table.kinds, table.offsets, strict=True)):
-        points[:, axis] = np.frombuffer(unpacked, kind, number, number * offset)
+    for column, axis in enumerate("xyz"):
+        begin = number * table.offsets[axis]
+        points[:, column] = np.frombuffer(unpacked, table.kinds[axis], number, begin)
     return points
 
 

@@ -15,7 +15,9 @@ import hashlib
 import io
 import os
 import zipfile
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,8 +31,9 @@ from roboarm_nmp.envs.perception.point_clouds import (
 )
 from roboarm_nmp.envs.perception.sensors import PointCloud, observe_scene, sensors_from_json
 from roboarm_nmp.envs.robots.metadata import check_robot
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import ROW, Scene, padded_rows
-from roboarm_nmp.networks.exported_networks import NetworkError, load_network
+from roboarm_nmp.networks.exported_networks import ExportedNetwork, NetworkError, load_network
 from roboarm_nmp.utils.files import cache_folder, write_atomically
 from roboarm_nmp.utils.names import suggest
 from roboarm_nmp.utils.progress import progress_bar, write_line
@@ -42,18 +45,24 @@ DECODER = ".decoder.pt"
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
 MAX_POINTS = 9_999
-CACHED_SCENES, CACHED_DECODED = 500, 1_000
-DECODED_CELL, DECODED_REACH = 0.025, 0.015  # m
-# The grid of decoded points: the arm's workspace above the table, m.
-DECODED_LOW, DECODED_HIGH = (-0.9, -0.9, 0.0), (0.9, 0.9, 1.5)
+CACHED_SCENES = 500
+CACHED_DECODED = 1_000
+# The grid of decoded points, m: its cells, how close to obstacles its points are, and its corners,
+# those of the arm's workspace above the table.
+DECODED_CELL = 0.025
+DECODED_REACH = 0.015
+DECODED_LOW = (-0.9, -0.9, 0.0)
+DECODED_HIGH = (0.9, 0.9, 1.5)
 
 
-def pretrained_encoders():
+def pretrained_encoders() -> list[str]:
     """Names of the encoders in `PRETRAINED`."""
     return sorted(path.stem for path in PRETRAINED.glob("*.pt") if not path.match(f"*{DECODER}"))
 
 
-def make_encoder(name, num_points=NUM_POINTS, geometry_source=None):
+def make_encoder(
+    name: str | Path, num_points: int = NUM_POINTS, geometry_source: str | Path | None = None
+) -> "SceneEncoder":
     """The encoder of a name, one per process and set of arguments.
 
     Args:
@@ -71,8 +80,9 @@ def make_encoder(name, num_points=NUM_POINTS, geometry_source=None):
     if name == ORACLE:
         return _shared(OracleEncoder)
     if name == POINT_CLOUD:
-        observed = geometry_source is None or str(geometry_source) == POINT_CLOUD
-        encoder = None if observed else encoder_with_decoder(geometry_source)
+        encoder = None
+        if geometry_source is not None and str(geometry_source) != POINT_CLOUD:
+            encoder = encoder_with_decoder(geometry_source)
         return _shared(PointCloudEncoder, num_points, encoder)
     if name in pretrained_encoders():
         return _shared(NetworkEncoder, PRETRAINED / f"{name}.pt", name)
@@ -86,20 +96,20 @@ def make_encoder(name, num_points=NUM_POINTS, geometry_source=None):
     return _shared(NetworkEncoder, path, name)
 
 
-def encoder_with_decoder(name):
+def encoder_with_decoder(name: str | Path) -> "NetworkEncoder":
     """`make_encoder(name)`. Raises NetworkError, too, if it has no decoder."""
     encoder = make_encoder(name)
-    if encoder.decoder is None:
+    if not isinstance(encoder, NetworkEncoder) or encoder.decoder is None:
         raise _no_decoder(name)
     return encoder
 
 
-def _no_decoder(name):
+def _no_decoder(name: str | Path) -> NetworkError:
     return NetworkError(f"{name} has no decoder: no obstacles can be decoded from its z_E")
 
 
 @functools.lru_cache
-def _shared(kind, *args):
+def _shared(kind: type["SceneEncoder"], *args: Any) -> "SceneEncoder":
     """The encoder of a class and its arguments, one per process."""
     return kind(*args)
 
@@ -119,23 +129,28 @@ class SceneEncoder:
             information about a scene; `point_cloud` where z_E cannot be decoded.
     """
 
-    decoder = None
-    geometry_source = POINT_CLOUD
+    decoder: ExportedNetwork | None = None
+    geometry_source: str = POINT_CLOUD
 
-    def __init__(self, name, size, token_size):
-        self.name, self.size, self.token_size = name, size, token_size
+    def __init__(self, name: str, size: int, token_size: int):
+        self.name = name
+        self.size = size
+        self.token_size = token_size
         self._of_demos = {}  # scene -> z_E
         self._cached = functools.lru_cache(CACHED_SCENES)(self._encode)
 
-    def __call__(self, scene):
+    def __call__(self, scene: Scene) -> np.ndarray:
         """z_E of a `Scene`, float32 (size,); not to be changed."""
         z = self._of_demos.get(scene)
         return self._cached(scene) if z is None else z
 
-    def check_robot(self, robot):
+    def _encode(self, scene: Scene) -> np.ndarray:
+        raise NotImplementedError
+
+    def check_robot(self, robot: Robot) -> None:
         """Raise NetworkError if the encoder was trained for another `Robot`."""
 
-    def encode_demos(self, demos):
+    def encode_demos(self, demos: Any) -> np.ndarray:
         """z_E of all scenes of `datasets.demonstrations.Demos`: float32 (n, size).
 
         Later calls of the encoder with these scenes return the same numbers.
@@ -146,12 +161,12 @@ class SceneEncoder:
         if not all(scene.is_static for scene in scenes):
             raise ValueError("demonstrations among moving obstacles cannot be encoded")
         latents = self._encode_all(scenes, demos.task)
-        self._of_demos |= zip(scenes, latents, strict=True)
+        self._of_demos.update(zip(scenes, latents, strict=True))
         return latents
 
-    def _encode_all(self, scenes, task):
-        of_scene = {scene: self._encode(scene) for scene in _progress(scenes, f"encoding {task}")}
-        return np.stack([of_scene[scene] for scene in scenes])
+    def _encode_all(self, scenes: Sequence[Scene], task: str) -> np.ndarray:
+        latents = {scene: self._encode(scene) for scene in _progress(scenes, f"encoding {task}")}
+        return np.stack([latents[scene] for scene in scenes])
 
 
 class OracleEncoder(SceneEncoder):
@@ -169,7 +184,7 @@ class OracleEncoder(SceneEncoder):
     def __reduce__(self):
         return make_encoder, (ORACLE,)
 
-    def _encode(self, scene):
+    def _encode(self, scene: Scene) -> np.ndarray:
         count = len(scene.obstacles)
         if count > MAX_OBSTACLES:
             raise ValueError(f"the oracle has room for {MAX_OBSTACLES} obstacles, not for {count}")
@@ -190,15 +205,16 @@ class PointCloudEncoder(SceneEncoder):
         ValueError: `num_points` is out of range.
     """
 
-    def __init__(self, num_points=NUM_POINTS, encoder=None):
+    def __init__(self, num_points: int = NUM_POINTS, encoder: "NetworkEncoder | None" = None):
         if type(num_points) is not int or not 1 <= num_points <= MAX_POINTS:
             raise ValueError(f"num_points must be 1 to {MAX_POINTS:,}, got {num_points!r}")
         super().__init__(POINT_CLOUD, 3 * num_points, 3)
-        self.num_points, self._encoder = num_points, encoder
+        self.num_points = num_points
+        self._encoder = encoder
         if encoder is not None:
             self.geometry_source = encoder.name
 
-    def check_robot(self, robot):
+    def check_robot(self, robot: Robot) -> None:
         """As `SceneEncoder.check_robot`."""
         if self._encoder is not None:
             self._encoder.check_robot(robot)
@@ -206,11 +222,11 @@ class PointCloudEncoder(SceneEncoder):
     def __reduce__(self):
         return _shared, (PointCloudEncoder, self.num_points, self._encoder)
 
-    def _encode(self, scene):
+    def _encode(self, scene: Scene) -> np.ndarray:
         points = observed_points if self._encoder is None else self._encoder.decoded_points
         return farthest_points(points(scene), self.num_points).ravel()
 
-    def _encode_all(self, scenes, task):
+    def _encode_all(self, scenes: Sequence[Scene], task: str) -> np.ndarray:
         if self._encoder is None:  # link distances may need all of them, too
             for scene in _progress(scenes, f"observing {task}"):
                 remember_points(scene)
@@ -233,7 +249,7 @@ class NetworkEncoder(SceneEncoder):
         NetworkError: the file cannot be used.
     """
 
-    def __init__(self, path, name=None):
+    def __init__(self, path: str | Path, name: str | None = None):
         self.path = Path(path)
         self._network = load_network(path)
         if self._network.metadata.get("kind") != "encoder":
@@ -255,29 +271,30 @@ class NetworkEncoder(SceneEncoder):
             return make_encoder, (self.name,)
         return _shared, (NetworkEncoder, self.path.absolute(), self.name)
 
-    def check_robot(self, robot):
+    def check_robot(self, robot: Robot) -> None:
         """As `SceneEncoder.check_robot`: what sensors observe contains the robot."""
         check_robot(self.name, self._network.metadata, robot)
 
-    def observe(self, scene):
+    def observe(self, scene: Scene) -> dict[str, torch.Tensor]:
         """The network's inputs, a batch of one: what the sensors observe of a `Scene`."""
         inputs = {}
         for name, outputs in observe_scene(scene, self.sensors).items():
             if isinstance(self.sensors[name], PointCloud):
-                inputs |= {f"{name}_{output}": array for output, array in outputs.items()}
+                for output, array in outputs.items():
+                    inputs[f"{name}_{output}"] = array
             else:
                 inputs[name] = outputs["rgb"]
         return {name: torch.from_numpy(inputs[name])[None] for name in self._network.inputs}
 
-    def encode(self, observed):
+    def encode(self, observed: dict[str, torch.Tensor]) -> np.ndarray:
         """z_E, float32 (size,), of what `observe` returned. Raises NetworkError: it is none."""
-        return self._network.predict_one(observed)
+        return np.asarray(self._network.predict_one(observed))
 
-    def _encode(self, scene):
+    def _encode(self, scene: Scene) -> np.ndarray:
         self.check_robot(scene.robot)
         return self.encode(self.observe(scene))
 
-    def _encode_all(self, scenes, task):
+    def _encode_all(self, scenes: Sequence[Scene], task: str) -> np.ndarray:
         """Latents are kept in the user's cache folder, where that is possible.
 
         A file there counts only for the same network and the same scenes.
@@ -303,18 +320,19 @@ class NetworkEncoder(SceneEncoder):
 
     # --- The decoder: from z_E back to geometry
 
-    def distances(self, scene, points):
+    def distances(self, scene: Scene, points: np.ndarray) -> np.ndarray:
         """Decoded distances of points (n, 3), m, from the nearest obstacle: float32 (n,), m.
 
         Raises NetworkError: there is no decoder, or it cannot be used.
         """
         if self.decoder is None:
             raise _no_decoder(self.name)
-        inputs = {"latent": self(scene), "points": np.float32(points)}
-        inputs = {name: torch.from_numpy(array)[None] for name, array in inputs.items()}
-        return self.decoder.predict_one(inputs, len(points))
+        latent = torch.from_numpy(self(scene))[None]
+        positions = torch.from_numpy(np.asarray(points, np.float32))[None]
+        inputs = {"latent": latent, "points": positions}
+        return np.asarray(self.decoder.predict_one(inputs, len(points)))
 
-    def decoded_points(self, scene):
+    def decoded_points(self, scene: Scene) -> np.ndarray:
         """Points of a scene's obstacles, decoded from z_E alone: float32 (n, 3), m.
 
         Those points of a grid of `DECODED_CELL` whose decoded distance from an obstacle is below
@@ -322,22 +340,22 @@ class NetworkEncoder(SceneEncoder):
         """
         return self._decoded(scene)
 
-    def _decode_points(self, scene):
+    def _decode_points(self, scene: Scene) -> np.ndarray:
         coarse = 3 * DECODED_CELL
         centres = _grid(coarse)
         # Only where a coarse cell may contain such points, all 27 of its cells are decoded.
         near = self.distances(scene, centres) < DECODED_REACH + coarse * 3**0.5 / 2
-        offsets = DECODED_CELL * (np.stack(np.indices((3, 3, 3)), axis=-1).reshape(-1, 3) - 1)
+        offsets = DECODED_CELL * (np.moveaxis(np.indices((3, 3, 3)), 0, -1).reshape(-1, 3) - 1)
         points = (centres[near][:, None] + offsets.astype(np.float32)).reshape(-1, 3)
         return points[self.distances(scene, points) < DECODED_REACH] if len(points) else points
 
 
-def _progress(scenes, description):
-    """The different ones of some scenes, with a progress bar."""
+def _progress(scenes: Sequence[Scene], description: str) -> Iterable[Scene]:
+    """The scenes, each of them once, with a progress bar."""
     return progress_bar(dict.fromkeys(scenes), description, unit="scene")
 
 
-def _read_latents(path, key):
+def _read_latents(path: Path, key: str) -> np.ndarray | None:
     """The latents in a file; None if there is none, or it is damaged or of another key."""
     try:
         with np.load(path) as file:
@@ -347,9 +365,8 @@ def _read_latents(path, key):
 
 
 @functools.cache
-def _grid(cell):
+def _grid(cell: float) -> np.ndarray:
     """The centres of cells between `DECODED_LOW` and `DECODED_HIGH`: float32 (n, 3), m."""
-    axes = [
-        np.arange(a + cell / 2, b, cell) for a, b in zip(DECODED_LOW, DECODED_HIGH, strict=True)
-    ]
+    corners = zip(DECODED_LOW, DECODED_HIGH, strict=True)
+    axes = [np.arange(low + cell / 2, high, cell) for low, high in corners]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)

@@ -14,6 +14,9 @@ Table and floor are known to all of them, and so are obstacles with `may_touch`:
 import functools
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import (
@@ -26,6 +29,9 @@ from roboarm_nmp.envs.perception.point_clouds import (
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scene
 from roboarm_nmp.utils.names import suggest
+
+if TYPE_CHECKING:
+    from roboarm_nmp.envs.perception.encoders import NetworkEncoder
 
 GeometrySource = Callable[[Scene], CollisionChecker]
 GROUND_TRUTH = "ground_truth"
@@ -64,13 +70,13 @@ def find_geometry_source(name, robot=PANDA, fine=False):
 
 
 @functools.lru_cache(CACHED_CHECKERS)
-def ground_truth_checker(scene):
+def ground_truth_checker(scene: Scene) -> CollisionChecker:
     """The `CollisionChecker` of a `Scene`."""
     return CollisionChecker(scene)
 
 
 @functools.lru_cache(CACHED_CHECKERS)
-def observed_checker(scene):
+def observed_checker(scene: Scene) -> CollisionChecker:
     """A `CollisionChecker` of table, floor, and the observed points of a `Scene`'s obstacles."""
     if isinstance(scene, ObservedScene):
         return CollisionChecker(replace(scene, obstacles=()))
@@ -79,7 +85,7 @@ def observed_checker(scene):
 
 
 @functools.lru_cache(CACHED_FINE_CHECKERS)
-def fine_observed_checker(scene):
+def fine_observed_checker(scene: Scene) -> CollisionChecker:
     """As `observed_checker`, with more points and smaller balls; an `ObservedScene` has its own."""
     if isinstance(scene, ObservedScene):
         return observed_checker(scene)
@@ -88,12 +94,12 @@ def fine_observed_checker(scene):
 
 
 @functools.lru_cache(CACHED_CHECKERS)
-def decoded_checker(scene, encoder):
+def decoded_checker(scene: Scene, encoder: "NetworkEncoder") -> CollisionChecker:
     """A `CollisionChecker` of table, floor, and points decoded from z_E of a `NetworkEncoder`."""
     return _checker_of_points(scene, encoder.decoded_points(scene), DECODED_RADIUS)
 
 
-def _checker_of_points(scene, points, radius):
+def _checker_of_points(scene: Scene, points: np.ndarray, radius: float) -> CollisionChecker:
     """The checker of points in the place of a scene's obstacles, except those with `may_touch`."""
     known = tuple(obstacle for obstacle in scene.obstacles if obstacle.may_touch)
     points = without_known(points, known) if known else points

@@ -10,7 +10,9 @@ and query give the same noise, in any order of the episodes.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -68,20 +70,24 @@ class SensorNoise:
 
     def __post_init__(self):
         for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            words, kind = ("a whole number", int) if name in _WHOLE else ("a number", float)
-            most, is_given = _MOST.get(name, 1000), is_number(value) and not isinstance(value, bool)
-            if not (is_given and 0 <= value <= most and kind(value) == value):
+            name = field.name
+            value = getattr(self, name)
+            kind = int if name in _WHOLE else float
+            most = _MOST.get(name, 1000)
+            is_valid = is_number(value) and not isinstance(value, bool)
+            if not (is_valid and 0 <= value <= most and kind(value) == value):
+                words = "a whole number" if kind is int else "a number"
                 raise ValueError(f"{name} must be {words} from 0 to {most}, got {value!r}")
             object.__setattr__(self, name, kind(value))  # NumPy's numbers do not fit into JSON
 
     @classmethod
-    def parse(cls, settings):
+    def parse(cls, settings: Iterable[str]) -> "SensorNoise":
         """The noise of settings such as `("gaussian=0.005", "missing_cameras=1")`.
 
         Raises ValueError: an unknown name, one that is given twice, or no number in its range.
         """
-        values, names = {}, [field.name for field in fields(cls)]
+        values = {}
+        names = [field.name for field in fields(cls)]
         for setting in settings:
             name, equals, text = setting.partition("=")
             if name not in names or not equals:
@@ -97,12 +103,12 @@ class SensorNoise:
                 raise ValueError(f"sensor noise: {name} needs {kind}, got {text!r}") from error
         return cls(**values)
 
-    def to_metadata(self):
+    def to_metadata(self) -> dict[str, Any]:
         """The attributes that are not the defaults, as a dict."""
         return {name: value for name, value in asdict(self).items() if value}
 
     @property
-    def changes_images(self):
+    def changes_images(self) -> bool:
         """Whether there is more than latency."""
         return any(value for name, value in asdict(self).items() if name not in ("latency", "seed"))
 
@@ -119,12 +125,14 @@ class NoiseOfEpisode:
         number: of cameras.
     """
 
-    def __init__(self, noise, key, number):
-        self._noise, self._key = noise, key
+    def __init__(self, noise: SensorNoise, key: int, number: int):
+        self._noise = noise
+        self._key = key
         order = _rng(noise, key).permutation(number)
-        self._missing, self._sensors = set(order[: noise.missing_cameras].tolist()), {}
+        self._missing = set(order[: noise.missing_cameras].tolist())
+        self._sensors = {}
 
-    def of_sensor(self, view):
+    def of_sensor(self, view: np.ndarray) -> "NoiseOfSensor":
         """The noise of the camera with a view: in the order in which they observe first."""
         place = view[: AXES + 9].tobytes()
         if place not in self._sensors:
@@ -141,13 +149,15 @@ class NoiseOfSensor:
         is_missing: whether it observes nothing.
     """
 
-    def __init__(self, noise, key, is_missing):
-        self._noise, self._key, self.is_missing = noise, key, is_missing
+    def __init__(self, noise: SensorNoise, key: tuple[int, int], is_missing: bool):
+        self._noise = noise
+        self._key = key
+        self.is_missing = is_missing
         rng = _rng(noise, *key)
         self._shift = 1e-3 * noise.calibration_mm * rng.standard_normal(3)
         self._turn = _rotation(math.radians(noise.calibration_degrees) * rng.standard_normal(3))
 
-    def true_view(self, view):
+    def true_view(self, view: np.ndarray) -> np.ndarray:
         """Where the camera really is (`ray_kernels.VIEW`): its assumed view with the errors."""
         noise = self._noise
         if not (noise.calibration_mm or noise.calibration_degrees):
@@ -157,12 +167,15 @@ class NoiseOfSensor:
         view[AXES : AXES + 9] = (view[AXES : AXES + 9].reshape(3, 3) @ self._turn.T).ravel()
         return view
 
-    def apply(self, depth, classes, far, number):
+    def apply(
+        self, depth: np.ndarray, classes: np.ndarray, far: float, number: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """A depth image (m) and its classes with noise.
 
         `number`: of the observation in its episode, from 0 on.
         """
-        noise, rng = self._noise, _rng(self._noise, *self._key, 1 + number)
+        noise = self._noise
+        rng = _rng(noise, *self._key, 1 + number)
         if self.is_missing:
             return np.full_like(depth, far), np.full_like(classes, NOTHING)
         hit = classes != NOTHING
@@ -172,9 +185,10 @@ class NoiseOfSensor:
             share = rng.random(depth.shape, np.float32)
             depth = np.where(flies, front + share * (back - front), depth)
         if noise.gaussian or noise.per_metre:
-            spread = np.float32(noise.gaussian), np.float32(noise.per_metre)
-            depth = depth + spread[0] * rng.standard_normal(depth.shape, np.float32)
-            depth = depth + spread[1] * depth * rng.standard_normal(depth.shape, np.float32)
+            constant = np.float32(noise.gaussian)
+            growing = np.float32(noise.per_metre)
+            depth = depth + constant * rng.standard_normal(depth.shape, np.float32)
+            depth = depth + growing * depth * rng.standard_normal(depth.shape, np.float32)
         if noise.quantisation:
             step = np.float32(noise.quantisation)
             depth = np.round(depth / step) * step
@@ -186,11 +200,11 @@ class NoiseOfSensor:
         return np.where(hit, depth, np.float32(far)), np.where(hit, classes, np.uint8(NOTHING))
 
 
-def _rng(noise, *key):
+def _rng(noise: SensorNoise, *key: int) -> np.random.Generator:
     return np.random.default_rng([noise.seed, Stream.SENSOR_NOISE, *key])
 
 
-def _rotation(vector):
+def _rotation(vector: np.ndarray) -> np.ndarray:
     """The rotation matrix (3, 3) about a vector (3,), by its norm in rad (Rodrigues' formula)."""
     angle = np.linalg.norm(vector)
     if angle == 0.0:

@@ -12,6 +12,7 @@ without labels, `prepare_cloud` removes the others by their distance.
 """
 
 import functools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -28,11 +29,21 @@ from roboarm_nmp.envs.perception.sensors import (
     OBSTACLE,
     PointCloud,
     SceneObservation,
+    SensorWorld,
     cardinal,
     world_of,
 )
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
-from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, ObservedScene, floor_box
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.primitives import (
+    FLOOR,
+    TABLE,
+    Box,
+    ObservedScene,
+    Obstacle,
+    Scene,
+    floor_box,
+)
 
 POINT_CLOUD = "point_cloud"
 """Its name as an encoder and as a geometry source."""
@@ -41,7 +52,8 @@ NUM_POINTS = 64
 CELL = 0.025
 """m. One point of each cube of this size is used: about 1,500 on `random_boxes_hard`. For an arm of
 another reach than the Panda's, it is scaled, and so is `POINT_RADIUS`."""
-FINE_CELL, FINE_POINT_RADIUS = 0.006, 0.005
+FINE_CELL = 0.006
+FINE_POINT_RADIUS = 0.005
 """m. The same as `CELL` and `POINT_RADIUS` for approach paths, which lead closer to surfaces."""
 KNOWN_DISTANCE = 0.01
 """m. Points nearer to the table or the floor than this are theirs."""
@@ -49,14 +61,14 @@ ARM_DISTANCE = 0.02
 """m. Points nearer to the arm than this are its own."""
 MIN_POINTS = 3
 """Points that a cube of `CELL` and the 26 around it need, or they are outliers."""
-STEPS = ("not finite", "outside the workspace", "of table or floor", "of the arm")
+STEPS: tuple[str, ...] = ("not finite", "outside the workspace", "of table or floor", "of the arm")
 """What `prepare_cloud` removes before outliers, in its order."""
-_AS_COMPILED = "CW"  # contiguous and writeable, or Numba compiles once more
+_AS_COMPILED = ("C", "W")  # contiguous and writeable, or Numba compiles once more
 CACHED_SCENES = 500  # about 20 kB each
 _remembered = {}  # scene -> points
 
 
-def observed_points(scene):
+def observed_points(scene: Scene) -> np.ndarray:
     """Points of a `Scene`'s obstacles: float32 (n, 3), m, in the base's frame; not to be changed.
 
     One per cube of `CELL`; none, (0, 3), where no obstacle is visible. The last scenes are cached.
@@ -69,47 +81,50 @@ def observed_points(scene):
     return _observe(scene) if points is None else points
 
 
-def remember_points(scene):
+def remember_points(scene: Scene) -> None:
     """Keep the observed points of a `Scene` in memory, about 20 kB, until the process ends."""
     _remembered[scene] = observed_points(scene)
 
 
-def fine_observed_points(scene):
+def fine_observed_points(scene: Scene) -> np.ndarray:
     """As `observed_points`, one per cube of `FINE_CELL`."""
     return _thin(scene, FINE_CELL)
 
 
 @functools.lru_cache(CACHED_SCENES)
-def _observe(scene):
+def _observe(scene: Scene) -> np.ndarray:
     return _thin(scene, CELL)
 
 
-def _thin(scene, cell):
-    points, scale = _clouds(scene), scale_of(scene.robot)
+def _thin(scene: Scene, cell: float) -> np.ndarray:
+    points = _clouds(scene)
+    scale = scale_of(scene.robot)
     if isinstance(scene, SceneObservation) and scene.noise.changes_images:
         points = without_outliers(points, scale * CELL, MIN_POINTS)
     return one_per_cell(points, scale * cell)
 
 
 @functools.lru_cache(1)  # 500 kB; the coarse and the fine points of a scene are needed together
-def _clouds(scene):
+def _clouds(scene: Scene) -> np.ndarray:
     sensors = cardinal(PointCloud, scene.robot).values()
     return obstacle_points(world_of(scene, len(sensors)), sensors)
 
 
-def obstacle_points(world, sensors):
+def obstacle_points(world: SensorWorld, sensors: Iterable[PointCloud]) -> np.ndarray:
     """All points of obstacles that sensors observe: float32 (n, 3), m, in the base's frame.
 
     Args:
         world: an `envs.perception.sensors.SensorWorld`.
         sensors: `PointCloud`s.
     """
-    images = [(sensor, *world.cast(sensor, sensor.size)) for sensor in sensors]
-    points = [sensor.points_of_class(*image, OBSTACLE) for sensor, *image in images]
-    return np.concatenate([np.empty((0, 3), np.float32), *points])
+    clouds = [np.empty((0, 3), np.float32)]
+    for sensor in sensors:
+        depth, classes = world.cast(sensor, sensor.size)
+        clouds.append(sensor.points_of_class(depth, classes, OBSTACLE))
+    return np.concatenate(clouds)
 
 
-def one_per_cell(points, cell=CELL):
+def one_per_cell(points: np.ndarray, cell: float = CELL) -> np.ndarray:
     """The first of the points (n, 3), m, in each cube with edges of `cell`, m, in their order.
 
     Use it with points of your own: the pretrained policies were trained with such clouds.
@@ -119,16 +134,38 @@ def one_per_cell(points, cell=CELL):
     return points[first_in_cells(numbers, numbers.dtype.type(cell))[0]]
 
 
-def without_known(points, obstacles, distance=KNOWN_DISTANCE):
+def without_known(
+    points: np.ndarray, obstacles: Iterable[Obstacle], distance: float = KNOWN_DISTANCE
+) -> np.ndarray:
     """The points (n, 3), m, that are not within a distance (m) of the boxes around obstacles."""
-    points, labels = np.require(points, np.float32, _AS_COMPILED), np.empty(len(points), np.uint8)
-    everywhere, no_arm = np.array([[-np.inf] * 3, [np.inf] * 3]), np.empty(0)
-    arm = arm_hulls(PANDA)
-    label_points(points, *everywhere, shape_rows(obstacles), distance, no_arm, 0.0, arm, labels)
+    points = np.require(points, np.float32, _AS_COMPILED)
+    everywhere = np.array([[-np.inf] * 3, [np.inf] * 3])
+    labels = _labels(points, everywhere, shape_rows(obstacles), distance)
     return points[labels == OF_OBSTACLE]
 
 
-def without_outliers(points, cell, min_points):
+def _labels(
+    points: np.ndarray,
+    workspace: np.ndarray,
+    shapes: np.ndarray,
+    distance: float,
+    robot: Robot = PANDA,
+    state: np.ndarray | None = None,
+    arm_distance: float = 0.0,
+) -> np.ndarray:
+    """What each point belongs to, uint8 (n,): an index into `STEPS`, or `OF_OBSTACLE`.
+
+    `state`: the arm's, normalised; None: the points have none of the arm.
+    """
+    lower, upper = workspace
+    state = np.empty(0) if state is None else state
+    labels = np.empty(len(points), np.uint8)
+    arm = arm_hulls(robot)
+    label_points(points, lower, upper, shapes, distance, state, arm_distance, arm, labels)
+    return labels
+
+
+def without_outliers(points: np.ndarray, cell: float, min_points: int) -> np.ndarray:
     """Those of float32 points (n, 3), m, that have enough points around them, themselves included.
 
     Their cube with edges of `cell` (m) and the 26 around it have at least `min_points`.
@@ -145,21 +182,21 @@ class PreparedCloud(NamedTuple):
     """
 
     points: np.ndarray
-    removed: dict
+    removed: dict[str, int]
 
 
 def prepare_cloud(
-    points,
-    robot=PANDA,
-    configuration=None,
+    points: np.ndarray,
+    robot: Robot = PANDA,
+    configuration: np.ndarray | None = None,
     *,
-    workspace=None,
-    table=TABLE,
-    floor=FLOOR,
-    cell=None,
-    min_points=MIN_POINTS,
-    arm_distance=ARM_DISTANCE,
-):
+    workspace: np.ndarray | None = None,
+    table: Box | None = TABLE,
+    floor: float | None = FLOOR,
+    cell: float | None = None,
+    min_points: int = MIN_POINTS,
+    arm_distance: float = ARM_DISTANCE,
+) -> PreparedCloud:
     """The points of obstacles in a cloud, as collision checks and policies take them.
 
     In this order, points are removed that
@@ -201,18 +238,20 @@ def prepare_cloud(
     workspace = np.array(workspace, dtype=np.float64)
     if workspace.shape != (2, 3):
         raise ValueError(f"workspace must be two corners, (2, 3), got {workspace.shape}")
-    known = [table] if table is not None else []
-    known += [] if floor is None else [floor_box(floor)]
-    state = np.empty(0)
+    known = []
+    if table is not None:
+        known.append(table)
+    if floor is not None:
+        known.append(floor_box(floor))
+    state = None
     if configuration is not None:
         if np.shape(configuration) != (robot.num_joints,):
             raise ValueError(f"configuration must be {robot.num_joints} joint angles")
         state = np.clip(robot.normalise(configuration), -1.0, 1.0)
     with np.errstate(over="ignore"):
         points = np.require(points, np.float32, _AS_COMPILED)
-    labels = np.empty(len(points), np.uint8)
-    shapes, arm = shape_rows(known), arm_hulls(robot)
-    label_points(points, *workspace, shapes, KNOWN_DISTANCE, state, arm_distance, arm, labels)
+    shapes = shape_rows(known)
+    labels = _labels(points, workspace, shapes, KNOWN_DISTANCE, robot, state, arm_distance)
     counts = np.bincount(labels, minlength=OF_OBSTACLE + 1).tolist()
     removed = dict(zip(STEPS, counts, strict=False))
     points = points[labels == OF_OBSTACLE]
@@ -224,7 +263,7 @@ def prepare_cloud(
     return PreparedCloud(thin, removed)
 
 
-def farthest_points(points, number):
+def farthest_points(points: np.ndarray, number: int) -> np.ndarray:
     """`number` points by farthest point sampling (Eldar et al., 1997): float32 (number, 3).
 
     The first is the one farthest from the base. Where there are fewer points, the rest are zeros:

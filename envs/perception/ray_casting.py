@@ -10,6 +10,7 @@ and capsules.
 
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -28,17 +29,25 @@ from roboarm_nmp.envs.perception.ray_kernels import (
     TURN,
     cast_rays,
 )
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.rotations import matrix
+from roboarm_nmp.envs.scenes.numbers import Vector
 from roboarm_nmp.envs.scenes.primitives import (
     Box,
     ConvexHull,
     Cylinder,
+    Obstacle,
+    Scene,
     floor_box,
     hull_faces,
     to_array,
 )
 
 # Classes (paper, appendix "Training and verifying the encoders").
-ROBOT, STATIC, OBSTACLE, NOTHING = range(4)  # static: table and floor
+ROBOT = 0
+STATIC = 1  # table and floor
+OBSTACLE = 2
+NOTHING = 3
 _CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 # Counterclockwise from outside.
 _CUBE_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -54,11 +63,14 @@ class RayCaster:
         configuration: the arm's joint angles (n, rad).
     """
 
-    def __init__(self, scene, configuration):
+    def __init__(self, scene: Scene, configuration: np.ndarray | Sequence[float]):
         robot = scene.robot
         self._state = np.asarray(robot.normalise(configuration), dtype=np.float64)
-        known = [scene.table] if scene.table is not None else []
-        known += [] if scene.floor is None else [floor_box(scene.floor)]
+        known = []
+        if scene.table is not None:
+            known.append(scene.table)
+        if scene.floor is not None:
+            known.append(floor_box(scene.floor))
         hulls = tuple(o.vertices for o in scene.obstacles if isinstance(o, ConvexHull))
         arm, self._polyhedra = _meshes(robot, hulls)
         rows = _surfaces((*known, *scene.obstacles), len(self._polyhedra[1]) - 1 - len(hulls))
@@ -66,32 +78,30 @@ class RayCaster:
         self._surfaces = np.concatenate([rows, arm])
         self._arm = arm_hulls(robot)[:2]
 
-    def image(self, view, size):
+    def image(self, view: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Depth, float32 (height, width), m along the viewing direction, and classes, uint8.
 
         Args:
             view: float64 (`ray_kernels.VIEW`,), see `envs.perception.sensors.view_of`.
             size: (width, height) in pixels.
         """
-        inverse = np.empty(size[::-1])
-        classes = np.full(size[::-1], NOTHING, np.uint8)
-        given = self._state, *self._arm, self._surfaces, self._polyhedra
-        cast_rays(view, *given, inverse, classes)
+        width, height = size
+        inverse = np.empty((height, width))
+        classes = np.full((height, width), NOTHING, np.uint8)
+        cast_rays(view, self._state, *self._arm, self._surfaces, self._polyhedra, inverse, classes)
         return (1.0 / inverse).astype(np.float32), classes
 
 
-def _surfaces(obstacles, first_hull):
+def _surfaces(obstacles: Sequence[Obstacle], first_hull: int) -> np.ndarray:
     """Obstacles as rows for `cast_rays`. `first_hull`: the polyhedron of the first hull."""
-    rows, given = np.zeros((len(obstacles), SURFACE_COLUMNS)), to_array(obstacles)
-    rows[:, MOVED_BY], rows[:, CLASS] = -1, OBSTACLE
-    rows[:, PLACE : PLACE + 3] = given[:, 1:4]
-    x, y, z, w = (given[:, 4:8] / np.linalg.norm(given[:, 4:8], axis=1, keepdims=True)).T
-    turn = rows[:, TURN : TURN + 9].T
-    turn[0], turn[4] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
-    turn[8] = 1 - 2 * (x * x + y * y)
-    turn[1], turn[2], turn[5] = 2 * (x * y - z * w), 2 * (x * z + y * w), 2 * (y * z - x * w)
-    turn[3], turn[6], turn[7] = 2 * (x * y + z * w), 2 * (x * z - y * w), 2 * (y * z + x * w)
-    rows[:, SIZE : SIZE + 3] = given[:, 8:11]
+    numbers = to_array(obstacles)
+    quaternions = numbers[:, 4:8] / np.linalg.norm(numbers[:, 4:8], axis=1, keepdims=True)
+    rows = np.zeros((len(obstacles), SURFACE_COLUMNS))
+    rows[:, MOVED_BY] = -1
+    rows[:, CLASS] = OBSTACLE
+    rows[:, PLACE : PLACE + 3] = numbers[:, 1:4]
+    rows[:, TURN : TURN + 9] = matrix(quaternions.T).reshape(9, -1).T
+    rows[:, SIZE : SIZE + 3] = numbers[:, 8:11]
     for row, obstacle in zip(rows, obstacles, strict=True):
         row[SHAPE] = _KINDS.get(type(obstacle), BALL)
         if isinstance(obstacle, Box):
@@ -99,13 +109,14 @@ def _surfaces(obstacles, first_hull):
         elif isinstance(obstacle, Cylinder):
             row[SIZE + 2] /= 2
         elif isinstance(obstacle, ConvexHull):
-            row[SIZE : SIZE + 3], row[MESH] = 1.0, first_hull
+            row[SIZE : SIZE + 3] = 1.0
+            row[MESH] = first_hull
             first_hull += 1
     return rows
 
 
 @functools.lru_cache(maxsize=64)
-def _meshes(robot, hulls):
+def _meshes(robot: Robot, hulls: tuple[tuple[Vector, ...], ...]):
     """The arm's surfaces, and the polyhedra: a cube, the arm's, and those of convex hulls.
 
     Args:
@@ -118,27 +129,33 @@ def _meshes(robot, hulls):
     corners = np.full((sum(len(faces) for _, faces in meshes), 4), -1, np.int64)
     corners[: len(_CUBE_FACES)] = _CUBE_FACES
     corners[len(_CUBE_FACES) :, :3] = np.concatenate([faces[:, :3] for _, faces in meshes])[6:]
-    vertex_ends, face_ends = (
-        np.cumsum([0, *(len(mesh[part]) for mesh in meshes)]) for part in (0, 1)
-    )
-    return arm, (np.concatenate([mesh for mesh, _ in meshes]), vertex_ends, face_ends, corners)
+    vertices = np.concatenate([vertices for vertices, _ in meshes])
+    vertex_ends = np.cumsum([0, *[len(vertices) for vertices, _ in meshes]])
+    face_ends = np.cumsum([0, *[len(faces) for _, faces in meshes]])
+    return arm, (vertices, vertex_ends, face_ends, corners)
 
 
 @functools.lru_cache(maxsize=64)
-def _arm_surfaces(robot):
+def _arm_surfaces(robot: Robot) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
     """The arm's surfaces, and their polyhedra, which follow the cube: `(vertices, faces)` each."""
-    rows, meshes = [], []
+    rows = []
+    meshes = []
     for link, _, rounding, mesh in link_shapes(robot):
         row = np.zeros(SURFACE_COLUMNS)
-        row[SHAPE], row[MOVED_BY], row[CLASS] = POLYHEDRON, 1 + link.frame, ROBOT
-        row[TURN : TURN + 9], row[SIZE : SIZE + 3] = np.eye(3).ravel(), 1.0
+        row[SHAPE] = POLYHEDRON
+        row[MOVED_BY] = 1 + link.frame
+        row[CLASS] = ROBOT
+        row[TURN : TURN + 9] = np.eye(3).ravel()
+        row[SIZE : SIZE + 3] = 1.0
         if len(mesh) <= 2:  # a sphere, or a capsule: two spheres and a cylinder
-            row[SHAPE], row[SIZE : SIZE + 3] = BALL, rounding
+            row[SHAPE] = BALL
+            row[SIZE : SIZE + 3] = rounding
             for centre in mesh:
                 rows.append(row.copy())
                 rows[-1][PLACE : PLACE + 3] = centre
             if len(mesh) == 2:
-                row[SHAPE], row[PLACE : PLACE + 3] = ROUND, mesh.mean(0)
+                row[SHAPE] = ROUND
+                row[PLACE : PLACE + 3] = mesh.mean(0)
                 row[TURN : TURN + 9] = _turn_to(mesh[1] - mesh[0]).ravel()
                 row[SIZE + 2] = math.dist(*mesh) / 2
                 rows.append(row)
@@ -149,7 +166,7 @@ def _arm_surfaces(robot):
     return np.reshape(rows, (-1, SURFACE_COLUMNS)), meshes
 
 
-def _polyhedron(mesh):
+def _polyhedron(mesh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The convex hull of vertices (v, 3), m: vertices, and faces (f, 3)."""
     try:
         return mesh, hull_faces(tuple(map(tuple, mesh.tolist())))
@@ -158,7 +175,7 @@ def _polyhedron(mesh):
         return mesh, hull_faces(tuple(map(tuple, mesh.tolist())))
 
 
-def _turn_to(direction):
+def _turn_to(direction: np.ndarray) -> np.ndarray:
     """A rotation (3, 3) whose z axis, the third column, has a direction (3,)."""
     z = direction / np.linalg.norm(direction)
     x = np.cross(z, np.eye(3)[np.abs(z).argmin()])

@@ -11,7 +11,9 @@ from PyBullet. Noise: `envs.perception.noise`.
 import functools
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -27,19 +29,22 @@ from roboarm_nmp.envs.perception.ray_casting import (  # noqa: F401 (the classes
 from roboarm_nmp.envs.perception.ray_kernels import AXES, EYE, VIEW, points_of_pixels
 from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
-from roboarm_nmp.envs.scenes.primitives import MAX_LENGTH, Scene, is_number
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.numbers import MAX_LENGTH, Vector, is_number
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.world import MAX_EDGE, World, image_array
 from roboarm_nmp.utils.bullet import pybullet as p
 
-CLASSES = ("robot", "table and floor", "obstacle", "nothing")
 ROBOT_COLOUR = (0.90, 0.45, 0.15, 1)
 OUTPUTS = ("rgb", "depth", "segmentation")
 MIN_NEAR = 0.001  # m, of `near`: far below it, depths have no resolution left
 # Cardinal directions as seen by the robot: x is forward, y left.
 CARDINAL = {"front": (1, 0), "left": (0, 1), "back": (-1, 0), "right": (0, -1)}
-# Of the default sensors around the Panda: their distance and height, the height they look at, the
-# farthest visible distance (m). For another arm they are scaled with its reach.
-DISTANCE, HEIGHT, TARGET, FAR = 1.6, 0.8, 0.4, 5.0
+# Of the default sensors around the Panda, m. For another arm they are scaled with its reach.
+DISTANCE = 1.6
+HEIGHT = 0.8
+TARGET = 0.4  # the height they look at
+FAR = 5.0  # the farthest visible distance
 
 
 @dataclass(frozen=True)
@@ -61,9 +66,9 @@ class Camera:
         ValueError: an attribute is out of its range.
     """
 
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float] = (0.0, 0.0, 0.4)
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    eye: Vector
+    target: Vector = (0.0, 0.0, 0.4)
+    up: Vector = (0.0, 0.0, 1.0)
     field_of_view: float = 60.0
     size: tuple[int, int] = (224, 224)
     near: float = 0.1
@@ -75,7 +80,7 @@ class Camera:
         if not (
             isinstance(self.outputs, (tuple, list))
             and self.outputs
-            and all(isinstance(one, str) and one in OUTPUTS for one in self.outputs)
+            and all(isinstance(name, str) and name in OUTPUTS for name in self.outputs)
         ):
             raise ValueError(
                 f"outputs must be one or more of {', '.join(OUTPUTS)}, got {self.outputs!r}"
@@ -88,7 +93,7 @@ class Camera:
             raise ValueError(f"size must be two numbers from 1 to {MAX_EDGE}, got {self.size!r}")
 
     @property
-    def space(self):
+    def space(self) -> gym.spaces.Dict:
         """Gymnasium space of an observation, a dict of the outputs."""
         width, height = self.size
         spaces = {
@@ -98,7 +103,7 @@ class Camera:
         }
         return gym.spaces.Dict({name: spaces[name] for name in self.outputs})
 
-    def observe(self, world):
+    def observe(self, world: "SensorWorld") -> dict[str, np.ndarray]:
         """Its observation of a `SensorWorld`: a dict of the outputs."""
         observed = {}
         if "rgb" in self.outputs:
@@ -120,9 +125,9 @@ class PointCloud:
         ValueError: an attribute is out of its range.
     """
 
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float] = (0.0, 0.0, 0.4)
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    eye: Vector
+    target: Vector = (0.0, 0.0, 0.4)
+    up: Vector = (0.0, 0.0, 1.0)
     field_of_view: float = 60.0
     num_samples: int = 10_000
     near: float = 0.1
@@ -139,7 +144,7 @@ class PointCloud:
             raise ValueError(f"num_samples must be a square number to {MAX_EDGE}², got {number!r}")
 
     @property
-    def space(self):
+    def space(self) -> gym.spaces.Dict:
         """Gymnasium space of an observation: a dict of `points` and `labels`."""
         shape = (self.num_samples, 3)
         return gym.spaces.Dict(
@@ -150,12 +155,20 @@ class PointCloud:
         )
 
     @property
-    def camera(self):
+    def camera(self) -> Camera:
         """The camera whose pixels are the rays."""
-        fields = self.eye, self.target, self.up, self.field_of_view, self.size
-        return Camera(*fields, self.near, self.far, outputs=("depth", "segmentation"))
+        return Camera(
+            self.eye,
+            self.target,
+            self.up,
+            self.field_of_view,
+            self.size,
+            self.near,
+            self.far,
+            outputs=("depth", "segmentation"),
+        )
 
-    def points(self, depth, segmentation):
+    def points(self, depth: np.ndarray, segmentation: np.ndarray) -> dict[str, np.ndarray]:
         """An observation, from the camera's `depth` (m) and `segmentation`: a dict of
 
         - `points`: float32 (num_samples, 3), m, in the frame of the robot's base: where rays hit
@@ -169,28 +182,34 @@ class PointCloud:
         points_of_pixels(self._view, depth, segmentation, -1, NOTHING, points, labels)
         return {"points": points, "labels": labels}
 
-    def points_of_class(self, depth, segmentation, label):
+    def points_of_class(
+        self, depth: np.ndarray, segmentation: np.ndarray, label: int
+    ) -> np.ndarray:
         """As `points`, those of one class alone, without zeros: float32 (n, 3), m."""
         points = np.empty((self.num_samples, 3), np.float32)
         labels = np.empty(self.num_samples, np.uint8)
-        given = self._view, depth, segmentation, label, NOTHING
-        return points[: points_of_pixels(*given, points, labels)]
+        number = points_of_pixels(self._view, depth, segmentation, label, NOTHING, points, labels)
+        return points[:number]
 
     @property
-    def size(self):
+    def size(self) -> tuple[int, int]:
         """(width, height) of the grid of rays."""
-        return (math.isqrt(self.num_samples),) * 2
+        edge = math.isqrt(self.num_samples)
+        return edge, edge
 
     @property
-    def _view(self):
+    def _view(self) -> np.ndarray:
         return view_of(self, self.size)
 
-    def observe(self, world):
+    def observe(self, world: "SensorWorld") -> dict[str, np.ndarray]:
         """Its observation of a `SensorWorld`: a dict of `points` and `labels`, see `points`."""
         return self.points(*world.cast(self, self.size))
 
 
-def cardinal(kind=Camera, robot=PANDA, **options):
+Sensor = Camera | PointCloud
+
+
+def cardinal(kind: type[Any] = Camera, robot: Robot = PANDA, **options: Any) -> dict[str, Any]:
     """Four sensors of a kind around a `Robot`, looking at it: a dict of name -> sensor.
 
     (Paper, section 4: "four sensors located in cardinal directions".) `options` go to each.
@@ -203,7 +222,7 @@ def cardinal(kind=Camera, robot=PANDA, **options):
     }
 
 
-def deproject(sensor, depth):
+def deproject(sensor: Sensor, depth: np.ndarray) -> np.ndarray:
     """The points (height, width, 3), m, in the frame of the robot's base, of a depth image.
 
     Args:
@@ -220,7 +239,7 @@ def deproject(sensor, depth):
     return np.array(sensor.eye) + depth[..., None] * rays
 
 
-def _axes_of(eye, target, up):
+def _axes_of(eye: Vector, target: Vector, up: Vector) -> tuple[np.ndarray, ...]:
     """Unit vectors (right, up, forward) of an image."""
     forward = np.subtract(target, eye).astype(np.float64)
     forward /= np.linalg.norm(forward)
@@ -229,7 +248,7 @@ def _axes_of(eye, target, up):
     return right, np.cross(right, forward), forward
 
 
-def _check_view(sensor):
+def _check_view(sensor: Sensor) -> None:
     for name in ("eye", "target", "up"):
         vector = getattr(sensor, name)
         if len(vector) != 3 or not all(is_number(x) and abs(x) <= MAX_LENGTH for x in vector):
@@ -251,21 +270,24 @@ def _check_view(sensor):
         )
 
 
-def view_of(sensor, size):
+def view_of(sensor: Sensor, size: tuple[int, int]) -> np.ndarray:
     """A sensor's place and directions as `ray_kernels.cast_rays` takes them: float64 (`VIEW`,).
 
     `size`: (width, height) in pixels. Not to be changed.
     """
-    place = (tuple(map(float, vector)) for vector in (sensor.eye, sensor.target, sensor.up))
-    return _view(*place, sensor.field_of_view, *size, sensor.near, sensor.far)
+    eye = tuple(map(float, sensor.eye))
+    target = tuple(map(float, sensor.target))
+    up = tuple(map(float, sensor.up))
+    return _view(eye, target, up, sensor.field_of_view, *size, sensor.near, sensor.far)
 
 
 @functools.lru_cache(maxsize=256)
-def _view(eye, target, up, field_of_view, width, height, near, far):
+def _view(eye, target, up, field_of_view, width, height, near, far) -> np.ndarray:
     half = math.tan(math.radians(field_of_view) / 2)
     view = np.empty(VIEW)
-    view[EYE:AXES], view[AXES : AXES + 9] = eye, np.ravel(_axes_of(eye, target, up))
-    view[AXES + 9 :] = half * width / height, half, near, far
+    view[EYE:AXES] = eye
+    view[AXES : AXES + 9] = np.ravel(_axes_of(eye, target, up))
+    view[AXES + 9 :] = (half * width / height, half, near, far)
     return view
 
 
@@ -280,29 +302,35 @@ class SensorWorld:
         noise: an `envs.perception.noise.SensorNoise`, from the first `begin_episode` on.
 
     Attributes:
-        scene: the `Scene`; None before `show`.
+        scene: the `Scene`; there is none before `show`.
         configuration: the arm's joint angles (n, rad).
 
     Raises:
         RuntimeError: of `cast` and `render`: it is closed.
     """
 
-    def __init__(self, noise=NO_NOISE):
-        self.noise, self.scene, self.configuration = noise, None, None
-        self._caster = self._drawn = self._of_episode = None
-        self._number, self._is_closed = 0, False
+    scene: Scene
+    configuration: np.ndarray | Sequence[float]
+
+    def __init__(self, noise: SensorNoise = NO_NOISE):
+        self.noise = noise
+        self._caster: RayCaster | None = None
+        self._drawn: _DrawnWorld | None = None
+        self._noise_of_episode: NoiseOfEpisode | None = None
+        self._number = 0
+        self._is_closed = False
 
     @property
-    def robot(self):
+    def robot(self) -> Robot:
         """The scene's `Robot`."""
         return self.scene.robot
 
     @property
-    def client(self):
+    def client(self) -> int | None:
         """PyBullet's number of a physics engine with the scene and the arm."""
         return self._draw().client
 
-    def begin_episode(self, key, number):
+    def begin_episode(self, key: int, number: int) -> None:
         """Draw the noise that stays the same for an episode.
 
         Args:
@@ -310,13 +338,15 @@ class SensorWorld:
             number: of cameras, of which `SensorNoise.missing_cameras` are missing.
         """
         if self.noise.changes_images:
-            self._of_episode = NoiseOfEpisode(self.noise, key, number)
+            self._noise_of_episode = NoiseOfEpisode(self.noise, key, number)
 
-    def _check_open(self):
+    def _check_open(self) -> None:
         if self._is_closed:
             raise RuntimeError("this sensor world is closed")
 
-    def show(self, scene, configuration, number=0):
+    def show(
+        self, scene: Scene, configuration: np.ndarray | Sequence[float], number: int = 0
+    ) -> None:
         """Change to a `Scene` with the arm at joint angles (n, rad).
 
         `number`: of the observation in its episode, for noise.
@@ -325,10 +355,12 @@ class SensorWorld:
         """
         if not scene.is_static:
             raise ValueError("obstacles of this scene move: observe scene.at(t), at a time t")
-        self.scene, self.configuration, self._number = scene, configuration, number
+        self.scene = scene
+        self.configuration = configuration
+        self._number = number
         self._caster = None
 
-    def cast(self, sensor, size):
+    def cast(self, sensor: Sensor, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """What rays from a sensor's place hit, with `size` (width, height) in pixels.
 
         Returns:
@@ -338,32 +370,35 @@ class SensorWorld:
         if self._caster is None:
             self._caster = RayCaster(self.scene, self.configuration)
         view = view_of(sensor, size)
-        if self._of_episode is None:
+        if self._noise_of_episode is None:
             return self._caster.image(view, size)
-        of_sensor = self._of_episode.of_sensor(view)
-        image = self._caster.image(of_sensor.true_view(view), size)
-        return of_sensor.apply(*image, sensor.far, self._number)
+        noise = self._noise_of_episode.of_sensor(view)
+        depth, classes = self._caster.image(noise.true_view(view), size)
+        return noise.apply(depth, classes, sensor.far, self._number)
 
-    def render(self, sensor, size):
+    def render(self, sensor: Sensor, size: tuple[int, int]) -> np.ndarray:
         """The colour image from a sensor's place, with `size` (width, height) in pixels.
 
         Returns:
             `rgb`, as `Camera` describes it.
         """
-        client, (width, height) = self.client, size
-        place = sensor.eye, sensor.target, sensor.up
-        if self._of_episode is not None:
+        client = self.client
+        width, height = size
+        eye, target, up = sensor.eye, sensor.target, sensor.up
+        if self._noise_of_episode is not None:
             view = view_of(sensor, size)
-            of_sensor = self._of_episode.of_sensor(view)
-            if of_sensor.is_missing:
+            noise = self._noise_of_episode.of_sensor(view)
+            if noise.is_missing:
                 return np.zeros((height, width, 3), np.uint8)
-            view = of_sensor.true_view(view).tolist()
-            eye, up, forward = (view[i : i + 3] for i in (EYE, AXES + 3, AXES + 6))
-            place = eye, np.add(eye, forward).tolist(), up
+            view = noise.true_view(view).tolist()
+            eye = view[EYE:AXES]
+            up = view[AXES + 3 : AXES + 6]
+            forward = view[AXES + 6 : AXES + 9]
+            target = np.add(eye, forward).tolist()
         image = p.getCameraImage(
             width,
             height,
-            p.computeViewMatrix(*place),
+            p.computeViewMatrix(eye, target, up),
             p.computeProjectionMatrixFOV(
                 sensor.field_of_view, width / height, sensor.near, sensor.far
             ),
@@ -373,7 +408,7 @@ class SensorWorld:
         )
         return image_array(image[2], width, height)
 
-    def _draw(self):
+    def _draw(self) -> "_DrawnWorld":
         self._check_open()
         if self._drawn is None:
             self._drawn = _DrawnWorld(self.scene)
@@ -381,7 +416,7 @@ class SensorWorld:
         self._drawn.arm.set_configuration(self.configuration)
         return self._drawn
 
-    def close(self):
+    def close(self) -> None:
         """Close it, and PyBullet's world, if there is one. Closing twice is allowed."""
         self._is_closed = True
         if self._drawn is not None:
@@ -414,11 +449,17 @@ class SceneObservation(Scene):
     number: int = 0
 
     @classmethod
-    def of(cls, scene, configuration, noise=NO_NOISE, key=0, number=0):
+    def of(
+        cls,
+        scene: Scene,
+        configuration: np.ndarray | Sequence[float],
+        noise: SensorNoise = NO_NOISE,
+        key: int = 0,
+        number: int = 0,
+    ) -> "SceneObservation":
         """The observation of a static `Scene` with the arm at joint angles (n, rad)."""
-        given = {field.name: getattr(scene, field.name) for field in fields(Scene)}
         return cls(
-            **given,
+            **{field.name: getattr(scene, field.name) for field in fields(Scene)},
             configuration=tuple(map(float, configuration)),
             noise=noise,
             key=key,
@@ -427,11 +468,11 @@ class SceneObservation(Scene):
 
 
 @functools.lru_cache(maxsize=8)
-def _shared_world(noise):
+def _shared_world(noise: SensorNoise) -> SensorWorld:
     return SensorWorld(noise)
 
 
-def world_of(scene, number):
+def world_of(scene: Scene, number: int) -> SensorWorld:
     """A `SensorWorld` that shows a `Scene`, or a `SceneObservation`, for so many sensors."""
     if not isinstance(scene, SceneObservation):
         world = _shared_world(NO_NOISE)
@@ -443,7 +484,7 @@ def world_of(scene, number):
     return world
 
 
-def observe_scene(scene, sensors):
+def observe_scene(scene: Scene, sensors: Mapping[str, Sensor]) -> dict[str, dict[str, np.ndarray]]:
     """Observations of a `Scene` with the arm in its robot's `observed_pose`.
 
     Args:
@@ -460,7 +501,7 @@ def observe_scene(scene, sensors):
 _KINDS = {"camera": Camera, "point_cloud": PointCloud}
 
 
-def sensors_to_json(sensors):
+def sensors_to_json(sensors: Mapping[str, Sensor]) -> str:
     """A dict of name -> `Camera` or `PointCloud` as text."""
     kinds = {kind: name for name, kind in _KINDS.items()}
     return json.dumps(
@@ -468,7 +509,7 @@ def sensors_to_json(sensors):
     )
 
 
-def sensors_from_json(text):
+def sensors_from_json(text: str) -> dict[str, Sensor]:
     """The inverse of `sensors_to_json`. Raises ValueError: it is no text of that function."""
     sensors = {}
     try:
