@@ -12,7 +12,7 @@ without labels, `prepare_cloud` removes the others by their distance.
 """
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -135,7 +135,7 @@ def one_per_cell(points: np.ndarray, cell: float = CELL) -> np.ndarray:
 
 
 def without_known(
-    points: np.ndarray, obstacles: Iterable[Obstacle], distance: float = KNOWN_DISTANCE
+    points: np.ndarray, obstacles: Sequence[Obstacle], distance: float = KNOWN_DISTANCE
 ) -> np.ndarray:
     """The points (n, 3), m, that are not within a distance (m) of the boxes around obstacles."""
     points = np.require(points, np.float32, _AS_COMPILED)

@@ -76,7 +76,7 @@ class RayCaster:
         rows = _surfaces((*known, *scene.obstacles), len(self._polyhedra[1]) - 1 - len(hulls))
         rows[: len(known), CLASS] = STATIC
         self._surfaces = np.concatenate([rows, arm])
-        self._arm = arm_hulls(robot)[:2]
+        self._chain, self._bodies, *_ = arm_hulls(robot)
 
     def image(self, view: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Depth, float32 (height, width), m along the viewing direction, and classes, uint8.
@@ -88,7 +88,16 @@ class RayCaster:
         width, height = size
         inverse = np.empty((height, width))
         classes = np.full((height, width), NOTHING, np.uint8)
-        cast_rays(view, self._state, *self._arm, self._surfaces, self._polyhedra, inverse, classes)
+        cast_rays(
+            view,
+            self._state,
+            self._chain,
+            self._bodies,
+            self._surfaces,
+            self._polyhedra,
+            inverse,
+            classes,
+        )
         return (1.0 / inverse).astype(np.float32), classes
 
 

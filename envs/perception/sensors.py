@@ -425,7 +425,8 @@ class SensorWorld:
 
 
 class _DrawnWorld(World):
-    def _load_arm(self):
+    def _load_arm(self) -> Body:
+        assert self.client is not None  # it was just opened
         return Body.coarse(self.robot, self.client, ROBOT_COLOUR)
 
 

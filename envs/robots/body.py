@@ -111,7 +111,7 @@ class Body:
         mimics = self.robot.mimics
         return [scale * configuration[joint] + offset for _, joint, scale, offset in mimics]
 
-    def set_configuration(self, configuration: Sequence[float]) -> None:
+    def set_configuration(self, configuration: np.ndarray | Sequence[float]) -> None:
         """Teleport the arm to joint angles (n, rad), at rest."""
         angles = [[angle] for angle in configuration]
         following = [[angle] for angle in self._followers(configuration)]
