@@ -6,7 +6,6 @@ import pytest
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import POINT, CollisionChecker
-from roboarm_nmp.envs.perception import point_clouds
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import observed_checker
 from roboarm_nmp.envs.perception.point_clouds import (
@@ -42,14 +41,6 @@ def test_observed_points_lie_on_visible_surfaces():
     # At most one in each cell.
     cells = np.floor(points / CELL).astype(int)
     assert len(np.unique(cells, axis=0)) == len(points)
-
-
-def test_observed_points_are_reproducible():
-    scene = Scene((BOX, Sphere((-0.4, 0.4, 0.3), 0.1)))
-    before = observed_points(scene).tobytes()
-    observed_points(Scene((Sphere((0.4, 0.4, 0.4), 0.05),)))
-    point_clouds._observe.cache_clear()
-    assert observed_points(scene).tobytes() == before
 
 
 def test_empty_scene_has_no_observed_points():
@@ -123,33 +114,6 @@ def test_distances_from_observed_points_are_close_to_those_from_obstacles(clutte
 def test_invalid_points_are_rejected(points, radius):
     with pytest.raises(ValueError, match="points"):
         CollisionChecker(EMPTY, points, radius)
-
-
-def test_farthest_points_equal_a_loop():
-    points = np.random.default_rng(2).uniform(-1, 1, (50, 3)).astype(np.float32)
-    chosen = [max(range(50), key=lambda i: np.linalg.norm(points[i]))]
-    while len(chosen) < 8:
-        chosen.append(
-            max(range(50), key=lambda i: min(np.linalg.norm(points[i] - points[j]) for j in chosen))
-        )
-    assert farthest_points(points, 8).tolist() == points[chosen].tolist()
-    padded = farthest_points(points[:3], 5)
-    assert sorted(padded[:3].tolist()) == sorted(points[:3].tolist()) and not padded[3:].any()
-
-
-def test_environment_appends_farthest_observed_points():
-    env = envs.make("random_boxes_hard", encoder="point_cloud")
-    observation, _ = env.reset(seed=1)
-    scene = observation["observation"][10:].reshape(64, 3)
-    expected = farthest_points(observed_points(env.unwrapped.scene), 64)
-    assert scene.tobytes() == expected.tobytes() and scene.any()
-    assert env.observation_space.contains(observation)
-    after, *_ = env.step(np.full(7, 0.01))
-    assert after["observation"][10:].tobytes() == scene.tobytes()
-    env.close()
-    env = envs.make("random_boxes_hard", encoder="point_cloud", num_points=16)
-    assert env.reset(seed=1)[0]["observation"].shape == (10 + 48,)
-    env.close()
 
 
 def test_vector_environment_observes_as_single_ones():

@@ -55,19 +55,6 @@ def test_each_step_leaves_its_points_out_and_counts_them():
     assert all(tuple(row) in rows for row in kept)
 
 
-def test_preparation_can_keep_what_is_left_out_by_default():
-    points = np.array([[0.5, 0.3, 0.005], [0.0, 0.0, 0.1], [5.0, 0.0, 0.0]])
-    workspace = [[-9] * 3, [9] * 3]
-    options = {"workspace": workspace, "table": None, "floor": None, "min_points": 0}
-    kept, removed = prepare_cloud(points, **options)
-    assert kept.tolist() == np.float32(points).tolist() and not any(removed.values())
-
-
-def test_fine_cells_do_not_turn_surfaces_into_outliers():
-    kept, removed = prepare_cloud(WALL, cell=0.002)
-    assert len(kept) == len(WALL) and not any(removed.values())
-
-
 def test_same_points_give_the_same_cloud_whatever_their_memory():
     read_only = np.array(WALL, np.float32)
     read_only.flags.writeable = False

@@ -3,7 +3,6 @@
 import math
 import re
 
-import gymnasium as gym
 import numpy as np
 import psutil
 import pytest
@@ -25,7 +24,7 @@ from roboarm_nmp.envs.perception.sensors import (
     sensors_from_json,
     sensors_to_json,
 )
-from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.scenes.primitives import Cylinder, Scene, Sphere
 from roboarm_nmp.envs.wrappers import SensorWrapper
 from roboarm_nmp.utils.bullet import pybullet as p
 
@@ -62,8 +61,9 @@ def test_images_do_not_depend_on_how_pybullet_was_built(world, monkeypatch):
         assert as_built[name] in camera.space[name] and of_tuples[name] in camera.space[name]
 
 
-@pytest.mark.parametrize(("size", "fov"), [((224, 224), 60.0), ((160, 120), 40.0)])
-def test_ball_appears_where_a_pinhole_camera_projects_it(world, size, fov):
+def test_ball_appears_where_a_pinhole_camera_projects_it(world):
+    size = (160, 120)
+    fov = 40.0
     world.show(Scene((BALL,)), HOME)
     # Looks along -x, so that the image's right is +y and its upper edge +z.
     camera = Camera((2.0, 0.2, 0.7), (0.0, 0.2, 0.7), (0, 0, 1), fov, size, outputs=OUTPUTS)
@@ -83,7 +83,7 @@ def test_ball_appears_where_a_pinhole_camera_projects_it(world, size, fov):
     assert observed["rgb"].shape == (*size[::-1], 3) and observed["rgb"].dtype == np.uint8
 
 
-@pytest.mark.parametrize("name", list(cardinal()))
+@pytest.mark.parametrize("name", ["front", "right"])
 def test_points_lie_on_surfaces_of_their_class(world, name):
     pole = Cylinder((0.0, -0.5, 0.4), 0.05, 0.8)
     world.show(Scene((BALL, pole)), HOME)
@@ -122,12 +122,6 @@ def test_point_cloud_equals_a_camera_in_its_place(world):
     depth = (cloud["points"][hits] - np.array([0.0, 1.6, 0.8])) @ ahead
     np.testing.assert_allclose(depth, image["depth"][visible], atol=1e-5)
     assert (image["depth"][~visible] == 5.0).all()
-
-
-def test_table_and_floor_may_be_missing(world):
-    world.show(Scene((Box((0.5, 0.0, 0.3), (0.1, 0.1, 0.1)),), table=None, floor=None), HOME)
-    labels = cardinal(PointCloud)["front"].observe(world)["labels"]
-    assert set(labels) == {ROBOT, OBSTACLE, NOTHING}
 
 
 def test_observations_depend_on_scene_and_arm_only(world):
@@ -229,9 +223,9 @@ def test_observing_changes_no_episode():
     unmarked = SensorWrapper(envs.make("random_boxes_hard"), MIX)
     assert same(marked, unmarked.reset(seed=3)[0]["sensors"])
     rng = np.random.default_rng(0)
-    for episode in range(3):
+    for episode in range(2):
         expected, observed = plain.reset(seed=episode)[0], wrapped.reset(seed=episode)[0]
-        for _ in range(60):
+        for _ in range(20):
             for name, array in expected.items():
                 np.testing.assert_array_equal(observed[name], array)
             action = rng.uniform(-0.05, 0.05, 7)
@@ -240,16 +234,7 @@ def test_observing_changes_no_episode():
         env.close()
 
 
-def test_sensors_work_in_a_vector_environment():
-    vector = gym.vector.SyncVectorEnv(
-        [lambda: SensorWrapper(envs.make("random_boxes_easy"), MIX) for _ in range(2)]
-    )
-    observation, _ = vector.reset(seed=[1, 2])
-    assert observation["sensors"]["above"]["rgb"].shape == (2, 24, 32, 3)
-    assert observation["sensors"]["cloud"]["points"].shape == (2, 400, 3)
-    vector.close()
-
-
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_scenes():
     env = SensorWrapper(envs.make("random_boxes_hard"), cardinal(size=(16, 16)))
     rng, sizes = np.random.default_rng(0), []
