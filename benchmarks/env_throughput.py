@@ -33,7 +33,6 @@ from tqdm import trange
 from roboarm_nmp import envs
 from roboarm_nmp.envs.robots.control import SUBSTEPS
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.utils.bullet import pybullet as p
 
 EPISODE = 100  # steps
@@ -98,11 +97,8 @@ def record_targets(env, episode):
     """
     start, goal, actions = episode
     targets, tracking = [], []
-    command = Robot.command
-    Robot.command = lambda robot, client, body, target: (
-        targets.append(target),
-        command(robot, client, body, target),
-    )
+    command = env.world.arm.command
+    env.world.arm.command = lambda target: (targets.append(target), command(target))
     try:
         env.reset_specific(start, goal)
         targets.clear()
@@ -115,7 +111,7 @@ def record_targets(env, episode):
                 tracking.append((after - before) @ asked / (asked @ asked))
             before = after
     finally:
-        Robot.command = command
+        del env.world.arm.command
     return targets, tracking
 
 

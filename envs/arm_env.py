@@ -479,6 +479,7 @@ class RoboArmEnv(gym.Env):
         else:
             self._goal_state = np.full(self.robot.num_joints, np.nan)
             self._goal_end_effector = end_effector
+        self._goal_position = self._goal_end_effector[:3]
         desired = self._goal_type.achieved(self._goal_state, self._goal_end_effector)
         self._desired_goal = desired.astype(np.float32)
         self._steps = 0
@@ -486,7 +487,7 @@ class RoboArmEnv(gym.Env):
         self._in_sink = False
         self._read_arm()
         if self.render_mode is not None:
-            self.world.mark_goal(self._goal_end_effector[:3], self.ee_tolerance)
+            self.world.mark_goal(self._goal_position, self.ee_tolerance)
         observation = self._observation()
         _, self._is_success = self._compare(observation["achieved_goal"], self._desired_goal)
         self._is_success = bool(self._is_success)
@@ -514,7 +515,7 @@ class RoboArmEnv(gym.Env):
             return self._observation(), 0.0, False, self._steps >= self.horizon, info
 
         delta = action if self.action_mode == "relative" else action - self._state
-        length = math.sqrt(delta @ delta)
+        length = math.sqrt(delta.dot(delta))
         if length > self.max_step:
             delta = delta * (self.max_step / length)
         state = _clipped((self._state + delta).tolist())
@@ -554,14 +555,14 @@ class RoboArmEnv(gym.Env):
         }
 
     def _info(self, collision, is_success):
-        to_goal = self._end_effector[:3] - self._goal_end_effector[:3]
+        to_goal = self._end_effector[:3] - self._goal_position
         to_goal_state = self._state - self._goal_state
         info = {
             "is_success": is_success,
             "collision": collision,
             "collision_so_far": self._collision_so_far,
-            "ee_distance": math.sqrt(to_goal @ to_goal),
-            "config_distance": math.sqrt(to_goal_state @ to_goal_state),
+            "ee_distance": math.sqrt(to_goal.dot(to_goal)),
+            "config_distance": math.sqrt(to_goal_state.dot(to_goal_state)),
             "elapsed_steps": self._steps,
         }
         if self._goal_type.has_rotation:

@@ -33,14 +33,14 @@ class GoalType:
         has_position: a goal has the end effector's position (3, m), after the configuration.
         has_rotation: after the position, the end effector's quaternion (4, xyzw). `observation`
             has it, too.
-        measured: the part of a goal whose L2 distance counts.
+        measured: the part of a goal whose L2 distance counts; None for all of it.
     """
 
     name: str
     has_configuration: bool
     has_position: bool
     has_rotation: bool
-    measured: slice
+    measured: slice | None = None
 
     @property
     def end_effector_size(self) -> int:
@@ -76,7 +76,9 @@ class GoalType:
         In metres, or for `config` in the normalised space. With a rotation, the angle counts as
         the share of its tolerance, in metres.
         """
-        apart = (achieved - desired)[..., self.measured]
+        apart = achieved - desired
+        if self.measured is not None:
+            apart = apart[..., self.measured]
         distance = np.sqrt(np.add.reduce(apart * apart, axis=-1))
         reached = distance <= (tolerances.ee if self.has_position else tolerances.config)
         if self.has_rotation:
@@ -89,8 +91,8 @@ class GoalType:
 GOAL_TYPES = {
     goal_type.name: goal_type
     for goal_type in (
-        GoalType("ee", False, True, False, measured=slice(None)),
-        GoalType("config", True, False, False, measured=slice(None)),
+        GoalType("ee", False, True, False),
+        GoalType("config", True, False, False),
         GoalType("combined", True, True, False, measured=slice(-3, None)),  # reached like `ee`
         GoalType("pose", False, True, True, measured=slice(0, 3)),
     )

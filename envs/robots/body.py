@@ -108,8 +108,9 @@ class Body:
                 )
 
     def _followers(self, configuration):
-        mimics = self.robot.mimics
-        return [scale * configuration[joint] + offset for _, joint, scale, offset in mimics]
+        return [
+            scale * configuration[joint] + offset for _, joint, scale, offset in self.robot.mimics
+        ]
 
     def set_configuration(self, configuration: np.ndarray | Sequence[float]) -> None:
         """Teleport the arm to joint angles (n, rad), at rest."""
@@ -129,7 +130,7 @@ class Body:
             self.id,
             self._commanded,
             p.POSITION_CONTROL,
-            targetPositions=[*configuration, *self._followers(configuration)],
+            targetPositions=configuration + self._followers(configuration),
             forces=self._forces,
             positionGains=self.gains,
             physicsClientId=self.client,

@@ -301,28 +301,28 @@ class Robot:
         return float(np.linalg.norm(positions, axis=1).max())
 
     @functools.cached_property
-    def _mid_and_range(self):
-        return self.upper + self.lower, self.upper - self.lower
+    def _middle_and_half_range(self):
+        return (self.upper + self.lower) / 2.0, (self.upper - self.lower) / 2.0
 
     @functools.cached_property
-    def _mid_and_range_lists(self):
-        mid, span = self._mid_and_range
-        return list(zip(mid.tolist(), span.tolist(), strict=True))
+    def _middle_and_half_range_of_joints(self):
+        middle, half_range = self._middle_and_half_range
+        return list(zip(middle.tolist(), half_range.tolist(), strict=True))
 
     def normalise(self, configuration: ArrayLike) -> np.ndarray:
         """Joint angles in rad, (..., n) -> normalised configuration in [-1, 1], same shape."""
-        mid, span = self._mid_and_range
-        return (2.0 * np.asarray(configuration) - mid) / span
+        middle, half_range = self._middle_and_half_range
+        return (np.asarray(configuration) - middle) / half_range
 
     def denormalise(self, state: ArrayLike) -> np.ndarray:
         """Normalised configuration, (..., n) -> joint angles in rad, same shape."""
-        mid, span = self._mid_and_range
-        return (np.asarray(state) * span + mid) / 2.0
+        middle, half_range = self._middle_and_half_range
+        return np.asarray(state) * half_range + middle
 
     def denormalise_one(self, state) -> list[float]:
         """`denormalise` of one configuration, n floats, as a list: faster than NumPy."""
-        pairs = zip(state, self._mid_and_range_lists, strict=True)
-        return [(value * width + mid) / 2.0 for value, (mid, width) in pairs]
+        joints = zip(state, self._middle_and_half_range_of_joints, strict=True)
+        return [value * half_range + middle for value, (middle, half_range) in joints]
 
     # --- Kinematics
 

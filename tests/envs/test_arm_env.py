@@ -18,7 +18,6 @@ from paths import ROOT
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, from_array, to_array
 from roboarm_nmp.utils.bullet import pybullet as p
 
@@ -66,10 +65,7 @@ def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
     env.reset_specific(HOME, NEAR_HOME)
     s = 2 * (HOME.astype(float) - PANDA.lower) / (PANDA.upper - PANDA.lower) - 1
     commanded = []
-    command = PANDA.command
-    monkeypatch.setattr(
-        Robot, "command", lambda _, c, body, q: (commanded.append(q), command(c, body, q))
-    )
+    monkeypatch.setattr(env.world.arm, "command", commanded.append)
     rng = np.random.default_rng(0)
     direction = rng.normal(size=7)
     direction /= np.linalg.norm(direction)
