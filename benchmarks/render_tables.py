@@ -18,8 +18,9 @@ FIXED = ("wall", "double_walls")
 REMARK = (
     "Success is reaching the goal, contacts allowed. Go-to-goal moves straight to the goal. "
     "DAgger has a safety filter and receives link distances from the same source as its "
-    "observation. The paper's policies have neither. The last two methods of `random_boxes_hard` "
-    "search, the others do not. Each policy is one seed, except BC and, on `wall`, SAC with three."
+    "observation. The paper's policies have neither. Only the last two methods of "
+    "`random_boxes_hard` search for a path before they move. Most rows are from one training seed; "
+    "BC, and SAC on `wall`, are from three."
 )
 
 
