@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import re
-import signal
 import subprocess
 import sys
 import textwrap
@@ -17,6 +15,7 @@ from paths import ROOT
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets import format as dataset_format
+from roboarm_nmp.datasets.__main__ import main as data_command
 from roboarm_nmp.datasets.format import SPLITS, DatasetError
 from roboarm_nmp.datasets.queries import (
     Queries,
@@ -102,56 +101,52 @@ def test_same_contents_same_bytes(tmp_path):
     assert write(tmp_path / "second.h5").read_bytes() == first
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_file_made_again_has_the_same_bytes(made, tmp_path, workers):
+def test_file_made_again_by_two_workers_has_the_same_bytes(made, tmp_path):
     again = tmp_path / "again.h5"
-    make_queries.make_queries(again, "wall", 0, 30, 10, num_workers=workers, progress=False)
+    make_queries.make_queries(again, "wall", 0, 30, 10, num_workers=2, progress=False)
     assert again.read_bytes() == made.read_bytes()
 
 
-def test_interrupted_command_continues_to_the_same_bytes(made, tmp_path, monkeypatch):
-    again, done = tmp_path / "again.h5", []
+def in_this_process(make_worker, arguments, jobs, *_, **__):
+    """As `workers.run`."""
+    yield from map(make_worker(*arguments), jobs)
 
-    def die(journal, entry):
-        if len(done) == 17:
+
+def test_interrupted_command_continues_to_the_same_bytes(made, tmp_path, monkeypatch):
+    again = tmp_path / "again.h5"
+    numbers = []
+    append = make_queries.Journal.append
+
+    def append_or_die(journal, entry):
+        if len(numbers) == 17:
             raise OSError("the disk is full")
-        done.append(entry["index"])
+        numbers.append(entry["index"])
         append(journal, entry)
 
-    append = make_queries.Journal.append
-    monkeypatch.setattr(make_queries.Journal, "append", die)
+    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
+    monkeypatch.setattr(make_queries.Journal, "append", append_or_die)
     with pytest.raises(OSError, match="disk is full"):
         make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
     with pytest.raises(ValueError, match="seed 0, not 1"):
         make_queries.make_queries(again, "wall", 1, 30, 10, progress=False)
-    monkeypatch.undo()
-    sampled = []
+    first = list(numbers)
+    numbers.clear()
     monkeypatch.setattr(
         make_queries.Journal,
         "append",
-        lambda journal, entry: sampled.append(entry["index"]) or append(journal, entry),
+        lambda journal, entry: numbers.append(entry["index"]) or append(journal, entry),
     )
     make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
-    assert len(sampled) == 40 - 17 and not set(sampled) & set(done)
+    assert len(numbers) == 40 - 17 and not set(numbers) & set(first)
     assert again.read_bytes() == made.read_bytes()
     assert list(tmp_path.iterdir()) == [again]
 
 
-def test_query_does_not_depend_on_the_others(made):
-    queries = load_queries(made)
-    sampler = make_queries.Sampler("wall", solvable=False)
-    for index in (29, 3):
-        query = sampler((0, "test", index))
-        np.testing.assert_array_equal(queries.start[index], query["start"])
-        np.testing.assert_array_equal(queries.goal[index], query["goal"])
-    sampler.env.close()
-
-
 def test_made_queries_are_feasible_and_not_those_of_a_reset(made):
-    everything = validate(made, "wall", simulate=True)
+    splits = validate(made, "wall", simulate=True)
     env = envs.make("wall")
     env.reset(seed=0)
-    for queries in everything.values():
+    for queries in splits.values():
         assert not (queries.start == env.start_configuration).all(axis=1).any()
     env.close()
 
@@ -161,7 +156,6 @@ def test_made_queries_are_feasible_and_not_those_of_a_reset(made):
     [
         (lambda start, goal: (start.astype(np.float64), goal), "float32"),
         (lambda start, goal: (start[:, :6], goal), r"\(n, 7\)"),
-        (lambda start, goal: (start[:-1], goal), "rows"),
         (lambda start, goal: (start[:0], goal[:0]), "n > 0"),
         (lambda start, goal: (start * np.float32(np.nan), goal), "not finite"),
         (lambda start, goal: (start + np.float32(10), goal), "joint limits"),
@@ -203,14 +197,6 @@ def truncate(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
 
 
-def empty(path):
-    path.write_bytes(b"")
-
-
-def text(path):
-    path.write_text("start,goal\n0,1\n")
-
-
 def foreign(path):
     with h5py.File(path, "w") as file:
         file["start"] = np.zeros((3, 7))
@@ -231,50 +217,21 @@ def change_one_number(path):
         file["validation/start"][2, 3] -= np.float32(1e-6)
 
 
-def change_the_seed(path):
-    with h5py.File(path, "r+") as file:
-        file.attrs["seed"] = 4
-
-
 def newer_schema(path):
     with h5py.File(path, "r+") as file:
         file.attrs["schema_version"] = 2
 
 
-def without_an_array(path):
-    with h5py.File(path, "r+") as file:
-        del file["validation/goal"]
-
-
-def without_an_attribute(path):
-    with h5py.File(path, "r+") as file:
-        del file.attrs["scene"]
-
-
-def replace_array(path, array):
+def wrong_dtype(path):
     with h5py.File(path, "r+") as file:
         del file["test/goal"]
-        file["test/goal"] = array
-
-
-def wrong_dtype(path):
-    replace_array(path, np.zeros((30, 7)))
-
-
-def wrong_shape(path):
-    replace_array(path, np.zeros((29, 7), np.float32))
+        file["test/goal"] = np.zeros((30, 7))
 
 
 def soft_link(path):
     with h5py.File(path, "r+") as file:
         del file["test/goal"]
         file["test/goal"] = h5py.SoftLink("/test/start")
-
-
-def external_link(path):
-    with h5py.File(path, "r+") as file:
-        del file["test"]
-        file["test"] = h5py.ExternalLink("/etc/passwd", "/test")
 
 
 def elsewhere(path):
@@ -284,49 +241,33 @@ def elsewhere(path):
         file.create_dataset("test/goal", shape, np.float32, external=where)
 
 
-def never_written(path):
-    with h5py.File(path, "r+") as file:
-        for name in ("start", "goal"):
-            del file[f"test/{name}"]
-            file.create_dataset(f"test/{name}", (5 * 10**6, 7), np.float32)
-
-
 def promised(path):
     with h5py.File(path, "r+") as file:
         del file["test/goal"]
         file.create_dataset("test/goal", (10**12, 7), np.float32, chunks=(1000, 7))
 
 
-BAD = [
-    (soft_link, "/test/goal is a link, which is never followed"),
-    (external_link, "/test is a link, which is never followed"),
-    (elsewhere, "/test/goal is not an array in this file"),
-    (never_written, "was never written"),
-    (promised, "too many"),
-    (missing, "no such file"),
-    (truncate, "truncated"),
-    (empty, "not an HDF5 file"),
-    (text, "not an HDF5 file"),
-    (foreign, "not a query file"),
-    (flip_stored_bytes, "corrupt"),
-    (change_one_number, "checksum"),
-    (change_the_seed, "checksum"),
-    (newer_schema, "schema version 2, this code reads 1"),
-    (without_an_array, "array validation/goal is missing"),
-    (without_an_attribute, "attribute scene"),
-    (wrong_dtype, "test/goal must be float32, is float64"),
-    (wrong_shape, "test/goal has 29 rows"),
-]
-
-
-@pytest.mark.parametrize(("damage", "complaint"), BAD, ids=[damage.__name__ for damage, _ in BAD])
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (missing, "no such file"),
+        (truncate, "truncated"),
+        (foreign, "not a query file"),
+        (flip_stored_bytes, "corrupt"),
+        (change_one_number, "checksum"),
+        (newer_schema, "schema version 2, this code reads 1"),
+        (wrong_dtype, "test/goal must be float32, is float64"),
+        (soft_link, "/test/goal is a link, which is never followed"),
+        (elsewhere, "/test/goal is not an array in this file"),
+        (promised, "too many"),
+    ],
+)
 def test_bad_file_is_rejected_by_name(path, damage, complaint):
     damage(path)
-    for read in (load_queries, validate):
-        with pytest.raises(DatasetError) as caught:
-            read(path)
-        assert str(path) in str(caught.value) and complaint in str(caught.value)
-        assert "\n" not in str(caught.value)
+    with pytest.raises(DatasetError) as caught:
+        load_queries(path)
+    assert str(path) in str(caught.value) and complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_flipped_byte_changes_nothing_or_is_rejected(path):
@@ -334,7 +275,7 @@ def test_flipped_byte_changes_nothing_or_is_rejected(path):
     expected = load_queries(path)
     rng = np.random.default_rng(0)
     rejected = 0
-    for position in rng.integers(len(contents), size=300):
+    for position in rng.integers(len(contents), size=60):
         damaged = bytearray(contents)
         damaged[position] ^= int(rng.integers(1, 256))
         path.write_bytes(damaged)
@@ -362,7 +303,6 @@ def test_file_for_another_task_is_rejected(path, monkeypatch):
     "scene",
     [
         Scene((Box((0.5, 0.0, 0.3), (0.5, 0.05, 0.61)),)),
-        Scene(),
         dataclasses.replace(envs.TASKS["wall"].scene, table=None),
         dataclasses.replace(envs.TASKS["wall"].scene, floor=-0.61),
     ],
@@ -422,67 +362,20 @@ KILLED_IN_THE_MIDDLE = """
     write_queries(sys.argv[1], "wall", 0, splits, "", {})
 """
 
-WRITES_AGAIN_AND_AGAIN = """
-    import sys
-    import numpy as np
-    from roboarm_nmp.envs.robots.panda import PANDA
-    from roboarm_nmp.datasets.queries import write_queries
-
-    rng = np.random.default_rng(1)
-    test, validation = (
-        [rng.uniform(0.9 * PANDA.lower, 0.9 * PANDA.upper, (n, 7)).astype(np.float32)] * 2
-        for n in (3000, 10)
-    )
-    for seed in range(10, 10_000):
-        splits = {"test": test, "validation": validation}
-        write_queries(sys.argv[1], "wall", seed, splits, "", {})
-        print("in the middle", flush=True)
-"""
-
-
-def start_writer(script, path):
-    """The process of `script`, after it has printed its first line."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(script), path],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    assert any(line.startswith("in the middle") for line in process.stdout)
-    return process
-
 
 def test_writer_killed_in_the_middle_leaves_the_old_file(path):
     before = path.read_bytes()
-    process = start_writer(KILLED_IN_THE_MIDDLE, path)
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(KILLED_IN_THE_MIDDLE), path],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline() == "in the middle\n"
     process.kill()
-    assert process.wait() == -signal.SIGKILL
-    process.stdout.close()
+    process.communicate()
     assert path.read_bytes() == before
     write(path)  # in spite of leftovers of the killed writer
-    assert path.read_bytes() == before
-
-
-def test_writer_killed_anywhere_leaves_a_whole_file(path):
-    for delay in (0.0, 0.01, 0.023, 0.041):
-        process = start_writer(WRITES_AGAIN_AND_AGAIN, path)
-        time.sleep(delay)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-        assert len(load_queries(path)) == 3000
-        process.stdout.close()
-
-
-def test_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
-    before = path.read_bytes()
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        write(path, random_splits(1))
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
 
@@ -496,38 +389,26 @@ def command(*arguments):
     )
 
 
-def test_validate_command(made, path):
-    good = command("roboarm_nmp.datasets", "validate", made, "--task", "wall", "--simulate")
-    assert good.returncode == 0
-    assert "30 test and 10 validation queries for wall, seed 0" in good.stdout
+def test_validate_command_names_bad_files(made, path, capsys):
     truncate(path)
-    bad = command("roboarm_nmp.datasets", "validate", path, made)
-    assert bad.returncode == 1
-    errors = [line for line in bad.stderr.splitlines() if line.startswith("error:")]
-    assert len(errors) == 1 and str(path) in errors[0] and "truncated" in errors[0]
-    assert "Traceback" not in bad.stderr
-    assert str(made) in bad.stdout
+    assert data_command(["validate", str(made), "--task", "wall", "--simulate"]) == 0
+    assert "30 test and 10 validation queries for wall, seed 0" in capsys.readouterr().out
+    assert data_command(["validate", str(path), str(made)]) == 1
+    output = capsys.readouterr()
+    [error] = [line for line in output.err.splitlines() if str(path) in line]
+    assert "truncated" in error and str(made) in output.out
 
 
 def test_make_queries_command_repeats_itself(tmp_path):
     path = tmp_path / "wall.h5"
-    arguments = "--task wall --seed 5 --num-test 12 --num-validation 3"
-    made_by = f"roboarm queries {arguments}"
-    result = command(
-        "roboarm_nmp.demo_generation.make_queries", *arguments.split(), "--output", path
-    )
+    made_by = "roboarm queries --task wall --seed 5 --num-test 12 --num-validation 3"
+    again = ["roboarm_nmp", *made_by.split()[1:], "--output", path, "--workers", 1]
+    result = command(*again)
     assert result.returncode == 0, result.stderr
     with h5py.File(path) as file:
         assert file.attrs["made_by"].decode() == made_by
         assert json.loads(file.attrs["parameters"].decode())["hold_steps"] == 24
     first = path.read_bytes()
-    again = ["roboarm_nmp", *made_by.split()[1:], "--output", path, "--workers", 1]
-    refused = command(*again)
-    assert refused.returncode == 1 and path.read_bytes() == first
-    assert (
-        refused.stderr.splitlines()[-1]
-        == f"roboarm queries: {path} exists; --overwrite replaces it"
-    )
     path.write_bytes(b"old")
     assert command(*again, "--overwrite").returncode == 0
     assert path.read_bytes() == first
@@ -563,31 +444,19 @@ def test_queries_inside_the_limits_of_the_datasheet_are_a_share_of_all(tmp_path)
 
 
 def test_goal_region_without_room_is_an_error_that_counts(tmp_path, monkeypatch):
-    monkeypatch.setattr(make_queries, "MAX_GOALS", 20_000)
+    monkeypatch.setattr(make_queries, "MAX_GOALS", 2_000)
+    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
     inside_a_wall = (0.3, 0.9, -0.015, 0.015, 0.1, 0.7)
     args = make_queries.Args(
         ("wall",), goal_region=inside_a_wall, output=tmp_path / "no.h5", workers=1
     )
-    sampler = make_queries.Sampler("wall", False, goal_region=inside_a_wall)
-    goals = np.random.default_rng(1).uniform(PANDA.lower, PANDA.upper, (20_000, 7))
-    positions = PANDA.forward_kinematics(goals)
-    inside = (np.abs(positions - (0.6, 0, 0.4)) <= (0.3, 0.015, 0.3)).all(axis=1).sum()
-    with pytest.raises(RuntimeError) as error:
-        sampler((0, "test", 0))
-    text = str(error.value)
-    counted = re.search(r"of 20,000 random configurations, (\d+) \(", text)
-    assert inside > 20 and int(counted[1]) == pytest.approx(inside, rel=0.5)
-    assert text.endswith("0 of these are feasible goals")
-
-    def in_this_process(make_worker, arguments, jobs, *_, **__):
-        yield from map(make_worker(*arguments), jobs)
-
-    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
-    with pytest.raises(SystemExit, match="--goal-region: of 20,000"):
+    message = r"--goal-region: of 2,000 random configurations, \d+ .* 0 of these are feasible goals"
+    with pytest.raises(SystemExit, match=message):
         make_queries.main(args)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_terminated_make_queries_command_continues(made, tmp_path):
     path = tmp_path / "wall.h5"
     arguments = ["roboarm_nmp", "queries", "--task", "wall", "--num-test", 30]
@@ -616,12 +485,9 @@ def test_terminated_make_queries_command_continues(made, tmp_path):
         (["--task", "wall", "wal"], "unknown task 'wal'"),
         (["--task", "mixed_scenes"], "mixed_scenes are scenes for training"),
         (["--task", "wall", "--output", "no/such/folder/wall.h5"], "cannot write no/such/folder"),
-        (["--task", "wall", "--output", "envs"], "envs is a directory"),
         (["--task", "all", "--output", "some.h5"], "one task"),
         (["--task", "wall", "--workers", "0"], "--workers must be in [1, 256]"),
-        (["--task", "wall", "--seed", "-1"], "--seed must be in [0, 2^32)"),
         (["--task", "wall"], "wall.h5 exists; --overwrite replaces it"),
-        (["--task", "wall", "--goal-region", "1", "2", "3"], "--goal-region takes XMIN XMAX YMIN"),
         (
             ["--task", "wall", "--goal-region", "1", "0", "0", "1", "0", "1"],
             "each minimum below its maximum, got 1.0 0.0 0.0",
@@ -629,10 +495,9 @@ def test_terminated_make_queries_command_continues(made, tmp_path):
     ],
 )
 def test_make_queries_rejects_bad_flags_before_any_work(arguments, complaint):
-    result = command("roboarm_nmp.demo_generation.make_queries", *arguments)
-    assert result.returncode == 1
-    assert complaint in result.stderr
-    assert "queries/s" not in result.stderr and "Traceback" not in result.stderr
+    with pytest.raises(SystemExit) as ended:
+        make_queries.main(make_queries.flags.parse(make_queries.Args, arguments))
+    assert complaint in str(ended.value)
 
 
 # --- Files of the project
@@ -650,7 +515,7 @@ def test_queries_of_the_project_are_feasible_and_have_their_positions(task):
     for split in SPLITS:
         queries = load_queries(task, split)
         assert len(queries) == {"test": 10_000, "validation": 200}[split]
-        chosen = np.random.default_rng(0).choice(len(queries), 20, replace=False)
+        chosen = np.random.default_rng(0).choice(len(queries), 8, replace=False)
         for start, goal, scene in queries[chosen]:
             env.set_scene(scene)
             assert env.is_feasible(start)
@@ -664,17 +529,9 @@ def test_queries_of_the_project_are_feasible_and_have_their_positions(task):
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("task", "fewest", "most"),
-    [
-        ("random_boxes_easy", 2, 4),
-        ("random_boxes_medium", 3, 6),
-        ("random_boxes_hard", 4, 8),
-    ],
-)
-def test_random_scenes_of_the_project_have_every_number_of_obstacles(task, fewest, most):
-    queries = load_queries(task)
-    with h5py.File(query_path(task)) as file:
+def test_random_scenes_of_the_project_have_every_number_of_obstacles():
+    queries = load_queries("random_boxes_hard")
+    with h5py.File(query_path("random_boxes_hard")) as file:
         parameters = json.loads(file.attrs["parameters"].decode())
         counts = file["test/obstacle_count"][()]
         scene = file["test/scene"][()]
@@ -683,8 +540,7 @@ def test_random_scenes_of_the_project_have_every_number_of_obstacles(task, fewes
     np.testing.assert_array_equal(scene, np.arange(10_000) // 5)
     assert len({queries[i].scene for i in range(0, 10_000, 5)}) == 2000
     shares = np.bincount(counts, minlength=9) / 2000
-    expected = np.zeros(9)
-    expected[fewest : most + 1] = 1 / (most + 1 - fewest)
-    np.testing.assert_allclose(shares, expected, atol=0.04)
-    validation = {query.scene for query in load_queries(task, "validation")}
-    assert len(validation) == 40 and not validation & {queries[i].scene for i in range(10_000)}
+    np.testing.assert_allclose(shares, [0, 0, 0, 0, *[1 / 5] * 5], atol=0.04)
+    validation = {query.scene for query in load_queries("random_boxes_hard", "validation")}
+    assert len(validation) == 40
+    assert not validation & {queries[i].scene for i in range(0, 10_000, 5)}

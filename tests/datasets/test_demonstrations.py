@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import time
 
 import h5py
 import numpy as np
@@ -23,7 +22,7 @@ from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
-from roboarm_nmp.envs.subgoals import MAX_STEP, SUBGOAL_SPACING, subgoals
+from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING, subgoals
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 
@@ -132,7 +131,7 @@ def test_demonstrations_are_indexed_like_queries(path):
     demos, queries = load_demos(path), load_queries("wall")
     assert queries[-1].start.tolist() == queries[len(queries) - 1].start.tolist()
     assert demos[-1].digest == demos[4].digest and demos[np.int64(1)].digest == demos[1].digest
-    for index in (slice(1, 4), slice(None, None, -2), [4, 0], np.arange(5) > 2, slice(0, 0)):
+    for index in (slice(1, 4), [4, 0], np.arange(5) > 2):
         chosen = np.arange(5)[index]
         fewer = demos[index]
         assert len(fewer) == len(queries[: len(chosen)]) == len(chosen)
@@ -146,15 +145,6 @@ def test_demonstrations_are_indexed_like_queries(path):
             data[number]
     with pytest.raises(IndexError, match="demonstration 5 of 5"):
         demos[5]
-
-
-def test_configurations_of_a_demonstration_are_radians_like_those_of_queries(path):
-    demo = load_demos(path)[0]
-    middle, half = (PANDA.upper + PANDA.lower) / 2, (PANDA.upper - PANDA.lower) / 2
-    np.testing.assert_allclose(demo.configurations, middle + half * demo.states, atol=1e-6)
-    # As start and goal, up to the resolution of the stored states and the arrival's tolerance.
-    np.testing.assert_allclose(demo.configurations[0], demo.start, atol=1e-3)
-    np.testing.assert_allclose(demo.configurations[-1], demo.goal, atol=0.1)
 
 
 def naive_subgoals(plan):
@@ -188,26 +178,19 @@ def test_actions_lead_to_the_next_subgoal_and_are_clipped(path):
     assert 0 < clipped < 0.5 * len(demos.actions)
 
 
-def test_subgoals_are_close_and_contain_the_waypoints(made):
-    plans, executions, _ = made
-    for plan in plans:
+def test_subgoals_are_those_by_the_book(made):
+    for plan in made[0]:
         points = subgoals(plan, PANDA)
-        assert points.dtype == np.float64
         np.testing.assert_allclose(points, naive_subgoals(plan), rtol=0, atol=1e-12)
         assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() <= SUBGOAL_SPACING + 1e-12
-        waypoints = PANDA.normalise(plan.astype(np.float64))
-        for waypoint in waypoints:
-            assert np.abs(points - waypoint).max(1).min() < 1e-12
-        np.testing.assert_allclose(points[[0, -1]], waypoints[[0, -1]], rtol=0, atol=1e-12)
-    assert SUBGOAL_SPACING < MAX_STEP == 0.03
-    assert subgoals(plans[0][[0, 0]], PANDA).shape == (2, 7)  # standing still
+    assert subgoals(plan[[0, 0]], PANDA).shape == (2, 7)  # standing still
 
 
-@pytest.mark.parametrize("steps", [2, 5])
-def test_subgoals_speed_up_and_slow_down_between_waypoints(steps):
+def test_subgoals_speed_up_and_slow_down_between_waypoints():
+    steps = 5
     robot = dataclasses.replace(PANDA, acceleration_steps=steps)
     state = np.zeros(7)
-    for length in (1e-4, 0.01, 0.1, 1.0):
+    for length in (1e-4, 0.1, 1.0):
         path = robot.denormalise([state, state + length / math.sqrt(7), state])
         points = subgoals(path, robot)
         there = len(points) // 2
@@ -220,11 +203,6 @@ def test_subgoals_speed_up_and_slow_down_between_waypoints(steps):
         # One step less would not do.
         less = [min(i + 1, there - 1 - i, steps) for i in range(there - 1)]
         assert sum(less) * SUBGOAL_SPACING / steps < length
-
-
-def test_same_contents_same_bytes(path, made, tmp_path):
-    time.sleep(1.1)  # HDF5's time stamps are whole seconds
-    assert write(tmp_path / "again.h5", made).read_bytes() == path.read_bytes()
 
 
 def test_statistics_equal_those_by_hand(tmp_path):
@@ -258,7 +236,7 @@ def test_statistics_equal_those_by_hand(tmp_path):
 # --- Replayed
 
 
-@pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
+@pytest.mark.parametrize("goal_type", ["ee", "config"])
 def test_actions_lead_to_the_goal(path, goal_type):
     env, reached = envs.make("wall", goal_type=goal_type), 0
     for demo in load_demos(path):
@@ -304,26 +282,13 @@ def test_plan_through_an_obstacle_collides(made):
 # --- Rejected when writing
 
 
-def with_row(array, row, value):
-    array = array.copy()
-    array[row] = value
-    return array
-
-
 def the_same_query_twice(arguments):
     arguments["plans"][2][[0, -1]] = arguments["plans"][0][[0, -1]]
 
 
-def a_query_of(split):
-    def change(arguments):
-        start, goal, _ = load_queries("no_obstacles", split)[17]
-        arguments["plans"][1][0], arguments["plans"][1][-1] = start, goal
-
-    return change
-
-
-def not_a_number_in_a_plan(arguments):
-    arguments["plans"][2][1, 3] = np.nan
+def a_test_query(arguments):
+    start, goal, _ = load_queries("no_obstacles", "test")[17]
+    arguments["plans"][1][0], arguments["plans"][1][-1] = start, goal
 
 
 def a_plan_outside_the_limits(arguments):
@@ -332,10 +297,6 @@ def a_plan_outside_the_limits(arguments):
 
 def not_a_number_in_an_execution(arguments):
     arguments["executions"][1][1, 0] = np.nan
-
-
-def an_execution_of_one_row(arguments):
-    arguments["executions"][1] = arguments["executions"][1][:1]
 
 
 def a_plan_of_one_row(arguments):
@@ -350,30 +311,16 @@ def a_digest_too_few(arguments):
     arguments["columns"]["digest"].pop()
 
 
-def executions_of_another_width(arguments):
-    arguments["executions"] = [states[:, :6] for states in arguments["executions"]]
-
-
-def nothing(arguments):
-    for values in (arguments["plans"], arguments["executions"], *arguments["columns"].values()):
-        values.clear()
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
         (the_same_query_twice, "1 queries are in it twice"),
-        (a_query_of("test"), "1 queries are test queries of no_obstacles"),
-        (a_query_of("validation"), "1 queries are validation queries of no_obstacles"),
-        (not_a_number_in_a_plan, "plan has numbers that are not finite"),
+        (a_test_query, "1 queries are test queries of no_obstacles"),
         (a_plan_outside_the_limits, r"plan\[6\] is outside the joint limits"),
         (not_a_number_in_an_execution, "not finite"),
-        (an_execution_of_one_row, "at least two"),
         (a_plan_of_one_row, "at least two"),
-        (an_execution_too_few, None),
+        (an_execution_too_few, "3 plans and 2 executions"),
         (a_digest_too_few, "digest has 2 rows, not 3"),
-        (executions_of_another_width, None),
-        (nothing, None),
     ],
 )
 def test_bad_demonstrations_are_not_written(path, change, complaint):
@@ -395,37 +342,7 @@ def test_unknown_task_is_rejected(path):
         load_demos("wal")
 
 
-def test_failed_write_leaves_the_old_file_and_no_other(path, monkeypatch):
-    before = path.read_bytes()
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        write_demos(path, **hand_made())
-    assert path.read_bytes() == before
-    assert list(path.parent.iterdir()) == [path]
-
-
 # --- Bad files
-
-
-def missing(path):
-    path.unlink()
-
-
-def truncate(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
-
-
-def text(path):
-    path.write_text("plan,state\n0,1\n")
-
-
-def foreign(path):
-    with h5py.File(path, "w") as file:
-        file["plan"] = np.zeros((3, 7))
 
 
 def a_query_file(path):
@@ -441,19 +358,9 @@ def flip_a_byte_in_the_middle(path):
     path.write_bytes(contents)
 
 
-def change_one_number(path):
-    with h5py.File(path, "r+") as file:
-        file["residual"][2, 3] += 1
-
-
 def change_a_seed(path):
     with h5py.File(path, "r+") as file:
         file["plan_seed"][2] += 1
-
-
-def newer_schema(path):
-    with h5py.File(path, "r+") as file:
-        file.attrs["schema_version"] = 2
 
 
 def without_an_array(path):
@@ -461,23 +368,10 @@ def without_an_array(path):
         del file["digest"]
 
 
-def without_parameters(path):
+def with_a_digest_too_few(path):
     with h5py.File(path, "r+") as file:
-        del file.attrs["parameters"]
-
-
-def replace_array(path, name, array):
-    with h5py.File(path, "r+") as file:
-        del file[name]
-        file[name] = array
-
-
-def wrong_dtype(path):
-    replace_array(path, "length", np.zeros(5, np.int64))
-
-
-def wrong_shape(path):
-    replace_array(path, "digest", np.zeros(4, np.uint32))
+        del file["digest"]
+        file["digest"] = np.zeros(4, np.uint32)
 
 
 def sign_again(path):
@@ -506,63 +400,27 @@ def other_parameters(parameters):
     return damage
 
 
-BAD = [
-    (other_parameters("{}"), "parameters: lag is not 7 finite numbers"),
-    (other_parameters('{"lag": [0, 0, 0, 0, 0, 0, NaN]}'), "lag is not 7 finite numbers"),
-    (other_parameters('{"lag": "seven"}'), "lag is not 7 finite numbers"),
-    (other_parameters('{"lag": [0, 0, 0, 0, 0, 0, 0], "quantum": NaN}'), "quantum is not 1"),
-    (other_parameters("[]"), "parameters is not a dict"),
-    (other_parameters("{"), "corrupt"),
-    (missing, "no such file"),
-    (truncate, "truncated"),
-    (text, "not an HDF5 file"),
-    (foreign, "not a demonstration file"),
-    (a_query_file, "not a demonstration file (schema 'roboarm-nmp queries'"),
-    (flip_a_byte_in_the_middle, "corrupt"),
-    (change_one_number, "checksum"),
-    (change_a_seed, "checksum"),
-    (newer_schema, "schema version 2, this code reads 1"),
-    (without_an_array, "array digest is missing"),
-    (without_parameters, "attribute parameters"),
-    (wrong_dtype, "length must be uint32, is int64"),
-    (wrong_shape, "digest has 4 rows, not 5"),
-    (a_row_too_many, "the lengths do not add up"),
-]
-
-
-@pytest.mark.parametrize(("damage", "complaint"), BAD, ids=[damage.__name__ for damage, _ in BAD])
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (other_parameters("{}"), "parameters: lag is not 7 finite numbers"),
+        (other_parameters('{"lag": [0, 0, 0, 0, 0, 0, NaN]}'), "lag is not 7 finite numbers"),
+        (other_parameters('{"lag": [0, 0, 0, 0, 0, 0, 0], "quantum": NaN}'), "quantum is not 1"),
+        (other_parameters("[]"), "parameters is not a dict"),
+        (a_query_file, "not a demonstration file (schema 'roboarm-nmp queries'"),
+        (flip_a_byte_in_the_middle, "corrupt"),
+        (change_a_seed, "checksum"),
+        (without_an_array, "array digest is missing"),
+        (with_a_digest_too_few, "digest has 4 rows, not 5"),
+        (a_row_too_many, "the lengths do not add up"),
+    ],
+)
 def test_bad_file_is_rejected_by_name(path, damage, complaint):
     damage(path)
     with pytest.raises(DatasetError) as caught:
         load_demos(path)
     assert str(path) in str(caught.value) and complaint in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_flipped_byte_changes_nothing_or_is_rejected(path):
-    contents = path.read_bytes()
-    expected = load_demos(path)
-    rng = np.random.default_rng(0)
-    rejected = 0
-    for position in rng.integers(len(contents), size=150):
-        damaged = bytearray(contents)
-        damaged[position] ^= int(rng.integers(1, 256))
-        path.write_bytes(damaged)
-        try:
-            demos = load_demos(path)
-        except DatasetError as error:
-            assert str(path) in str(error)
-            rejected += 1
-        else:  # a byte that HDF5 does not use
-            np.testing.assert_array_equal(demos.states, expected.states)
-            np.testing.assert_array_equal(demos.plan, expected.plan)
-    assert rejected > 0
-
-
-def test_demonstration_file_is_not_a_query_file(path):
-    with pytest.raises(DatasetError, match="not a query file") as caught:
-        load_queries(path)
-    assert str(path) in str(caught.value)
 
 
 def test_file_for_another_task_is_rejected(path, monkeypatch):
@@ -573,18 +431,11 @@ def test_file_for_another_task_is_rejected(path, monkeypatch):
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "scene",
-    [
-        Scene((Box((0.5, 0.0, 0.3), (0.5, 0.05, 0.61)),)),
-        dataclasses.replace(envs.TASKS["wall"].scene, table=None),
-        dataclasses.replace(envs.TASKS["wall"].scene, floor=-0.61),
-    ],
-)
-def test_file_for_an_old_scene_is_rejected(path, monkeypatch, scene):
+def test_file_for_an_old_scene_is_rejected(path, monkeypatch):
+    scene = Scene((Box((0.5, 0.0, 0.3), (0.5, 0.05, 0.61)),))
     task = dataclasses.replace(envs.TASKS["wall"], scene=scene)
     monkeypatch.setitem(envs.TASKS, "wall", task)
-    with pytest.raises(DatasetError, match="out of date.*made by a test") as caught:
+    with pytest.raises(DatasetError, match="out of date.*made by a test.*--overwrite") as caught:
         load_demos(path)
     assert str(path) in str(caught.value)
 
@@ -600,7 +451,7 @@ def test_demonstrations_of_the_project_repeat(file):
     demos = load_demos(file.stem)
     assert len(demos) == 10_000 and not demos.collided.any()
     env = envs.make(file.stem)
-    for i in np.random.default_rng(0).choice(len(demos), 8, replace=False):
+    for i in np.random.default_rng(0).choice(len(demos), 3, replace=False):
         execution = follow(env, demos[i].plan, demos[i].scene)
         assert execution.reached and not execution.collided
         np.testing.assert_allclose(execution.states, demos[i].states, rtol=0, atol=demos.quantum)

@@ -7,9 +7,8 @@ import roboarm_nmp
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, Sphere
-from roboarm_nmp.evaluation.rollout import Trajectory
 from roboarm_nmp.motions.metrics import motion_metrics, sparc
-from roboarm_nmp.motions.trajectories import JointTrajectory
+from roboarm_nmp.motions.trajectories import JointTrajectory, Trajectory
 
 REST = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])
 

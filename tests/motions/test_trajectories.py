@@ -8,10 +8,10 @@ import pytest
 
 from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.evaluation.rollout import Trajectory
 from roboarm_nmp.motions.trajectories import (
     STEP_SECONDS,
     JointTrajectory,
+    Trajectory,
     load_joint_path,
     load_trajectory,
     save_joint_path,
@@ -78,25 +78,18 @@ def test_joints_of_a_ros_message_are_read_in_any_order(tmp_path):
         ("a.yaml", "a: [", "no YAML"),
         ("a.yaml", "a: &b [1]\nc: *b", "anchors and aliases"),
         ("a.yaml", "!!python/object/apply:os.system ['touch made']", "no YAML"),
-        ("a.yaml", "[" * 5000, "not a joint path"),
-        ("a.yaml", "points: 3", "no list `points`"),
         ("a.yaml", ROS1.replace("0.7, 1.6", "1.6"), "has not 7 numbers"),
-        ("a.yaml", ROS1.replace("0.7,", "x,"), "something other than numbers"),
         ("a.yaml", ROS1.replace("panda_joint7", "iiwa_joint7"), "its joints are .*iiwa_joint7"),
         ("a.yaml", ROS1.replace("secs: 1", "secs: 0.5"), "no duration in whole sec"),
-        ("a.yaml", ROS1.replace("time_from_start", "time"), "no `time_from_start`"),
         ("a.yaml", ROS1.replace("-1.8", "-90.0"), "q4 exceeds its limits"),
-        ("a.yaml", ROS1.replace("velocities: []", "velocities: [1.0]"), "has not 7 numbers"),
         (
             "a.yaml",
             ROS1.replace("velocities: []", f"velocities: [{', '.join(['.inf'] * 7)}]"),
             "velocities must be finite",
         ),
         ("a.json", "{", "not a joint path"),
-        ("a.json", "[1]", "no JSON object"),
         ("a.json", "[" * 100_000, "not a joint path"),
         ("a.json", json.dumps({"times": [0.0]}), "no array configurations, but times"),
-        ("a.json", json.dumps({"configurations": [[0] * 7, [0]]}), "not a joint path"),
         ("a.json", json.dumps({"configurations": [[10**400] * 7]}), "something other than numbers"),
     ],
 )
@@ -128,7 +121,7 @@ def test_positions_between_samples_are_those_of_cubic_polynomials():
     assert len(trajectory.frames()) == 61
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz", "a.CSV", "a.json", "a.yaml"])
+@pytest.mark.parametrize("name", ["a.CSV", "a.npz", "a.json", "a.yaml"])
 def test_joint_path_is_read_as_it_was_written(name, tmp_path):
     save_joint_path(tmp_path / name, PATH, [0.5, 2.0])
     times, configurations = load_joint_path(tmp_path / name, PANDA)
@@ -145,26 +138,20 @@ def test_csv_file_with_a_byte_order_mark_is_read(tmp_path):
     np.testing.assert_array_equal(load_joint_path(tmp_path / "c.csv", PANDA)[1], PATH[:1])
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
-def test_file_of_an_episode_has_its_states_actions_contacts_and_times(name, tmp_path):
+def test_file_of_an_episode_has_its_states_actions_contacts_and_times(tmp_path):
     states = PANDA.normalise(PATH).astype(np.float32)
     action = np.linspace(-0.01, 0.02, 7)[None]
     episode = Trajectory(states, action, np.array([True]), np.array([0.25]), success=False)
-    save_trajectory(tmp_path / name, episode)
-    times, configurations = load_joint_path(tmp_path / name, PANDA)
-    np.testing.assert_allclose(times, [0, 1 / 30])
-    np.testing.assert_allclose(configurations, PATH, atol=1e-6)
-    if name == "a.npz":
-        with np.load(tmp_path / name) as file:
-            assert set(file) == {
-                *("times", "configurations", "states", "actions", "contacts"),
-                *("policy_seconds", "success"),
-            }
-            np.testing.assert_array_equal(file["states"], states)
-            np.testing.assert_array_equal(file["actions"], action)
-            assert file["contacts"].tolist() == [True] and not file["success"]
-        return
-    with open(tmp_path / name, newline="") as file:
+    for name in ("a.csv", "a.npz"):
+        save_trajectory(tmp_path / name, episode)
+        times, configurations = load_joint_path(tmp_path / name, PANDA)
+        np.testing.assert_allclose(times, [0, 1 / 30])
+        np.testing.assert_allclose(configurations, PATH, atol=1e-6)
+    with np.load(tmp_path / "a.npz") as file:
+        np.testing.assert_array_equal(file["states"], states)
+        np.testing.assert_array_equal(file["actions"], action)
+        assert file["contacts"].tolist() == [True] and not file["success"]
+    with open(tmp_path / "a.csv", newline="") as file:
         first, last = csv.DictReader(file)
     names = [*("time", *Q.split(",")), *(f"action{i}" for i in range(1, 8))]
     assert list(first) == [*names, "contact", "policy_seconds"]
@@ -189,10 +176,7 @@ def test_waypoints_without_times_are_passed_at_the_speed_of_the_environment(tmp_
     [
         ("", "no column q1"),
         ("time,q1,q2\n0,1,2\n", "no column q3; the header names q1 to q7, rad"),
-        (f"{Q}\n", "configurations must be"),
         (f"{Q}\n0,0,0,-1,0,1,x\n", "line 2: not a number"),
-        (f"{Q}\n0,0,0,-1,0,1\n", "line 2: not a number"),
-        (f"{Q}\n0,0,0,-1,0,1,nan\n", "not finite"),
         (f"{Q}\n0,0,0,-90,0,90,0\n", "q4 exceeds its limits by 86.86 rad .are the angles in rad"),
         (f"time,{Q}\n0,0,0,0,-1,0,1,0\n0,0,0,0,-1,0,1,0\n", "times do not increase"),
         (f"time,{Q}\ninf,0,0,0,-1,0,1,0\n", "one finite time per configuration"),
@@ -207,10 +191,8 @@ def test_bad_csv_file_is_named_with_the_reason(text, message, tmp_path):
 def test_bad_npz_file_is_named_with_the_reason(tmp_path):
     path = tmp_path / "a.npz"
     for arrays, message in (
-        ({"path": PATH}, "no array configurations, but path"),
         ({"configurations": PATH[:, :6]}, "must be .n, 7., are .2, 6."),
         ({"configurations": PATH, "times": [0.0]}, "one finite time per configuration"),
-        ({"configurations": np.array([["a"] * 7])}, "something other than numbers"),
         ({"configurations": np.array([[object()] * 7])}, "not a joint path"),
     ):
         np.savez(path, **arrays)

@@ -45,13 +45,6 @@ def test_bar_inside_another_leaves_only_its_lines_in_a_log_file(capsys, monkeypa
     assert "\x1b" not in error and all(line.strip() for line in error.splitlines())
 
 
-def test_log_file_gets_no_lines_in_between_where_work_is_slow(capsys):
-    bar = progress_bar(None, "wall", total=2)
-    assert bar.maxinterval == progress.LOG_INTERVAL  # tqdm draws a slow bar again after this time
-    bar.close()
-    capsys.readouterr()
-
-
 def test_transient_bar_disappears_from_a_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     assert list(progress_bar(range(3), "validation", unit="query", transient=True)) == [0, 1, 2]

@@ -39,7 +39,8 @@ from roboarm_nmp.envs.tasks import get_task
 
 # Resolution of the stored configurations, normalised. Their error is at most half of it, and moves
 # the end effector by less than 0.5 mm. Where scenes vary, twice that keeps the files small.
-QUANTUM, QUANTUM_IN_SCENES = 2e-4, 4e-4
+QUANTUM = 2e-4
+QUANTUM_IN_SCENES = 4e-4
 
 
 @dataclass(frozen=True, eq=False)

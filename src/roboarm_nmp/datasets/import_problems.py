@@ -92,7 +92,9 @@ def import_problems(
     Raises:
         ValueError: a file cannot be used; the message names it.
     """
-    candidates, kept, rejected = [], [], []
+    candidates = []
+    kept = []
+    rejected = []
     for path in paths:
         problems = load_problems(path, robot)
         candidates += problems.all

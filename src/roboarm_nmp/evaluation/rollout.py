@@ -12,7 +12,6 @@ are derived from trajectories.
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -20,48 +19,12 @@ import numpy as np
 from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
-from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.motions.trajectories import Trajectory
 from roboarm_nmp.policies.baselines import Observation, Policy
 
 AnyPolicy = TypeVar("AnyPolicy", bound=Policy)
 REAL_TIME = "real_time"
 """A delay: as many steps as an action takes to compute, of wall-clock time."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """An episode of T steps of an arm with n joints.
-
-    Attributes:
-        states: float32 (T + 1, n), normalised configurations, from the start on.
-        actions: float64 (T, n), as the environment received them.
-        contacts: bool (T,), whether the arm was in contact during each step.
-        times: float64 (T,), s, from each observation to its action; with a delay, to the next step.
-        success: whether the goal was reached.
-        robot: the `Robot`.
-    """
-
-    states: np.ndarray
-    actions: np.ndarray
-    contacts: np.ndarray
-    times: np.ndarray
-    success: bool
-    robot: Robot = PANDA
-
-    def __len__(self):
-        """The number of steps."""
-        return len(self.actions)
-
-    @property
-    def configurations(self):
-        """Joint angles (T + 1, n), rad."""
-        return self.robot.denormalise(self.states)
-
-    @property
-    def collides(self):
-        """Whether there was a contact in any step."""
-        return bool(self.contacts.any())
 
 
 class Episode:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from roboarm_nmp.motions.trajectories import STEP_SECONDS, EpisodeTrajectory, JointTrajectory
+from roboarm_nmp.motions.trajectories import STEP_SECONDS, JointTrajectory, Trajectory
 
 if TYPE_CHECKING:
     from roboarm_nmp.envs.collision.checker import CollisionChecker
@@ -27,13 +27,13 @@ THRESHOLD = 0.05  # share of the largest amplitude; weaker frequencies at the en
 
 
 def motion_metrics(
-    trajectory: JointTrajectory | EpisodeTrajectory,
+    trajectory: JointTrajectory | Trajectory,
     checker: "CollisionChecker | Sequence[CollisionChecker] | None" = None,
 ) -> dict[str, float | None]:
     """Compute the metrics of a motion.
 
     Args:
-        trajectory: a `JointTrajectory`, or an episode, an `evaluation.rollout.Trajectory`, with
+        trajectory: a `JointTrajectory`, or an episode, a `Trajectory`, with
             `STEP_SECONDS` between its configurations.
         checker: a `CollisionChecker` of the scene, for `min_clearance`; of an episode with moving
             obstacles a list of them, one for each configuration.

@@ -20,7 +20,7 @@ the arm stops at the corner, and is exactly on the path before and after it.
 """
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -53,14 +53,6 @@ LEAST_CELLS = 4  # of each piece
 
 class MissingToppraError(ImportError):
     """toppra is not installed."""
-
-
-class Bounds(NamedTuple):
-    """The largest velocity, acceleration and jerk of each joint, (n,)."""
-
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    jerk: np.ndarray
 
 
 def time_parameterise(
@@ -104,7 +96,7 @@ def time_parameterise(
         raise ValueError(f"step must be in [0.001, 1] s, got {step!r}")
     path = _checked_path(path, robot, limits)
     step = round(1e9 * step) / 1e9
-    bounds = Bounds(
+    bounds = (
         _bound("velocity", velocity, robot.velocity, DEFAULT_VELOCITY, robot),
         _bound("acceleration", acceleration, robot.acceleration, DEFAULT_ACCELERATION, robot),
         _bound("jerk", jerk, robot.jerk, math.inf, robot),
@@ -345,12 +337,10 @@ def fastest(
 
 def _controls(polyline, half_widths, bounds, step):
     """Control points (m, n), rad, of a spline within the bounds, and the s of each (m,)."""
-    sections = [
-        fastest(pieces, bounds.velocity, bounds.acceleration)
-        for pieces in polyline.pieces(half_widths)
-    ]
+    velocity, acceleration, jerk = bounds
+    sections = [fastest(p, velocity, acceleration) for p in polyline.pieces(half_widths)]
     # The mean over so many control points bounds the jerk.
-    width = max(1, math.ceil((2 * bounds.acceleration / (bounds.jerk * step)).max() - 1e-9))
+    width = max(1, math.ceil((2 * acceleration / (jerk * step)).max() - 1e-9))
     stretch = 1.0
     while True:
         at = [np.zeros(width + 1)]

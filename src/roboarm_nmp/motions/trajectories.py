@@ -34,13 +34,13 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import yaml
 
 from roboarm_nmp.datasets.format import MAX_ARRAY_BYTES, DatasetError
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
+from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.utils.files import write_atomically
@@ -130,24 +130,39 @@ class JointTrajectory:
         return positions
 
 
-class EpisodeTrajectory(Protocol):
-    """An episode of T steps, as `evaluation.rollout.Trajectory` has it."""
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """An episode of T steps of an arm with n joints.
+
+    Attributes:
+        states: float32 (T + 1, n), normalised configurations, from the start on.
+        actions: float64 (T, n), as the environment received them.
+        contacts: bool (T,), whether the arm was in contact during each step.
+        times: float64 (T,), s, from each observation to its action; with a delay, to the next step.
+        success: whether the goal was reached.
+        robot: the `Robot`.
+    """
+
+    states: np.ndarray
+    actions: np.ndarray
+    contacts: np.ndarray
+    times: np.ndarray
+    success: bool
+    robot: Robot = PANDA
+
+    def __len__(self) -> int:
+        """The number of steps."""
+        return len(self.actions)
 
     @property
-    def states(self) -> np.ndarray: ...
+    def configurations(self) -> np.ndarray:
+        """Joint angles (T + 1, n), rad."""
+        return self.robot.denormalise(self.states)
+
     @property
-    def actions(self) -> np.ndarray: ...
-    @property
-    def contacts(self) -> np.ndarray: ...
-    @property
-    def times(self) -> np.ndarray: ...
-    @property
-    def success(self) -> bool: ...
-    @property
-    def robot(self) -> Robot: ...
-    @property
-    def configurations(self) -> np.ndarray: ...
-    def __len__(self) -> int: ...
+    def collides(self) -> bool:
+        """Whether there was a contact in any step."""
+        return bool(self.contacts.any())
 
 
 def check_ending(path: str | Path) -> None:
@@ -198,8 +213,8 @@ def save_joint_path(
     _write(path, {"configurations": configurations, "times": times}, robot)
 
 
-def save_trajectory(path: str | Path, trajectory: JointTrajectory | EpisodeTrajectory) -> None:
-    """Write a `JointTrajectory`, or an episode, a `Trajectory`, as `save_joint_path` does.
+def save_trajectory(path: str | Path, trajectory: JointTrajectory | Trajectory) -> None:
+    """Write a trajectory, or an episode, as `save_joint_path` does.
 
     The first time of an episode is 0.
     """

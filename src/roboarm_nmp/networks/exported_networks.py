@@ -371,7 +371,8 @@ class _ByName(torch.nn.Module):
 
     def __init__(self, module, names):
         super().__init__()
-        self.module, self.names = module, names
+        self.module = module
+        self.names = names
 
     def forward(self, *inputs):
         return self.module(**dict(zip(self.names, inputs, strict=True)))

@@ -28,7 +28,7 @@ class _LogFile:
 
 def progress_bar(
     iterable: Iterable | None = None,
-    description: str = "",
+    description: str | None = "",
     total: int | None = None,
     unit: str = "step",
     initial: int = 0,
