@@ -53,7 +53,6 @@ reports collisions with the arm.
 
 import json
 import math
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -155,84 +154,61 @@ def _format_scene(scene: Scene) -> str:
     robot = scene.robot
     lines = []
     if robot.arm != PANDA:
-        lines.append(f"robot: {robot.source}")
+        lines.append(f"robot: {json.dumps(robot.source)}")
     if robot.held_positions != robot.arm.held_positions:
-        held = ", ".join(f"{joint}: {value!r}" for joint, value in robot.held.items())
-        lines.append(f"held: {{{held}}}")
+        lines.append(f"held: {_in_one_line(robot.held)}")
     if robot.attached:
         lines.append("attached:")
     for attached in robot.attached:
-        more = [f"link: {json.dumps(attached.link)}"]
+        entry = _entry(attached.shape)
+        [fields] = entry.values()
+        fields["link"] = attached.link
         if attached.touch_links:
-            more.append(f"touch_links: {json.dumps(attached.touch_links)}")
-        lines.append(f"  - {_format_obstacle(attached.shape, more)}")
-    if scene.table is None:
-        lines.append("table: false")
+            fields["touch_links"] = attached.touch_links
+        lines.append(f"  - {_in_one_line(entry)[1:-1]}")
+    if scene.table is None or scene.table == TABLE:
+        lines.append(f"table: {'false' if scene.table is None else 'true'}")
     else:
-        lines.append(f"table: {'true' if scene.table == TABLE else _format_fields(scene.table)}")
-    lines.append(f"floor: {'false' if scene.floor is None else repr(float(scene.floor))}")
+        lines.append(f"table: {_in_one_line(_entry(scene.table)['box'])}")
+    lines.append(f"floor: {'false' if scene.floor is None else float(scene.floor)}")
     if scene.friction != FRICTION:
-        lines.append(f"friction: {float(scene.friction)!r}")
+        lines.append(f"friction: {float(scene.friction)}")
     lines.append("obstacles:" if scene.obstacles else "obstacles: []")
-    lines += [f"  - {_format_obstacle(obstacle)}" for obstacle in scene.obstacles]
+    lines += [f"  - {_in_one_line(_entry(obstacle))[1:-1]}" for obstacle in scene.obstacles]
     return _HEADER + "\n".join(lines) + "\n"
 
 
-def _format_obstacle(obstacle: Obstacle, more: Iterable[str] = ()) -> str:
+def _entry(obstacle: Obstacle) -> dict[str, dict[str, Any]]:
+    """An obstacle's kind and fields, as they are in a file; numbers may be NumPy's."""
     kind = "convex_hull" if isinstance(obstacle, ConvexHull) else type(obstacle).__name__.lower()
-    return f"{kind}: {_format_fields(obstacle, more)}"
+    fields = vars(obstacle) | {"motion": _motion_fields(obstacle.motion)}
+    for name in ("motion", "may_touch"):
+        if not fields[name]:
+            del fields[name]
+    if fields.get("orientation") == IDENTITY:
+        del fields["orientation"]
+    return {kind: fields}
 
 
-def _format_fields(obstacle: Obstacle, more: Iterable[str] = ()) -> str:
-    """The dataclass's fields, and texts of more fields, as a YAML mapping on one line."""
-    fields = []
-    for name, value in vars(obstacle).items():
-        if name == "motion":
-            if value is not None:
-                fields.append(f"motion: {_format_motion(value)}")
-        elif name == "may_touch":
-            if value:
-                fields.append(f"may_touch: {json.dumps(value)}")
-        elif name in ("position", "size"):
-            fields.append(f"{name}: {_format_numbers(value)}")
-        elif name == "orientation":
-            if tuple(value) != IDENTITY:
-                fields.append(f"orientation: {_format_numbers(value)}")
-        elif name == "vertices":
-            fields.append(f"vertices: {_format_rows(value)}")
-        else:
-            fields.append(f"{name}: {float(value)!r}")
-    return "{" + ", ".join([*fields, *more]) + "}"
-
-
-def _format_motion(motion: Motion) -> str:
-    parts = []
-    moves = motion.motion if isinstance(motion, Presence) else motion
-    if isinstance(moves, Oscillation):
-        parts.append(
-            f"oscillation: {{amplitude: {_format_numbers(moves.amplitude)}, "
-            f"axis: {_format_numbers(moves.axis)}, period: {moves.period!r}, "
-            f"phase: {moves.phase!r}, angle: {moves.angle!r}}}"
-        )
-    elif isinstance(moves, Waypoints):
-        fields = [f"times: {_format_numbers(moves.times)}"]
-        fields.append(f"displacements: {_format_rows(moves.displacements)}")
-        if moves.rotations:
-            fields.append(f"rotations: {_format_rows(moves.rotations)}")
-        fields.append(f"repeat: {moves.repeat}")
-        parts.append(f"waypoints: {{{', '.join(fields)}}}")
+def _motion_fields(motion: Motion | None) -> dict[str, Any] | None:
     if isinstance(motion, Presence):
-        finite = [[time for time in interval if time < math.inf] for interval in motion.intervals]
-        parts.append(f"present: {_format_rows(finite)}")
-    return "{" + ", ".join(parts) + "}"
+        intervals = [[time for time in pair if time < math.inf] for pair in motion.intervals]
+        return (_motion_fields(motion.motion) or {}) | {"present": intervals}
+    if motion is None:
+        return None
+    fields = {name: value for name, value in vars(motion).items() if value != ()}
+    return {type(motion).__name__.lower(): fields}
 
 
-def _format_numbers(numbers: Iterable[float]) -> str:
-    return f"[{', '.join(repr(float(number)) for number in numbers)}]"
-
-
-def _format_rows(rows: Iterable[Iterable[float]]) -> str:
-    return f"[{', '.join(map(_format_numbers, rows))}]"
+def _in_one_line(value: Any) -> str:
+    """Mappings, lists, numbers and names as YAML, every float exact."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_in_one_line(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(map(_in_one_line, value)) + "]"
+    if value is None or isinstance(value, (bool, str)):
+        return json.dumps(value)
+    return repr(float(value))
 
 
 # --- Reading. Each function gets a node of the file, and raises `Mistake`.
