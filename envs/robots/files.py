@@ -24,12 +24,11 @@ import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
-import yaml
-
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.untrusted import RobotError
 from roboarm_nmp.envs.robots.urdf import check_options, robot_from_urdf
+from roboarm_nmp.utils.documents import DocumentError, load_document, plain_data
 
 ROBOT_FILES = (".urdf", ".yaml", ".yml")
 MAX_FILE = 100_000  # bytes
@@ -72,13 +71,10 @@ def _load(path, _):
 def _read(path):
     if not path.is_file() or path.stat().st_size > MAX_FILE:
         raise RobotError(f"{path}: no file, or more than {MAX_FILE // 1000} kB")
-    text = path.read_bytes()
-    if b"&" in text or b"*" in text:  # they expand without limit
-        raise RobotError(f"{path}: anchors and aliases (& and *) are not allowed")
     try:
-        options = yaml.safe_load(text.decode())
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise RobotError(f"{path}: no YAML: {error}".replace("\n", " ")) from error
+        options = plain_data(load_document(path, allow_tags=False))
+    except DocumentError as error:
+        raise RobotError(str(error)) from error
     if not isinstance(options, dict):
         raise RobotError(f"{path}: must be a mapping with the key `urdf`")
     options = {name: value for name, value in options.items() if value is not None}

@@ -97,11 +97,11 @@ from roboarm_nmp.utils.documents import (
     Node,
     describe,
     errors_at,
+    load_document,
     mistakes_in,
     number,
     numbers,
     parse_document,
-    read_text,
     sequence,
     shorten,
     switch,
@@ -120,9 +120,9 @@ def load_scene(path: str | Path) -> Scene:
     Raises:
         DocumentError: the file is missing, or is not a scene; also for a misspelt key.
     """
-    text = read_text(path)
+    root = load_document(path, allow_tags=False)
     with mistakes_in(path):
-        return _scene(parse_document(text, allow_tags=False), Path(path).parent)
+        return _scene(root, Path(path).parent)
 
 
 def save_scene(scene: Scene, path: str | Path) -> None:

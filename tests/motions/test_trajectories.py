@@ -75,9 +75,8 @@ def test_joints_of_a_ros_message_are_read_in_any_order(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.yaml", "a: [", "no YAML"),
-        ("a.yaml", "a: &b [1]\nc: *b", "anchors and aliases"),
-        ("a.yaml", "!!python/object/apply:os.system ['touch made']", "no YAML"),
+        ("a.yaml", "a: [", "line 2: .*did not find expected"),
+        ("a.yaml", "!!python/object/apply:os.system ['touch made']", "tags"),
         ("a.yaml", ROS1.replace("0.7, 1.6", "1.6"), "has not 7 numbers"),
         ("a.yaml", ROS1.replace("panda_joint7", "iiwa_joint7"), "its joints are .*iiwa_joint7"),
         ("a.yaml", ROS1.replace("secs: 1", "secs: 0.5"), "no duration in whole sec"),

@@ -17,6 +17,10 @@ MAX_FILE = 50_000_000  # bytes
 MAX_NODES = 3_000_000  # values, those that aliases repeat included
 MAX_DEPTH = 30  # of nested values
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_CONSTANTS = {
+    **{"": None, "~": None, "null": None, "true": True, "false": False},
+    **{".inf": math.inf, "-.inf": -math.inf, ".nan": math.nan},
+}
 _NOT_ALLOWED = yaml.reader.Reader.NON_PRINTABLE
 
 
@@ -53,7 +57,8 @@ class Mistake(Exception):
 
     def __init__(self, node: Node | Key, reason: str):
         super().__init__(node.line, reason)
-        self.line, self.reason = node.line, reason
+        self.line = node.line
+        self.reason = reason
 
 
 @contextlib.contextmanager
@@ -92,14 +97,13 @@ def read_text(path: str | Path) -> str:
         ) from error
 
 
-def load_document(path: str | Path) -> Node:
-    """The root `Node` of a YAML or JSON file.
+def load_document(path: str | Path, allow_tags: bool = True) -> Node:
+    """As `parse_document`, of a file.
 
-    Raises:
-        DocumentError: the file cannot be read, is malformed, or exceeds a limit.
+    Raises DocumentError: the file cannot be read, is malformed, or exceeds a limit.
     """
     with mistakes_in(path):
-        return parse_document(read_text(path))
+        return parse_document(read_text(path), allow_tags)
 
 
 def parse_document(text: str, allow_tags: bool = True) -> Node:
@@ -113,7 +117,8 @@ def parse_document(text: str, allow_tags: bool = True) -> Node:
     try:
         return _compose(yaml.parse(text, _LOADER), allow_tags)
     except yaml.MarkedYAMLError as error:
-        mark, reason = error.problem_mark, " ".join(str(error.problem).split())
+        mark = error.problem_mark
+        reason = " ".join(str(error.problem).split())
         if error.context and error.context_mark:
             reason = f"{error.context} from line {error.context_mark.line + 1} on, {reason}"
         raise Mistake(Node("", mark.line + 1 if mark else 1), reason) from error
@@ -190,6 +195,24 @@ def _key(node, container, line):
     key = Key(node.value)
     key.line = line
     return key
+
+
+def plain_data(node: Node) -> Any:
+    """A node as dicts, lists, text, numbers, booleans and None."""
+    value = node.value
+    if isinstance(value, dict):
+        return {str(key): plain_data(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [plain_data(item) for item in value]
+    if node.is_quoted:
+        return value
+    if value in _CONSTANTS:
+        return _CONSTANTS[value]
+    if value[0] in "+-.0123456789":
+        for kind in (int, float):
+            with contextlib.suppress(ValueError):
+                return kind(value)
+    return value
 
 
 # --- What readers ask of a node
