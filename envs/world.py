@@ -8,7 +8,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -465,8 +465,8 @@ class World:
         self._start = tuple(np.asarray(configuration)), self.time
         self._events = []
 
-    def command(self, configuration: list[float]) -> None:
-        """Set the targets of the arm's position controllers: joint angles (list of n, rad)."""
+    def command(self, configuration: Sequence[float]) -> None:
+        """Set the targets of the arm's position controllers: joint angles (n, rad)."""
         self.check_open()
         self._target = tuple(configuration)
         self.arm.command(configuration)

@@ -280,30 +280,19 @@ class _Table:
         names = [name for name, _, _ in fields]
         if any(names.count(axis) != 1 for axis in "xyz"):
             raise ValueError(f"it has the fields {' '.join(names)}, but no x, y, z")
-        self.row_size = 0  # bytes
-        self.width = 0  # words
-        self.kinds = {}
-        self.offsets = {}
-        self.columns = {}
-        for name, kind, count in fields:
-            if name in ("x", "y", "z"):
-                if count != 1:
-                    raise ValueError("x, y and z must be single numbers")
-                self.kinds[name] = order + kind
-                self.offsets[name] = self.row_size
-                self.columns[name] = self.width
-            self.row_size += int(kind[1]) * count
-            self.width += count
-        formats = [self.kinds[axis] for axis in "xyz"]
-        self.dtype = np.dtype(
-            {
-                "names": list("xyz"),
-                "formats": formats,
-                "offsets": [self.offsets[axis] for axis in "xyz"],
-                "itemsize": self.row_size,
-            }
-        )
-        self.result = np.result_type(*formats, np.float32)
+        if any(count != 1 for name, _, count in fields if name in ("x", "y", "z")):
+            raise ValueError("x, y and z must be single numbers")
+        self.row_size = sum(int(kind[1]) * count for _, kind, count in fields)  # bytes
+        self.width = sum(count for _, _, count in fields)  # words
+        self.kinds = []
+        self.offsets = []
+        self.columns = []
+        for axis in "xyz":
+            at = names.index(axis)
+            self.kinds.append(order + fields[at][1])
+            self.offsets.append(sum(int(kind[1]) * count for _, kind, count in fields[:at]))
+            self.columns.append(sum(count for _, _, count in fields[:at]))
+        self.result = np.result_type(*self.kinds, np.float32)
 
     def check(self, number: int, room: int) -> None:
         """Raise ValueError unless there is room (bytes) for so many points."""
@@ -320,22 +309,22 @@ class _Table:
             contents = file.read(len(block) * self.row_size)
             if len(contents) < len(block) * self.row_size:
                 raise ValueError("it ends too early")
-            table = np.frombuffer(contents, self.dtype)
-            for column, axis in enumerate("xyz"):
-                block[:, column] = table[axis]
+            bytes_of_rows = np.frombuffer(contents, np.uint8).reshape(len(block), self.row_size)
+            for axis, (kind, offset) in enumerate(zip(self.kinds, self.offsets, strict=True)):
+                numbers = bytes_of_rows[:, offset : offset + int(kind[2])]
+                block[:, axis] = np.ascontiguousarray(numbers).view(kind)[:, 0]
         return points
 
     def from_text(self, header: _Header, number: int, room: int) -> np.ndarray:
         """The points (number, 3) in the next lines."""
         self.check(number, (room + 1) // (2 * self.width))
         points = np.empty((number, 3))
-        columns = [self.columns[axis] for axis in "xyz"]
         done = 0
         while done < number:
             text = header.file.read(_BLOCK) + header.file.readline(_MAX_LINE)
             if not text:
                 raise ValueError(f"it ends after {done:,} of {number:,} points")
-            rows = _numbers(text.decode("latin-1"), columns, number - done, header.line)
+            rows = _numbers(text.decode("latin-1"), self.columns, number - done, header.line)
             points[done : done + len(rows)] = rows
             done += len(rows)
             header.line += text.count(b"\n")
@@ -456,9 +445,8 @@ def _decompressed(file: IO[bytes], number: int, table: _Table, room: int) -> np.
     if decompress_lzf(contents, unpacked) != uncompressed:
         raise ValueError("its compressed points are damaged")
     points = np.empty((number, 3), table.result)
-    for column, axis in enumerate("xyz"):
-        begin = number * table.offsets[axis]
-        points[:, column] = np.frombuffer(unpacked, table.kinds[axis], number, begin)
+    for axis, (kind, offset) in enumerate(zip(table.kinds, table.offsets, strict=True)):
+        points[:, axis] = np.frombuffer(unpacked, kind, number, number * offset)
     return points
 
 

@@ -124,13 +124,13 @@ class Body:
             physicsClientId=self.client,
         )
 
-    def command(self, configuration: list[float]) -> None:
-        """Set the targets of the position controllers: joint angles (list of n, rad)."""
+    def command(self, configuration: Sequence[float]) -> None:
+        """Set the targets of the position controllers: joint angles (n, rad)."""
         p.setJointMotorControlArray(
             self.id,
             self._commanded,
             p.POSITION_CONTROL,
-            targetPositions=configuration + self._followers(configuration),
+            targetPositions=[*configuration, *self._followers(configuration)],
             forces=self._forces,
             positionGains=self.gains,
             physicsClientId=self.client,

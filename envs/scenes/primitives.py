@@ -578,26 +578,20 @@ def from_lists(rows: Iterable[list[Any]]) -> tuple[Obstacle, ...]:
     """The inverse of `to_lists`. Raises ValueError, TypeError: as `from_array`."""
     obstacles = []
     for row in rows:
-        numbers, motion, may_touch = split_list(row)
-        [obstacle] = from_array(np.array([numbers[:ROW]]), np.array(numbers[ROW:]))
-        obstacles.append(replace(obstacle, motion=motion_from_numbers(motion), may_touch=may_touch))
+        numbers = list(row)
+        motion = None
+        may_touch = ()
+        if numbers and (isinstance(numbers[-1], bool) or _is_list_of(str, numbers[-1])):
+            may_touch = numbers.pop()
+        if numbers and isinstance(numbers[-1], list):
+            motion = motion_from_numbers(numbers.pop())
+        [obstacle] = from_array(np.array([numbers[:ROW]]), numbers[ROW:])
+        obstacles.append(replace(obstacle, motion=motion, may_touch=may_touch))
     return tuple(obstacles)
 
 
-def split_list(row: list[Any]) -> tuple[list[float], list[float], tuple[str, ...] | bool]:
-    """The numbers, the motion's numbers and `may_touch` of a row of `to_lists`."""
-    row = list(row)
-    motion = []
-    may_touch = ()
-    if row and (isinstance(row[-1], bool) or _is_list_of_text(row[-1])):
-        may_touch = row.pop()
-    if row and isinstance(row[-1], list):
-        motion = row.pop()
-    return row, motion, may_touch
-
-
-def _is_list_of_text(value: Any) -> bool:
-    return isinstance(value, list) and len(value) > 0 and isinstance(value[0], str)
+def _is_list_of(kind: type, value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, kind) for item in value)
 
 
 def scene_to_json(scene: Scene) -> str:
