@@ -8,11 +8,10 @@ from paths import ROOT
 import roboarm_nmp
 from roboarm_nmp.datasets.format import (
     DEMO_ARRAYS,
-    HULL_ARRAYS,
-    MOTION_ARRAYS,
+    OPTIONAL_SCENE_ARRAYS,
     QUERY_ARRAYS,
     SCENE_ARRAYS,
-    TOUCH_ARRAYS,
+    SEED_ARRAYS,
 )
 from roboarm_nmp.datasets.problems import ARRAYS as PROBLEM_ARRAYS
 from roboarm_nmp.envs.scenes.files import load_scene
@@ -30,8 +29,11 @@ def code(title, language):
 
 
 def test_arrays_are_listed_with_their_dtypes():
+    queries = QUERY_ARRAYS | SCENE_ARRAYS | SEED_ARRAYS
+    for arrays in OPTIONAL_SCENE_ARRAYS:
+        queries |= arrays
     for title, arrays in (
-        ("Queries", QUERY_ARRAYS | SCENE_ARRAYS | HULL_ARRAYS | TOUCH_ARRAYS | MOTION_ARRAYS),
+        ("Queries", queries),
         ("Demonstrations", DEMO_ARRAYS),
         ("Problems", PROBLEM_ARRAYS),
     ):

@@ -22,6 +22,7 @@ from roboarm_nmp.datasets.format import (
     DEMO_SCHEMA,
     DatasetError,
     QueryScenes,
+    array_formats,
     check_configurations,
     check_format,
     locate,
@@ -322,7 +323,7 @@ def write_demos(
     arrays["length"] = np.array(lengths, np.uint32)
     for name, values in columns.items():
         arrays[name] = np.array(values, DEMO_ARRAYS[name][0])
-    check_format(path, DEMO_SCHEMA, arrays, robot)
+    check_format(path, array_formats(DEMO_SCHEMA, arrays), arrays, robot)
     parameters = {**parameters, "lag": lag}
     if quantum != QUANTUM:
         parameters["quantum"] = quantum

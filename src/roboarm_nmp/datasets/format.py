@@ -1,37 +1,7 @@
-"""The HDF5 format that query and demonstration files share: written, read, and checked.
+"""HDF5 files: written, read, and checked. Query and demonstration files, and their scenes.
 
-A query file, `datasets/data/<task>.h5`, has the groups `test` and `validation`, and `original`
-where a task has queries from elsewhere, each with
-
-- `start`, `goal`: float32 (n, j), joint angles in rad, exactly those checked in the simulator;
-- `goal_position`: float32 (n, 3), the end-effector position at the goal in metres,
-- where scenes vary, `scene`: uint32 (n,), the number of each query's scene, `obstacle_count`:
-  uint32 (s,), obstacles in each scene, and `obstacles`: float64 (k, 11), the obstacles of all
-  scenes, one scene after another, as rows of `envs.scenes.primitives.to_array`; where there are
-  convex hulls, `hull_vertices`: float64 (v, 3), their vertices, one hull after another; where there
-  are obstacles with `may_touch`, that of all k obstacles: uint8 (b,), a list as JSON; where
-  obstacles move, `motion_count`: uint32 (k,), how many numbers each one's motion has, and
-  `motions`: float64 (m,), the numbers (`envs.scenes.motions.motion_to_numbers`);
-- of tasks with moving obstacles, instead of these, `scene_seed`: uint32 (n,), from which each
-  query's scene is drawn (`AnimatedScenes`).
-
-A demonstration file, `datasets/demos/<task>.h5`, has the arrays
-
-- `plan`: float32 (p, j), joint angles in rad: the waypoints of all plans, one plan after another,
-  the first one of each the start, the last one the goal; `plan_length`: uint32 (n,);
-- `residual`: int16 (m, j), the executed configurations, one execution after another (see
-  `datasets.demonstrations.write_demos`); `length`: uint32 (n,), configurations in each;
-- `plan_seed`, `digest`: uint32 (n,), the planner's seed and the CRC-32 of the exact execution;
-- `collided`: uint8 (n,), whether the execution has a contact;
-- where scenes vary, `scene`, `obstacle_count`, `obstacles`, `hull_vertices`, `may_touch`, as above.
-
-j is the number of the robot's joints, 7 of the Panda.
-
-Both have the attributes `schema`, `schema_version`, `task`, `seed`, `scene` (JSON: the scene,
-without the obstacles that vary; it has the name and fingerprint of a robot, if that is not the
-Panda), `made_by` (the command that makes the file again), `parameters` (JSON) and `checksum`
-(SHA-256 of all the others and the arrays). Files are written under a temporary name and then
-renamed: there is never half a file.
+docs/reference/file_formats.md describes the arrays and attributes. Files are written under a
+temporary name and then renamed: there is never half a file.
 """
 
 import contextlib
@@ -89,6 +59,7 @@ DEMO_SCHEMA = "roboarm-nmp demonstrations"
 SCHEMA_VERSION = 1
 MAX_ARRAY_BYTES = 2**30
 """Largest array in memory: 100,000 demonstrations have a fifth of that."""
+MAY_BE_EMPTY = ("obstacles", "goals")  # scenes without any, problems with a goal pose
 JOINTS = "joints"
 # Of each array: dtype, numbers per row (None: one dimension; JOINTS: one per joint of the robot),
 # and the array of the same length.
@@ -465,15 +436,16 @@ def write_file(
     write_atomically(path, hdf5_bytes(attributes, datasets))
 
 
-def check_format(path: str | Path, schema: str, arrays: dict[str, Any], robot: Robot) -> None:
-    """Shapes and dtypes; `arrays` are NumPy arrays or HDF5 datasets, by name."""
-    formats = array_formats(schema, arrays)
+def check_format(
+    path: str | Path, formats: dict[str, tuple], arrays: dict[str, Any], robot: Robot
+) -> None:
+    """Raise DatasetError unless NumPy arrays or HDF5 datasets have these shapes and dtypes."""
     for name, array in arrays.items():
         dtype, width, sibling = formats[name]
         width = robot.num_joints if width == JOINTS else width
         if array.dtype != np.dtype(dtype):
             raise DatasetError(f"{path}: {name} must be {np.dtype(dtype)}, is {array.dtype}")
-        empty = array.size == 0 and name.rpartition("/")[2] != "obstacles"  # of scenes without any
+        empty = array.size == 0 and name.rpartition("/")[2] not in MAY_BE_EMPTY
         if array.shape[1:] != (() if width is None else (width,)) or empty:
             expected = "(n,)" if width is None else f"(n, {width})"
             raise DatasetError(
@@ -519,8 +491,9 @@ def _read_open(path, file, schema, task, robot):
         )
     base = read_base_scene(path, attributes["scene"], robot)
     check_plain(path, file)
-    datasets = {name: get_array(path, file, name) for name in array_formats(schema, file)}
-    check_format(path, schema, datasets, robot)
+    formats = array_formats(schema, file)
+    datasets = {name: get_array(path, file, name) for name in formats}
+    check_format(path, formats, datasets, robot)
     arrays = {name: dataset[()] for name, dataset in datasets.items()}
     check_checksum(path, file, attributes, arrays)
     if not isinstance(json.loads(attributes["parameters"]), dict):

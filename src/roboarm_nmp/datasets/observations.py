@@ -1,19 +1,11 @@
 """Files of observations of sensors: a folder of shards, HDF5 files of a few hundred scenes each.
 
-A shard, `shard_00012.h5`, has the arrays (n scenes)
+    observations = Observations("observations")
+    observations.read(3, "front/rgb")  # of shard 3: uint8 (n, height, width, 3)
+    observations.scenes(3)             # its n Scenes
 
-- `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
-  rows of `envs.scenes.primitives.to_array`; where there are convex hulls, `hull_vertices` float64
-  (v, 3), their vertices, one hull after another;
-- `configuration` float32 (n, j), the arm's joint angles in rad;
-- of each `Camera`, by its name, the outputs: `front/rgb` uint8 (n, height, width, 3),
-  `front/segmentation` uint8 (n, height, width), `front/depth` uint16 (n, height, width) in units of
-  `far` / 65,535;
-- of each `PointCloud`, `depth` and `segmentation` of its grid, from which the points follow;
-
-and the attributes `schema`, `schema_version`, `task`, `seed`, `first` (number of the first scene),
-`scene` (JSON: the scene without the obstacles that vary), `sensors` (JSON), `made_by`. Images are
-compressed one by one, with a checksum each, so each can be read alone.
+docs/reference/file_formats.md describes the arrays. Images are compressed one by one, with a
+checksum each, so each can be read alone.
 """
 
 from collections.abc import Sequence

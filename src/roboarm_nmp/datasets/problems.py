@@ -10,14 +10,8 @@ Formats:
   cylinders [height, radius]) with `request####.yaml` (MotionPlanRequest, joints in any order);
 - robometrics: a YAML file, lists of problems by the names of their scenes;
 - VAMP: a JSON file, with half extents or full edges of boxes;
-- `problems.h5`, of `write_problems`, and this project's query files.
-
-The attributes of a `problems.h5` are `schema`, `schema_version`, `robot` (JSON: name and
-fingerprint of the arm), `made_by` and `checksum` (SHA-256 of all others and the arrays). Its arrays
-are `start`: float64 (m, n), rad; `goal_count`: uint32 (m,); `goals`: float64 (k, n), rad, those of
-one problem after another; `goal_pose`: float64 (m, 7), position (m) and quaternion (xyzw), NaN
-where there is none; `scene`: uint32 (m,), the number of each problem's scene; `names` and `scenes`:
-uint8, the names and the scenes (`envs.scenes.primitives.scene_to_json`) as JSON.
+- `problems.h5`, of `write_problems`, and this project's query files
+  (docs/reference/file_formats.md).
 """
 
 import hashlib
@@ -30,10 +24,12 @@ from typing import overload
 import numpy as np
 
 from roboarm_nmp.datasets.format import (
+    JOINTS,
     QUERY_SCHEMA,
     DatasetError,
     attribute,
     check_checksum,
+    check_format,
     check_plain,
     check_robot,
     check_schema,
@@ -65,16 +61,16 @@ from roboarm_nmp.utils.files import write_atomically
 SCHEMA = "roboarm-nmp problems"
 SCHEMA_VERSION = 1
 MAX_ARRAY = 30_000_000  # bytes, of an array of a file: as JSON it needs twenty times as much
-DTYPES = {
-    "start": "<f8",
-    "goal_count": "<u4",
-    "goals": "<f8",
-    "goal_pose": "<f8",
-    "scene": "<u4",
-    "names": "<u1",
-    "scenes": "<u1",
+ARRAYS = {
+    "start": ("<f8", JOINTS, "start"),
+    "goal_count": ("<u4", None, "start"),
+    "goals": ("<f8", JOINTS, "goals"),
+    "goal_pose": ("<f8", 7, "start"),
+    "scene": ("<u4", None, "start"),
+    "names": ("<u1", None, "names"),
+    "scenes": ("<u1", None, "scenes"),
 }
-"""Of the arrays of a file."""
+"""As those of `datasets.format`."""
 ATTRIBUTES = {"schema": str, "schema_version": int, "robot": str, "made_by": str}
 
 
@@ -211,9 +207,8 @@ def write_problems(path: str | Path, problems: Iterable[Problem], made_by: str =
         "names": json_array([problem.name for problem in problems]),
         "scenes": json_array([json.loads(scene_to_json(scene)) for scene in number_of]),
     }
-    arrays = {name: arrays[name].astype(dtype) for name, dtype in DTYPES.items()}
-    for name, array in arrays.items():
-        _check_size(path, name, array)
+    arrays = {name: arrays[name].astype(dtype) for name, (dtype, *_) in ARRAYS.items()}
+    _check_arrays(path, arrays, arm)
     _problems_of(path, arrays, arm)
     attributes = {
         "schema": SCHEMA,
@@ -253,39 +248,30 @@ def _read_open(path, file, robot):
     check_schema(path, file, "problems", SCHEMA, SCHEMA_VERSION)
     attributes = read_attributes(path, file, ATTRIBUTES)
     check_plain(path, file)
-    arrays = {}
-    for name, dtype in DTYPES.items():
-        dataset = get_array(path, file, name)
-        if dataset.dtype != np.dtype(dtype):
-            raise DatasetError(f"{path}: array {name} is missing or damaged")
-        _check_size(path, name, dataset)
-        arrays[name] = dataset[()]
-    check_checksum(path, file, attributes, arrays)
     name, fingerprint = json.loads(attributes["robot"])
     check_robot(path, name, fingerprint, robot.arm)
+    datasets = {name: get_array(path, file, name) for name in ARRAYS}
+    _check_arrays(path, datasets, robot.arm)
+    arrays = {name: dataset[()] for name, dataset in datasets.items()}
+    check_checksum(path, file, attributes, arrays)
     return _problems_of(path, arrays, robot.arm)
 
 
-def _check_size(path, name, array):
-    if array.size * array.dtype.itemsize > MAX_ARRAY:
-        raise DatasetError(f"{path}: {name} has more than {MAX_ARRAY // 1_000_000} MB")
+def _check_arrays(path, arrays, arm):
+    check_format(path, ARRAYS, arrays, arm)
+    for name, array in arrays.items():
+        if array.size * array.dtype.itemsize > MAX_ARRAY:
+            raise DatasetError(f"{path}: {name} has more than {MAX_ARRAY // 1_000_000} MB")
+    if len(arrays["start"]) > MAX_PROBLEMS:
+        raise DatasetError(f"{path}: more than {MAX_PROBLEMS:,} problems")
 
 
 def _problems_of(path, arrays, arm):
     """The list of `Problem`s in a file's arrays. Raises DatasetError: they are no problems."""
     count = len(arrays["start"])
-    if not 1 <= count <= MAX_PROBLEMS:
-        raise DatasetError(f"{path}: {count:,} problems, must be 1 to {MAX_PROBLEMS:,}")
-    shapes = {
-        "start": (count, arm.num_joints),
-        "goal_count": (count,),
-        "goals": (int(arrays["goal_count"].sum()), arm.num_joints),
-        "goal_pose": (count, 7),
-        "scene": (count,),
-    }
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise DatasetError(f"{path}: {name} must have shape {shape}, has {arrays[name].shape}")
+    ends = offsets_of(arrays["goal_count"]).tolist()
+    if ends[-1] != len(arrays["goals"]):
+        raise DatasetError(f"{path}: goal_count does not fit the number of goals")
     poses = arrays["goal_pose"]
     has_pose = ~np.isnan(poses).all(axis=1)
     finite = {"start": arrays["start"], "goals": arrays["goals"], "goal_pose": poses[has_pose]}
@@ -308,7 +294,6 @@ def _problems_of(path, arrays, arm):
         scenes = [read_base_scene(path, json.dumps(scene), arm) for scene in scenes]
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: a scene or a pose that cannot be: {error}") from error
-    ends = offsets_of(arrays["goal_count"]).tolist()
     return [
         Problem(
             name=names[i],

@@ -22,6 +22,7 @@ from roboarm_nmp.datasets.format import (
     DatasetError,
     OutOfDateError,
     QueryScenes,
+    array_formats,
     check_configurations,
     check_format,
     locate,
@@ -177,7 +178,7 @@ def write_queries(
             arrays[f"{split}/goal_position"] = position
         if split == "test" and isinstance(scenes, AnimatedScenes):
             parameters = {**parameters, "first_scene": scenes.summary()}
-    check_format(path, QUERY_SCHEMA, arrays, base.robot)
+    check_format(path, array_formats(QUERY_SCHEMA, arrays), arrays, base.robot)
     _check_queries(path, arrays, base.robot)
     write_file(path, QUERY_SCHEMA, task, seed, arrays, made_by, parameters)
 

@@ -5,17 +5,7 @@
     paths.of_scene(i)                             # its paths: list of float32 (k, j), normalised
     paths.points, paths.offsets                   # the same, flat, for a whole folder
 
-A shard, `shard_00012.h5`, has the arrays
-
-- `obstacle_count` uint32 (n,) and `obstacles` float64 (k, 11): the scenes, one after another, as
-  rows of `envs.scenes.primitives.to_array`; where there are convex hulls, `hull_vertices` float64
-  (v, 3), their vertices, one hull after another;
-- `path_count` uint32 (n,): paths in each scene; `length` uint16 (m,): points of each path;
-- `points` float32 (p, j): normalised configurations, one path after another, the first point of
-  each the start, the last one the goal
-
-of a robot with j joints, and the attributes `schema`, `schema_version`, `task`, `seed`, `first`
-(number of the first scene), `scene` (JSON: the scene without the obstacles that vary), `made_by`.
+docs/reference/file_formats.md describes the arrays.
 """
 
 from collections.abc import Sequence

@@ -8,22 +8,9 @@
 
 `roboarm show --trajectory FILE` and `roboarm view --trajectory FILE` play such a file;
 `roboarm retime` makes an executable one; `roboarm show --save-trajectory FILE` writes an episode.
-The ending names the format, for an arm with n joints:
-
-- `.csv`: a header and a row per configuration: `time` (s), the joint angles `q1` to `qn` (rad), and
-  of a `JointTrajectory` velocities `v1`, ... (rad/s) and accelerations `a1`, ... (rad/s^2). An
-  episode has the action after each configuration (`action1`, ...), whether the arm was in contact
-  on the way to the next one (`contact`, 0 or 1) and the policy's computing time (`policy_seconds`);
-  the last configuration has none of these.
-- `.npz`: the same as arrays: `times` (m,), `configurations`, `velocities`, `accelerations` (m, n);
-  of an episode also `states` (m, n), normalised, `actions` (m - 1, n), `contacts` and
-  `policy_seconds` (m - 1,), and `success`.
-- `.json`: the arrays of `.npz` as lists, and `robot` and `joint_names`.
-- `.yaml`: ROS's message `trajectory_msgs/JointTrajectory`, with times rounded to 1 ns. The other
-  columns of an episode are not in it.
-
-Only joint angles have to be there. Other columns and arrays do not matter. `.json` and `.yaml` name
-their joints, which are read in any order; the other formats do not.
+The ending names the format: `.csv`, `.npz`, `.json`, or `.yaml`, ROS's
+`trajectory_msgs/JointTrajectory` (docs/reference/file_formats.md). Only joint angles have to be
+there. `.json` and `.yaml` name their joints, which are read in any order; the others do not.
 """
 
 import csv
