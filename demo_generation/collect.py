@@ -15,6 +15,7 @@ import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,10 +23,10 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import demo_path, write_demos
 from roboarm_nmp.datasets.journal import Journal, journal_of
 from roboarm_nmp.datasets.queries import query_path, validate
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
-from roboarm_nmp.envs.tasks import task_with_robot
-from roboarm_nmp.planning.following import follow
+from roboarm_nmp.planning.following import Execution, follow
 from roboarm_nmp.planning.planner import Planner, PlanningError
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.files import check_writable
@@ -49,9 +50,7 @@ REASONS = ("no_plan", "missed", "collided", "too_long")
 @dataclass
 class Args:
     task: str
-    """Name of a task, or path of a scene file."""
-    robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
+    """Name of a task, or path of a scene file; with another arm, TASK@FILE."""
     num: PositiveInt = 10_000
     """Number of demonstrations."""
     seed: Seed = 0
@@ -99,7 +98,7 @@ PLANNER_OPTIONS = ("planner", "max_checks", "clearance", "planner_range", "simpl
 EARLIER_OPTIONS = {"planner_range": 0.0, "simplify": 3}
 
 
-def options_of(args):
+def options_of(args: Args) -> dict:
     """The `OPTIONS` in `args`, whose task is known, as a dict."""
     options = {name: getattr(args, name) for name in OPTIONS}
     if args.attempts is None:
@@ -108,7 +107,7 @@ def options_of(args):
     return options
 
 
-def make_planner(env, options):
+def make_planner(env: RoboArmEnv, options: dict) -> Planner:
     """A `Planner` with the `PLANNER_OPTIONS` of a collection, or of a demonstration file."""
     options = EARLIER_OPTIONS | options
     return Planner(env, **{name: options[name] for name in PLANNER_OPTIONS})
@@ -117,14 +116,15 @@ def make_planner(env, options):
 class Collector:
     """Makes demonstrations one by one; `options` is a dict with the keys `OPTIONS`."""
 
-    def __init__(self, options):
+    def __init__(self, options: dict):
         self.options = options
         self.env = envs.make(options["task"])
         self.planner = make_planner(self.env, options)
 
-    def __call__(self, index):
+    def __call__(self, index: int) -> dict:
         """Demonstration `index`: a JSON-ready dict with its plan, execution and rejections."""
-        options, rejected = self.options, collections.Counter()
+        options = self.options
+        rejected = collections.Counter()
         rng = np.random.default_rng([options["seed"], Stream.DEMONSTRATIONS, index])
         for given_up in range(MAX_QUERIES):
             self.env.sample_scene(rng)
@@ -139,14 +139,13 @@ class Collector:
                 rejected,
             )
             if demo is not None:
-                path, execution, seed = demo
                 return {
                     "index": index,
-                    "plan": _encode(path),
-                    "states": _encode(execution.states),
-                    "digest": execution.digest,
-                    "collided": execution.collided,
-                    "plan_seed": seed,
+                    "plan": _encode(demo.plan),
+                    "states": _encode(demo.execution.states),
+                    "digest": demo.execution.digest,
+                    "collided": demo.execution.collided,
+                    "plan_seed": demo.plan_seed,
                     "obstacles": to_lists(self.env.scene.obstacles),
                     "rejected": dict(rejected),
                     "given_up": given_up,
@@ -157,8 +156,24 @@ class Collector:
         )
 
 
-def demonstrate(planner, start, goal, rng, attempts, allow_collisions=False, rejected=None):
-    """Plan and follow the plan until it works: `(path, Execution, planner's seed)`, or None.
+class Demonstration(NamedTuple):
+    """A plan, float32 (k, j), rad; its `Execution`; and the seed of the planner."""
+
+    plan: np.ndarray
+    execution: Execution
+    plan_seed: int
+
+
+def demonstrate(
+    planner: Planner,
+    start: np.ndarray,
+    goal: np.ndarray,
+    rng: np.random.Generator,
+    attempts: int,
+    allow_collisions: bool = False,
+    rejected: collections.Counter | None = None,
+) -> Demonstration | None:
+    """Plan and follow the plan until it works; None where it does not.
 
     Args:
         planner: a `Planner` with `max_checks`; its environment has the query's scene.
@@ -173,11 +188,11 @@ def demonstrate(planner, start, goal, rng, attempts, allow_collisions=False, rej
         seed = int(rng.integers(1, 2**32))
         try:
             # A limit in seconds would make the result depend on the machine.
-            path = planner.plan(start, goal, seed=seed, time_limit=math.inf)
+            plan = planner.plan(start, goal, seed=seed, time_limit=math.inf)
         except PlanningError:
             rejected["no_plan"] += 1
             continue
-        execution = follow(planner.env, path)
+        execution = follow(planner.env, plan)
         if not execution.reached:
             rejected["missed"] += 1
         elif execution.collided and not allow_collisions:
@@ -185,31 +200,31 @@ def demonstrate(planner, start, goal, rng, attempts, allow_collisions=False, rej
         elif len(execution.states) - 1 > planner.env.horizon:
             rejected["too_long"] += 1
         else:
-            return path, execution, seed
+            return Demonstration(plan, execution, seed)
     return None
 
 
-def _encode(array):
+def _encode(array: np.ndarray) -> str:
     return base64.b64encode(array.astype("<f4").tobytes()).decode()
 
 
-def _decode(text, num_joints):
+def _decode(text: str, num_joints: int) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, num_joints)
 
 
-def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
+def collect(
+    path: Path,
+    num: int,
+    options: dict,
+    num_workers: int = 1,
+    ray_address: str | None = None,
+    progress: bool = True,
+) -> collections.Counter:
     """Collect demonstrations into the journal of `path`, write the file, delete the journal.
 
-    Args:
-        path: file to write or replace.
-        num: number of demonstrations, > 0.
-        options: dict with the keys `OPTIONS`.
-        num_workers: number of local processes.
-        ray_address: work on this Ray cluster instead.
-        progress: show a progress bar.
-
-    Returns:
-        Counts, as stored in the file: `attempts`, those rejected by reason, and `queries_given_up`.
+    `options` has the keys `OPTIONS`. With `ray_address`, a Ray cluster works instead of local
+    processes. Returns counts, as stored in the file: `attempts`, those rejected by reason, and
+    `queries_given_up`.
 
     Raises:
         ValueError: the journal belongs to another collection, or is in use.
@@ -241,13 +256,14 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             counts[reason] = sum(demo["rejected"].get(reason, 0) for demo in demos)
             counts["attempts"] += counts[reason]
         counts["queries_given_up"] = sum(demo["given_up"] for demo in demos)
-        task, scenes_of = envs.get_task(options["task"]), None
-        base = task.base_scene
+        task = envs.get_task(options["task"])
+        base, scenes_of = task.base_scene, None
         joints = base.robot.num_joints
         if not isinstance(task.scene, Scene):
             scenes_of = [replace(base, obstacles=from_lists(demo["obstacles"])) for demo in demos]
-        flags = " ".join(f"--{name.replace('_', '-')} {options[name]}" for name in OPTIONS[:-1])
-        flags += " --allow-collisions" * options["allow_collisions"]
+        words = [f"--{name.replace('_', '-')} {options[name]}" for name in OPTIONS[:-1]]
+        if options["allow_collisions"]:
+            words.append("--allow-collisions")
         write_demos(
             path,
             options["task"],
@@ -255,7 +271,7 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
             [_decode(demo["plan"], joints) for demo in demos],
             [_decode(demo["states"], joints) for demo in demos],
             {name: [demo[name] for demo in demos] for name in ("plan_seed", "digest", "collided")},
-            made_by=f"roboarm collect --num {num} {flags}",
+            made_by=f"roboarm collect --num {num} {' '.join(words)}",
             parameters={"options": options, "counts": counts},
             scenes_of=scenes_of,
         )
@@ -263,11 +279,11 @@ def collect(path, num, options, num_workers=1, ray_address=None, progress=True):
         return counts
 
 
-def _check(args):
+def _check(args: Args) -> Path:
     """The path to write. Raises ValueError for arguments that cannot work."""
     flags.check(args)
-    path = args.output or demo_path(args.task)
-    demo_path(args.task)  # rejects an unknown task, also with --output
+    default = demo_path(args.task)  # rejects an unknown task, also with --output
+    path = args.output or default
     if not envs.get_task(args.task).trainable:
         raise ValueError(f"{args.task} is for testing only: training on it is not allowed")
     check_writable(path)
@@ -282,9 +298,9 @@ def _check(args):
     return path
 
 
-def main(args):
+def main(args: Args):
+    """The command."""
     try:
-        args = replace(args, task=task_with_robot(args.task, args.robot), robot=None)
         path = _check(args)
         options = options_of(args)
         counts = collect(path, args.num, options, args.workers, args.ray_address)

@@ -2,7 +2,7 @@
 
     pip install -e ".[minari]"
     roboarm minari --task double_walls --goal-type ee
-    roboarm minari --task no_obstacles --robot arm.yaml
+    roboarm minari --task no_obstacles@arm.yaml
 
 Then `minari.load_dataset("roboarm-nmp/double_walls/ee-v0")` has the demonstrations as episodes of
 the task's environment, each up to the first step that reaches its goal. The dataset is in Minari's
@@ -18,12 +18,9 @@ paths: on another machine, `recover_environment(task=...)` names them.
 """
 
 import contextlib
-import fcntl
 import importlib.util
-import os
 import shutil
 import sys
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -32,28 +29,29 @@ import gymnasium
 import numpy as np
 
 from roboarm_nmp import envs
-from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
+from roboarm_nmp.datasets.demonstrations import Demo, Demos, demo_path, load_demos
 from roboarm_nmp.datasets.episodes import demo_episode
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
-from roboarm_nmp.envs.tasks import has_name, split_robot, task_with_robot
+from roboarm_nmp.envs.tasks import has_name, split_robot
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.progress import progress_bar
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 PREFIX = ".exporting-"  # of incomplete folders; Minari ignores hidden ones
+GoalType = Literal["ee", "config", "combined", "pose"]
 
 
 @dataclass
 class Args:
     task: str | None = None
-    """Task with a fixed scene, a name or a scene file: export its demonstrations."""
-    robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
+    """Task with a fixed scene, a name or a scene file, with another arm as TASK@FILE: export its
+    demonstrations."""
     file: Path | None = None
     """Demonstration file to export instead of the task's own. Those of a scene file, or of another
     arm, need --task, too."""
-    goal_type: Literal["ee", "config", "combined", "pose"] = "ee"
+    goal_type: GoalType = "ee"
     """Kind of the goals."""
     dataset_id: str | None = None
     """Minari's name for the dataset. The default is `roboarm-nmp/<task>/<goal type>-v0`, or
@@ -64,7 +62,7 @@ class Args:
     """Replace the dataset, if it exists."""
 
 
-def unrounded(demo, env):
+def unrounded(demo: Demo, env: RoboArmEnv) -> Demo:
     """The demonstration with its exact states and actions, by following its plan in `env`.
 
     Raises ValueError: the execution differs on this machine.
@@ -74,13 +72,14 @@ def unrounded(demo, env):
         raise ValueError(
             "the executions differ on this machine: repair them with `roboarm verify FILE --repair`"
         )
-    states, points = execution.states, subgoals(demo.plan, env.robot)
+    states = execution.states
+    points = subgoals(demo.plan, env.robot)
     actions = points[np.minimum(np.arange(1, len(states)), len(points) - 1)] - states[:-1]
     actions *= np.minimum(1.0, MAX_STEP / np.linalg.norm(actions, axis=1, keepdims=True))
     return replace(demo, states=states, actions=actions.astype(np.float32))
 
 
-def episode(demo, env):
+def episode(demo: Demo, env: RoboArmEnv) -> dict:
     """A demonstration as the environment would have recorded it, up to reaching the goal.
 
     Args:
@@ -110,7 +109,7 @@ def episode(demo, env):
     }
 
 
-def _recoverable(demos, task):
+def _recoverable(demos: Demos, task: str | None) -> tuple[str, dict]:
     """The id and arguments with which Minari makes the environment of every episode again.
 
     Raises ValueError: it could not.
@@ -127,48 +126,34 @@ def _recoverable(demos, task):
             f"the demonstrations' task {demos.task!r} is not in envs.TASKS: name its scene file, "
             f"or the robot's file, with --task"
         )
-    parts = (part for part in split_robot(task) if part is not None)
+    parts = [part for part in split_robot(task) if part is not None]
     task = "@".join(part if has_name(part) else str(Path(part).resolve()) for part in parts)
     return envs.gymnasium_id(task), {"task": task}
 
 
 @contextlib.contextmanager
-def _locked(folder):
-    """A context with a lock on a folder. Raises BlockingIOError: another process has it."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def _removed_afterwards(folder: Path):
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     finally:
-        os.close(descriptor)
-
-
-def _clear_leftovers(root):
-    """Delete what killed exports left, unless a dataset was about to be replaced."""
-    for folder in root.glob(f"{PREFIX}*"):
-        with contextlib.suppress(OSError), _locked(folder):
-            if not (folder / "old").exists():
-                shutil.rmtree(folder)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def export(
-    demos,
-    goal_type="ee",
-    dataset_id=None,
-    exact=False,
-    overwrite=False,
-    progress=True,
-    task=None,
-):
+    demos: Demos,
+    goal_type: GoalType = "ee",
+    dataset_id: str | None = None,
+    exact: bool = False,
+    overwrite: bool = False,
+    progress: bool = True,
+    task: str | None = None,
+) -> tuple[str, int]:
     """Write `Demos` into Minari's local storage; returns the dataset's id and number of steps.
 
     Args:
-        demos: an `datasets.demonstrations.Demos`.
-        goal_type: `ee`, `config`, `combined` or `pose`.
         dataset_id: a name with a version, `namespace/name-v0`; None for the default.
         exact: follow the plans again, see above.
         overwrite: replace a dataset of this name. The old one stays until the new one is complete.
-        progress: show a progress bar.
         task: path of the scene file, or `TASK@ROBOT`, that the demonstrations are for, unless their
             task is in `envs.TASKS`.
 
@@ -199,16 +184,19 @@ def export(
         raise ValueError(f"the dataset {dataset_id} exists ({path}); --overwrite replaces it")
     planner = demos.parameters.get("options", {}).get("planner", "a planner")
     env = gymnasium.make(gymnasium_id, goal_type=goal_type, **arguments)
+    arm_env = env.unwrapped
+    assert isinstance(arm_env, RoboArmEnv)
+
+    def recorded(demo):
+        return episode(unrounded(demo, arm_env) if exact else demo, arm_env)
+
     bar = progress_bar(range(len(demos)), dataset_id, unit="episode", disable=not progress)
-    root = get_dataset_path().resolve()
-    _clear_leftovers(root)
-    with (
-        contextlib.closing(env),
-        tempfile.TemporaryDirectory(prefix=PREFIX, dir=root) as folder,
-        _locked(folder),
-    ):
-        new, old = Path(folder, "new"), Path(folder, "old")
-        new.mkdir()
+    # Beside the datasets, so that a rename puts the complete one in its place.
+    folder = get_dataset_path().resolve() / f"{PREFIX}{dataset_id.replace('/', '-')}"
+    shutil.rmtree(folder, ignore_errors=True)  # of a killed export
+    with contextlib.closing(env), _removed_afterwards(folder):
+        new = folder / "new"
+        new.mkdir(parents=True)
         storage = MinariStorage.new(
             new / "data", env.observation_space, env.action_space, env.spec, data_format="hdf5"
         )
@@ -221,25 +209,28 @@ def export(
                 f"of RoboArm-NMP, goal type {goal_type}. Made by: {demos.made_by}",
             }
         )
-        chosen = (unrounded(demos[i], env.unwrapped) if exact else demos[i] for i in bar)
-        storage.update_episodes(EpisodeBuffer(**episode(demo, env.unwrapped)) for demo in chosen)
+        storage.update_episodes(EpisodeBuffer(**recorded(demos[i])) for i in bar)
         if namespace is not None and namespace not in list_local_namespaces():
             create_namespace(namespace)
         steps = storage.total_steps
         if path.exists():
-            path.rename(old)
+            path.rename(folder / "old")
         new.rename(path)
     return dataset_id, steps
 
 
-def main(args):
+def main(args: Args):
+    """The command."""
     try:
-        if args.task is None and (args.file is None or args.robot is not None):
+        if args.file is not None:
+            demos = load_demos(args.file, args.task)
+        elif args.task is not None:
+            demos = load_demos(demo_path(args.task), args.task)
+        else:
             raise ValueError("give --task, or the --file of a named task of the Panda")
-        task = args.task and task_with_robot(args.task, args.robot)
-        demos = load_demos(args.file or demo_path(task), task)
-        options = args.goal_type, args.dataset_id, args.exact, args.overwrite
-        dataset_id, steps = export(demos, *options, task=task)
+        dataset_id, steps = export(
+            demos, args.goal_type, args.dataset_id, args.exact, args.overwrite, task=args.task
+        )
     except (ImportError, OSError, ValueError) as error:  # a DatasetError is a ValueError
         sys.exit(error_line(error))
     print(f"{dataset_id}: {len(demos)} episodes, {steps} steps")

@@ -44,7 +44,6 @@ from roboarm_nmp.datasets.queries import query_path, write_queries
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
-from roboarm_nmp.envs.tasks import is_for_any_robot, task_with_robot
 from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.utils import flags, workers
@@ -64,14 +63,13 @@ GOALS, MAX_GOALS = 1_000, 1_000_000
 
 
 Region = Annotated[tuple[float, ...], tyro.conf.arg(metavar="XMIN XMAX YMIN YMAX ZMIN ZMAX")]
+Limits = Literal["urdf", "datasheet"]
 
 
 @dataclass
 class Args:
     task: tuple[str, ...]
-    """Names of tasks, paths of scene files, or `all`."""
-    robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
+    """Names of tasks, or paths of scene files, with another arm as TASK@FILE; or `all`."""
     solvable: bool = False
     """Accept only queries that the planner solves."""
     queries_per_scene: PositiveInt = 1
@@ -79,7 +77,7 @@ class Args:
     goal_region: Region = ()
     """Box (m) for the goals' end-effector positions, in the world's frame: its origin is the arm's
     base, x points to the front, y to the left, z up. By default they are anywhere."""
-    limits: Literal["urdf", "datasheet"] = "urdf"
+    limits: Limits = "urdf"
     """Position limits of starts and goals: the URDF's, or those of the arm's datasheet."""
     seed: Seed = 0
     """Seed of the queries. (The files of this project have seed 0.)"""
@@ -103,14 +101,23 @@ class Args:
 class Sampler:
     """Samples queries of a task; a job is (seed, split, number)."""
 
-    def __init__(self, task, solvable, queries_per_scene=1, goal_region=None, limits="urdf"):
-        self.queries_per_scene, self.goal_region = queries_per_scene, goal_region
-        self.env, self.limits = envs.make(task), limits
+    def __init__(
+        self,
+        task: str,
+        solvable: bool,
+        queries_per_scene: int = 1,
+        goal_region: tuple[float, ...] | None = None,
+        limits: Limits = "urdf",
+    ):
+        self.queries_per_scene = queries_per_scene
+        self.goal_region = goal_region
+        self.limits = limits
+        self.env = envs.make(task)
         self.planner = None
         if solvable:
             self.planner = Planner(self.env, max_checks=SOLVE_CHECKS, limits=limits)
 
-    def __call__(self, job):
+    def __call__(self, job: tuple[int, str, int]) -> dict:
         """Query `number` of a split, as a JSON-ready dict.
 
         Its `rejected` counts the samples that the simulated arm does not hold for long enough
@@ -119,22 +126,25 @@ class Sampler:
         it has to be free (`blocked`).
         """
         seed, split, number = job
-        scene = [seed, STREAMS[split], number // self.queries_per_scene]
-        self.env.sample_scene(np.random.default_rng([*scene, SCENES]))
-        rng = np.random.default_rng([seed, STREAMS[split], number])
-        moving, scene_seed, motions = self.env.is_animated, None, rng
+        stream, robot = STREAMS[split], self.env.robot
+        scene_number = number // self.queries_per_scene
+        self.env.sample_scene(np.random.default_rng([seed, stream, scene_number, SCENES]))
+        rng = np.random.default_rng([seed, stream, number])
+        moving = self.env.is_animated
+        scene_seed, motions_rng = None, rng
         rejected = Counter()
         for _ in range(MAX_QUERIES):
             if moving:  # a scene for each query: its motions depend on start and goal
                 scene_seed = int(rng.integers(2**32))
-                at_rest, motions = map(np.random.default_rng, scene_seeds(scene_seed))
-                self.env.sample_scene(at_rest)
+                seed_at_rest, seed_of_motions = scene_seeds(scene_seed)
+                self.env.sample_scene(np.random.default_rng(seed_at_rest))
+                motions_rng = np.random.default_rng(seed_of_motions)
             start, goal = self._sample_query(rng)
-            ends, robot = np.array([start, goal]), self.env.robot
+            ends = np.array([start, goal])
             if self.limits != "urdf" and not robot.is_within(ends, self.limits).all():
                 rejected["outside"] += 1
                 continue
-            if not self.env.sample_motions(start, goal, motions):
+            if not self.env.sample_motions(start, goal, motions_rng):
                 rejected["blocked"] += 1
                 continue
             if moving:
@@ -144,21 +154,29 @@ class Sampler:
             elif self.planner and not demonstrate(self.planner, start, goal, rng, SOLVE_ATTEMPTS):
                 rejected["unsolved"] += 1
             else:
-                scene = {"obstacles": to_lists(self.env.scene.obstacles)}
+                query = {
+                    "index": f"{split}/{number}",
+                    "start": start.tolist(),
+                    "goal": goal.tolist(),
+                    "rejected": rejected,
+                }
                 if moving:
-                    scene = {"scene_seed": scene_seed}
-                ends = {"start": start.tolist(), "goal": goal.tolist()}
-                return {"index": f"{split}/{number}", **ends, **scene, "rejected": rejected}
+                    query["scene_seed"] = scene_seed
+                else:
+                    query["obstacles"] = to_lists(self.env.scene.obstacles)
+                return query
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
 
-    def _sample_query(self, rng):
+    def _sample_query(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """As `env.sample_query`, with the goal's end effector in the goal region, if there is one.
 
         Raises RuntimeError: no goal in it was found.
         """
         if self.goal_region is None:
             return self.env.sample_query(rng)
-        start, inside, robot = self.env.sample_feasible(rng), 0, self.env.robot
+        robot = self.env.robot
+        start = self.env.sample_feasible(rng)
+        inside = 0
         low, high = np.reshape(self.goal_region, (3, 2)).T
         for _ in range(MAX_GOALS // GOALS):
             goals = rng.uniform(robot.lower, robot.upper, (GOALS, robot.num_joints))
@@ -177,34 +195,29 @@ class Sampler:
 
 
 def make_queries(
-    path,
-    task,
-    seed,
-    num_test,
-    num_validation,
-    solvable=False,
-    queries_per_scene=1,
-    original=None,
-    num_workers=1,
-    progress=True,
-    goal_region=None,
-    limits="urdf",
-):
+    path: str | Path,
+    task: str,
+    seed: int,
+    num_test: int,
+    num_validation: int,
+    solvable: bool = False,
+    queries_per_scene: int = 1,
+    original: Path | None = None,
+    num_workers: int = 1,
+    progress: bool = True,
+    goal_region: tuple[float, ...] | None = None,
+    limits: Limits = "urdf",
+) -> Counter:
     """Sample the queries of a task and write its file.
 
     Args:
-        path: file to write or replace.
         task: name of the task, path of a scene file, or `TASK@ROBOT`.
-        seed: int >= 0.
-        num_test, num_validation: numbers of queries, > 0.
         solvable: accept only queries that the planner solves.
         queries_per_scene: queries in a row that have the same scene, where scenes vary.
         original: path of a file or folder of problems for the split `original`.
-        num_workers: number of processes.
-        progress: show a progress bar.
         goal_region: (xmin, xmax, ymin, ymax, zmin, zmax), m, of the goals' end-effector positions
             in the world's frame; None for anywhere.
-        limits: "urdf" or "datasheet", of starts and goals.
+        limits: of starts and goals.
 
     Returns:
         A Counter of the samples rejected: `unheld`, `unsolved`, `outside`.
@@ -217,11 +230,18 @@ def make_queries(
         Whatever is raised, what is in the journal is safe.
     """
     query_path(task)  # rejects an unknown task
-    splits = {} if original is None else {ORIGINAL: _original_queries(original)}
-    path, distribution, base = Path(path), envs.get_task(task).scene, envs.get_task(task).base_scene
-    options = {"task": str(task), "seed": seed, "solvable": solvable}
-    options |= {"queries_per_scene": queries_per_scene}
-    options["goal_region"] = None if goal_region is None else list(goal_region)
+    splits: dict[str, tuple] = {}
+    if original is not None:
+        splits[ORIGINAL] = _original_queries(original)
+    path = Path(path)
+    distribution, base = envs.get_task(task).scene, envs.get_task(task).base_scene
+    options = {
+        "task": str(task),
+        "seed": seed,
+        "solvable": solvable,
+        "queries_per_scene": queries_per_scene,
+        "goal_region": None if goal_region is None else list(goal_region),
+    }
     if limits != "urdf":
         options["limits"] = limits
     with contextlib.closing(Journal(journal_of(path), options)) as journal:
@@ -246,17 +266,17 @@ def make_queries(
             made = [journal.entries[f"{split}/{number}"] for number in range(num)]
             for query in made:
                 rejected.update(query["rejected"])
-            start, goal = (
-                np.array([query[name] for query in made], np.float32) for name in ("start", "goal")
-            )
-            splits[split] = (start, goal)
+            start = np.array([query["start"] for query in made], np.float32)
+            goal = np.array([query["goal"] for query in made], np.float32)
             if hasattr(distribution, "animate"):
                 seeds = np.array([query["scene_seed"] for query in made], np.uint32)
-                splits[split] += (AnimatedScenes(distribution, seeds, start, goal),)
-            elif not isinstance(distribution, Scene):
+                splits[split] = (start, goal, AnimatedScenes(distribution, seeds, start, goal))
+            elif isinstance(distribution, Scene):
+                splits[split] = (start, goal)
+            else:
                 rows = [query["obstacles"] for query in made]
                 scenes = [replace(base, obstacles=from_lists(row)) for row in rows]
-                splits[split] += (scenes,)
+                splits[split] = (start, goal, scenes)
         parameters = {
             "hold_steps": HOLD_STEPS,
             "hold_drift": HOLD_DRIFT,
@@ -264,22 +284,22 @@ def make_queries(
             "substeps": SUBSTEPS,
             "rejected": rejected["unheld"],
         }
-        if solvable:
-            parameters |= {"unsolved": rejected["unsolved"], "solve_checks": SOLVE_CHECKS}
-            parameters |= {"solve_attempts": SOLVE_ATTEMPTS}
-        if goal_region is not None:
-            parameters["goal_region"] = list(goal_region)
-        if limits != "urdf":
-            parameters |= {"limits": limits, "outside": rejected["outside"]}
         made_by = f"roboarm queries --task {task} --seed {seed} "
         made_by += f"--num-test {num_test} --num-validation {num_validation}"
-        made_by += " --solvable" * solvable
+        if solvable:
+            made_by += " --solvable"
+            parameters["unsolved"] = rejected["unsolved"]
+            parameters["solve_checks"] = SOLVE_CHECKS
+            parameters["solve_attempts"] = SOLVE_ATTEMPTS
         if queries_per_scene > 1:
             made_by += f" --queries-per-scene {queries_per_scene}"
         if goal_region is not None:
             made_by += f" --goal-region {' '.join(map(str, goal_region))}"
+            parameters["goal_region"] = list(goal_region)
         if limits != "urdf":
             made_by += f" --limits {limits}"
+            parameters["limits"] = limits
+            parameters["outside"] = rejected["outside"]
         if original is not None:
             made_by += f" --original {Path(original).name}"
         write_queries(path, task, seed, splits, made_by, parameters)
@@ -287,7 +307,7 @@ def make_queries(
     return rejected
 
 
-def _original_queries(path):
+def _original_queries(path: Path) -> tuple:
     """Starts, goals and scenes of the problems in a file. The gripper is as open as in any task."""
     problems = load_problems(path)
     if problems.rejected:
@@ -296,13 +316,10 @@ def _original_queries(path):
     return problems.start, problems.goal, scenes
 
 
-def _check(args):
+def _check(args: Args) -> list[tuple[str, Path]]:
     """The (task, path) pairs to make. Raises ValueError for arguments that cannot work."""
     flags.check(args)
-    tasks = tuple(dict.fromkeys(args.task))
-    if tasks == ("all",):
-        tasks = tuple(name for name in envs.TASKS if not args.robot or is_for_any_robot(name))
-    tasks = tuple(task_with_robot(task, args.robot) for task in tasks)
+    tasks = list(envs.TASKS) if args.task == ("all",) else list(dict.fromkeys(args.task))
     if not tasks:
         raise ValueError(f"--task: one or more of {', '.join(envs.TASKS)}, or all")
     if (args.output or args.original) is not None and len(tasks) > 1:
@@ -316,10 +333,9 @@ def _check(args):
         if region.shape != (6,) or not (
             np.isfinite(region).all() and (region[::2] < region[1::2]).all()
         ):
-            given = " ".join(map(str, args.goal_region))
             raise ValueError(
                 f"--goal-region takes XMIN XMAX YMIN YMAX ZMIN ZMAX, each minimum below its "
-                f"maximum, got {given}"
+                f"maximum, got {' '.join(map(str, args.goal_region))}"
             )
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
@@ -338,13 +354,10 @@ def _check(args):
     return pairs
 
 
-def main(args):
+def main(args: Args):
+    """The command."""
     try:
-        pairs = _check(args)
-    except (ValueError, OSError) as error:
-        sys.exit(error_line(error))
-    try:
-        for task, path in pairs:
+        for task, path in _check(args):
             rejected = make_queries(
                 path,
                 task,
@@ -360,10 +373,9 @@ def main(args):
             )
             text = f"{path}: written; {rejected['unheld']} samples rejected by the long hold check"
             if args.solvable:
-                share = rejected["unsolved"] / (
-                    args.num_test + args.num_validation + rejected["unsolved"]
-                )
-                text += f", {rejected['unsolved']} not solved by the planner ({share:.3f})"
+                unsolved = rejected["unsolved"]
+                share = unsolved / (args.num_test + args.num_validation + unsolved)
+                text += f", {unsolved} not solved by the planner ({share:.3f})"
             print(text)
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(error_line(error))

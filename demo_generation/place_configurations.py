@@ -4,10 +4,14 @@ scene, places = Containers().sample_with_places(rng)
 ends, on_ways = place_configurations(scene, places, rng, 20)
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
+from roboarm_nmp.envs.scenes.containers import Place
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.planning.approach_path import approach_path
 
 MARGIN, NEAR = 0.003, 0.015  # m: of all configurations, and of most of them at most
@@ -18,7 +22,9 @@ POSES, NUM_SEEDS, MAX_ROUNDS = 32, 8, 10  # of inverse kinematics: poses a round
 EVERY = 10  # steps of an approach path between configurations on the way
 
 
-def place_configurations(scene, places, rng, number):
+def place_configurations(
+    scene: Scene, places: Sequence[Place], rng: np.random.Generator, number: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Free configurations with the end effector in one of the `Place`s of a scene.
 
     Half of them are at the end of an approach path, with as much room as there is nearby.
@@ -26,26 +32,29 @@ def place_configurations(scene, places, rng, number):
     Returns:
         float64 (k, n), normalised, k <= `number`, and (m, n): more on the ways out of places.
     """
-    robot, checker, ends, on_ways = scene.robot, CollisionChecker(scene), [], []
+    robot, checker = scene.robot, CollisionChecker(scene)
+    ends, on_ways = [], []
     for _ in range(MAX_ROUNDS):
-        found = inverse_kinematics(
-            robot, _poses(places, rng), int(rng.integers(2**32)), NUM_SEEDS, checker, MARGIN
-        )
-        states = [robot.normalise(one[rng.integers(len(one))]) for one in found if len(one)]
+        poses = _poses(places, rng)
+        seed = int(rng.integers(2**32))
+        states = []
+        for solutions in inverse_kinematics(robot, poses, seed, NUM_SEEDS, checker, MARGIN):
+            if len(solutions):
+                states.append(robot.normalise(solutions[rng.integers(len(solutions))]))
         for state in states:
             near = not checker.is_free(state[None], NEAR)[0]
             if len(ends) == number or not (near or rng.random() < FAR_SHARE):
                 continue
             path = approach_path(robot, state, checker.link_distances)
             ends.append(path[-1] if rng.random() < RETREATED else path[0])
-            on_ways += list(path[::EVERY])
+            on_ways.extend(path[::EVERY])
         if len(ends) == number:
             break
-    joints = robot.num_joints
-    return np.reshape(ends, (-1, joints)), np.reshape(on_ways, (-1, joints))
+    shape = (-1, robot.num_joints)
+    return np.reshape(ends, shape), np.reshape(on_ways, shape)
 
 
-def _poses(places, rng):
+def _poses(places: Sequence[Place], rng: np.random.Generator) -> np.ndarray:
     """Random end-effector poses (POSES, 7) in places."""
     poses = np.empty((POSES, 7))
     for pose in poses:
@@ -58,7 +67,7 @@ def _poses(places, rng):
     return poses
 
 
-def _hand_along(axis, roll):
+def _hand_along(axis: np.ndarray, roll: float) -> np.ndarray:
     """The quaternion (xyzw) that turns z to a unit vector, after a turn about z."""
     x, y, z = axis
     # From z to the axis by the shortest turn; from -z by half a turn about x.

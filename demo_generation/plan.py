@@ -18,24 +18,25 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scene
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import check_writable
-from roboarm_nmp.utils.flags import (
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    Seed,
-)
+from roboarm_nmp.utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, Seed
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
+if TYPE_CHECKING:  # imported when they are needed, so that --help does not wait for Numba
+    from roboarm_nmp.envs.collision.checker import CollisionChecker
+    from roboarm_nmp.evaluation.rollout import Trajectory
+    from roboarm_nmp.motions.trajectories import JointTrajectory
+
 CLOUD_FLAGS = (
-    *("units", "frame", "intrinsics", "recorded_at", "arm_distance", "table", "workspace"),
-    *("cell", "min_points", "point_radius"),
+    *("robot", "units", "frame", "intrinsics", "recorded_at", "arm_distance", "table"),
+    *("workspace", "cell", "min_points", "point_radius"),
 )
 
 
@@ -50,9 +51,11 @@ class Args:
     cloud: Path | None = None
     """the point cloud: a .ply, .pcd, .npy or .npz file, or a depth image (with --intrinsics)"""
     task: str | None = None
-    """instead of a cloud: a task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml)"""
+    """instead of a cloud: a task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); with another
+    arm, TASK@FILE"""
     robot: Path | None = None
-    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md)"""
+    """the arm beside a cloud: a robot's file (.urdf, .yaml; docs/customise/robot.md); by default
+    the Panda"""
     policy: str = "planner"
     """`planner`, another baseline, a policy network, a run's folder, or the name of a pretrained
     policy (`roboarm policies`)"""
@@ -91,7 +94,7 @@ class Args:
     """write the motion to this file, .csv, .npz, .json or .yaml (docs/guide/trajectories.md)"""
 
 
-def _numbers(flag, text, number):
+def _numbers(flag: str, text: str, number: int) -> np.ndarray:
     """So many finite numbers in the text of a flag, float64. Raises ValueError."""
     try:
         values = np.array([float(word) for word in text.replace(",", " ").split()])
@@ -102,7 +105,7 @@ def _numbers(flag, text, number):
     return values
 
 
-def _configuration(flag, text, robot):
+def _configuration(flag: str, text: str, robot: Robot) -> np.ndarray:
     """A configuration (n,), rad, in the text of a flag. Raises ValueError: outside the limits."""
     configuration = _numbers(flag, text, robot.num_joints)
     outside = np.abs(robot.normalise(configuration)) > 1.0 + 1e-6
@@ -113,60 +116,69 @@ def _configuration(flag, text, robot):
     return configuration
 
 
-def _task_scene(args):
+def _task_scene(args: Args) -> Scene:
     """The `Scene` of the task, a random one where scenes are drawn."""
-    from roboarm_nmp.envs.tasks import get_task, task_with_robot
+    from roboarm_nmp.envs.tasks import get_task
 
-    scene = get_task(task_with_robot(args.task, args.robot)).scene
-    if hasattr(scene, "animate") or not getattr(scene, "is_static", True):
+    scene = get_task(str(args.task)).scene
+    moves = not scene.is_static if isinstance(scene, Scene) else hasattr(scene, "animate")
+    if moves:
         raise ValueError(f"--task: obstacles of {args.task} move, and plans are for scenes at rest")
-    return scene.sample(np.random.default_rng(args.seed)) if hasattr(scene, "sample") else scene
+    if isinstance(scene, Scene):
+        return scene
+    return scene.sample(np.random.default_rng(args.seed))
 
 
-def _observed_scene(args, robot):
+def _observed_scene(args: Args, robot: Robot) -> ObservedScene:
     """The `ObservedScene` of the cloud, which is prepared and described."""
     from roboarm_nmp.envs.perception.cloud_files import load_cloud
     from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
-    from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, ObservedScene
+    from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE
 
-    at = (
-        ("--start", args.start) if args.recorded_at is None else ("--recorded-at", args.recorded_at)
-    )
-    recorded_at = _configuration(*at, robot)
-    frame = args.frame and _numbers("--frame", args.frame, 7)
-    intrinsics = args.intrinsics and _numbers("--intrinsics", args.intrinsics, 4)
-    options = {"table": TABLE, "floor": FLOOR} if args.table else {"table": None, "floor": None}
-    given = {
+    if args.recorded_at is None:
+        recorded_at = _configuration("--start", args.start, robot)
+    else:
+        recorded_at = _configuration("--recorded-at", args.recorded_at, robot)
+    frame = None if args.frame is None else _numbers("--frame", args.frame, 7)
+    intrinsics = None
+    if args.intrinsics is not None:
+        intrinsics = _numbers("--intrinsics", args.intrinsics, 4)
+    table, floor = (TABLE, FLOOR) if args.table else (None, None)
+    options = {
         name: getattr(args, name)
         for name in ("cell", "min_points", "arm_distance")
         if getattr(args, name) is not None
     }
     if args.workspace is not None:
-        given["workspace"] = _numbers("--workspace", args.workspace, 6).reshape(2, 3)
-    read = load_cloud(args.cloud, args.units, frame, intrinsics)
-    prepare_cloud(read[:0], robot, recorded_at)  # what happens once per arm, outside of the time
+        options["workspace"] = _numbers("--workspace", args.workspace, 6).reshape(2, 3)
+    cloud = load_cloud(args.cloud, args.units, frame, intrinsics)
+    prepare_cloud(cloud[:0], robot, recorded_at)  # what happens once per arm, outside of the time
     began = time.perf_counter()
-    points, removed = prepare_cloud(read, robot, recorded_at, **options, **given)
+    points, removed = prepare_cloud(cloud, robot, recorded_at, table=table, floor=floor, **options)
     seconds = time.perf_counter() - began
-    out = ", ".join(f"{number:,} {step}" for step, number in removed.items() if number)
-    print(f"{args.cloud}: {len(read):,} points; left out: {out or 'none'}")
+    left_out = [f"{number:,} {step}" for step, number in removed.items() if number]
+    print(f"{args.cloud}: {len(cloud):,} points; left out: {', '.join(left_out) or 'none'}")
     print(f"{len(points):,} points remain, prepared in {1000 * seconds:.0f} ms")
-    return ObservedScene(points=points, point_radius=args.point_radius, robot=robot, **options)
+    return ObservedScene(
+        points=points, point_radius=args.point_radius, robot=robot, table=table, floor=floor
+    )
 
 
-def _goal(args, robot, start):
+def _goal(args: Args, robot: Robot, start: np.ndarray) -> dict[str, np.ndarray]:
     """The goal as an argument of `Planner.plan`: `goal` (n,), rad, or `goal_pose` (7,)."""
     from roboarm_nmp.policies.pose_goals import goal_configuration
 
-    if args.goal is not None:
-        return {"goal": _configuration("--goal", args.goal, robot)}
-    pose = _numbers("--goal-pose", args.goal_pose, 7)
-    if goal_configuration(robot, pose, start) is None:
-        raise ValueError("--goal-pose: the arm cannot reach it")
-    return {"goal_pose": pose}
+    if args.goal_pose is not None:
+        pose = _numbers("--goal-pose", args.goal_pose, 7)
+        if goal_configuration(robot, pose, start) is None:
+            raise ValueError("--goal-pose: the arm cannot reach it")
+        return {"goal_pose": pose}
+    return {"goal": _configuration("--goal", args.goal or "", robot)}
 
 
-def _check_end(flag, configuration, checker):
+def _check_end(
+    flag: str, configuration: np.ndarray, checker: "CollisionChecker", point_radius: float
+):
     """Raise ValueError if a point of the cloud is inside the arm, which the simulator ignores.
 
     That the arm is inside the ball around a point is allowed: balls are larger than surfaces.
@@ -177,13 +189,13 @@ def _check_end(flag, configuration, checker):
     state = np.clip(robot.normalise(configuration), -1.0, 1.0)
     near = checker.signed_distances(state, self_collisions=False)
     link = int(near.distance.argmin())
-    depth = -near.distance[link] - checker.scene.point_radius
+    depth = -near.distance[link] - point_radius
     if near.geometry[link] == POINT and depth > 0:
         name = robot.link_names[robot.collision_links[link]]
         raise ValueError(f"{flag} is in collision: a point is {1000 * depth:.0f} mm inside {name}")
 
 
-def _planned(args, scene, start, goal):
+def _planned(args: Args, scene: Scene, start: np.ndarray, goal: dict) -> tuple[np.ndarray, float]:
     """A path (k, n), rad, of the planner to a `_goal`, and its computing time (s).
 
     Raises PlanningError: there is none.
@@ -197,7 +209,13 @@ def _planned(args, scene, start, goal):
     return path, time.perf_counter() - began
 
 
-def _rolled_out(args, checker, start, goal=None, goal_pose=None):
+def _rolled_out(
+    args: Args,
+    checker: "CollisionChecker",
+    start: np.ndarray,
+    goal: np.ndarray | None = None,
+    goal_pose: np.ndarray | None = None,
+) -> "Trajectory":
     """The `Trajectory` of a policy from start to goal. Raises ValueError: it cannot act here."""
     from roboarm_nmp import envs
     from roboarm_nmp.datasets.queries import Query
@@ -207,12 +225,11 @@ def _rolled_out(args, checker, start, goal=None, goal_pose=None):
 
     policy, options = find_policy(args.policy)
     if args.cloud is not None:
-        inputs = {options.get("encoder"), options.get("geometry_source")}
-        other = inputs - {None, "point_cloud", "ground_truth"}
-        if other:
-            raise ValueError(f"{args.policy} observes {', '.join(sorted(other))}, not points")
+        for source in (options.get("encoder"), options.get("geometry_source")):
+            if source not in (None, "point_cloud", "ground_truth"):
+                raise ValueError(f"{args.policy} observes {source}, not points")
     if own_safety_filter(policy) or options.get("link_distances"):
-        options |= {"link_distances": True}
+        options["link_distances"] = True
         options.setdefault("geometry_source", "ground_truth")
     scene = checker.scene
     if goal is None:
@@ -225,7 +242,7 @@ def _rolled_out(args, checker, start, goal=None, goal_pose=None):
     return rollout(env, query, begin(0, query).act)
 
 
-def _retimed(path, checker):
+def _retimed(path: np.ndarray, checker: "CollisionChecker") -> "JointTrajectory":
     """The `JointTrajectory` of a path (k, n), rad, checked for collisions where that is possible.
 
     A path that is inside the ball around a point, as its ends may be, or in contact, as a policy's
@@ -244,12 +261,13 @@ def _retimed(path, checker):
     return trajectory
 
 
-def _describe(configurations, checker):
+def _describe(configurations: np.ndarray, checker: "CollisionChecker"):
     """Print the length of a motion (m, n), rad, and its minimum clearance from the scene."""
     from roboarm_nmp.envs.collision.checker import FLOOR, NOTHING, POINT, TABLE
     from roboarm_nmp.motions.metrics import path_length
 
-    robot, names = checker.robot, {TABLE: "the table", FLOOR: "the floor", POINT: "a point"}
+    robot = checker.robot
+    names = {TABLE: "the table", FLOOR: "the floor", POINT: "a point"}
     joints = path_length(configurations)
     metres = path_length(robot.forward_kinematics(configurations))
     print(f"path length {joints:.2f} rad, of the end effector {metres:.2f} m")
@@ -261,65 +279,80 @@ def _describe(configurations, checker):
         print(f"minimum clearance {1000 * near.distance[nearest]:.1f} mm, from {geometry}")
 
 
-def main(args):
-    try:
-        flags.check(args)
-        if (args.cloud is None) == (args.task is None):
-            raise ValueError("one of --cloud and --task is needed")
-        given = [name for name in CLOUD_FLAGS if getattr(args, name) != getattr(Args, name)]
-        if args.cloud is None and given:
-            raise ValueError(f"--{given[0].replace('_', '-')} goes with --cloud")
-        if (args.goal is None) == (args.goal_pose is None):
-            raise ValueError("one of --goal and --goal-pose is needed")
-        # Here, because --help need not wait for Numba.
-        from roboarm_nmp.envs.collision.checker import CollisionChecker
-        from roboarm_nmp.envs.robots.files import load_robot
-        from roboarm_nmp.envs.robots.panda import PANDA
-        from roboarm_nmp.motions.trajectories import (
-            check_ending,
-            save_joint_path,
-            save_trajectory,
-            timed,
-        )
+def _check(args: Args):
+    """Raise ValueError for flags that do not go together."""
+    flags.check(args)
+    if (args.cloud is None) == (args.task is None):
+        raise ValueError("one of --cloud and --task is needed")
+    if args.cloud is None:
+        for name in CLOUD_FLAGS:
+            if getattr(args, name) != getattr(Args, name):
+                raise ValueError(f"--{name.replace('_', '-')} goes with --cloud")
+    if (args.goal is None) == (args.goal_pose is None):
+        raise ValueError("one of --goal and --goal-pose is needed")
 
-        if args.output is not None:
-            check_ending(args.output)
-            check_writable(args.output)
-        if args.task is not None:
-            scene = _task_scene(args)
+
+def _plan(args: Args) -> bool:
+    """Plan, describe and write the motion. Returns whether it reaches the goal."""
+    _check(args)
+    # Here, because --help need not wait for Numba.
+    from roboarm_nmp.envs.collision.checker import CollisionChecker
+    from roboarm_nmp.envs.robots.files import load_robot
+    from roboarm_nmp.envs.robots.panda import PANDA
+    from roboarm_nmp.motions.trajectories import (
+        check_ending,
+        save_joint_path,
+        save_trajectory,
+        timed,
+    )
+
+    if args.output is not None:
+        check_ending(args.output)
+        check_writable(args.output)
+    if args.task is not None:
+        scene = _task_scene(args)
+    else:
+        scene = _observed_scene(args, load_robot(args.robot or PANDA.name))
+    start = _configuration("--start", args.start, scene.robot)
+    checker = CollisionChecker(scene)
+    goal = _goal(args, scene.robot, start)
+    if args.cloud is not None:
+        _check_end("--start", start, checker, args.point_radius)
+        if args.goal is not None:
+            _check_end("--goal", goal["goal"], checker, args.point_radius)
+    times = episode = trajectory = None
+    if args.policy == "planner":
+        path, seconds = _planned(args, scene, start, goal)
+        times, configurations = timed(path, scene.robot)
+        print(f"planned in {1000 * seconds:.0f} ms: {len(path)} waypoints")
+    else:
+        episode = _rolled_out(args, checker, start, **goal)
+        path = configurations = episode.configurations
+        reached = "reached" if episode.success else "not reached"
+        seconds = episode.times.sum()
+        print(f"{len(episode)} steps, goal {reached}; policy's time {1000 * seconds:.0f} ms")
+    if args.retime:
+        trajectory = _retimed(path, checker)
+        configurations = trajectory.positions
+    _describe(configurations, checker)
+    if args.output is not None:
+        if trajectory is not None:
+            save_trajectory(args.output, trajectory)
+        elif episode is not None:
+            save_trajectory(args.output, episode)
         else:
-            scene = _observed_scene(args, load_robot(args.robot or PANDA.name))
-        start, checker = _configuration("--start", args.start, scene.robot), CollisionChecker(scene)
-        goal = _goal(args, scene.robot, start)
-        if args.cloud is not None:
-            _check_end("--start", start, checker)
-            if args.goal is not None:
-                _check_end("--goal", goal["goal"], checker)
-        if args.policy == "planner":
-            path, seconds = _planned(args, scene, start, goal)
-            times, configurations = timed(path, scene.robot)
-            print(f"planned in {1000 * seconds:.0f} ms: {len(path)} waypoints")
-        else:
-            episode = _rolled_out(args, checker, start, **goal)
-            path = configurations = episode.configurations
-            reached = "reached" if episode.success else "not reached"
-            seconds = episode.times.sum()
-            print(f"{len(episode)} steps, goal {reached}; policy's time {1000 * seconds:.0f} ms")
-        if args.retime:
-            trajectory = _retimed(path, checker)
-            configurations = trajectory.positions
-        _describe(configurations, checker)
-        if args.output is not None:
-            if args.retime:
-                save_trajectory(args.output, trajectory)
-            elif args.policy == "planner":
-                save_joint_path(args.output, configurations, times, scene.robot)
-            else:
-                save_trajectory(args.output, episode)
-            print(f"{args.output}: {len(configurations)} configurations")
+            save_joint_path(args.output, configurations, times, scene.robot)
+        print(f"{args.output}: {len(configurations)} configurations")
+    return episode is None or episode.success
+
+
+def main(args: Args):
+    """The command."""
+    try:
+        reached = _plan(args)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         sys.exit(error_line(error))
-    sys.exit(int(args.policy != "planner" and not episode.success))
+    sys.exit(0 if reached else 1)
 
 
 if __name__ == "__main__":

@@ -18,15 +18,20 @@ Of an arm with j joints and l links that may collide:
 - `scene` int64 (n,): its index in `paths.scenes`.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from roboarm_nmp.datasets.episodes import observed
+from roboarm_nmp.datasets.roadmap_paths import RoadmapPaths
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 from roboarm_nmp.utils.random_streams import Stream
 
 AHEAD = 0.1  # normalised: an example's direction is to the point of its path so far ahead
 PER_PATH = 4  # examples of each chosen path, which share the link distances at its goal
+
+Examples = dict[str, np.ndarray]
 
 
 class RoadmapExamples:
@@ -40,22 +45,33 @@ class RoadmapExamples:
         goal_type: "config", "combined" or "pose".
     """
 
-    def __init__(self, paths, geometry_source, seed, goal_type="combined"):
-        self.paths, self.geometry_source = paths, geometry_source
-        self.seed, self.goal_type = seed, goal_type
+    def __init__(
+        self,
+        paths: RoadmapPaths,
+        geometry_source: Callable,
+        seed: int,
+        goal_type: str = "combined",
+    ):
+        self.paths = paths
+        self.geometry_source = geometry_source
+        self.seed = seed
+        self.goal_type = goal_type
         self._scenes = np.flatnonzero(np.diff(paths.path_offsets))  # those that have paths
         steps = np.linalg.norm(np.diff(paths.points, axis=0), axis=1)
         steps[paths.offsets[1:-1] - 1] = 1.0  # from a path's end to the next one: any length
         # Length of all paths up to each point.
         self._travelled = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
 
-    def choose_paths(self, rng, number):
+    def choose_paths(
+        self, rng: np.random.Generator, number: int
+    ) -> tuple[int, np.ndarray, np.ndarray]:
         """A random scene, and the first and last points of `number` of its paths: indices."""
         scene = int(rng.choice(self._scenes))
-        path = rng.integers(*self.paths.path_offsets[scene : scene + 2], number)
+        begin, end = self.paths.path_offsets[scene : scene + 2]
+        path = rng.integers(begin, end, number)
         return scene, self.paths.offsets[path], self.paths.offsets[path + 1] - 1
 
-    def random_query(self, rng):
+    def random_query(self, rng: np.random.Generator) -> tuple[int, np.ndarray]:
         """The two ends of a random path that the environment accepts as start and goal.
 
         Returns:
@@ -68,7 +84,7 @@ class RoadmapExamples:
             if ground_truth_checker(self.paths.scenes[scene]).is_free(ends, margin=0.001).all():
                 return scene, ends
 
-    def draw(self, number, count, noise):
+    def draw(self, number: int, count: int, noise: float) -> Examples:
         """Examples at random configurations near the paths of one scene.
 
         Args:
@@ -103,7 +119,14 @@ class RoadmapExamples:
         goals = self.paths.points[np.where(backwards, first, last)]
         return self._examples(scene, states, goals, moves / lengths[:, None], lengths + rest)
 
-    def label(self, scene, states, goals, rng, roadmap=None):
+    def label(
+        self,
+        scene: int,
+        states: np.ndarray,
+        goals: np.ndarray,
+        rng: np.random.Generator,
+        roadmap: Roadmap | None = None,
+    ) -> Examples:
         """Examples at given configurations, those from which a roadmap has a path to the goal.
 
         Args:
@@ -115,10 +138,11 @@ class RoadmapExamples:
         roadmap = roadmap or Roadmap(self.paths.scenes[scene], rng)
         directions, lengths = roadmap.labels(states, goals, rng)
         has_path = lengths > 0.0  # and is not at the goal
-        labelled = (x[has_path] for x in (states, goals, directions, lengths))
-        return self._examples(scene, *labelled)
+        return self._examples(
+            scene, states[has_path], goals[has_path], directions[has_path], lengths[has_path]
+        )
 
-    def _examples(self, scene, states, goals, directions, lengths):
+    def _examples(self, scene, states, goals, directions, lengths) -> Examples:
         robot = self.paths.scenes[scene].robot
         checker = self.geometry_source(self.paths.scenes[scene])
         ends, end_of = np.unique(goals, axis=0, return_inverse=True)

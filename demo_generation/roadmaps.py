@@ -27,7 +27,7 @@ interruption the same command continues; a finished collection is extended by a 
 
 import copy
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,11 +36,16 @@ from scipy.sparse.csgraph import dijkstra
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets import shards
-from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths, open_shard, shard_bytes
+from roboarm_nmp.datasets.roadmap_paths import (
+    RoadmapPaths,
+    load_roadmap_paths,
+    open_shard,
+    shard_bytes,
+)
 from roboarm_nmp.demo_generation.place_configurations import place_configurations
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
+from roboarm_nmp.envs.scenes.containers import Containers
 from roboarm_nmp.envs.scenes.primitives import Scene
-from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.utils.random_streams import Stream
@@ -92,51 +97,67 @@ class Roadmap:
         num_nodes: random free configurations.
         num_neighbours: nearest nodes to which each node is joined.
         margin: m, at least `NODE_MARGIN`: distance of paths from obstacles and from the arm itself.
-        more_nodes: (n, j): more nodes at those of these configurations that are free.
+        more_nodes: (n, j), or None: more nodes at those of these configurations that are free.
 
     Raises:
         ValueError: the margin is smaller.
         RuntimeError: the scene leaves no room for the arm.
     """
 
-    def __init__(self, scene, rng, num_nodes=1000, num_neighbours=14, margin=0.015, more_nodes=()):
+    def __init__(
+        self,
+        scene: Scene,
+        rng: np.random.Generator,
+        num_nodes: int = 1000,
+        num_neighbours: int = 14,
+        margin: float = 0.015,
+        more_nodes: np.ndarray | None = None,
+    ):
         if not margin >= NODE_MARGIN:
             raise ValueError(f"margin must be at least {NODE_MARGIN} m, got {margin!r}")
-        self.scene, self.num_neighbours, self.margin = scene, num_neighbours, margin
+        self.scene = scene
+        self.num_neighbours = num_neighbours
+        self.margin = margin
         self._checker = CollisionChecker(scene)
         self._joints = scene.robot.num_joints
-        self.nodes, self._room = np.empty((0, self._joints)), np.empty(0)
-        # Motions between neighbours: the index of the margin that each keeps, 2 for none; and
-        # whether it was checked finely, or only coarsely.
-        self._margins = margin, NODE_MARGIN
-        self._edges, self._edge_costs = np.empty((2, 0), np.int64), np.empty((2, 0))
-        self._kept, self._is_checked = np.empty(0, np.int64), np.empty(0, bool)
+        self.nodes = np.empty((0, self._joints))
+        self._room = np.empty(0)  # of each node, m: its distance, at most the margin
+        # Motions between neighbours: their two nodes, and their costs with the margin and without.
+        self._edges = np.empty((2, 0), np.int64)
+        self._edge_costs = np.empty((2, 0))
+        # The index of the margin that each keeps, 2 for none; and whether it was checked finely, or
+        # only coarsely.
+        self._margins = (margin, NODE_MARGIN)
+        self._kept = np.empty(0, np.int64)
+        self._is_checked = np.empty(0, bool)
         self._add_nodes(self.sample(num_nodes, rng, NODE_MARGIN))
-        if len(more_nodes):
+        if more_nodes is not None and len(more_nodes):
             self._add_nodes(more_nodes[self._checker.is_free(more_nodes, NODE_MARGIN)])
 
-    def _add_nodes(self, nodes):
+    def _add_nodes(self, nodes: np.ndarray):
         """Add free configurations (n, j) as nodes, with edges to their nearest nodes."""
         first = len(self.nodes)
         self.nodes = np.concatenate([self.nodes, nodes])
         self._room = np.concatenate([self._room, self._rooms(nodes)])
         near = self._nearest_nodes(nodes, self.num_neighbours + 1)  # one is the node itself
-        one = np.repeat(np.arange(first, len(self.nodes)), near.shape[1])
-        edges = np.stack([one, near.ravel()])
+        new = np.repeat(np.arange(first, len(self.nodes)), near.shape[1])
+        edges = np.stack([new, near.ravel()])
         edges = np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
         self._edges = np.concatenate([self._edges, edges], axis=1)
-        ends = self.nodes[edges]
-        costs = np.stack([self._costs(*ends, *self._room[edges]), self._costs(*ends, 0.0, 0.0)])
+        tails, heads = self.nodes[edges]
+        tail_room, head_room = self._room[edges]
+        with_margin = self._costs(tails, heads, tail_room, head_room)
+        costs = np.stack([with_margin, self._costs(tails, heads, 0.0, 0.0)])
         self._edge_costs = np.concatenate([self._edge_costs, costs], axis=1)
         kept = np.zeros(edges.shape[1], np.int64)
         for i, margin in enumerate(self._margins):
             checked = np.flatnonzero(kept == i)
-            motions = *self.nodes[edges[:, checked]], *self._room[edges[:, checked]]
-            kept[checked] += ~self._joined(*motions, margin, COARSE)
+            is_free = self._are_edges_free(edges[:, checked], margin, COARSE)
+            kept[checked[~is_free]] += 1
         self._kept = np.concatenate([self._kept, kept])
         self._is_checked = np.concatenate([self._is_checked, np.zeros(len(kept), bool)])
 
-    def _grown(self, around, rng):
+    def _grown(self, around: np.ndarray, rng: np.random.Generator) -> "Roadmap":
         """This roadmap with more nodes near configurations (n, j) that have no path in it."""
         centres = around[np.arange(GROWN) % len(around)]
         scale = rng.uniform(0.0, GROWN_SCALE, (GROWN, 1))
@@ -145,20 +166,22 @@ class Roadmap:
         roadmap._add_nodes(new[self._checker.is_free(new, NODE_MARGIN)])
         return roadmap
 
-    def sample(self, number, rng, margin=0.0):
+    def sample(self, number: int, rng: np.random.Generator, margin: float = 0.0) -> np.ndarray:
         """Random free configurations, float64 (number, j). Raises RuntimeError: none is found."""
-        found, missing = [np.empty((0, self._joints))], number
+        free, missing = [np.empty((0, self._joints))], number
         for _ in range(1000):
             if missing == 0:
                 break
             states = rng.uniform(-1.0, 1.0, (4 * missing, self._joints))
-            found.append(states[self._checker.is_free(states, margin)][:missing])
-            missing -= len(found[-1])
+            free.append(states[self._checker.is_free(states, margin)][:missing])
+            missing -= len(free[-1])
         else:
             raise RuntimeError("the scene leaves no room for the arm")
-        return np.concatenate(found)
+        return np.concatenate(free)
 
-    def random_paths(self, number, rng, ends=()):
+    def random_paths(
+        self, number: int, rng: np.random.Generator, ends: np.ndarray | None = None
+    ) -> list[np.ndarray]:
         """`number` smoothed paths between random free configurations: a list of float32 (k, j).
 
         Fewer, where hardly any two configurations have a path between them. With `ends` (n, j),
@@ -166,6 +189,8 @@ class Roadmap:
         starts is near the pose in which the arm is observed, where that is free.
         """
         goals = self.sample(_goal_count(number), rng)
+        if ends is None:
+            ends = np.empty((0, self._joints))
         if len(ends):
             goals = np.concatenate([goals[: -(-len(goals) // 5)], ends])
         paths = []
@@ -175,46 +200,47 @@ class Roadmap:
             starts = self.sample(tried, rng)
             if len(ends):
                 drawn = rng.random(tried)
-                starts[drawn < 1 / 3] = ends[rng.integers(len(ends), size=(drawn < 1 / 3).sum())]
+                at_end = drawn < 1 / 3
+                starts[at_end] = ends[rng.integers(len(ends), size=at_end.sum())]
                 pose = self.scene.robot.normalise(np.array(self.scene.robot.observed_pose))
                 poses = pose + POSE_NOISE * rng.standard_normal(starts.shape)
-                usual = (drawn > 3 / 4) & self._checker.is_free(poses.clip(-1.0, 1.0), NODE_MARGIN)
-                starts[usual] = poses[usual].clip(-1.0, 1.0)
-            found = self.paths(starts, goals[which], rng)
-            paths += [p for p in found if p is not None and (p[0] != p[-1]).any()]
+                poses = poses.clip(-1.0, 1.0)
+                at_pose = (drawn > 3 / 4) & self._checker.is_free(poses, NODE_MARGIN)
+                starts[at_pose] = poses[at_pose]
+            for path in self.paths(starts, goals[which], rng):
+                if path is not None and (path[0] != path[-1]).any():
+                    paths.append(path)
             if len(paths) >= number:
                 break
         return paths[:number]
 
-    def paths(self, starts, goals, rng):
+    def paths(self, starts, goals, rng: np.random.Generator) -> list[np.ndarray | None]:
         """Smoothed paths from starts (n, j) to goals (n, j): a list of float32 (k, j), k > 1.
 
         None where there is no path. Starts may be in contact, as for `labels`. Many queries with
         few different goals are fast.
         """
         # The simulated arm may be a little beyond its limits.
-        starts, goals = (
-            np.clip(np.asarray(x, dtype=np.float64), -1.0, 1.0).reshape(-1, self._joints)
-            for x in (starts, goals)
-        )
+        starts = np.clip(np.asarray(starts, np.float64), -1.0, 1.0).reshape(-1, self._joints)
+        goals = np.clip(np.asarray(goals, np.float64), -1.0, 1.0).reshape(-1, self._joints)
         begins = self._moved_out(starts, -INSIDE)
-        points, room, found = self._search(begins, goals)
-        paths = [None] * len(starts)
-        smooth = self._smooth(points[found], points[found], room[found], rng)
-        for i, path in zip(np.flatnonzero(found), smooth, strict=True):
+        points, room, is_found = self._search(begins, goals)
+        paths: list[np.ndarray | None] = [None] * len(starts)
+        points = points[is_found]
+        smooth = self._smooth(points, points, room[is_found], rng)
+        for i, path in zip(np.flatnonzero(is_found), smooth, strict=True):
             paths[i] = path
-        lost = np.flatnonzero(~found)
+        lost = np.flatnonzero(~is_found)
         if len(lost):
             # Through narrow places, where less than the margin is kept.
             begins[lost] = self._moved_out(begins[lost], NODE_MARGIN)
             ends = np.unique(np.concatenate([begins[lost], goals[lost]]), axis=0)
-            points, _, found = self._grown(ends, rng)._search(
-                begins[lost], goals[lost], narrow=True
-            )
-            states = _dense(points[found])
+            grown = self._grown(ends, rng)
+            points, _, is_found = grown._search(begins[lost], goals[lost], narrow=True)
+            states = _dense(points[is_found])
             room = self._rooms(states.reshape(-1, self._joints)).reshape(states.shape[:2])
-            smooth = self._smooth(points[found], states, room, rng)
-            for i, path in zip(lost[found], smooth, strict=True):
+            smooth = self._smooth(points[is_found], states, room, rng)
+            for i, path in zip(lost[is_found], smooth, strict=True):
                 paths[i] = path
         for i, path in enumerate(paths):
             if path is not None:
@@ -224,7 +250,7 @@ class Roadmap:
                 paths[i] = path[np.r_[True, moves]] if moves.any() else path[:2]
         return paths
 
-    def labels(self, states, goals, rng):
+    def labels(self, states, goals, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Direction and length of a path from each of the states (n, j) to its goal (n, j).
 
         States may be in contact. Where a state is closer than the margin, its path begins at its
@@ -240,42 +266,57 @@ class Roadmap:
         for i, path in enumerate(self.paths(states, goals, rng)):
             if path is not None:
                 steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-                come = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
-                move = [np.interp(AHEAD, come, values) for values in path.T] - path[0]
+                travelled = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+                move = [np.interp(AHEAD, travelled, values) for values in path.T] - path[0]
                 directions[i] = move / max(np.linalg.norm(move), 1e-12)
-                lengths[i] = come[-1]
+                lengths[i] = travelled[-1]
         return directions, lengths
 
-    def _distances(self, states):
+    def _distances(self, states: np.ndarray) -> np.ndarray:
         """Distances (m) of the arm from obstacles and from itself; negative in contact."""
         return self._checker.signed_distances(states).distance.min(-1)
 
-    def _rooms(self, states):
+    def _rooms(self, states: np.ndarray) -> np.ndarray:
         """The same, at most the margin."""
         room = np.full(len(states), self.margin)
         near = ~self._checker.is_free(states, self.margin)
         room[near] = np.minimum(self._distances(states[near]), self.margin)
         return room
 
-    def _free(self, starts, ends, states, room, margin, **options):
+    def _are_free(
+        self, starts, ends, states, room, margin, resolution=RESOLUTION, ends_known=True
+    ) -> np.ndarray:
         """Whether motions (n, j) are free, with the room at each one's states (n, k, j)."""
         endpoint_margins = (states, room - _ROUNDING, MARGIN_GROWTH)
         return self._checker.is_motion_free(
-            starts, ends, margin, endpoint_margins=endpoint_margins, **options
+            starts,
+            ends,
+            margin,
+            resolution=resolution,
+            ends_known=ends_known,
+            endpoint_margins=endpoint_margins,
         )
 
-    def _costs(self, starts, ends, start_room, end_room):
+    def _costs(self, starts, ends, start_room, end_room) -> np.ndarray:
         """Costs of straight motions (..., j)."""
         tightness = 1.0 - np.clip(np.minimum(start_room, end_room) / self.margin, 0.0, 1.0)
         return np.linalg.norm(ends - starts, axis=-1) * (1.0 + NARROW * tightness)
 
-    def _joined(self, starts, ends, start_room, end_room, margin, resolution=RESOLUTION):
+    def _are_straight_free(
+        self, starts, ends, start_room, end_room, margin, resolution=RESOLUTION
+    ) -> np.ndarray:
         """Whether straight motions (n, j) are free, with the room at both of their ends."""
-        states, room = np.stack([starts, ends], axis=1), np.stack([start_room, end_room], axis=1)
-        options = {"resolution": resolution, "ends_known": True}
-        return self._free(starts, ends, states, room, margin, **options)
+        states = np.stack([starts, ends], axis=1)
+        room = np.stack([start_room, end_room], axis=1)
+        return self._are_free(starts, ends, states, room, margin, resolution)
 
-    def _nearest_nodes(self, states, number):
+    def _are_edges_free(self, edges, margin, resolution=RESOLUTION) -> np.ndarray:
+        """Whether the motions between pairs of nodes (2, n) are free."""
+        starts, ends = self.nodes[edges]
+        start_room, end_room = self._room[edges]
+        return self._are_straight_free(starts, ends, start_room, end_room, margin, resolution)
+
+    def _nearest_nodes(self, states, number) -> np.ndarray:
         """Indices of the nearest nodes, (n, number), in any order."""
         squared = (self.nodes**2).sum(1) - 2.0 * states @ self.nodes.T
         return np.argpartition(squared, number, axis=1)[:, :number]
@@ -284,27 +325,30 @@ class Roadmap:
         """Shortened paths (n, k, j), padded, with the room at their states (n, m, j)."""
         return self._cut_short(self._prune(points, states, room), states, room, rng)
 
-    def _search(self, starts, goals, narrow=False):
+    def _search(self, starts, goals, narrow=False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Shortest paths: points (n, k, j), padded with the goal, their room (n, k), found (n,).
 
         `narrow` paths keep `NODE_MARGIN` only.
         """
-        margin, count = self._margins[narrow], len(self.nodes)
+        margin = NODE_MARGIN if narrow else self.margin
+        count = len(self.nodes)
         goals, which = np.unique(goals, axis=0, return_inverse=True)
         start_room, goal_room = self._rooms(starts), self._rooms(goals)
-        states, room = np.concatenate([self.nodes, goals]), np.concatenate([self._room, goal_room])
+        states = np.concatenate([self.nodes, goals])
+        room = np.concatenate([self._room, goal_room])
         # Edges lead from goals to nodes and not back: no path leads through another query's goal.
         goal = np.repeat(np.arange(len(goals)), JOINED)
         node = self._nearest_nodes(goals, JOINED).ravel()
-        motions = goals[goal], self.nodes[node], goal_room[goal], self._room[node]
+        motions = (goals[goal], self.nodes[node], goal_room[goal], self._room[node])
         goal_costs = self._costs(*motions)
-        goal_costs[~self._joined(*motions, margin)] = np.inf
+        goal_costs[~self._are_straight_free(*motions, margin)] = np.inf
         # The first step is to the goal itself or to a node.
         first = np.c_[count + which, self._nearest_nodes(starts, JOINED)]
         first_costs = self._costs(starts[:, None], states[first], start_room[:, None], room[first])
         first_costs[start_room < -INSIDE] = np.inf
         is_checked = np.zeros(first.shape, bool)
-        found, routes = np.zeros(len(starts), bool), {}
+        is_found = np.zeros(len(starts), bool)
+        routes = {}
         waiting = np.arange(len(starts))
         while len(waiting):
             asked, row = np.unique(which[waiting], return_inverse=True)
@@ -320,8 +364,9 @@ class Roadmap:
                     break
                 query, step = waiting[unchecked], best[unchecked]
                 tried = first[query, step]
-                ends = starts[query], states[tried]
-                free = self._joined(*ends, start_room[query], room[tried], margin)
+                free = self._are_straight_free(
+                    starts[query], states[tried], start_room[query], room[tried], margin
+                )
                 is_checked[query, step] = True
                 first_costs[query[~free], step[~free]] = np.inf
             waiting, best, row = waiting[possible], best[possible], row[possible]
@@ -332,15 +377,15 @@ class Roadmap:
                 route.append(at)
             route = np.stack(route, axis=1)
             free = self._check(route, narrow)
-            found[waiting[free]] = True
-            routes |= dict(zip(waiting[free], route[free], strict=True))
+            is_found[waiting[free]] = True
+            routes.update(zip(waiting[free], route[free], strict=True))
             waiting = waiting[~free]
         size = max(map(len, routes.values()), default=1)
         route = np.repeat(count + which[:, None], size, axis=1)
         for i, nodes in routes.items():
             route[i, : len(nodes)] = nodes
         points = np.concatenate([starts[:, None], states[route]], axis=1)
-        return points, np.concatenate([start_room[:, None], room[route]], axis=1), found
+        return points, np.concatenate([start_room[:, None], room[route]], axis=1), is_found
 
     def _shortest(self, asked, goal, node, goal_costs, narrow):
         """Dijkstra's algorithm from the goals `asked`, by motions that are not known to collide.
@@ -349,13 +394,14 @@ class Roadmap:
 
         Returns lengths and predecessors, (asked, nodes + goals).
         """
-        count, usable = len(self.nodes), np.flatnonzero(self._kept <= narrow)
-        one, other = self._edges[:, usable]
+        count = len(self.nodes)
+        usable = np.flatnonzero(self._kept <= int(narrow))
+        first, second = self._edges[:, usable]
         costs = self._edge_costs[self._kept[usable], usable]
-        joined = np.isfinite(goal_costs)
-        tails = np.concatenate([one, other, count + goal[joined]])
-        heads = np.concatenate([other, one, node[joined]])
-        costs = np.concatenate([costs, costs, goal_costs[joined]])
+        is_joined = np.isfinite(goal_costs)
+        tails = np.concatenate([first, second, count + goal[is_joined]])
+        heads = np.concatenate([second, first, node[is_joined]])
+        costs = np.concatenate([costs, costs, goal_costs[is_joined]])
         size = count + goal[-1] + 1
         graph = csr_array((costs, (tails, heads)), shape=(size, size))
         return dijkstra(graph, indices=count + asked, return_predecessors=True)
@@ -368,18 +414,18 @@ class Roadmap:
         count = len(self.nodes)
         path, step = np.nonzero((route[:, 1:] < count) & (route[:, :-1] != route[:, 1:]))
         ends = np.sort([route[path, step], route[path, step + 1]], axis=0)
-        names, wanted = self._edges[0] * count + self._edges[1], ends[0] * count + ends[1]
+        names = self._edges[0] * count + self._edges[1]  # one number for each edge
+        wanted = ends[0] * count + ends[1]
         order = np.argsort(names)
         used = order[np.searchsorted(names, wanted, sorter=order)]
         unchecked = np.unique(used[~self._is_checked[used]])
         for kept in (1, 0):
             edges = unchecked[self._kept[unchecked] == kept]
-            ends = self._edges[:, edges]
-            free = self._joined(*self.nodes[ends], *self._room[ends], self._margins[kept])
+            free = self._are_edges_free(self._edges[:, edges], self._margins[kept])
             self._is_checked[edges[free]] = True
             self._kept[edges[~free]] += 1
         free = np.ones(len(route), bool)
-        free[path[~self._is_checked[used] | (self._kept[used] > narrow)]] = False
+        free[path[~self._is_checked[used] | (self._kept[used] > int(narrow))]] = False
         return free
 
     def _prune(self, points, states, room):
@@ -392,16 +438,19 @@ class Roadmap:
         first, last = np.triu_indices(size, 2)
         path, pair = np.nonzero(moves[:, last - 1, last] > 0.0)  # not to the padding
         first, last = first[pair], last[pair]
-        ends = points[path, first], points[path, last]
-        free = self._free(*ends, states[path], room[path], self.margin, ends_known=True)
+        free = self._are_free(
+            points[path, first], points[path, last], states[path], room[path], self.margin
+        )
         path, first, last = path[free], first[free], last[free]
         moves[path, first, last] = lengths[path, first, last]
         # The shortest path through these motions, by dynamic programming.
-        costs, before = np.zeros((n, size)), np.zeros((n, size), np.int64)
+        costs = np.zeros((n, size))
+        before = np.zeros((n, size), np.int64)
         for i in range(1, size):
             through = costs[:, :i] + moves[:, :i, i]
             before[:, i], costs[:, i] = through.argmin(1), through.min(1)
-        kept, at = np.zeros((n, size), bool), np.full(n, size - 1)
+        kept = np.zeros((n, size), bool)
+        at = np.full(n, size - 1)
         for _ in range(size):
             kept[np.arange(n), at] = True
             at = before[np.arange(n), at]
@@ -426,8 +475,9 @@ class Roadmap:
             chord = head - (head - tail) * rest[:, :, None]
             gain = along[:, 1] - along[:, 0] - np.linalg.norm(chord[:, 1] - chord[:, 0], axis=1)
             tried = np.flatnonzero(gain > LEAST_GAIN * total)
-            free = self._free(
-                *np.moveaxis(chord[tried], 1, 0), states[tried], room[tried], self.margin
+            begin, end = np.moveaxis(chord[tried], 1, 0)
+            free = self._are_free(
+                begin, end, states[tried], room[tried], self.margin, ends_known=False
             )
             cut = tried[free]
             points = np.concatenate([points, points[:, -1:]], axis=1)
@@ -462,7 +512,7 @@ class Roadmap:
         return states
 
 
-def _dense(points):
+def _dense(points: np.ndarray) -> np.ndarray:
     """Points along paths (n, k, j), at most DENSE apart: (n, m, j)."""
     moves = np.diff(points, axis=1)[:, :, None]
     pieces = max(int(np.ceil(np.linalg.norm(moves, axis=-1).max(initial=0.0) / DENSE)), 1)
@@ -476,10 +526,8 @@ class Args:
     output: Path
     """Folder to write to."""
     task: str = "random_boxes_hard"
-    """Name of a task, `mixed_scenes`, `containers`, or path of a scene file. Each scene has a
-    roadmap of its own, also where scenes do not vary."""
-    robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
+    """Name of a task, `mixed_scenes`, `containers`, or path of a scene file; with another arm,
+    TASK@FILE. Each scene has a roadmap of its own, also where scenes do not vary."""
     scenes: PositiveInt = 6000
     """Number of scenes."""
     paths_per_scene: PositiveInt = 300
@@ -512,32 +560,38 @@ OPTIONS = (
 )
 
 
-def random_paths_of_scene(index, options):
+def random_paths_of_scene(index: int, options: dict) -> tuple[Scene, list[np.ndarray]]:
     """`(Scene, paths)` of scene `index` of a collection. `options`: a dict with keys `OPTIONS`."""
     rng = np.random.default_rng([options["seed"], Stream.ROADMAPS, index])
     scene = envs.get_task(options["task"]).scene
-    number, ends, on_ways = options["paths_per_scene"], (), ()
-    arguments = {name: options[name] for name in ("num_nodes", "num_neighbours", "margin")}
-    if hasattr(scene, "sample_with_places"):
+    number = options["paths_per_scene"]
+    ends = more_nodes = None
+    if isinstance(scene, Containers):
         scene, places = scene.sample_with_places(rng)
         ends, on_ways = place_configurations(scene, places, rng, _goal_count(number))
-        on_ways = _around(on_ways, rng)
+        more_nodes = _around(on_ways, rng)
     elif not isinstance(scene, Scene):
         scene = scene.sample(rng)
-    roadmap = Roadmap(scene, rng, **arguments, more_nodes=on_ways)
+    roadmap = Roadmap(
+        scene,
+        rng,
+        num_nodes=options["num_nodes"],
+        num_neighbours=options["num_neighbours"],
+        margin=options["margin"],
+        more_nodes=more_nodes,
+    )
     return scene, roadmap.random_paths(number, rng, ends)
 
 
-def _around(states, rng):
+def _around(states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The configurations (n, j), and more around them."""
     centres = np.repeat(states, AROUND, axis=0)
     scale = rng.uniform(0.0, GROWN_SCALE / 2, (len(centres), 1))
-    return np.concatenate([states, centres + scale * rng.standard_normal(centres.shape)]).clip(
-        -1, 1
-    )
+    around = centres + scale * rng.standard_normal(centres.shape)
+    return np.concatenate([states, around]).clip(-1, 1)
 
 
-def _goal_count(number):
+def _goal_count(number: int) -> int:
     """Goals of so many paths."""
     return int(np.ceil(GOALS_PER_PATH * number))
 
@@ -545,19 +599,23 @@ def _goal_count(number):
 class Collector:
     """Makes shards; a job is (number of the shard, first scene, scene after the last)."""
 
-    def __init__(self, options, made_by):
-        self.options, self.made_by = options, made_by
+    def __init__(self, options: dict, made_by: str):
+        self.options = options
+        self.made_by = made_by
 
-    def __call__(self, job):
+    def __call__(self, job: tuple[int, int, int]) -> tuple[int, bytes]:
         """`(number, contents of the file)`."""
         number, first, end = job
-        made = [random_paths_of_scene(index, self.options) for index in range(first, end)]
-        scenes, paths = zip(*made, strict=True)
+        scenes, paths = [], []
+        for index in range(first, end):
+            scene, paths_of_scene = random_paths_of_scene(index, self.options)
+            scenes.append(scene)
+            paths.append(paths_of_scene)
         task, seed = self.options["task"], self.options["seed"]
         return number, shard_bytes(task, seed, first, scenes, paths, self.made_by)
 
 
-def collect(args, progress=True):
+def collect(args: Args, progress: bool = True) -> RoadmapPaths:
     """Make the missing shards. Returns all `RoadmapPaths`.
 
     Raises:
@@ -567,7 +625,6 @@ def collect(args, progress=True):
         OSError: the folder cannot be written. Finished shards are kept.
     """
     flags.check(args)
-    args = replace(args, task=task_with_robot(args.task, args.robot), robot=None)
     if args.num_nodes <= max(args.num_neighbours, JOINED):
         raise ValueError(f"--num-nodes must be above {max(args.num_neighbours, JOINED)}")
     if not args.margin >= NODE_MARGIN:
@@ -579,8 +636,8 @@ def collect(args, progress=True):
         )
     shards.check_collection(args)
     options = {name: getattr(args, name) for name in OPTIONS}
-    given = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
-    made_by = " ".join(["roboarm roadmaps", *given])
+    words = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
+    made_by = " ".join(["roboarm roadmaps", *words])
     shards.collect(
         args,
         args.scenes,
@@ -596,14 +653,15 @@ def collect(args, progress=True):
     return load_roadmap_paths(args.output, envs.get_task(args.task).base_scene.robot)
 
 
-def main(args):
+def main(args: Args):
+    """The command."""
     try:
-        made = collect(args)
+        paths = collect(args)
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(error_line(error))
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
-    count = len(made.offsets) - 1
-    print(f"{args.output}: {len(made)} scenes, {count} paths, {size / 1e6:.1f} MB")
+    count = len(paths.offsets) - 1
+    print(f"{args.output}: {len(paths)} scenes, {count} paths, {size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":

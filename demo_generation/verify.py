@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from roboarm_nmp.datasets.demonstrations import demo_path, load_demos, write_demos
+from roboarm_nmp.datasets.demonstrations import Demo, demo_path, load_demos, write_demos
 from roboarm_nmp.datasets.format import DatasetError, locate
-from roboarm_nmp.demo_generation.collect import demonstrate, make_planner
+from roboarm_nmp.demo_generation.collect import Demonstration, demonstrate, make_planner
 from roboarm_nmp.envs.arm_env import RoboArmEnv
-from roboarm_nmp.envs.tasks import is_task, task_with_robot
-from roboarm_nmp.planning.following import follow
+from roboarm_nmp.envs.tasks import is_task
+from roboarm_nmp.planning.following import Execution, follow
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.flags import CORES, Workers
 from roboarm_nmp.utils.progress import progress_bar, write_line
@@ -34,11 +34,9 @@ REPAIR_ATTEMPTS = 10
 @dataclass
 class Args:
     files: tyro.conf.Positional[tuple[str, ...]]
-    """Demonstration files, or tasks (names or scene files)."""
+    """Demonstration files, or tasks (names or scene files; with another arm, TASK@FILE)."""
     task: str | None = None
-    """The task that the files are for. Files of an arm other than the Panda need it."""
-    robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
+    """The task that the files are for. Files of an arm other than the Panda need it: TASK@FILE."""
     workers: Workers = CORES
     """Number of processes, by default that of the cores."""
     repair: bool = False
@@ -48,7 +46,7 @@ class Args:
 class Verifier:
     """Follows the demonstrations of a file; with `repair`, plans failed ones anew."""
 
-    def __init__(self, path, repair, task=None):
+    def __init__(self, path: str | Path, repair: bool, task: str | None = None):
         self.demos = load_demos(path, task)
         self.repair = repair
         self.env = RoboArmEnv(self.demos.scenes.base)
@@ -56,12 +54,13 @@ class Verifier:
         self.allow_collisions = options["allow_collisions"]
         self.planner = make_planner(self.env, options)
 
-    def __call__(self, index):
+    def __call__(self, index: int) -> tuple[int, str, dict | None]:
         """`(index, verdict, demo)`: one of `VERDICTS`, and, with `repair`, the repaired demo.
 
         That is a dict of plan, states, plan_seed, digest and collided; None: it was not repaired.
         """
-        demo, seed = self.demos[index], int(self.demos.plan_seed[index])
+        demo = self.demos[index]
+        seed = int(self.demos.plan_seed[index])
         try:
             execution = follow(self.env, demo.plan, demo.scene)
         except ValueError:
@@ -70,15 +69,19 @@ class Verifier:
         if not self.repair:
             return index, verdict, None
         if verdict in ("good", "changed"):
-            return index, verdict, _demo(demo.plan, execution, seed)
+            return index, verdict, _columns(Demonstration(demo.plan, execution, seed))
         rng = np.random.default_rng([seed, index])
-        found = demonstrate(
-            *(self.planner, demo.start, demo.goal, rng, REPAIR_ATTEMPTS),
+        repaired = demonstrate(
+            self.planner,
+            demo.start,
+            demo.goal,
+            rng,
+            attempts=REPAIR_ATTEMPTS,
             allow_collisions=self.allow_collisions,
         )
-        return index, verdict, found and _demo(*found)
+        return index, verdict, None if repaired is None else _columns(repaired)
 
-    def _verdict(self, demo, execution):
+    def _verdict(self, demo: Demo, execution: Execution) -> str:
         if not execution.reached:
             return "missed"
         if execution.collided and not self.allow_collisions:
@@ -90,17 +93,23 @@ class Verifier:
         return "good" if close else "changed"
 
 
-def _demo(plan, execution, seed):
+def _columns(demo: Demonstration) -> dict:
     return {
-        "plan": plan,
-        "states": execution.states,
-        "plan_seed": seed,
-        "digest": execution.digest,
-        "collided": execution.collided,
+        "plan": demo.plan,
+        "states": demo.execution.states,
+        "plan_seed": demo.plan_seed,
+        "digest": demo.execution.digest,
+        "collided": demo.execution.collided,
     }
 
 
-def verify(task_or_path, num_workers=1, repair=False, progress=True, task=None):
+def verify(
+    task_or_path: str | Path,
+    num_workers: int = 1,
+    repair: bool = False,
+    progress: bool = True,
+    task: str | None = None,
+) -> dict[str, int]:
     """Follow every demonstration of a task or file; with `repair`, replace the file by a good one.
 
     `task` is that of a file, as of `load_demos`.
@@ -115,27 +124,28 @@ def verify(task_or_path, num_workers=1, repair=False, progress=True, task=None):
         DatasetError: the file cannot be used.
         OSError: it cannot be written.
     """
-    path, found = locate(task_or_path, demo_path)
-    task = task or found
+    path, own_task = locate(task_or_path, demo_path)
+    task = task or own_task
     demos = load_demos(path, task)
-    arguments = path, repair, task
+    arguments = (path, repair, task)
     task = task or demos.task
     if repair and not is_task(task):
         raise DatasetError(f"{path}: to repair it, name the scene file {task}.yaml instead")
     if "options" not in demos.parameters:
         raise DatasetError(f"{path}: has no record of the options it was collected with")
-    counts, kept = Counter(), {}
+    counts = Counter()
+    repaired = {}  # number -> demonstration; None for one that is removed
     results = workers.run(Verifier, arguments, range(len(demos)), num_workers, write_line)
     bar = progress_bar(results, path.name, len(demos), unit="demo", disable=not progress)
     with contextlib.closing(results):
         for index, verdict, demo in bar:
             counts[verdict] += 1
-            kept[index] = demo
+            repaired[index] = demo
     bad = len(demos) - counts["good"]
     removed = 0
     if repair and bad:
-        kept = {index: kept[index] for index in sorted(kept) if kept[index] is not None}
-        good = list(kept.values())
+        kept = [index for index in range(len(demos)) if repaired[index] is not None]
+        good = [repaired[index] for index in kept]
         removed = len(demos) - len(good)
         if not good:
             raise DatasetError(f"{path}: none of its demonstrations can be repaired")
@@ -152,25 +162,22 @@ def verify(task_or_path, num_workers=1, repair=False, progress=True, task=None):
                 "repaired": demos.parameters.get("repaired", 0) + bad - removed,
                 "removed": demos.parameters.get("removed", 0) + removed,
             },
-            scenes_of=None if demos.scenes.index is None else map(demos.scenes.__getitem__, kept),
+            scenes_of=None if demos.scenes.index is None else [demos.scenes[i] for i in kept],
         )
-    return {name: counts[name] for name in VERDICTS} | {"total": len(demos), "removed": removed}
+    totals = {name: counts[name] for name in VERDICTS}
+    return {**totals, "total": len(demos), "removed": removed}
 
 
-def main(args):
+def main(args: Args):
+    """The command. It exits with 1 if any demonstration is bad and was not repaired."""
     try:
         flags.check(args)
-        task = args.task and task_with_robot(args.task, args.robot)
-        if args.robot and not task and not all(map(is_task, args.files)):
-            raise ValueError("--robot of a file needs its --task")
     except ValueError as error:
         sys.exit(error_line(error))
     failed = False
     for name in args.files:
         try:
-            if is_task(name):
-                name = task_with_robot(name, args.robot)
-            counts = verify(name, args.workers, args.repair, task=task)
+            counts = verify(name, args.workers, args.repair, task=args.task)
         except (ValueError, OSError, RuntimeError) as error:
             print(error_line(error), file=sys.stderr)
             failed = True

@@ -20,7 +20,7 @@ from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.utils.bullet import pybullet as p
-from roboarm_nmp.viewer.show import render_query
+from roboarm_nmp.viewer.images import render_query
 
 SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls

@@ -19,7 +19,8 @@ from tqdm import tqdm
 from roboarm_nmp.utils.files import write_atomically
 from roboarm_nmp.viewer import app, demo
 from roboarm_nmp.viewer.drawing import Drawing
-from roboarm_nmp.viewer.simulation import PolicyArm, Simulation, task_episodes
+from roboarm_nmp.viewer.episodes import task_episodes
+from roboarm_nmp.viewer.simulation import PolicyArm, Simulation
 
 OUTPUT = Path(__file__).parent / "figures" / "hero.gif"
 PORT, SIZE = 8191, (760, 400)

@@ -11,7 +11,7 @@ extended by a larger `--num`.
 """
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +21,6 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets import shards
 from roboarm_nmp.datasets.observations import Observations, observe, open_shard, shard_bytes
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, SensorWorld, cardinal
-from roboarm_nmp.envs.tasks import task_with_robot
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.flags import CORES, PositiveInt, Seed, Workers
 from roboarm_nmp.utils.random_streams import Stream
@@ -31,9 +30,7 @@ from roboarm_nmp.utils.signals import end_with_one_line, error_line
 @dataclass
 class Args:
     task: str = "random_boxes_hard"
-    """Name of a task, or path of a scene file."""
-    robot: Path | None = None
-    """Another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE."""
+    """Name of a task, or path of a scene file; with another arm, TASK@FILE."""
     num: PositiveInt = 20_000
     """Number of scenes."""
     sensors: Literal["images", "clouds", "both"] = "both"
@@ -54,9 +51,10 @@ class Args:
     """Address of a Ray cluster (`auto`, `HOST:PORT`) to use instead of local processes."""
 
 
-def make_sensors(args):
+def make_sensors(args: Args) -> dict[str, Camera | PointCloud]:
     """The sensors of the flags: dict of name -> sensor."""
-    sensors, robot = {}, envs.get_task(args.task).base_scene.robot
+    robot = envs.get_task(args.task).base_scene.robot
+    sensors = {}
     if args.sensors != "clouds":
         sensors |= cardinal(Camera, robot, size=(args.image_size, args.image_size))
     if args.sensors != "images":
@@ -68,11 +66,15 @@ def make_sensors(args):
 class Collector:
     """Makes shards. A job is (number of the shard, first scene, scene after the last)."""
 
-    def __init__(self, task, seed, sensors, made_by):
-        self.task, self.seed, self.sensors, self.made_by = task, seed, sensors, made_by
-        self.env, self.world = envs.make(task), SensorWorld()
+    def __init__(self, task: str, seed: int, sensors: dict, made_by: str):
+        self.task = task
+        self.seed = seed
+        self.sensors = sensors
+        self.made_by = made_by
+        self.env = envs.make(task)
+        self.world = SensorWorld()
 
-    def __call__(self, job):
+    def __call__(self, job: tuple[int, int, int]) -> tuple[int, bytes]:
         """`(number, contents of the file)`."""
         number, first, end = job
         scenes, configurations, observations = [], [], []
@@ -83,11 +85,20 @@ class Collector:
             scenes.append(self.env.scene)
             self.world.show(self.env.scene, configurations[-1])
             observations.append(observe(self.world, self.sensors))
-        arguments = (self.sensors, scenes, configurations, observations, self.made_by)
-        return number, shard_bytes(self.task, self.seed, first, *arguments)
+        contents = shard_bytes(
+            self.task,
+            self.seed,
+            first,
+            self.sensors,
+            scenes,
+            configurations,
+            observations,
+            self.made_by,
+        )
+        return number, contents
 
 
-def collect(args, progress=True):
+def collect(args: Args, progress: bool = True) -> Observations:
     """Make the missing shards. Returns the `Observations`.
 
     Raises:
@@ -96,11 +107,10 @@ def collect(args, progress=True):
         OSError: the folder cannot be written. Finished shards are kept.
     """
     flags.check(args)
-    args = replace(args, task=task_with_robot(args.task, args.robot), robot=None)
     shards.check_collection(args)
     names = ("task", "sensors", "image_size", "num_samples", "shard_size", "seed")
-    given = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
-    made_by = " ".join(["roboarm observations", *given])
+    words = [f"--{name.replace('_', '-')} {getattr(args, name)}" for name in names]
+    made_by = " ".join(["roboarm observations", *words])
     arguments = (args.task, args.seed, make_sensors(args), made_by)
     shards.collect(
         args,
@@ -116,13 +126,14 @@ def collect(args, progress=True):
     return Observations(args.output, envs.get_task(args.task).base_scene.robot)
 
 
-def main(args):
+def main(args: Args):
+    """The command."""
     try:
-        made = collect(args)
+        observations = collect(args)
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(error_line(error))
     size = sum(path.stat().st_size for path in args.output.glob("shard_*.h5"))
-    print(f"{args.output}: {len(made)} scenes, {size / 1e6:.1f} MB")
+    print(f"{args.output}: {len(observations)} scenes, {size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ COMMANDS = {
     "train": (None, "train a policy or a scene encoder: roboarm train --help"),
     "evaluate": ("clean_rl_scripts.evaluate", "evaluate a policy on the queries of a task"),
     "policies": ("policies", "list the pretrained policies and encoders"),
-    "show": ("viewer.show", "window, image or animation of a task and of a policy"),
+    "show": ("viewer.show", "image or animation of a task and of a policy"),
     "view": ("viewer.app", "policies in the browser; move goal and obstacles"),
     "demo": ("viewer.demo", "a pretrained policy in the browser, without arguments"),
     "retime": ("motions.retime", "make an executable trajectory of a joint path"),

@@ -41,7 +41,10 @@ def file(tmp_path_factory):
     options = collect.options_of(collect.Args(task))
     collect.collect(demo_path(task), 3, options, progress=False)
     sizes = {"scenes": 2, "paths_per_scene": 6, "num_nodes": 150, "workers": 1}
-    roadmaps.collect(roadmaps.Args(folder / "roadmaps", robot=file, **sizes), progress=False)
+    roadmaps.collect(
+        roadmaps.Args(folder / "roadmaps", task=f"random_boxes_hard@{file}", **sizes),
+        progress=False,
+    )
     return file
 
 

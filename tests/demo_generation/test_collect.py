@@ -33,7 +33,6 @@ from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.utils import workers
-from roboarm_nmp.utils.signals import error_line
 
 TASK, NUM = "double_walls", 16
 
@@ -171,12 +170,11 @@ def test_file_records_the_command_that_makes_it(whole):
     assert demos.parameters["options"] == options()
 
 
-@pytest.mark.parametrize("task", ["double_walls", "random_boxes_hard"])
-def test_pretrained_demonstrations_have_the_queries_of_their_seed(task):
+def test_pretrained_demonstrations_have_the_queries_of_their_seed():
     """Only their plans are those of an earlier planner (docs/guide/demonstrations.md)."""
-    pretrained = load_demos(task)
-    collector = collect.Collector(options(task=task))
-    for index in (0, 1, 4_321):
+    pretrained = load_demos("random_boxes_hard")
+    collector = collect.Collector(options(task="random_boxes_hard"))
+    for index in (0, 4_321):
         demo = collector(index)
         assert demo["given_up"] == 0
         plan = collect._decode(demo["plan"], 7)
@@ -192,19 +190,16 @@ def test_rejected_attempts_are_counted(output):
     assert stored["attempts"] == 4 + sum(stored[reason] for reason in collect.REASONS)
     rejected = [collect.Collector(tight)(index)["rejected"] for index in range(4)]
     for reason in collect.REASONS:
-        assert stored[reason] == sum(one.get(reason, 0) for one in rejected)
+        assert stored[reason] == sum(counts.get(reason, 0) for counts in rejected)
     assert stored["no_plan"] > 0
     assert stored["queries_given_up"] == stored["attempts"] - 4  # one attempt on each query
 
 
-def test_limits_too_tight_for_every_query_are_an_error(tmp_path):
-    result = run(tmp_path / "demos.h5", "--max-checks", 1, task="no_obstacles")
-    assert result.returncode == 1
-    assert (
-        "collect.py: 100 queries in a row could not be solved ({'no_plan': 300})" in result.stderr
-    )
-    last = result.stderr.strip().splitlines()[-1]
-    assert last.startswith("collect.py: ") and "Traceback" not in result.stderr
+def test_limits_too_tight_for_every_query_are_an_error(output):
+    args = collect.Args("no_obstacles", num=4, workers=1, max_checks=1, output=output)
+    with pytest.raises(SystemExit) as ended:
+        collect.main(args)
+    assert "100 queries in a row could not be solved ({'no_plan': 300})" in str(ended.value.code)
 
 
 # --- Interrupted, killed, damaged
@@ -238,7 +233,6 @@ def test_killed_run_continues_and_leaves_no_workers(whole, output):
     [
         (signal.SIGINT, os.killpg, 130, "interrupted"),  # from a terminal, to the workers too
         (signal.SIGTERM, os.kill, 143, "terminated"),
-        (signal.SIGTERM, os.killpg, 143, "terminated"),  # as `timeout` does
     ],
 )
 def test_interrupted_run_continues(whole, output, number, whom, code, word):
@@ -280,12 +274,9 @@ def test_journal_entries_are_not_made_again(journal, output):
     assert (digests == 123456789).sum() == 1
 
 
-@pytest.mark.parametrize("cut", [1, 9000], ids=["without its end", "with lines before"])
-def test_torn_last_line_is_dropped(whole, journal, output, cut):
-    collect.journal_of(output).write_bytes(journal[:-cut])
-    left = journal[:-cut].count(b"\n") - 1
-    assert 8 < left < NUM
-    assert finish(output, whole) == left
+def test_torn_last_line_is_dropped(whole, journal, output):
+    collect.journal_of(output).write_bytes(journal[:-1])
+    assert finish(output, whole) == NUM - 1
 
 
 def test_journal_continues_after_a_torn_line(journal, output):
@@ -309,17 +300,6 @@ def test_flipped_bit_drops_its_entry_and_is_reported(whole, journal, output):
     assert NUM - 2 <= begun < NUM  # two of them, if it was the end of a line
 
 
-def test_torn_first_line_is_written_again(whole, journal, output):
-    collect.journal_of(output).write_bytes(journal[:30])
-    assert finish(output, whole) == 0
-
-
-def test_journal_may_have_any_of_the_demonstrations(whole, journal, output):
-    few = journal.splitlines(keepends=True)[:5]
-    collect.journal_of(output).write_bytes(b"".join(few))  # numbers 12 to 15
-    assert finish(output, whole) == 4
-
-
 def test_file_may_have_fewer_demonstrations_than_the_journal(whole, journal, output):
     collect.journal_of(output).write_bytes(journal)
     collect.collect(output, 3, options(), progress=False)
@@ -333,8 +313,7 @@ def test_full_disk_keeps_the_journal(whole, output):
     result = subprocess.run(
         command(output), cwd=ROOT, capture_output=True, text=True, preexec_fn=small_files
     )
-    assert result.returncode == 1
-    assert "collect.py: " in result.stderr and "Traceback" not in result.stderr
+    assert result.returncode == 1 and "Traceback" not in result.stderr
     assert result.stderr.strip().splitlines()[-1].startswith("what was collected is safe")
     contents = collect.journal_of(output).read_bytes()
     assert contents.endswith(b"\n") and 1000 < len(contents) <= 9000
@@ -356,7 +335,7 @@ def test_disk_too_full_for_the_file_keeps_the_journal(whole, journal, output, mo
         patched.setattr("os.fsync", full)
         with pytest.raises(SystemExit) as ended:
             collect.main(collect.Args(TASK, num=NUM, output=output))
-    assert str(ended.value.code).startswith(error_line("[Errno 28] No space left on device"))
+    assert "[Errno 28] No space left on device" in str(ended.value.code)
     assert collect.journal_of(output).read_bytes() == journal and not output.exists()
     assert finish(output, whole) == NUM
 
@@ -367,7 +346,7 @@ def test_second_collection_of_the_same_file_is_rejected(whole, output):
         second = run(output)
         process.send_signal(signal.SIGCONT)
         assert second.returncode == 1
-        expected = f"collect.py: {collect.journal_of(output)}: another process is writing to it\n"
+        expected = f": {collect.journal_of(output)}: another process is writing to it\n"
         assert second.stderr.endswith(expected) and "Traceback" not in second.stderr
         assert process.wait(60) == 0
     assert output.read_bytes() == whole.read_bytes()
@@ -383,7 +362,7 @@ def rejection(args):
         collect.main(args)
     assert time.monotonic() - begin < 10
     message = ended.value.code
-    assert isinstance(message, str) and message.startswith(error_line("")) and "\n" not in message
+    assert isinstance(message, str) and "\n" not in message
     return message
 
 
@@ -391,19 +370,12 @@ def rejection(args):
     ("arguments", "complaint"),
     [
         ({"task": "double_wals"}, "unknown task 'double_wals': did you mean double_walls"),
+        ({"task": "three_shelves"}, "three_shelves is for testing only"),
         ({"planner": "RRTConect"}, "unknown planner 'RRTConect': did you mean RRTConnect"),
         ({"num": 0}, "--num must be at least 1"),
-        ({"workers": 0}, r"--workers must be in \[1, 256\], got 0"),
-        ({"seed": -1}, r"--seed must be in \[0, 2\^32\)"),
-        ({"attempts": 0}, "--attempts must be at least 1"),
-        ({"max_checks": 0}, "--max-checks must be at least 1"),
-        ({"clearance": -0.1}, "--clearance must be at least 0"),
         ({"clearance": 0.6}, "clearance must be in"),
         ({"ray_address": "x"}, "--ray-address must be `auto` or HOST:PORT"),
-        ({"planner_range": -1.0}, "--planner-range must be at least 0"),
-        ({"simplify": -1}, "--simplify must be at least 0"),
         ({"output": Path("missing/demos.h5")}, "cannot write .*missing/demos.h5: No such file"),
-        ({"output": Path(".")}, "is a directory"),
     ],
 )
 def test_bad_flag_is_rejected_before_any_work(tmp_path, arguments, complaint):
@@ -413,23 +385,10 @@ def test_bad_flag_is_rejected_before_any_work(tmp_path, arguments, complaint):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("task", [name for name in envs.TASKS if not envs.TASKS[name].trainable])
-def test_task_for_testing_only_is_rejected(task, output):
-    assert f"{task} is for testing only" in rejection(collect.Args(task, output=output))
-
-
-def test_error_is_one_line(tmp_path):
-    result = run(tmp_path / "missing" / "demos.h5", task="wall")
-    assert result.returncode == 1 and result.stdout.count("\n") <= 1
-    errors = [line for line in result.stderr.splitlines() if "pybullet" not in line]
-    assert len(errors) == 1 and errors[0].startswith("collect.py: cannot write")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_existing_file_is_rejected_without_overwrite(whole, output):
     output.write_bytes(b"precious")
     args = collect.Args(TASK, num=NUM, output=output)
-    assert rejection(args) == error_line(f"{output} exists; --overwrite replaces it")
+    assert rejection(args).endswith(f": {output} exists; --overwrite replaces it")
     assert output.read_bytes() == b"precious" and list(output.parent.iterdir()) == [output]
     assert finish(output, whole, "--overwrite") == 0
 
@@ -445,7 +404,7 @@ def test_journal_of_another_collection_is_rejected(journal, output):
 
 @pytest.mark.parametrize(
     "contents",
-    [b"dear diary,\ntoday was fine\n", b"PK\x03", b'["a", "list"]\n', b'{"journal": 99}\n'],
+    [b"dear diary,\ntoday was fine\n", b'{"journal": 99}\n'],
 )
 def test_file_that_is_no_journal_is_left_unchanged(output, contents):
     path = collect.journal_of(output)
@@ -464,10 +423,10 @@ def test_exception_of_a_job_is_raised():
 
 
 def test_workers_that_always_die_are_an_error():
-    said = []
+    warnings = []
     with pytest.raises(RuntimeError, match="workers died 5 times without a result"):
-        list(workers.run(os._exit, (1,), range(3), 1, warn=said.append))
-    assert len(said) == 4 and all("a worker died" in text for text in said)
+        list(workers.run(os._exit, (1,), range(3), 1, warn=warnings.append))
+    assert len(warnings) == 4 and all("a worker died" in text for text in warnings)
 
 
 class DiesOnceOnEachJob:
@@ -485,10 +444,10 @@ class DiesOnceOnEachJob:
 
 
 def test_each_job_is_done_once_although_workers_die(tmp_path):
-    said = []
-    results = list(workers.run(DiesOnceOnEachJob, (tmp_path,), range(7), 1, warn=said.append))
-    assert sorted(results) == [0, 10, 20, 30, 40, 50, 60]
-    assert len(said) == 7 > workers.MAX_DEATHS  # with results between
+    warnings, jobs = [], range(workers.MAX_DEATHS + 1)
+    results = list(workers.run(DiesOnceOnEachJob, (tmp_path,), jobs, 1, warn=warnings.append))
+    assert sorted(results) == [10 * job for job in jobs]
+    assert len(warnings) == len(jobs)  # with results between
 
 
 def test_running_jobs_are_aborted_when_the_results_are_closed():
@@ -517,10 +476,6 @@ def test_death_of_a_worker_ends_results_in_order():
     with pytest.raises(BrokenProcessPool):
         collections.deque(results)
     assert all(has_ended(child) for child in children)
-
-
-def test_no_jobs_start_no_workers():
-    assert list(workers.run(os._exit, (1,), [], 1)) == []
 
 
 # --- Verifying and repairing
@@ -651,12 +606,6 @@ def test_repair_replaces_or_removes_bad_demonstrations(damaged):
     assert verify(path, progress=False) == expected
 
 
-def test_repair_of_a_good_file_changes_nothing(whole, output):
-    output.write_bytes(whole.read_bytes())
-    assert verify(output, repair=True, progress=False)["good"] == NUM
-    assert output.read_bytes() == whole.read_bytes()
-
-
 def test_states_that_differ_from_the_execution_are_found(output, exact):
     demos = list(exact[:3])
     states = demos[1][1].states.copy()
@@ -682,27 +631,23 @@ def test_collisions_are_rejected_unless_allowed(output, straight):
     assert set(verdicts(write(output, reached))) == {"good", "collided"}
 
 
-def test_file_without_a_repairable_demonstration_is_an_error(output, exact, colliding):
-    before = write(output, [starting_at(colliding, exact[0])]).read_bytes()
-    with pytest.raises(DatasetError) as caught:
-        verify(output, num_workers=1, repair=True, progress=False)
-    assert str(output) in str(caught.value)
-    assert output.read_bytes() == before
-
-
-def test_file_without_options_cannot_be_verified(output, exact):
+def test_file_without_options_or_without_a_repairable_demonstration_is_an_error(
+    output, exact, colliding
+):
     write(output, exact[:2], parameters={})  # it does not say with what options
-    with pytest.raises(DatasetError) as caught:
+    with pytest.raises(DatasetError, match=str(output)):
         verify(output, num_workers=1, progress=False)
-    assert str(output) in str(caught.value)
+    before = write(output, [starting_at(colliding, exact[0])]).read_bytes()
+    with pytest.raises(DatasetError, match=str(output)):
+        verify(output, num_workers=1, repair=True, progress=False)
+    assert output.read_bytes() == before
 
 
 def test_verify_continues_after_a_bad_file(whole, tmp_path):
     (tmp_path / "bad.h5").write_bytes(whole.read_bytes()[:3000])
     result = verify_command(tmp_path / "bad.h5", tmp_path / "none.h5", whole)
     assert result.returncode == 1 and "Traceback" not in result.stderr
-    errors = [line for line in result.stderr.splitlines() if line.startswith("verify.py: ")]
-    assert len(errors) == 2 and "bad.h5" in errors[0] and "none.h5: no such file" in errors[1]
+    assert "bad.h5: " in result.stderr and "none.h5: no such file" in result.stderr
     assert f"{whole}: {NUM} good" in result.stdout
 
 
@@ -741,5 +686,5 @@ def test_missing_cluster_is_an_error(output):
     pytest.importorskip("ray")
     result = run(output, "--ray-address", "auto")
     assert result.returncode == 1 and "Traceback" not in result.stderr
-    assert "collect.py: Could not find any running Ray instance" in result.stderr
+    assert "Could not find any running Ray instance" in result.stderr
     assert not output.exists()

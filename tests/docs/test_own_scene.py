@@ -36,6 +36,7 @@ COMMANDS = [
     for line in text.splitlines()
     if kind == "" and line.startswith(("python ", "roboarm "))
 ]
+COMMANDS = [command for command in COMMANDS if "roboarm view" not in command]  # in the browser
 OF_MY_SCENE = [command for command in COMMANDS if "moving.yaml" not in command]
 YAML = next(text for kind, text in BLOCKS if kind == "yaml")
 POSTS = [text for kind, text in BLOCKS if kind == "python"][-1]
@@ -110,7 +111,6 @@ def page(tmp_path_factory):
     folder, results, names = tmp_path_factory.mktemp("page"), {}, {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.delenv("DISPLAY", raising=False)
         patch.setattr(show, "MAX_FRAMES", 4)
         for kind, text in BLOCKS:
             if kind == "yaml":
@@ -131,7 +131,6 @@ def page(tmp_path_factory):
 def inside(page, tmp_path, monkeypatch):
     """In a copy of what the page made, without the runs."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
     for name in ("my_scene.yaml", "my_scene_queries.h5", "my_scene_demos.h5"):
         Path(name).write_bytes((page[0] / name).read_bytes())
     return tmp_path
@@ -146,13 +145,10 @@ def result_of(page, part):
 
 
 def test_commands_of_the_page_work(page):
-    assert len(page[1]) == len(COMMANDS) == 15
+    assert len(page[1]) == len(COMMANDS) == 14
     for command, result in page[1].items():
-        window = "show" in command and "--output" not in command
-        assert result.code == (2 if window else 0), (command, result.error)
+        assert result.code == 0, (command, result.error)
         assert "Traceback" not in result.error
-        if window:
-            assert result.error.startswith("error: a window needs a display")
     assert sorted(path.name for path in page[0].iterdir()) == [
         "episode.gif",
         "from_python.yaml",

@@ -21,7 +21,9 @@ XARM6 = ROOT / "examples" / "robots" / "xarm6.yaml"
 def observations(tmp_path_factory):
     folder = tmp_path_factory.mktemp("observations")
     options = {"num": 12, "sensors": "clouds", "num_samples": 400, "workers": 1}
-    made = collect.collect(collect.Args(output=folder, robot=XARM6, **options), progress=False)
+    made = collect.collect(
+        collect.Args(f"random_boxes_hard@{XARM6}", output=folder, **options), progress=False
+    )
     sensors = cardinal(PointCloud, load_robot(XARM6), num_samples=400)
     assert made.sensors["front_cloud"] == sensors["front"]
     return folder

@@ -38,14 +38,11 @@ def error_of(capfd, *arguments, main=app.main):
     ("arguments", "words"),
     [
         (["nothing"], "unknown task 'nothing'"),
-        (["missing.yaml"], "missing.yaml: No such file"),
         (["wall", "--policy", "nothing"], "no such policy: nothing"),
         (["wall", "--query", "10000"], "no test query 10000: the numbers are 0 to 9999"),
-        (["three_shelves", "--demos"], "three_shelves"),
+        (["three_shelves", "--policy", "demo"], "three_shelves has no demonstrations"),
         (["wall", "--trajectory", "a.csv"], "a.csv: No such file"),
-        (["wall", "--trajectory", "a.csv", "--demos"], "give one of them"),
-        (["wall", "--port", "0"], "--port must be in [1, 65535], got 0"),
-        (["wall", "--speed", "0"], "--speed must be above 0"),
+        (["wall", "--trajectory", "a.csv", "--policy", "demo"], "give one of them"),
         (["wall", "--record", "replay.gif"], "--record must end in .html"),
         (["wall", "--record", "no/such/folder/replay.html"], "no/such/folder"),
         (["wall", "--host", "192.0.2.1"], "cannot listen at 192.0.2.1, port 8080"),
@@ -63,14 +60,12 @@ def test_arguments_that_cannot_be_used_give_one_line(
 
 def test_folder_that_has_no_roadmap_paths_gives_one_line(capfd, tmp_path):
     assert str(tmp_path) in error_of(capfd, tmp_path)
-    assert "--demos" in error_of(capfd, tmp_path, "--demos")
+    assert "go with a task" in error_of(capfd, tmp_path, "--policy", "demo")
 
 
-@pytest.mark.parametrize("main", [app.main, demo.main])
-def test_port_in_use_gives_one_line(capfd, main):
-    task = ["wall"] if main is app.main else []
+def test_port_in_use_gives_one_line(capfd):
     with port_in_use() as port:
-        message = error_of(capfd, *task, "--port", port, "--no-open", main=main)
+        message = error_of(capfd, "--port", port, "--no-open", main=demo.main)
     assert f"port {port}" in message and "--port" in message
 
 
@@ -79,14 +74,8 @@ def test_missing_viser_gives_one_line_with_the_command_that_installs_it(capfd, m
     assert "pip install viser" in error_of(capfd, "wall")
 
 
-@pytest.mark.parametrize("failure", [lambda url: False, webbrowser.Error("no browser")])
-def test_missing_browser_gives_one_line_with_the_address(capfd, monkeypatch, failure):
-    def fail(url):
-        if isinstance(failure, Exception):
-            raise failure
-        return failure(url)
-
-    monkeypatch.setattr(webbrowser, "open", fail)
+def test_missing_browser_gives_one_line_with_the_address(capfd, monkeypatch):
+    monkeypatch.setattr(webbrowser, "open", lambda url: False)
     monkeypatch.setattr(app._Page, "run", lambda page: None)
     with port_in_use() as port:
         pass
@@ -96,8 +85,7 @@ def test_missing_browser_gives_one_line_with_the_address(capfd, monkeypatch, fai
     assert f"no browser could be opened: open http://127.0.0.1:{port} yourself" == second
 
 
-@pytest.mark.parametrize(("number", "word"), [("SIGINT", "interrupted"), ("SIGTERM", "terminated")])
-def test_signal_ends_the_command_with_one_line(number, word):
+def test_sigterm_ends_the_command_with_one_line():
     with port_in_use() as port:
         pass
     command = [sys.executable, "-m", "roboarm_nmp", "view", "no_obstacles", "--no-open"]
@@ -105,15 +93,15 @@ def test_signal_ends_the_command_with_one_line(number, word):
         [*command, "--port", str(port)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert process.stdout.readline().startswith("http://127.0.0.1")
-    process.send_signal(getattr(signal, number))
+    process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=60)
-    assert process.returncode == {"SIGINT": 130, "SIGTERM": 143}[number]
-    assert errors.splitlines() == [f"{word}; the same command starts again"] and output == ""
+    assert process.returncode == 143
+    assert errors.splitlines() == ["terminated; the same command starts again"] and output == ""
 
 
 def test_recordings_of_demonstrations_and_of_policies_are_written(capfd, tmp_path):
     path = tmp_path / "replay.html"
-    arguments = ["wall", "--demos", "--policy", "go-to-goal", "--query", "3", "--record", str(path)]
+    arguments = ["wall", "--policy", "demo", "go-to-goal", "--query", "3", "--record", str(path)]
     assert app.main(arguments) == 0
     written, *arms = capfd.readouterr().out.splitlines()
     assert written.startswith(f"{path}: written")

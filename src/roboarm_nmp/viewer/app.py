@@ -3,8 +3,8 @@
     roboarm view wall
     roboarm view wall --policy sac-ee-wall-p1-s1 go-to-goal
     roboarm view my_scene.yaml
-    roboarm view random_boxes_hard --robot ur5.yaml
-    roboarm view wall --demos
+    roboarm view random_boxes_hard@ur5.yaml
+    roboarm view wall --policy demo
     roboarm view wall --trajectory motion.yaml
     roboarm view roadmaps
     roboarm view wall --policy planner --record replay.html
@@ -27,15 +27,17 @@ import sys
 import threading
 import time
 import webbrowser
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 import tyro
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Sphere
 from roboarm_nmp.envs.world import SUBSTEPS, TIME_STEP
 from roboarm_nmp.policies.baselines import BASELINES
@@ -43,7 +45,19 @@ from roboarm_nmp.policies.registry import policy_file, pretrained_policies
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import check_writable, write_atomically
 from roboarm_nmp.utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, Seed
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
+from roboarm_nmp.viewer.episodes import (
+    DEMO,
+    demonstration_episodes,
+    roadmap_episodes,
+    task_episodes,
+    trajectory_episodes,
+)
+
+if TYPE_CHECKING:  # imported when they are needed, so that errors are seen at once
+    import viser
+
+    from roboarm_nmp.viewer.simulation import Simulation
 
 PORT = 8080
 Port = Annotated[
@@ -60,31 +74,20 @@ KINEMATIC = (
     "**Kinematic simulation**, because goal or scene were edited: no forces, and obstacles do not "
     "stop the arm. *Restart* runs the edited query in the physics."
 )
-NEW_OBSTACLES = {  # in front of the Panda; for other arms in proportion to their reach
-    "box": Box((0.5, 0.0, 0.5), (0.15, 0.15, 0.15)),
-    "cylinder": Cylinder((0.5, 0.0, 0.5), 0.06, 0.3),
-    "sphere": Sphere((0.5, 0.0, 0.5), 0.1),
-}
+NEW_OBSTACLES = ("box", "cylinder", "sphere")
 POINT_CLOUD_PLANNER = "planner (point cloud)"  # in the page's list of policies
 NO_OBSTACLE = "none"
-
-
-class ViewError(ValueError):
-    """Something that cannot be viewed; the message says why."""
 
 
 @dataclass
 class Args:
     task: tyro.conf.Positional[str]
     """the task's name, the path of a scene file (.yaml), or a folder of roadmap paths"""
-    robot: Path | None = None
-    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
     policy: tuple[str, ...] = ()
     """the policies, side by side: `go-to-goal`, `random`, `via-points`, `planner`, a policy
-    network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy; without
+    network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy; `demo`
+    replays the task's demonstrations, and --query is then the number of a demonstration; without
     one, `go-to-goal`, or the recorded motion alone"""
-    demos: bool = False
-    """show the task's demonstrations; --query is then the number of a demonstration"""
     trajectory: Path | None = None
     """play this file (.csv, .npz, .json, .yaml; docs/guide/trajectories.md) in the scene of
     --query"""
@@ -135,15 +138,30 @@ class _Page:
     simulation and drawing belong to one thread.
     """
 
-    def __init__(self, server, simulation, args, choices, loader):
+    def __init__(
+        self,
+        server: "viser.ViserServer",
+        simulation: "Simulation",
+        args: Args,
+        choices: list[_Choice],
+        loader: "Callable[[_Page, int, _Choice, int], None]",
+    ):
         from roboarm_nmp.viewer.drawing import Drawing  # it imports Numba
 
-        self.server, self.simulation, self.args = server, simulation, args
-        self.choices, self._load = choices, loader
-        self._work, self._drags = queue.SimpleQueue(), {}
-        self._dragging, self.selected = set(), None
-        self.playing, self.speed, self._message = True, args.speed, ""
-        self._ended_at, self._shown_at, self._frames, self._rate = None, 0.0, [], 0.0
+        self.server = server
+        self.simulation = simulation
+        self.args = args
+        self.choices = choices
+        self._load = loader
+        self._work: queue.SimpleQueue = queue.SimpleQueue()
+        self._drags = {}  # what is dragged -> function and arguments
+        self._dragging = set()
+        self.selected: int | None = None  # obstacle
+        self.playing = True
+        self.speed = args.speed
+        self._message = ""
+        self._ended_at: float | None = None
+        self._shown_at = 0.0
         self.drawing = Drawing(server, simulation)
         self.drawing.on_click = lambda index: self.do(self._select_obstacle, index)
         self._add_controls()
@@ -170,7 +188,6 @@ class _Page:
                 if now >= due:
                     due = max(due + 1 / (STEPS_PER_SECOND * self.speed), now)
                     self.simulation.step()
-                    self._count_frame(now)
                     changed = True
             else:
                 due = now + IDLE_SECONDS
@@ -186,18 +203,16 @@ class _Page:
 
     def _do_work(self, timeout):
         """Do what other threads have asked for; wait for the first of it. Returns whether any."""
-        worked, until = False, time.monotonic() + timeout
+        worked = False
         while True:
-            left = until - time.monotonic()
             try:
-                function, arguments = (
-                    self._work.get(timeout=max(left, 0.0))
-                    if left > 0
-                    else (self._work.get_nowait())
-                )
+                if timeout > 0 and not worked:
+                    function, arguments = self._work.get(timeout=timeout)
+                else:
+                    function, arguments = self._work.get_nowait()
             except queue.Empty:
                 break
-            worked, until = True, 0.0
+            worked = True
             if function is not None:
                 self._try(function, *arguments)
         while self._drags:
@@ -211,11 +226,6 @@ class _Page:
             function(*arguments)
         except (OSError, ValueError) as error:
             self._message = str(error)
-
-    def _count_frame(self, now):
-        self._frames = [one for one in self._frames if one > now - 1.0] + [now]
-        span = now - self._frames[0]
-        self._rate = (len(self._frames) - 1) / span if span > 0 else 0.0
 
     def _after_the_end(self, now):
         """What happens once all episodes are over. Returns whether the drawing changes."""
@@ -248,8 +258,10 @@ class _Page:
             self._speed.on_update(lambda event: self.do(self._set_speed))
             self._at_end = gui.add_dropdown("at the end", ("repeat", "next query", "stop"))
         with gui.add_folder("Query"):
-            split, count = simulation.split, simulation.episodes.count(simulation.split)
-            self._split = gui.add_dropdown("split", simulation.episodes.splits, initial_value=split)
+            count = simulation.episodes.count(simulation.split)
+            self._split = gui.add_dropdown(
+                "split", simulation.episodes.splits, initial_value=simulation.split
+            )
             self._number = gui.add_number(
                 "number",
                 simulation.number,
@@ -257,8 +269,8 @@ class _Page:
                 max=MAX_QUERY if count is None else count - 1,
                 step=1,
             )
-            self._split.on_update(lambda event: self._chosen(event))
-            self._number.on_update(lambda event: self._chosen(event))
+            self._split.on_update(self._query_chosen)
+            self._number.on_update(self._query_chosen)
             buttons = gui.add_button_group(" ", ("previous", "next"))
             buttons.on_click(lambda event: self.do(self._move_on, event.target.value))
         with gui.add_folder("Arms"):
@@ -271,7 +283,7 @@ class _Page:
                 menu.on_update(lambda event, index=index: self._policy_chosen(event, index))
                 self._policies.append((index, menu))
             self._seed = gui.add_number("seed", self.args.seed, min=0, max=2**32 - 1, step=1)
-            self._seed.on_update(lambda event: self._seed_chosen(event))
+            self._seed.on_update(self._seed_chosen)
         with gui.add_folder("Show"):
             names = {
                 "start": "start",
@@ -290,10 +302,10 @@ class _Page:
         with gui.add_folder("Edit"):
             position = tuple(simulation.robot.forward_kinematics(simulation.query.goal))
             self._goal = gui.add_vector3("goal (m)", position, step=0.01)
-            self._goal.on_update(lambda event: self._goal_typed(event))
+            self._goal.on_update(self._goal_typed)
             self._obstacle = gui.add_dropdown("obstacle", self._obstacle_names())
-            self._obstacle.on_update(lambda event: self._obstacle_chosen(event))
-            add = gui.add_button_group("add", tuple(NEW_OBSTACLES))
+            self._obstacle.on_update(self._obstacle_chosen)
+            add = gui.add_button_group("add", NEW_OBSTACLES)
             add.on_click(lambda event: self.do(self._add_obstacle, event.target.value))
             delete = gui.add_button("Delete the obstacle")
             delete.on_click(lambda event: self.do(self._delete))
@@ -310,57 +322,65 @@ class _Page:
         self._obstacle_gizmo.on_update(self._obstacle_dragged)
 
     def _obstacle_names(self):
-        kinds = enumerate(self.simulation.query.scene.obstacles)
-        return (NO_OBSTACLE, *(f"{i}: {type(one).__name__.lower()}" for i, one in kinds))
+        kinds = [type(obstacle).__name__ for obstacle in self.simulation.query.scene.obstacles]
+        return (NO_OBSTACLE, *(f"{i}: {kind.lower()}" for i, kind in enumerate(kinds)))
 
     def _update_controls(self):
         """Set controls and gizmos that are not being used to the simulation's values."""
+        from roboarm_nmp.viewer.drawing import set_property
+
         simulation = self.simulation
         position = simulation.robot.forward_kinematics(simulation.query.goal)
         if "goal" not in self._dragging:
-            _set(self._goal_gizmo, "position", position)
+            set_property(self._goal_gizmo, "position", position)
             if self._turns:
                 x, y, z, w = simulation.robot.end_effector_pose(simulation.query.goal)[3:]
-                _set(self._goal_gizmo, "wxyz", np.array((w, x, y, z)))
-        _set(self._goal, "value", tuple(float(x) for x in np.round(position, 4)))
+                set_property(self._goal_gizmo, "wxyz", np.array((w, x, y, z)))
+        set_property(self._goal, "value", tuple(float(x) for x in np.round(position, 4)))
         names = self._obstacle_names()
         if self._obstacle.options != names:
             self._obstacle.options = names
         if self.selected is not None and self.selected >= len(names) - 1:
             self._select_obstacle(None)
-        _set(self._obstacle, "value", names[0 if self.selected is None else self.selected + 1])
-        _set(self._obstacle_gizmo, "visible", self.selected is not None)
+        set_property(
+            self._obstacle, "value", names[0 if self.selected is None else self.selected + 1]
+        )
+        set_property(self._obstacle_gizmo, "visible", self.selected is not None)
         if self.selected is not None and "obstacle" not in self._dragging:
             obstacle = simulation.query.scene.obstacles[self.selected]
             x, y, z, w = getattr(obstacle, "orientation", (0.0, 0.0, 0.0, 1.0))
-            _set(self._obstacle_gizmo, "position", np.array(obstacle.position))
-            _set(self._obstacle_gizmo, "wxyz", np.array((w, x, y, z)))
-        _set(self._number, "value", simulation.number)
-        _set(self._play, "label", "Pause" if self.playing else "Play")
+            set_property(self._obstacle_gizmo, "position", np.array(obstacle.position))
+            set_property(self._obstacle_gizmo, "wxyz", np.array((w, x, y, z)))
+        set_property(self._number, "value", simulation.number)
+        set_property(self._play, "label", "Pause" if self.playing else "Play")
 
     def _update_status(self):
-        from roboarm_nmp.viewer.drawing import outcome
+        from roboarm_nmp.viewer.drawing import outcome, set_property
 
         simulation = self.simulation
-        task, split, number = simulation.episodes.task, simulation.split, simulation.number
-        lines = [f"**{task}**, {split} query {number}"]
+        episodes = simulation.episodes
+        lines = [f"**{episodes.task}**, {episodes.label(simulation.split, simulation.number)}"]
+        if episodes.note:
+            lines.append(f"Random queries: {episodes.note}.")
         for arm in simulation.arms:
-            mark = "✓" if arm.success else "✗" if arm.ended and not arm.problem else "▶"
-            cells = [f"{mark} **{arm.name}**", outcome(arm)]
+            mark = "▶"
+            if arm.success:
+                mark = "✓"
+            elif arm.ended and not arm.problem:
+                mark = "✗"
+            facts = [outcome(arm)]
             if arm.ms_per_action is not None:
-                cells.append(f"{arm.ms_per_action:.1f} ms per action")
+                facts.append(f"{arm.ms_per_action:.1f} ms per action")
             if arm.escaping:
-                cells.append("an escape from a local minimum, or an approach path")
+                facts.append("an escape from a local minimum, or an approach path")
             elif arm.correction is not None:
-                cells.append(f"correction by the filter {arm.correction:.3f}")
-            lines.append(f"{cells[0]}: {'; '.join(cells[1:])}.")
+                facts.append(f"correction by the filter {arm.correction:.3f}")
+            lines.append(f"{mark} **{arm.name}**: {'; '.join(facts)}.")
         kinematic = any(arm.kinematic for arm in simulation.arms) and simulation.edited
         lines.append(KINEMATIC if kinematic else PHYSICS)
-        if self.playing and not simulation.ended:
-            lines[-1] += f" {self._rate:.0f} frames per second."
         if self._message:
             lines.append(f"**{self._message}**")
-        _set(self._status, "content", "\n\n".join(lines))
+        set_property(self._status, "content", "\n\n".join(lines))
 
     # --- What controls do. Callbacks run in viser's threads, the rest in the loop.
 
@@ -385,9 +405,12 @@ class _Page:
         self.speed = self._speed.value
 
     def _show(self, option, shown):
-        (self.drawing.show.add if shown else self.drawing.show.discard)(option)
+        if shown:
+            self.drawing.show.add(option)
+        else:
+            self.drawing.show.discard(option)
 
-    def _chosen(self, event):
+    def _query_chosen(self, event):
         if event.client is not None:  # not set by this program
             self.do(lambda: self._select(self._split.value, int(self._number.value)))
 
@@ -404,17 +427,17 @@ class _Page:
         self.simulation.select(split, max(number, 0))
 
     def _policy_chosen(self, event, index):
-        if event.client is None:
-            return
-        choice = next(one for one in self.choices if one.label == event.target.value)
-        self._load(self, index, choice, int(self._seed.value))
+        if event.client is not None:
+            self._load_choice(index, event.target.value)
 
     def _seed_chosen(self, event):
-        if event.client is None:
-            return
-        for index, menu in self._policies:
-            choice = next(one for one in self.choices if one.label == menu.value)
-            self._load(self, index, choice, int(self._seed.value))
+        if event.client is not None:
+            for index, menu in self._policies:
+                self._load_choice(index, menu.value)
+
+    def _load_choice(self, index, label):
+        choice = next(choice for choice in self.choices if choice.label == label)
+        self._load(self, index, choice, int(self._seed.value))
 
     def _goal_typed(self, event):
         if event.client is not None:
@@ -435,7 +458,10 @@ class _Page:
         self._drag("obstacle", self._move_obstacle, self.selected, *pose)
 
     def _follow(self, what, phase):
-        (self._dragging.discard if phase == "end" else self._dragging.add)(what)
+        if phase == "end":
+            self._dragging.discard(what)
+        else:
+            self._dragging.add(what)
 
     def _move_obstacle(self, index, position, wxyz):
         if index is None or index >= len(self.simulation.query.scene.obstacles):
@@ -462,7 +488,7 @@ class _Page:
 
     def _delete(self):
         if self.selected is None:
-            raise ViewError("choose an obstacle: click it, or use the list")
+            raise ValueError("choose an obstacle: click it, or use the list")
         index = self.selected
         self._select_obstacle(None)
         self.simulation.remove_obstacle(index)
@@ -473,61 +499,54 @@ class _Page:
         print(f"{path}: written", flush=True)
 
 
-def new_obstacle(kind, robot):
+def new_obstacle(kind: str, robot: Robot) -> Box | Cylinder | Sphere:
     """An obstacle in front of a robot's base; its lengths are in proportion to the reach."""
-    obstacle, scale = NEW_OBSTACLES[kind], scale_of(robot)
-    sizes = {
-        name: tuple(scale * x for x in size) if isinstance(size, tuple) else scale * size
-        for name, size in vars(obstacle).items()
-        if name in ("size", "radius", "length")
-    }
-    position = (b + scale * x for b, x in zip(robot.base_position, obstacle.position, strict=True))
-    return replace(obstacle, position=tuple(position), **sizes)
-
-
-def _set(handle, name, value):
-    """Set a property of a handle where it differs: each setting is a message to the page."""
-    if not np.array_equal(getattr(handle, name), value):
-        setattr(handle, name, value)
+    scale = scale_of(robot)
+    x, y, z = robot.base_position
+    position = (x + 0.5 * scale, y, z + 0.5 * scale)
+    if kind == "box":
+        return Box(position, (0.15 * scale, 0.15 * scale, 0.15 * scale))
+    if kind == "cylinder":
+        return Cylinder(position, 0.06 * scale, 0.3 * scale)
+    return Sphere(position, 0.1 * scale)
 
 
 # --- The command
 
 
-def _check(args):
+def _check(args: Args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
-    for flag in ("demos", "robot", "trajectory"):
-        if getattr(args, flag) and Path(args.task).is_dir():
-            raise ViewError(f"--{flag} goes with a task, not with a folder of roadmap paths")
-    if args.demos and args.trajectory is not None:
-        raise ViewError("--demos and --trajectory are both recordings: give one of them")
-    args.task = envs.tasks.task_with_robot(args.task, args.robot)
-    if not Path(args.task).is_dir():
+    if Path(args.task).is_dir():
+        if DEMO in args.policy or args.trajectory is not None:
+            raise ValueError("demonstrations and --trajectory go with a task, not with a folder")
+    else:
         envs.get_task(args.task)
+    if DEMO in args.policy and args.trajectory is not None:
+        raise ValueError("--policy demo and --trajectory are both recordings: give one of them")
     for policy in args.policy:
-        if policy not in BASELINES:
+        if policy != DEMO and policy not in BASELINES:
             policy_file(policy)  # or it raises
     if args.record is not None:
         if args.record.suffix.lower() != ".html":
-            raise ViewError(f"--record must end in .html, got {args.record}")
+            raise ValueError(f"--record must end in .html, got {args.record}")
         check_writable(args.record)
     try:
         import viser  # noqa: F401
     except ImportError as error:
-        raise ViewError(f"{NEEDS_VISER} ({error})") from error
+        raise ValueError(f"{NEEDS_VISER} ({error})") from error
     if args.record is None:
         _check_port(args.host, args.port)
 
 
 def _check_port(host, port):
-    """Raises ViewError unless a server can listen there: viser would choose another port."""
+    """Raises ValueError unless a server can listen there: viser would choose another port."""
     try:
         with socket.create_server((host, port)):
             pass
     except OSError as error:
         reason = error.strerror or error
-        raise ViewError(
+        raise ValueError(
             f"cannot listen at {host}, port {port} ({reason}): choose another with --port"
         ) from error
 
@@ -549,36 +568,36 @@ def _stop(server):
         server.stop()
 
 
-def _simulation(args):
+def _simulation(args: Args) -> "Simulation":
     """The `Simulation` of the arguments, without policies, on its first query."""
-    from roboarm_nmp.viewer import simulation as core
+    from roboarm_nmp.viewer.simulation import RecordedArm, Simulation
 
     if Path(args.task).is_dir():
-        episodes = core.roadmap_episodes(args.task)
-    elif args.demos:
-        episodes = core.demonstration_episodes(args.task)
+        episodes = roadmap_episodes(args.task)
+    elif DEMO in args.policy:
+        episodes = demonstration_episodes(args.task)
     elif args.trajectory is not None:
-        episodes = core.trajectory_episodes(args.task, args.trajectory)
+        episodes = trajectory_episodes(args.task, args.trajectory, args.seed)
     else:
-        episodes = core.task_episodes(args.task, args.seed)
-    simulation = core.Simulation(episodes)
+        episodes = task_episodes(args.task, args.seed)
+    simulation = Simulation(episodes, episodes.split(args.split), args.query)
     if episodes.recording is not None:
-        simulation.add(core.RecordedArm(episodes))
-    split = args.split if args.split in episodes.splits else episodes.splits[0]
-    simulation.select(split, args.query)
+        simulation.add(RecordedArm(episodes.recording))
     return simulation
 
 
-def _choices(args, simulation):
+def _choices(args: Args, simulation) -> tuple[list[_Choice], list[_Choice]]:
     """The policies of the arguments, and all that the page's list offers: lists of `_Choice`."""
-    names = args.policy or (() if simulation.episodes.recording else ("go-to-goal",))
-    given = [_Choice(name, name, args.geometry_source) for name in names]
-    offered = {choice.label: choice for choice in given}
+    names = [name for name in args.policy if name != DEMO]
+    if not names and simulation.episodes.recording is None:
+        names = ["go-to-goal"]
+    chosen = [_Choice(name, name, args.geometry_source) for name in names]
+    offered = {choice.label: choice for choice in chosen}
     pretrained = pretrained_policies() if simulation.robot.arm == PANDA else ()
     for name in (*BASELINES, *pretrained):
         offered.setdefault(name, _Choice(name, name, args.geometry_source))
     offered[POINT_CLOUD_PLANNER] = _Choice(POINT_CLOUD_PLANNER, "planner", "point_cloud")
-    return given, list(offered.values())
+    return chosen, list(offered.values())
 
 
 def _arm(args, task, choice, seed):
@@ -592,11 +611,11 @@ def _arm(args, task, choice, seed):
     arm = PolicyArm(
         task,
         choice.policy,
-        args.goal_type,
-        choice.geometry_source,
-        safety_filter,
-        seed,
-        args.time_limit,
+        goal_type=args.goal_type,
+        geometry_source=choice.geometry_source,
+        safety_filter=safety_filter,
+        seed=seed,
+        time_limit=args.time_limit,
     )
     arm.name = choice.label
     return arm
@@ -616,8 +635,8 @@ def _serve(server, simulation, args):
     from roboarm_nmp.viewer.simulation import WaitingArm
 
     task = simulation.episodes.task
-    given, offered = _choices(args, simulation)
-    for choice in given:
+    chosen, offered = _choices(args, simulation)
+    for choice in chosen:
         simulation.add(WaitingArm(choice.label))
     lock = threading.Lock()  # arms are made one after another
 
@@ -649,9 +668,10 @@ def _serve(server, simulation, args):
     print(f"{url}  (Ctrl-C ends)", flush=True)
     if args.open and not _open(url):
         print(f"no browser could be opened: open {url} yourself", flush=True)
-    first = len(simulation.arms) - len(given)
-    for index in sorted(range(len(given)), key=lambda i: given[i].policy not in BASELINES):
-        load(page, first + index, given[index], args.seed, restart=True)
+    first = len(simulation.arms) - len(chosen)
+    # Baselines first: they are ready at once.
+    for index in sorted(range(len(chosen)), key=lambda i: chosen[i].policy not in BASELINES):
+        load(page, first + index, chosen[index], args.seed, restart=True)
     page.run()
 
 
@@ -662,19 +682,22 @@ def _open(url):
         return False
 
 
-def camera(arms, robot=PANDA):
+def camera(arms: int, robot: Robot = PANDA) -> tuple[np.ndarray, np.ndarray, float]:
     """Where the camera of a page with so many arms is at first, m; its target; its field (rad)."""
     from roboarm_nmp.viewer.drawing import SPACING
 
-    middle, base = SPACING * (arms - 1) / 2, np.array(robot.base_position)
-    eye, target = (1.4 + arms, middle + 0.6, 0.9 + 0.3 * arms), (0.0, middle, 0.4)
-    eye, target = (base + scale_of(robot) * np.array(point) for point in (eye, target))
+    middle = SPACING * (arms - 1) / 2
+    base, scale = np.array(robot.base_position), scale_of(robot)
+    eye = base + scale * np.array((1.4 + arms, middle + 0.6, 0.9 + 0.3 * arms))
+    target = base + scale * np.array((0.0, middle, 0.4))
     return eye, target, math.radians(50)
 
 
 def _place_camera(server, simulation):
-    first = server.initial_camera
-    first.position, first.look_at, first.fov = camera(len(simulation.arms), simulation.robot)
+    eye, target, field_of_view = camera(len(simulation.arms), simulation.robot)
+    server.initial_camera.position = eye
+    server.initial_camera.look_at = target
+    server.initial_camera.fov = field_of_view
 
 
 def _record(args):
@@ -682,8 +705,7 @@ def _record(args):
     from roboarm_nmp.viewer.drawing import COARSE_MESH_CELL, Drawing, outcome
 
     simulation = _simulation(args)
-    given, _ = _choices(args, simulation)
-    for choice in given:
+    for choice in _choices(args, simulation)[0]:
         simulation.add(_arm(args, simulation.episodes.task, choice, args.seed))
     server = _server("127.0.0.1", args.port)
     try:
@@ -705,7 +727,7 @@ def _record(args):
         print(f"  {arm.name}: {outcome(arm)}")
 
 
-def view(args, prog="roboarm view"):
+def view(args: Args) -> int:
     """Run the viewer. Returns the exit code: 0, or 2 where nothing can be viewed."""
     end_with_one_line("the same command starts again")
     try:
@@ -715,12 +737,12 @@ def view(args, prog="roboarm view"):
         else:
             _view(args)
     except (OSError, ValueError) as error:
-        print(f"{prog}: {error}".replace("\n", " "), file=sys.stderr)
+        print(error_line(error), file=sys.stderr)
         return 2
     return 0
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """The command. Returns the exit code: 0, or 2 where nothing can be viewed."""
     return view(flags.parse(Args, arguments, others="viewer"))
 

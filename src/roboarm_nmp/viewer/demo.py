@@ -6,6 +6,7 @@ The same as `roboarm view random_boxes_hard --policy POLICY go-to-goal --query Q
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,12 +29,10 @@ class DemoArgs:
     """open the page in the browser"""
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """The command. Returns the exit code: 0, or 2 where nothing can be viewed."""
     args = flags.parse(DemoArgs, arguments, others="viewer")
-    return view(
-        Args(task=TASK, policy=(POLICY, "go-to-goal"), query=QUERY, **vars(args)), "roboarm demo"
-    )
+    return view(Args(task=TASK, policy=(POLICY, "go-to-goal"), query=QUERY, **vars(args)))
 
 
 if __name__ == "__main__":

@@ -4,14 +4,29 @@ Every arm has its own copy of the scene, `SPACING` beside the last one. The arm'
 frames, of which only the joints move.
 """
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, find_geometry_source
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
 from roboarm_nmp.envs.perception.sensors import SceneObservation
 from roboarm_nmp.envs.robots.panda import scale_of
-from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, Cylinder, hull_faces, obstacle_at
-from roboarm_nmp.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, arm_joints, link_meshes
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.primitives import (
+    Box,
+    ConvexHull,
+    Cylinder,
+    Sphere,
+    hull_faces,
+    obstacle_at,
+)
+from roboarm_nmp.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, Colour, arm_joints, link_meshes
+from roboarm_nmp.viewer.simulation import Arm, Simulation
+
+if TYPE_CHECKING:
+    import viser
 
 # m, for the Panda; for other arms in proportion to their reach.
 SPACING, LABEL_HEIGHT = 2.2, 1.35  # between the bases of two arms; of the arms' names
@@ -28,7 +43,14 @@ OBSERVED_COLOUR, DECODED_COLOUR = (255, 140, 0), (150, 60, 200)
 WANTED_COLOUR, FILTERED_COLOUR = (130, 130, 130), (20, 110, 230)
 TRACE_COLOUR = (235, 150, 40)
 NEAR, FAR = 0.05, 0.3  # m: link distances are red up to the first, and not drawn beyond the second
+NO_LINES = (np.zeros((0, 2, 3)), np.zeros((0, 2, 3), np.uint8))
 ARROW_LENGTH = 0.25  # m, of the end effector's motion in a step of the longest length
+
+
+def set_property(handle, name: str, value):
+    """Set a property of a handle where it differs: each setting is a message to the page."""
+    if not np.array_equal(getattr(handle, name), value):
+        setattr(handle, name, value)
 
 
 def _wxyz(orientation):
@@ -48,14 +70,25 @@ class ArmDrawing:
         colour, opacity: of a ghost; None for the arm's own colours.
     """
 
-    def __init__(self, scene, robot, name, cell=MESH_CELL, colour=None, opacity=None):
+    def __init__(
+        self,
+        scene: "viser.SceneApi",
+        robot: Robot,
+        name: str,
+        cell: float = MESH_CELL,
+        colour: Colour | None = None,
+        opacity: float | None = None,
+    ):
         self._root = scene.add_frame(
             name,
             show_axes=False,
             position=robot.base_position,
             wxyz=_wxyz(robot.base_orientation),
         )
-        self._meshes, self._red, self._joints, nodes = {}, frozenset(), [], {-1: name}
+        self._meshes = {}  # link -> list of handles and their own colours
+        self._red = frozenset()  # links
+        self._joints = []
+        nodes = {-1: name}  # of each link
         for joint in arm_joints(robot):
             node = f"{nodes[joint.parent]}/joint{joint.link}"
             scene.add_frame(node, show_axes=False, position=joint.position, wxyz=joint.wxyz)
@@ -63,11 +96,12 @@ class ArmDrawing:
                 node = f"{node}/moved"
                 self._joints.append((joint, scene.add_frame(node, show_axes=False)))
             nodes[joint.link] = node
-        still = colour is not None  # the bases of ghosts are where the arm's is
         for link, meshes in link_meshes(robot, cell * scale_of(robot)).items():
             self._meshes[link] = []
-            for i, (own, vertices, faces) in enumerate(() if still and link == -1 else meshes):
-                shown = own if colour is None else colour
+            if colour is not None and link == -1:
+                continue  # the bases of ghosts are where the arm's is
+            for i, (own_colour, vertices, faces) in enumerate(meshes):
+                shown = own_colour if colour is None else colour
                 handle = scene.add_mesh_simple(
                     f"{nodes[link]}/mesh{i}",
                     vertices,
@@ -79,41 +113,25 @@ class ArmDrawing:
                 )
                 self._meshes[link].append((handle, shown))
 
-    @property
-    def visible(self):
-        """Whether it is drawn."""
-        return self._root.visible
+    def show(self, visible: bool):
+        """Draw it, or hide it."""
+        set_property(self._root, "visible", visible)
 
-    @visible.setter
-    def visible(self, visible):
-        if self._root.visible != visible:
-            self._root.visible = visible
-
-    def set(self, configuration):
+    def set(self, configuration: np.ndarray):
         """Draw it at joint angles (n,), rad."""
         for joint, handle in self._joints:
             position, wxyz = joint.pose(configuration)
-            for name, value, steps in (
-                ("position", position, POSITION_STEPS),
-                ("wxyz", wxyz, ORIENTATION_STEPS),
-            ):
-                value = np.round(np.array(value) * steps) / steps
-                if not np.array_equal(getattr(handle, name), value):
-                    setattr(handle, name, value)
+            position = np.round(np.array(position) * POSITION_STEPS) / POSITION_STEPS
+            set_property(handle, "position", position)
+            wxyz = np.round(np.array(wxyz) * ORIENTATION_STEPS) / ORIENTATION_STEPS
+            set_property(handle, "wxyz", wxyz)
 
-    def colour(self, links):
+    def colour(self, links: frozenset[int]):
         """Draw the links of these indices in red, the others in their own colours."""
         for link in links ^ self._red:
-            for handle, own in self._meshes.get(link, ()):
-                handle.color = CONTACT_COLOUR if link in links else own
+            for handle, own_colour in self._meshes.get(link, ()):
+                handle.color = CONTACT_COLOUR if link in links else own_colour
         self._red = frozenset(links)
-
-    def colour_all(self, colour):
-        """Draw all links in one colour."""
-        for meshes in self._meshes.values():
-            for handle, _ in meshes:
-                if tuple(handle.color) != tuple(colour):
-                    handle.color = colour
 
 
 class _Place:
@@ -121,7 +139,8 @@ class _Place:
 
     def __init__(self, scene, robot, index, cell):
         scale = scale_of(robot)
-        self.name, self.offset = f"/arm{index}", np.array([0.0, SPACING * scale * index, 0.0])
+        self.name = f"/arm{index}"
+        self.offset = np.array([0.0, SPACING * scale * index, 0.0])
         scene.add_frame(self.name, show_axes=False, position=self.offset)
         self.arm = ArmDrawing(scene, robot, f"{self.name}/robot", cell)
         ghost = COARSE_MESH_CELL
@@ -136,7 +155,9 @@ class _Place:
             position=(x, y, z + LABEL_HEIGHT * scale),
             anchor="bottom-center",
         )
-        self.scene, self.bodies, self.shapes = None, [], {}
+        self.scene = None  # what is drawn of it: scene, selected obstacle, time
+        self.bodies = []  # of each: the body and its colour; its handle
+        self.shapes = {}  # overlays by name
 
 
 class Drawing:
@@ -156,19 +177,21 @@ class Drawing:
 
     OPTIONS = ("start", "goal", "observed", "decoded", "distances", "correction", "trace")
 
-    def __init__(self, server, simulation, cell=MESH_CELL):
-        self.simulation, self._scene, self._cell = simulation, server.scene, cell
-        self.show, self.selected, self.on_click = {"start", "goal", "correction"}, None, None
-        self._places = []
+    def __init__(
+        self, server: "viser.ViserServer", simulation: Simulation, cell: float = MESH_CELL
+    ):
+        self.simulation = simulation
+        self._scene = server.scene
+        self._cell = cell
+        self.show = {"start", "goal", "correction"}
+        self.selected: int | None = None
+        self.on_click: Callable[[int], None] | None = None
+        self._places: list[_Place] = []
         # An environment map would be a third of a recording.
         self._scene.configure_environment_map(None)
         self._scene.add_light_hemisphere(
             "/sky", sky_color=(255, 255, 255), ground_color=(190, 190, 190), intensity=0.9
         )
-
-    def offset(self, index):
-        """Where the base of an arm is drawn, m, (3,)."""
-        return self._places[index].offset
 
     def update(self):
         """Draw the simulation as it is now."""
@@ -227,8 +250,7 @@ class Drawing:
         (before, before_colour), handle = place.bodies[i]
         if (body, colour) == (before, before_colour):
             return
-        same = before is not None and body is not None and _shape(before) == _shape(body)
-        if not same:
+        if before is None or body is None or _shape(before) != _shape(body):
             if handle is not None:
                 handle.remove()
             place.bodies[i] = self._add_body(place, i, body, colour)
@@ -243,24 +265,27 @@ class Drawing:
     def _add_body(self, place, i, body, colour):
         if body is None:
             return (body, colour), None
-        name, options = f"{place.name}/body{i}", {"color": colour, "position": body.position}
+        name = f"{place.name}/body{i}"
+        options = {"color": colour, "position": body.position}
+        if not isinstance(body, Sphere):
+            options["wxyz"] = _wxyz(body.orientation)
         if isinstance(body, Box):
-            wxyz = _wxyz(body.orientation)
-            handle = self._scene.add_box(name, dimensions=body.size, wxyz=wxyz, **options)
+            handle = self._scene.add_box(name, dimensions=body.size, **options)
         elif isinstance(body, Cylinder):
-            size = {"radius": body.radius, "height": body.length}
-            wxyz = _wxyz(body.orientation)
-            handle = self._scene.add_cylinder(name, **size, wxyz=wxyz, **options)
+            handle = self._scene.add_cylinder(
+                name, radius=body.radius, height=body.length, **options
+            )
         elif isinstance(body, ConvexHull):
-            mesh = np.array(body.vertices, np.float32), hull_faces(body.vertices).astype(np.uint32)
-            wxyz = _wxyz(body.orientation)
+            vertices = np.array(body.vertices, np.float32)
+            faces = hull_faces(body.vertices).astype(np.uint32)
             handle = self._scene.add_mesh_simple(
-                name, *mesh, flat_shading=True, wxyz=wxyz, **options
+                name, vertices, faces, flat_shading=True, **options
             )
         else:
             handle = self._scene.add_icosphere(name, radius=body.radius, **options)
-        if self.on_click is not None and colour != TABLE_COLOUR:
-            handle.on_click(lambda event: self.on_click(i))
+        on_click = self.on_click
+        if on_click is not None and colour != TABLE_COLOUR:
+            handle.on_click(lambda event: on_click(i))
         return (body, colour), handle
 
     # --- The arm
@@ -269,16 +294,17 @@ class Drawing:
         query, robot = self.simulation.query, self.simulation.robot
         place.arm.set(robot.denormalise(arm.state))
         place.arm.colour(arm.contacts.links)
-        place.start.visible = "start" in self.show
+        place.start.show("start" in self.show)
         place.start.set(query.start)
-        place.goal.visible = place.ball.visible = place.axes.visible = "goal" in self.show
+        place.goal.show("goal" in self.show)
         place.goal.set(query.goal)
         pose = robot.end_effector_pose(query.goal)
-        place.ball.position = place.axes.position = pose[:3]
+        for marker in (place.ball, place.axes):
+            marker.visible = "goal" in self.show
+            marker.position = pose[:3]
         place.axes.wxyz = _wxyz(pose[3:])
-        text = f"{arm.name}{_label(arm)}"  # seldom another: a browser takes long to draw text
-        if place.label.text != text:
-            place.label.text = text
+        # Seldom another text: a browser takes long to draw it.
+        set_property(place.label, "text", f"{arm.name}{_label(arm)}")
 
     # --- Overlays: redrawn while they are shown
 
@@ -315,16 +341,18 @@ class Drawing:
 
     def _lines(self, place, name, thickness, find, arrows=False):
         handle = place.shapes.get(name)
-        points, colours = find() if name in self.show else (np.zeros((0, 2, 3)), None)
+        points, colours = find() if name in self.show else NO_LINES
         if not len(points):
             if handle is not None:
                 handle.remove()
                 del place.shapes[name]
             return
-        node, points = f"{place.name}/{name}", np.round(points, 4).astype(np.float32)
+        node = f"{place.name}/{name}"
+        points = np.round(points, 4).astype(np.float32)
         if arrows:
-            sizes = {"shaft_radius": 0.008, "head_radius": 0.02, "head_length": 0.04}
-            place.shapes[name] = self._scene.add_arrows(node, points, colours, **sizes)
+            place.shapes[name] = self._scene.add_arrows(
+                node, points, colours, shaft_radius=0.008, head_radius=0.02, head_length=0.04
+            )
         elif handle is None or len(handle.points) != len(points):
             place.shapes[name] = self._scene.add_line_segments(
                 node, points, colours, thickness=thickness
@@ -333,11 +361,16 @@ class Drawing:
             handle.points, handle.colors = points, colours
 
     def _contacts(self, place, arm):
-        points, handle = arm.contacts.points.astype(np.float32), place.shapes.get("contacts")
+        points = arm.contacts.points.astype(np.float32)
+        handle = place.shapes.get("contacts")
         if handle is None and len(points):
-            options = {"point_size": 0.03, "point_shape": "circle", "precision": "float32"}
             place.shapes["contacts"] = self._scene.add_point_cloud(
-                f"{place.name}/contacts", points, CONTACT_COLOUR, **options
+                f"{place.name}/contacts",
+                points,
+                CONTACT_COLOUR,
+                point_size=0.03,
+                point_shape="circle",
+                precision="float32",
             )
         elif handle is not None:
             handle.visible = len(points) > 0
@@ -345,7 +378,7 @@ class Drawing:
                 handle.points = points
 
 
-def outcome(arm):
+def outcome(arm: Arm) -> str:
     """The state of an arm's episode in a few words."""
     if arm.problem is not None and arm.ended:
         return arm.problem
@@ -367,7 +400,11 @@ def _label(arm):
 
 
 def _shape(body):
-    return type(body), {k: v for k, v in vars(body).items() if k not in ("position", "orientation")}
+    """What makes two bodies equal except for their pose."""
+    properties = dict(vars(body))
+    properties.pop("position")
+    properties.pop("orientation", None)
+    return type(body), properties
 
 
 def _observed(scene, arm):
@@ -377,18 +414,20 @@ def _observed(scene, arm):
 def _decoded(scene, arm):
     from roboarm_nmp.envs.perception.encoders import encoder_with_decoder  # PyTorch takes seconds
 
-    known = arm.geometry_source in (None, GROUND_TRUTH, POINT_CLOUD)
-    return encoder_with_decoder(DECODED_BY if known else arm.geometry_source).decoded_points(scene)
+    encoder = arm.geometry_source
+    if encoder in (None, GROUND_TRUTH, POINT_CLOUD):
+        encoder = DECODED_BY
+    return encoder_with_decoder(encoder).decoded_points(scene)
 
 
 def _distance_lines(arm, simulation):
     """Lines (n, 2, 3), m, from each link to the nearest geometry, and their colours (n, 2, 3)."""
     scene = simulation.query.scene.at(arm.time)
     checker = find_geometry_source(arm.geometry_source or GROUND_TRUTH)(scene)
-    found = checker.signed_distances(np.clip(arm.state, -1.0, 1.0), False, within=FAR)
-    near = np.isfinite(found.distance)
-    distance, witness = found.distance[near], found.witness[near]
-    points = np.stack([witness, witness - distance[:, None] * found.normal[near]], axis=1)
+    signed = checker.signed_distances(np.clip(arm.state, -1.0, 1.0), False, within=FAR)
+    near = np.isfinite(signed.distance)
+    distance, witness = signed.distance[near], signed.witness[near]
+    points = np.stack([witness, witness - distance[:, None] * signed.normal[near]], axis=1)
     share = np.clip((distance - NEAR) / (FAR - NEAR), 0.0, 1.0)[:, None]
     colours = (1 - share) * CONTACT_COLOUR + share * np.array(GOAL_COLOUR)
     return points, np.repeat(colours[:, None], 2, axis=1).astype(np.uint8)
@@ -397,7 +436,7 @@ def _distance_lines(arm, simulation):
 def _arrows(arm, robot):
     """The end effector's motion as the policy wants it, and as the safety filter corrects it."""
     if arm.correction is None or arm.correction < 1e-3 or arm.ended or len(arm.trace) < 2:
-        return np.zeros((0, 2, 3)), None
+        return NO_LINES
     before = arm.trace[-2]
     states = np.clip(np.stack([before, before + arm.wanted, before + arm.action]), -1.0, 1.0)
     start, *ends = robot.forward_kinematics(robot.denormalise(states))
@@ -409,6 +448,6 @@ def _arrows(arm, robot):
 def _trace(arm, robot):
     """The path of the end effector so far."""
     if len(arm.trace) < 2:
-        return np.zeros((0, 2, 3)), None
+        return NO_LINES
     positions = robot.forward_kinematics(robot.denormalise(np.array(arm.trace)))
     return np.stack([positions[:-1], positions[1:]], axis=1), np.array(TRACE_COLOUR, np.uint8)

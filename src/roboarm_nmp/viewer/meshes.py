@@ -2,18 +2,24 @@
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 
 from roboarm_nmp.envs.robots.body import parsed_urdf
+from roboarm_nmp.envs.robots.robot import Robot
 
 # Visual meshes are reduced by merging the vertices in each cube of this size (m, of the Panda).
 # Ghosts and recordings have the larger one: browsers without a GPU render slowly.
 MESH_CELL, COARSE_MESH_CELL = 0.005, 0.013
 DEFAULT_COLOUR = (200, 200, 205)  # red, green, blue, where neither URDF nor mesh has any
 SECTIONS = 32  # of the circumference of a cylinder
+
+Colour = tuple[int, int, int]
+"""Red, green, blue."""
+Part = tuple[Colour, np.ndarray, np.ndarray]
+"""Colour, vertices (v, 3), faces (f, 3)."""
 
 
 class Joint(NamedTuple):
@@ -30,57 +36,61 @@ class Joint(NamedTuple):
 
     parent: int
     link: int
-    position: tuple
-    wxyz: tuple
-    axis: tuple
+    position: np.ndarray
+    wxyz: np.ndarray
+    axis: np.ndarray
     is_fixed: bool
     is_prismatic: bool
     joint: int | None
     multiplier: float
     offset: float
 
-    def pose(self, configuration):
+    def pose(self, configuration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Position (m) and quaternion of what it moves, in its own frame, at angles (n,), rad."""
         value = self.offset
         if self.joint is not None:
             value += self.multiplier * configuration[self.joint]
         if self.is_prismatic:
-            return tuple(value * x for x in self.axis), (1.0, 0.0, 0.0, 0.0)
-        sin = math.sin(value / 2)
-        return (0.0, 0.0, 0.0), (math.cos(value / 2), *(sin * x for x in self.axis))
+            return value * self.axis, np.array((1.0, 0.0, 0.0, 0.0))
+        return np.zeros(3), np.array((math.cos(value / 2), *(math.sin(value / 2) * self.axis)))
 
 
 @functools.cache
-def arm_joints(robot):
+def arm_joints(robot: Robot) -> list[Joint]:
     """The `Joint`s of a robot's URDF, parents first."""
     joints, links = _bullet_indices(robot)
     follows = {index: (i, 1.0, 0.0) for i, index in enumerate(robot.joint_indices)}
-    follows |= {index: follower for index, *follower in robot.mimics}
+    for index, joint, multiplier, offset in robot.mimics:
+        follows[index] = (joint, multiplier, offset)
     held = dict(zip(robot.held_indices, robot.held_positions, strict=True))
-    found = []
+    described = []
     for element in parsed_urdf(robot).findall("joint"):
         index = joints[element.get("name")]
-        kind, axis = element.get("type"), np.array((1.0, 0.0, 0.0))
+        kind = element.get("type")
+        axis = np.array((1.0, 0.0, 0.0))
         if kind != "fixed":
             axis = np.array(_numbers(element.find("axis"), "xyz", tuple(axis)))
         matrix = _origin(element)
-        found.append(
+        joint, multiplier, offset = follows.get(index, (None, 0.0, held.get(index, 0.0)))
+        described.append(
             Joint(
-                links[element.find("parent").get("link")],
-                links[element.find("child").get("link")],
-                tuple(matrix[:3, 3].tolist()),
-                tuple(trimesh.transformations.quaternion_from_matrix(matrix).tolist()),
-                tuple((axis / np.linalg.norm(axis)).tolist()),
-                kind == "fixed",
-                kind == "prismatic",
-                *follows.get(index, (None, 0.0, held.get(index, 0.0))),
+                parent=links[_link_name(element, "parent")],
+                link=links[_link_name(element, "child")],
+                position=matrix[:3, 3],
+                wxyz=trimesh.transformations.quaternion_from_matrix(matrix),
+                axis=axis / np.linalg.norm(axis),
+                is_fixed=kind == "fixed",
+                is_prismatic=kind == "prismatic",
+                joint=joint,
+                multiplier=multiplier,
+                offset=offset,
             )
         )
-    return sorted(found, key=lambda joint: joint.link)  # PyBullet has parents first
+    return sorted(described, key=lambda joint: joint.link)  # PyBullet has parents first
 
 
 @functools.cache
-def link_meshes(robot, cell):
+def link_meshes(robot: Robot, cell: float) -> dict[int, list[Part]]:
     """The meshes of a robot's links.
 
     Links without visual shapes have their collision shapes.
@@ -97,8 +107,8 @@ def link_meshes(robot, cell):
         ValueError: a mesh cannot be read.
     """
     _, links = _bullet_indices(robot)
-    root, found = parsed_urdf(robot), {}
-    colours = {}
+    root = parsed_urdf(robot)
+    meshes, colours = {}, {}
     for material in root.iter("material"):
         colours.setdefault(material.get("name"), _rgb(material))
     for link in root.findall("link"):
@@ -109,11 +119,11 @@ def link_meshes(robot, cell):
             if material is not None:
                 colour = _rgb(material) or colours.get(material.get("name"))
             parts += _shape(shape, colour, cell)
-        found[links[link.get("name")]] = parts
-    return found
+        meshes[links[link.get("name")]] = parts
+    return meshes
 
 
-def _shape(element, colour, cell):
+def _shape(element, colour, cell) -> list[Part]:
     """A URDF's `visual` or `collision` element as a list of (colour, vertices, faces)."""
     kind = element.find("geometry/*")
     if kind is None:
@@ -139,7 +149,7 @@ def _cylinder(element):
     return {"radius": float(element.get("radius")), "height": float(element.get("length"))}
 
 
-def _mesh(element, origin, colour, cell):
+def _mesh(element, origin, colour, cell) -> list[Part]:
     """A `mesh` element at an origin (4, 4) as a list of (colour, vertices, faces)."""
     scale = _numbers(element, "scale", (1.0, 1.0, 1.0))
     scale = np.diag([*(3 * scale if len(scale) == 1 else scale), 1.0])
@@ -147,10 +157,11 @@ def _mesh(element, origin, colour, cell):
     if len(of_colour) == 1 and colour is not None:  # a mesh of several colours keeps them
         of_colour = {colour: next(iter(of_colour.values()))}
     parts = []
-    for own, meshes in of_colour.items():
-        vertices, faces = _joined(meshes)
-        vertices = trimesh.transform_points(vertices, origin @ scale)
-        parts.append((own or DEFAULT_COLOUR, *_merged(vertices, faces, cell)))
+    for own_colour, meshes in of_colour.items():
+        mesh: Any = trimesh.util.concatenate(meshes)
+        vertices = trimesh.transform_points(mesh.vertices, origin @ scale)
+        vertices, faces = _merged(vertices, mesh.faces, cell)
+        parts.append((own_colour or DEFAULT_COLOUR, vertices, faces))
     return parts
 
 
@@ -162,24 +173,18 @@ def _mesh_by_colour(path):
         parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
         if not parts:
             raise ValueError("it has no triangles")
-        unit = float((loaded.units or "").partition(" * ")[0]) if "*" in (loaded.units or "") else 1
+        units = loaded.units or ""
+        unit = float(units.partition(" * ")[0]) if "*" in units else 1.0
     except Exception as error:  # its readers raise all kinds
         raise ValueError(f"{path}: the mesh cannot be drawn: {error}") from error
     of_colour = {}
     for part in parts:
-        material = getattr(part.visual, "material", None)
-        colour = None if material is None else tuple(int(c) for c in material.main_color[:3])
+        material = getattr(getattr(part, "visual", None), "material", None)
+        colour = None if material is None else _colour(material.main_color[:3])
         if unit != 1:
             part.apply_scale(unit)
         of_colour.setdefault(colour, []).append(part)
     return of_colour
-
-
-def _joined(meshes):
-    """Vertices (v, 3) and faces (f, 3) of several meshes."""
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + k for mesh, k in zip(meshes, first, strict=True)]
-    return np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces)
 
 
 def _merged(vertices, faces, cell):
@@ -205,6 +210,11 @@ def _bullet_indices(robot):
     return joints, {name: index for index, name in robot.link_names.items()}
 
 
+def _link_name(joint, kind):
+    """The name of a joint's `parent` or `child`."""
+    return joint.find(kind).get("link")
+
+
 def _numbers(element, name, default=None):
     """The numbers of an attribute."""
     if element is None or element.get(name) is None:
@@ -215,12 +225,13 @@ def _numbers(element, name, default=None):
 def _origin(element):
     """The transform (4, 4) of an element's `origin`."""
     origin = element.find("origin")
-    matrix = trimesh.transformations.euler_matrix(*_numbers(origin, "rpy", (0.0, 0.0, 0.0)))
+    roll, pitch, yaw = _numbers(origin, "rpy", (0.0, 0.0, 0.0))
+    matrix = trimesh.transformations.euler_matrix(roll, pitch, yaw)
     matrix[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0))
     return matrix
 
 
-def _rgb(material):
+def _rgb(material) -> Colour | None:
     """The colour of a URDF's material; None without one, or where it is malformed."""
     try:
         rgb = np.array(_numbers(material.find("color"), "rgba", ())[:3])
@@ -228,4 +239,9 @@ def _rgb(material):
         return None
     if rgb.shape != (3,) or not np.isfinite(rgb).all():
         return None
-    return tuple(int(x) for x in np.round(255 * np.clip(rgb, 0.0, 1.0)))
+    return _colour(np.round(255 * np.clip(rgb, 0.0, 1.0)))
+
+
+def _colour(numbers) -> Colour:
+    red, green, blue = numbers
+    return int(red), int(green), int(blue)

@@ -24,6 +24,7 @@ from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.robots.control import calibrate
 from roboarm_nmp.envs.robots.files import load_robot
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, with_robot
 from roboarm_nmp.envs.world import World
@@ -31,7 +32,7 @@ from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.files import check_writable
 from roboarm_nmp.utils.flags import PositiveInt, Seed, check
 from roboarm_nmp.utils.signals import error_line
-from roboarm_nmp.viewer.show import render_configurations
+from roboarm_nmp.viewer.images import render_configurations
 
 SCENES_TASK = "random_boxes_hard"  # of the collision checks that are compared
 PER_SCENE = 100
@@ -40,7 +41,10 @@ HELD_POSES = 200
 MAX_POSITION_ERROR = 1e-4  # m
 MAX_DISAGREEMENT, MAX_DEPTH = 0.001, 0.002  # share of configurations; m
 MIN_EXECUTED, MIN_HELD = 0.7, 0.9  # shares
-POSE_SIZE, WORKSPACE_SIZE, NUM_POSES, NUM_POSITIONS = (360, 300), (540, 450), 3, 6_000
+# Of the image: pixels, poses, and positions of the workspace.
+POSE_SIZE, WORKSPACE_SIZE = (360, 300), (540, 450)
+NUM_POSES, NUM_POSITIONS = 3, 6_000
+SIDE = (0.0, -15.0)  # yaw and pitch, degrees
 BEAD = 0.006  # share of the reach: half the edge of a position's cube
 MOTION_LIMITS = {"velocity": 10, "acceleration": 14, "jerk": 10}  # columns and their widths
 MAY_COLLIDE, NEVER = (235, 120, 40), (232, 232, 232)
@@ -71,7 +75,7 @@ class Agreement(NamedTuple):
     depth: float
 
 
-def position_error(robot, rng, number=500):
+def position_error(robot: Robot, rng: np.random.Generator, number: int = 500) -> float:
     """Largest distance (m) of forward kinematics from PyBullet's end effector."""
     world = World(Scene(table=None, floor=None, robot=robot), drawn=False)
     worst = 0.0
@@ -83,7 +87,7 @@ def position_error(robot, rng, number=500):
     return worst
 
 
-def compare_checks(robot, rng, number, scenes=None):
+def compare_checks(robot: Robot, rng: np.random.Generator, number: int, scenes=None) -> Agreement:
     """The `Agreement` at random configurations in random scenes.
 
     Args:
@@ -95,7 +99,10 @@ def compare_checks(robot, rng, number, scenes=None):
     from roboarm_nmp.envs.collision.checker import CollisionChecker  # Numba takes long to import
 
     scenes = scenes or with_robot(get_task(SCENES_TASK).scene, robot)
-    world, checked, free, wrong, depth = World(scenes.base, drawn=False), 0, 0, 0, 0.0
+    assert not isinstance(scenes, Scene)
+    world = World(scenes.base, drawn=False)
+    checked, free, wrong = 0, 0, 0
+    depth = 0.0
     while checked < number:
         scene = scenes.sample(rng)
         world.set_scene(scene)
@@ -112,9 +119,10 @@ def compare_checks(robot, rng, number, scenes=None):
     return Agreement(checked, free / checked, wrong, depth)
 
 
-def held_share(robot, rng, number=HELD_POSES):
+def held_share(robot: Robot, rng: np.random.Generator, number: int = HELD_POSES) -> float:
     """Share of the contact-free configurations, without obstacles, that the controller holds."""
-    world, held, tried = World(Scene(robot=robot), drawn=False), 0, 0
+    world = World(Scene(robot=robot), drawn=False)
+    held, tried = 0, 0
     while tried < number:
         configuration = rng.uniform(robot.lower, robot.upper)
         if not world.in_collision(configuration.tolist()):
@@ -124,7 +132,7 @@ def held_share(robot, rng, number=HELD_POSES):
     return held / number
 
 
-def describe(robot):
+def describe(robot: Robot) -> str:
     """The description of a robot: text of several lines."""
     lines = [
         f"{robot.name}: {robot.num_joints} joints, reach {robot.reach:.2f} m, {robot.urdf}",
@@ -138,7 +146,7 @@ def describe(robot):
             values = getattr(robot, limit)
             line += f"{'unknown':>{width}}" if values is None else f"{values[i]:>{width}.2f}"
         lines.append(f"{line}{robot.effort[i]:>9.0f}")
-    if robot.datasheet_lower is not None:
+    if robot.datasheet_lower is not None and robot.datasheet_upper is not None:
         pairs = zip(robot.datasheet_lower, robot.datasheet_upper, strict=True)
         lines.append(f"datasheet: {', '.join(f'{low:.3f} to {high:.3f}' for low, high in pairs)}")
     names = robot.link_names
@@ -156,13 +164,14 @@ def describe(robot):
     return "\n".join(lines)
 
 
-def draw(robot, rng):
+def draw(robot: Robot, rng: np.random.Generator) -> Image.Image:
     """An image of the robot: configurations, workspace, and pairs of links that may collide."""
-    env = RoboArmEnv(Scene(robot=robot))
+    scene = Scene(robot=robot)
+    env = RoboArmEnv(scene)
     poses = [env.sample_feasible(rng) for _ in range(NUM_POSES)]
-    query = Query(poses[0], poses[1], env.scene)
+    query = Query(poses[0], poses[1], scene)
     images = list(render_configurations(env, query, poses, POSE_SIZE))
-    around = _behind(robot, rng)
+    behind = _behind(robot, rng)
     bead = p.createVisualShape(
         p.GEOM_BOX,
         halfExtents=[BEAD * robot.reach] * 3,
@@ -170,13 +179,14 @@ def draw(robot, rng):
         physicsClientId=env.client,
     )
     p.createMultiBody(
-        baseVisualShapeIndex=bead, batchPositions=around.tolist(), physicsClientId=env.client
+        baseVisualShapeIndex=bead, batchPositions=behind.tolist(), physicsClientId=env.client
     )
-    images += render_configurations(env, query, poses[:1], WORKSPACE_SIZE, around, "side")
+    images += render_configurations(env, query, poses[:1], WORKSPACE_SIZE, behind, SIDE)
     env.close()
     images.append(draw_pairs(robot, WORKSPACE_SIZE))
-    rows = np.concatenate(images[:NUM_POSES], axis=1), np.concatenate(images[NUM_POSES:], axis=1)
-    return Image.fromarray(np.concatenate(rows))
+    top = np.concatenate(images[:NUM_POSES], axis=1)
+    bottom = np.concatenate(images[NUM_POSES:], axis=1)
+    return Image.fromarray(np.concatenate([top, bottom]))
 
 
 def _behind(robot, rng):
@@ -186,12 +196,13 @@ def _behind(robot, rng):
     return positions[positions[:, 1] > robot.base_position[1]]
 
 
-def draw_pairs(robot, size):
+def draw_pairs(robot: Robot, size: tuple[int, int]) -> np.ndarray:
     """An image of the links as rows and columns: uint8 (height, width, 3)."""
     names = robot.link_names
     links = sorted(link.index for link in robot.links)
-    image, font = Image.new("RGB", size, "white"), ImageFont.load_default(12)
-    painter, left = ImageDraw.Draw(image), size[0] // 3
+    image = Image.new("RGB", size, "white")
+    painter, font = ImageDraw.Draw(image), ImageFont.load_default(12)
+    left = size[0] // 3
     cell = min((size[0] - left) // len(links), (size[1] - 40) // len(links))
     painter.text((10, 8), "pairs of links that may collide (orange)", "black", font)
     for row, a in enumerate(links):
@@ -205,7 +216,7 @@ def draw_pairs(robot, size):
     return np.asarray(image)
 
 
-def main(args):
+def main(args: Args) -> bool:
     """Print the description and the verification. Returns whether all is within tolerance."""
     robot = load_robot(args.robot)
     image = args.image or Path(f"{Path(args.robot).stem}_check.png")
@@ -215,20 +226,27 @@ def main(args):
     print(describe(robot))
     rng = np.random.default_rng(args.seed)
     error = position_error(robot, rng)
-    found = compare_checks(robot, rng, args.configurations)
+    agreement = compare_checks(robot, rng, args.configurations)
     executed = calibrate(robot, gains=robot.gains[:1])[1]
     held = held_share(robot, rng)
-    share = found.disagreements / found.number
+    share = agreement.disagreements / agreement.number
     results = [
-        (f"forward kinematics: at most {error * 1000:.4f} mm from PyBullet's",
-         error <= MAX_POSITION_ERROR),
-        (f"collision checks: {found.disagreements} of {found.number:,} differ from PyBullet's, by "
-         f"up to {found.depth * 1000:.2f} mm ({found.free:.0%} of the configurations are free)",
-         share <= MAX_DISAGREEMENT and found.depth <= MAX_DEPTH),
-        (f"controller: {executed:.2f} of a commanded step is executed (gain {robot.gains[0]:g})",
-         executed >= MIN_EXECUTED),
+        (
+            f"forward kinematics: at most {error * 1000:.4f} mm from PyBullet's",
+            error <= MAX_POSITION_ERROR,
+        ),
+        (
+            f"collision checks: {agreement.disagreements} of {agreement.number:,} differ from "
+            f"PyBullet's, by up to {agreement.depth * 1000:.2f} mm ({agreement.free:.0%} of the "
+            "configurations are free)",
+            share <= MAX_DISAGREEMENT and agreement.depth <= MAX_DEPTH,
+        ),
+        (
+            f"controller: {executed:.2f} of a commanded step is executed (gain {robot.gains[0]:g})",
+            executed >= MIN_EXECUTED,
+        ),
         (f"controller: {held:.1%} of contact-free configurations are held", held >= MIN_HELD),
-    ]  # fmt: skip
+    ]
     for text, is_good in results:
         print(f"{'ok ' if is_good else 'BAD'} {text}")
     draw(robot, rng).save(image)
