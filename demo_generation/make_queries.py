@@ -43,6 +43,7 @@ from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import query_path, write_queries
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.moving_boxes import MovingScenes
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
 from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 from roboarm_nmp.planning.planner import Planner
@@ -111,7 +112,7 @@ class Sampler:
     ):
         self.queries_per_scene = queries_per_scene
         self.goal_region = goal_region
-        self.limits = limits
+        self.limits: Limits = limits
         self.env = envs.make(task)
         self.planner = None
         if solvable:
@@ -268,7 +269,7 @@ def make_queries(
                 rejected.update(query["rejected"])
             start = np.array([query["start"] for query in made], np.float32)
             goal = np.array([query["goal"] for query in made], np.float32)
-            if hasattr(distribution, "animate"):
+            if isinstance(distribution, MovingScenes):
                 seeds = np.array([query["scene_seed"] for query in made], np.uint32)
                 splits[split] = (start, goal, AnimatedScenes(distribution, seeds, start, goal))
             elif isinstance(distribution, Scene):
@@ -339,7 +340,7 @@ def _check(args: Args) -> list[tuple[str, Path]]:
             )
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
-        if hasattr(envs.get_task(task).scene, "animate") and (
+        if isinstance(envs.get_task(task).scene, MovingScenes) and (
             args.solvable or args.queries_per_scene > 1
         ):
             raise ValueError(

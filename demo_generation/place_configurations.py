@@ -58,7 +58,7 @@ def _poses(places: Sequence[Place], rng: np.random.Generator) -> np.ndarray:
     """Random end-effector poses (POSES, 7) in places."""
     poses = np.empty((POSES, 7))
     for pose in poses:
-        place = places[rng.integers(len(places))]
+        place = places[int(rng.integers(len(places)))]
         x, y, z = rng.uniform(-0.5, 0.5, 3) * place.size
         cos, sin = np.cos(place.yaw), np.sin(place.yaw)
         pose[:3] = place.centre + [cos * x - sin * y, sin * x + cos * y, z]

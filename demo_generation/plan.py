@@ -320,10 +320,10 @@ def _plan(args: Args) -> bool:
         _check_end("--start", start, checker, args.point_radius)
         if args.goal is not None:
             _check_end("--goal", goal["goal"], checker, args.point_radius)
-    times = episode = trajectory = None
+    episode = trajectory = None
     if args.policy == "planner":
         path, seconds = _planned(args, scene, start, goal)
-        times, configurations = timed(path, scene.robot)
+        _, configurations = timed(path, scene.robot)
         print(f"planned in {1000 * seconds:.0f} ms: {len(path)} waypoints")
     else:
         episode = _rolled_out(args, checker, start, **goal)
@@ -341,6 +341,7 @@ def _plan(args: Args) -> bool:
         elif episode is not None:
             save_trajectory(args.output, episode)
         else:
+            times, configurations = timed(path, scene.robot)
             save_joint_path(args.output, configurations, times, scene.robot)
         print(f"{args.output}: {len(configurations)} configurations")
     return episode is None or episode.success

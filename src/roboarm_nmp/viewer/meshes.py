@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,7 +70,7 @@ def arm_joints(robot: Robot) -> list[Joint]:
         kind = element.get("type")
         axis = np.array((1.0, 0.0, 0.0))
         if kind != "fixed":
-            axis = np.array(_numbers(element.find("axis"), "xyz", tuple(axis)))
+            axis = np.array(_numbers(element.find("axis"), "xyz", axis))
         matrix = _origin(element)
         joint, multiplier, offset = follows.get(index, (None, 0.0, held.get(index, 0.0)))
         described.append(
@@ -215,10 +216,10 @@ def _link_name(joint, kind):
     return joint.find(kind).get("link")
 
 
-def _numbers(element, name, default=None):
+def _numbers(element, name: str, default: Sequence[float] = ()) -> tuple[float, ...]:
     """The numbers of an attribute."""
     if element is None or element.get(name) is None:
-        return default
+        return tuple(default)
     return tuple(float(part) for part in element.get(name).split())
 
 

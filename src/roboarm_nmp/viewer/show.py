@@ -158,12 +158,12 @@ def _show(args: Args):
     if episodes.note:
         print(f"{task}: {episodes.note}: random queries of seed {args.seed}")
     if args.output is not None and args.output.suffix.lower() == ".png":
-        _draw(args, episodes, arguments["goal_type"])
+        _draw(args, args.output, episodes, arguments["goal_type"])
     else:
         _animate(args, episodes, policy, arguments)
 
 
-def _draw(args: Args, episodes: Episodes, goal_type: str):
+def _draw(args: Args, output: Path, episodes: Episodes, goal_type: str):
     """Write an image of queries, side by side."""
     split, last = episodes.split(args.split), args.query + args.draws - 1
     episodes.find(split, last)
@@ -182,9 +182,9 @@ def _draw(args: Args, episodes: Episodes, goal_type: str):
         grid.paste(Image.fromarray(image), (i % columns * width, i // columns * height))
     contents = io.BytesIO()
     grid.save(contents, "PNG", optimize=True)
-    write_atomically(args.output, contents.getbuffer())
+    write_atomically(output, contents.getbuffer())
     until = f" to {last}" if args.draws > 1 else ""
-    print(f"{args.output}: written, {args.task}, {episodes.label(split, args.query)}{until}")
+    print(f"{output}: written, {args.task}, {episodes.label(split, args.query)}{until}")
 
 
 def _animate(args: Args, episodes: Episodes, policy, arguments: dict):
@@ -217,7 +217,7 @@ def _animate(args: Args, episodes: Episodes, policy, arguments: dict):
             seconds = [*np.diff(steps) * STEP_SECONDS, PAUSE]
             save_animation(args.output, frames, seconds)
             print(f"{args.output}: written, {args.task}, {outcome}")
-    if args.save_trajectory is not None:
+    if args.save_trajectory is not None and trajectory is not None:
         save_trajectory(args.save_trajectory, trajectory)
         what = "the trajectory" if args.output is not None else f"{args.task}, {outcome}"
         print(f"{args.save_trajectory}: written, {what}")
