@@ -12,20 +12,21 @@ import contextlib
 import math
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.format import QueryScenes
+from roboarm_nmp.datasets.problem_formats import Problem
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import Query, load_queries, validate
-from roboarm_nmp.envs.arm_env import deviations
+from roboarm_nmp.envs.arm_env import RoboArmEnv, deviations
 from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
@@ -44,9 +45,11 @@ from roboarm_nmp.policies.baselines import (
     SPACE_TIME,
     TIME_LIMIT,
     TRIES,
+    Policy,
 )
 from roboarm_nmp.policies.pose_goals import goal_configuration
 from roboarm_nmp.policies.registry import (
+    BeginEpisode,
     filter_around,
     find_policy,
     make_policy,
@@ -90,13 +93,13 @@ class EvaluationOptions:
         geometry_source: where `planner`, `via-points`, the safety filter and the policy's
             observations take the obstacles from (`envs.perception.geometry_source`); None for the
             policy's own, otherwise `ground_truth`.
-        safety_filter: an `policies.safety_filter.SafetyFilter` around the policy; None for the
-            one that the policy includes, if any; False for none.
+        safety_filter: a `policies.safety_filter.SafetyFilter` around the policy; None for the one
+            that the policy includes, if any; False for none.
         replan: whenever the policy is stuck, follow a plan for a while
             (`policies.replanning.ReplanWhenStuck`), among the geometry source's obstacles.
         observe_every: steps from one observation of the scene to the next; None: static scenes are
             observed once (`envs.wrappers.ObservedSceneWrapper`).
-        sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
+        sensor_noise: a `envs.perception.noise.SensorNoise`; None for none.
         action_delay: steps after which an action takes effect; 0: the simulation waits for the
             policy (`evaluation.rollout.rollout`).
         real_time: instead of `action_delay`, as many steps as an action, or a plan, takes to
@@ -137,8 +140,10 @@ class EvaluationOptions:
             if getattr(self, name) < 1:
                 raise EvaluationError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not isinstance(self.action_delay, int | np.integer) or self.action_delay < 0:
-            steps = "steps: a whole number, not negative"
-            raise EvaluationError(f"action_delay must be {steps}, got {self.action_delay!r}")
+            raise EvaluationError(
+                "action_delay must be steps: a whole number, not negative, got "
+                f"{self.action_delay!r}"
+            )
         if self.action_delay and self.real_time:
             raise EvaluationError("action_delay and real_time: give one of them")
         if not 0 < self.time_limit < math.inf:
@@ -147,7 +152,13 @@ class EvaluationOptions:
             )
 
 
-def evaluate(policy, task=None, *, progress=False, **options):
+def evaluate(
+    policy: str | Path | Policy,
+    task: str | Path | None = None,
+    *,
+    progress: bool = False,
+    **options: Any,
+) -> dict[str, Any]:
     """Run a policy on a task's queries.
 
     Args:
@@ -179,7 +190,7 @@ def evaluate(policy, task=None, *, progress=False, **options):
           `action_delay` (steps, or `real_time`), `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles;
-        - `observe_every`, `sensor_noise` (a dict), where they were given.
+        - `replan`, `observe_every`, `sensor_noise` (a dict), where they were given.
 
     Raises:
         EvaluationError: the policy, the task or the queries cannot be used.
@@ -188,7 +199,9 @@ def evaluate(policy, task=None, *, progress=False, **options):
     return _summary(job, _run(job, progress))
 
 
-def first_episode_image(policy, task=None, frames=8, **options):
+def first_episode_image(
+    policy: str | Path | Policy, task: str | Path | None = None, frames: int = 8, **options: Any
+) -> np.ndarray:
     """The first query's episode as an image strip, uint8 (height, frames * width, 3).
 
     Arguments and errors as for `evaluate`. Short episodes have fewer frames.
@@ -197,26 +210,28 @@ def first_episode_image(policy, task=None, frames=8, **options):
     env, begin = job.make(render_mode="rgb_array")
     query = job.query(0)
     actions = rollout(env, query, begin(0, query).act, job.delay).actions
-    steps = np.linspace(0, len(actions), frames).round().astype(int)
-    image = render_strip(env, query, actions, sorted(set(steps.tolist())))
+    steps = np.unique(np.linspace(0, len(actions), frames).round().astype(int)).tolist()
+    image = render_strip(env, query, actions, steps)
     env.close()
     return image
 
 
-def is_privileged(env_arguments):
+def is_privileged(env_arguments: dict[str, Any]) -> bool:
     """Whether observations contain ground-truth obstacles.
 
     Args:
         env_arguments: dict of arguments of `envs.make`.
     """
-    distances = env_arguments.get("link_distances") and env_arguments.get("geometry_source")
-    return env_arguments.get("encoder") == ORACLE or distances == GROUND_TRUTH
+    if env_arguments.get("encoder") == ORACLE:
+        return True
+    has_distances = bool(env_arguments.get("link_distances"))
+    return has_distances and env_arguments.get("geometry_source") == GROUND_TRUTH
 
 
 # --- Metrics
 
 
-def wilson_interval(successes, n):
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     """The 95% Wilson score interval (low, high) of a share, for `successes` out of `n` >= 1."""
     z = 1.959964
     share = successes / n
@@ -238,68 +253,89 @@ class _Job:
     there are `start`, `goal` and `scenes`. `problems` is as in the result.
     """
 
-    policy: str | Path | Callable
+    policy: str | Path | Policy
     task: str
     options: EvaluationOptions
     start: np.ndarray
     goal: np.ndarray
     scenes: Sequence[Scene]
-    problems: dict | None = None
+    problems: dict[str, str] | None = None
 
-    def make(self, **kwargs):
+    def make(self, render_mode: str | None = None) -> tuple[RoboArmEnv, BeginEpisode]:
         """The environment, and the policy in it as `make_policy` returns it."""
-        o = self.options
-        kwargs |= {"observe_every": o.observe_every, "sensor_noise": o.sensor_noise}
-        env = envs.make(self.task, **o.env, **kwargs)
-        source, safety_filter = o.geometry_source or GROUND_TRUTH, o.safety_filter or False
-        options = o.seed, o.tries, o.time_limit, source, safety_filter
-        return env, make_policy(self.policy, env, *options, replan=o.replan)
+        options = self.options
+        env = envs.make(
+            self.task,
+            **options.env,
+            observe_every=options.observe_every,
+            sensor_noise=options.sensor_noise,
+            render_mode=render_mode,
+        )
+        begin = make_policy(
+            self.policy,
+            env,
+            seed=options.seed,
+            tries=options.tries,
+            time_limit=options.time_limit,
+            geometry_source=options.geometry_source or GROUND_TRUTH,
+            safety_filter=options.safety_filter or False,
+            replan=options.replan,
+        )
+        return env, begin
 
     @property
-    def delay(self):
+    def delay(self) -> int | str:
         """As of `rollout`."""
         return REAL_TIME if self.options.real_time else self.options.action_delay
 
-    def query(self, index):
+    def query(self, index: int) -> Query:
         return Query(self.start[index], self.goal[index], self.scenes[index])
 
 
-def _prepare(policy, task, options):
+def _prepare(policy, task, options: EvaluationOptions) -> _Job:
     """The `_Job` of an evaluation, once all of its arguments have been checked."""
     try:
-        if task is not None:
-            get_task(task)  # or it raises
-        if not callable(policy):
-            policy, trained = find_policy(policy)
-            task = own_task(policy) if task is None else task
-            own = trained.get("goal_type")
-            by_kinematics = (
-                options.goal_type == "pose" and trained and GOAL_TYPES[own].has_configuration
-            )
-            if trained and options.goal_type not in (None, own) and not by_kinematics:
-                raise EvaluationError(
-                    f"{policy} was trained with the goal type {trained['goal_type']!r}, it cannot "
-                    f"be evaluated with {options.goal_type!r}"
-                )
-            options = replace(options, env=trained or options.env)
-        problems = None
-        if options.problems is not None:
-            task = "no_obstacles" if task is None else task
-            options, problems = _with_problems(task, options)
-        if task is None:
-            name = getattr(policy, "__name__", policy)
-            raise EvaluationError(f"{name} has no task of its own: choose one (--task)")
-        queries, scenes = _queries(task, options)
-        file = str(options.queries) if isinstance(options.queries, (str, Path)) else None
-        options = replace(
-            _in_use(policy, options), queries=file, split=getattr(queries, "split", None)
-        )
-        start, goal = queries.start[: options.num_queries], queries.goal[: options.num_queries]
-        job = _Job(policy, str(task), options, start, goal, scenes, problems)
-        job.make()[0].close()  # or it raises
+        job = _make_job(policy, task, options)
+        job.make()[0].close()  # to see whether that raises
     except (TypeError, ValueError) as error:
         raise EvaluationError(str(error)) from error
     return job
+
+
+def _make_job(policy, task, options):
+    if task is not None:
+        get_task(task)  # to see whether that raises
+    if not callable(policy):
+        policy, trained = find_policy(policy)
+        if task is None:
+            task = own_task(policy)
+        own = trained.get("goal_type")
+        by_kinematics = (
+            options.goal_type == "pose" and trained and GOAL_TYPES[own].has_configuration
+        )
+        if trained and options.goal_type not in (None, own) and not by_kinematics:
+            raise EvaluationError(
+                f"{policy} was trained with the goal type {own!r}, it cannot be evaluated with "
+                f"{options.goal_type!r}"
+            )
+        options = replace(options, env=trained or options.env)
+    problems = None
+    if options.problems is not None:
+        if task is None:
+            task = "no_obstacles"
+        options, problems = _with_problems(task, options)
+    if task is None:
+        name = getattr(policy, "__name__", policy)
+        raise EvaluationError(f"{name} has no task of its own: choose one (--task)")
+    queries, scenes = _queries(task, options)
+    options = replace(
+        _in_use(policy, options),
+        queries=str(options.queries) if isinstance(options.queries, (str, Path)) else None,
+        split=getattr(queries, "split", None),
+    )
+    start = queries.start[: options.num_queries]
+    goal = queries.goal[: options.num_queries]
+    return _Job(policy, str(task), options, start, goal, scenes, problems)
 
 
 def _with_problems(task, options):
@@ -314,12 +350,12 @@ def _with_problems(task, options):
             f"{len(problems.rejected)} problems cannot be used: {problems.rejected[0].reason}; "
             f"`roboarm import` writes a file of the others"
         )
-    problems = replace(problems, all=tuple(_with_one_goal(one) for one in problems.all))
-    said = {"file": Path(options.problems).name, "sha256": problems.digest}
-    return replace(options, queries=problems), said
+    with_one_goal = tuple(_with_one_goal(problem) for problem in problems.all)
+    options = replace(options, queries=replace(problems, all=with_one_goal))
+    return options, {"file": Path(options.problems).name, "sha256": problems.digest}
 
 
-def _with_one_goal(problem):
+def _with_one_goal(problem: Problem) -> Problem:
     """A problem with a single goal configuration; one of several, or of its goal pose.
 
     Ground-truth obstacles decide which are free, as they decide where episodes may begin.
@@ -345,20 +381,22 @@ def _with_one_goal(problem):
 
 def _in_use(policy, options):
     """The options with environment, safety filter and geometry source as they will be used."""
-    env, safety_filter = dict(options.env or {}), options.safety_filter
+    env = dict(options.env or {})
     env["goal_type"] = options.goal_type or env.get("goal_type", "ee")
     env["stop_on_collision"] = options.stop_on_collision
     if options.replan and policy == REPLANNING:
         raise EvaluationError("replan: replanning plans again by itself")
+    safety_filter = options.safety_filter
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
     safety_filter = filter_around(policy, safety_filter, options.replan)
     if safety_filter:
         env["link_distances"] = True
+    encoder = env.get("encoder")
     source = options.geometry_source or env.get("geometry_source")
     if env.get("link_distances"):
         source = env["geometry_source"] = source or GROUND_TRUTH
-    elif env.get("encoder") == POINT_CLOUD and source != GROUND_TRUTH:
+    elif encoder == POINT_CLOUD and source != GROUND_TRUTH:
         source = env["geometry_source"] = source or POINT_CLOUD
     elif policy in CHECKING or options.replan:
         source = source or GROUND_TRUTH
@@ -367,13 +405,13 @@ def _in_use(policy, options):
             "geometry_source is for via-points, planner, a safety filter, replanning, and policies "
             "that observe points or link distances"
         )
-    noise = options.sensor_noise
-    if (source is None and env.get("encoder") is None) or policy == SPACE_TIME:
+    if policy == SPACE_TIME or (source is None and encoder is None):
         for name in ("observe_every", "sensor_noise"):
             if getattr(options, name) is not None:
                 raise EvaluationError(f"{name}: this policy observes nothing of the scene")
-    unseen = (None, GROUND_TRUTH), (None, ORACLE)
-    if noise and noise.changes_images and source in unseen[0] and env.get("encoder") in unseen[1]:
+    noise = options.sensor_noise
+    uses_sensors = source not in (None, GROUND_TRUTH) or encoder not in (None, ORACLE)
+    if noise is not None and noise.changes_images and not uses_sensors:
         raise EvaluationError(
             "sensor_noise: nothing is observed by sensors; choose the geometry source point_cloud, "
             "or a policy that receives an encoded scene"
@@ -410,37 +448,21 @@ MOTION_METRICS = (
     *("ee_path_length", "ee_rotation", "duration", "mean_jerk", "max_jerk", "sparc", "ee_sparc"),
     "min_clearance",
 )
-
-
-class _Outcome(NamedTuple):
-    """The result of one episode; lengths are NaN where the goal was not reached.
-
-    `plan_found`: see `EpisodePolicy`. `motion`: the `MOTION_METRICS`, likewise. `actions`: how many
-    the policy chose, fewer than there are steps where these are delayed.
-    """
-
-    success: bool
-    collision: bool
-    steps: int
-    path_length: float
-    smoothness: float
-    motion: tuple[float, ...]
-    actions: int
-    policy_seconds: float
-    planning_seconds: float
-    plan_found: bool | None
+LENGTHS = ("mean_steps", "path_length", "smoothness", *MOTION_METRICS)
+Outcome = dict[str, float]
+"""Of an episode: its success, contact and times, and if it was successful its `LENGTHS`."""
 
 
 class _Worker:
     """Runs the queries of a job, chunk by chunk."""
 
-    def __init__(self, job):
+    def __init__(self, job: _Job):
         torch.set_num_threads(1)
         self.job = job
         self.env, self.begin = job.make()
 
-    def __call__(self, indices):
-        """`indices`, a range, and their outcomes."""
+    def __call__(self, indices: range) -> tuple[range, list[Outcome]]:
+        """`indices`, and their outcomes."""
         outcomes = []
         for index in indices:
             try:
@@ -454,7 +476,7 @@ class _Worker:
         began = time.perf_counter()
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
-        actions = 0
+        actions = 0  # fewer than there are steps where they are delayed
 
         def counted(observation):
             nonlocal actions
@@ -463,22 +485,21 @@ class _Worker:
 
         policy = counted if act else None
         trajectory = rollout(self.env, query, policy, self.job.delay, planning_seconds)
-        lengths = [np.nan, np.nan, (np.nan,) * len(MOTION_METRICS)]
+        outcome = {
+            "success": trajectory.success,
+            "collision": trajectory.collides,
+            "actions": actions,
+            "policy_seconds": float(trajectory.times.sum()),
+            "planning_seconds": planning_seconds,
+            "plan_found": bool(plan_found),
+        }
         if trajectory.success:
-            configurations = trajectory.configurations
+            outcome["mean_steps"] = len(trajectory)
+            outcome["path_length"] = path_length(trajectory.configurations)
+            outcome["smoothness"] = smoothness(trajectory.configurations)
             motion = motion_metrics(trajectory, self._checker(query.scene, len(trajectory)))
-            lengths = [path_length(configurations), smoothness(configurations)]
-            lengths.append(tuple(motion[name] for name in MOTION_METRICS))
-        return _Outcome(
-            trajectory.success,
-            trajectory.collides,
-            len(trajectory),
-            *lengths,
-            actions,
-            float(trajectory.times.sum()),
-            planning_seconds,
-            plan_found,
-        )
+            outcome.update((name, motion[name]) for name in MOTION_METRICS)
+        return outcome
 
     def _checker(self, scene, steps):
         """For the clearance in an episode; None where it is not measured."""
@@ -492,27 +513,28 @@ class _Worker:
         return [CollisionChecker(scene.at(step * STEP_SECONDS)) for step in range(steps + 1)]
 
 
-def _run(job, progress):
+def _run(job: _Job, progress: bool) -> list[Outcome]:
     """The outcomes of all queries, in their order."""
     count = len(job.start)
     chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
-    outcomes, successes = [None] * count, 0
+    outcomes = {}
+    successes = 0
     bar = progress_bar(total=count, unit="query", disable=not progress)
     threads = torch.get_num_threads()
     try:
         with bar, contextlib.closing(_results(job, chunks)) as results:
             for indices, chunk in results:
-                outcomes[indices.start : indices.stop] = chunk
-                successes += sum(outcome.success for outcome in chunk)
+                outcomes.update(zip(indices, chunk, strict=True))
+                successes += sum(outcome["success"] for outcome in chunk)
                 bar.update(len(chunk))
                 if bar.n:  # 0 if no bar is shown
                     bar.set_postfix(success=f"{successes / bar.n:.3f}")
     finally:
         torch.set_num_threads(threads)
-    return outcomes
+    return [outcomes[index] for index in range(count)]
 
 
-def _results(job, chunks):
+def _results(job, chunks) -> Iterator[tuple[range, list[Outcome]]]:
     """Yield the chunks and their outcomes, in any order."""
     count = min(job.options.workers, len(chunks))
     if count == 1:
@@ -524,69 +546,73 @@ def _results(job, chunks):
 # --- The result
 
 
-def _summary(job, outcomes):
-    options, count = job.options, len(outcomes)
-    columns = _Outcome(*(np.array(column) for column in zip(*outcomes, strict=True)))
-    reached = columns.success
-    actions = int(columns.actions.sum())
-
-    def share(name, hits):
-        low, high = wilson_interval(int(hits.sum()), count)
-        return {name: float(hits.mean()), f"{name}_interval": [low, high]}
-
-    def mean(values, which=reached):
-        return float(values[which].mean()) if which.any() else None
-
-    motion = np.array(columns.motion, dtype=np.float64).T
-    motion = dict(zip(MOTION_METRICS, map(mean, motion), strict=True))
-    if not options.measure_clearance:
-        motion["min_clearance"] = None
-    plans, safety_filter = job.policy in PLANNERS, options.safety_filter
-    planning = {"planning_seconds": None, "planning_seconds_solved": None, "free_motion_rate": None}
-    if plans:
-        found = columns.plan_found.astype(bool)
-        planning["planning_seconds"] = float(columns.planning_seconds.mean())
-        planning["planning_seconds_solved"] = mean(columns.planning_seconds, found)
-        if job.policy == "via-points":
-            planning["free_motion_rate"] = float(found.mean())
-    checks = job.policy in CHECKING or options.replan
-    random = checks or job.policy == "random" or safety_filter
-    packages = ["pybullet", "torch", "numpy"] + ["ompl"] * (job.policy in OMPL_PLANNERS)
-    return {
-        "policy": getattr(job.policy, "__name__", str(job.policy)),
+def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
+    options = job.options
+    policy = job.policy
+    count = len(outcomes)
+    reached = [outcome for outcome in outcomes if outcome["success"]]
+    checks = policy in CHECKING or options.replan
+    is_random = checks or policy == "random" or options.safety_filter
+    result = {
+        "policy": getattr(policy, "__name__", str(policy)),
         "task": None if job.problems else job.task,
         "robot": get_task(job.task).base_scene.robot.name,
         "goal_type": options.env["goal_type"],
         "split": options.split,
         "queries": options.queries,
-        **({"problems": job.problems} if job.problems else {}),
-        "num_queries": count,
-        **share("success_rate", reached),
-        **share("collision_free_success_rate", reached & ~columns.collision),
-        **share("collision_rate", columns.collision),
-        "mean_steps": mean(columns.steps),
-        "path_length": mean(columns.path_length),
-        "smoothness": mean(columns.smoothness),
-        **motion,
-        "ms_per_action": 1e3 * float(columns.policy_seconds.sum()) / actions if actions else None,
-        **planning,
+    }
+    if job.problems:
+        result["problems"] = job.problems
+    result["num_queries"] = count
+    for name, hits in (
+        ("success_rate", len(reached)),
+        ("collision_free_success_rate", sum(not outcome["collision"] for outcome in reached)),
+        ("collision_rate", sum(outcome["collision"] for outcome in outcomes)),
+    ):
+        result[name] = hits / count
+        result[f"{name}_interval"] = list(wilson_interval(hits, count))
+    for name in LENGTHS:
+        is_measured = options.measure_clearance or name != "min_clearance"
+        result[name] = _mean(reached, name) if is_measured else None
+    actions = sum(outcome["actions"] for outcome in outcomes)
+    seconds = sum(outcome["policy_seconds"] for outcome in outcomes)
+    result["ms_per_action"] = 1e3 * seconds / actions if actions else None
+    result |= dict.fromkeys(("planning_seconds", "planning_seconds_solved", "free_motion_rate"))
+    if policy in PLANNERS:
+        solved = [outcome for outcome in outcomes if outcome["plan_found"]]
+        result["planning_seconds"] = _mean(outcomes, "planning_seconds")
+        result["planning_seconds_solved"] = _mean(solved, "planning_seconds")
+        if policy == "via-points":
+            result["free_motion_rate"] = len(solved) / count
+    packages = ["pybullet", "torch", "numpy"]
+    if policy in OMPL_PLANNERS:
+        packages.append("ompl")
+    result |= {
         "env": options.env,
         "deviations": deviations(options.env),
         "geometry_source": options.geometry_source,
-        **({"observe_every": options.observe_every} if options.observe_every else {}),
-        **({"sensor_noise": options.sensor_noise.to_metadata()} if options.sensor_noise else {}),
         "privileged": is_privileged(options.env)
         or (checks and options.geometry_source == GROUND_TRUTH),
-        **({"replan": True} if options.replan else {}),
-        "safety_filter": safety_filter.to_metadata() | {"version": VERSION}
-        if safety_filter
-        else None,
-        "seed": options.seed if random else None,
-        "tries": options.tries if job.policy == "via-points" else None,
-        "time_limit": options.time_limit if job.policy in OMPL_PLANNERS else None,
+        "safety_filter": None,
+        "seed": options.seed if is_random else None,
+        "tries": options.tries if policy == "via-points" else None,
+        "time_limit": options.time_limit if policy in OMPL_PLANNERS else None,
         "action_delay": job.delay,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: version(name) for name in packages},
-        },
+        "versions": {"python": platform.python_version()},
     }
+    result["versions"].update((package, version(package)) for package in packages)
+    if options.safety_filter:
+        result["safety_filter"] = options.safety_filter.to_metadata() | {"version": VERSION}
+    if options.observe_every:
+        result["observe_every"] = options.observe_every
+    if options.sensor_noise:
+        result["sensor_noise"] = options.sensor_noise.to_metadata()
+    if options.replan:
+        result["replan"] = True
+    return result
+
+
+def _mean(outcomes, name):
+    """The mean of a number in outcomes; None where there are none."""
+    values = np.array([outcome[name] for outcome in outcomes], dtype=np.float64)
+    return float(values.mean()) if len(values) else None

@@ -1,53 +1,56 @@
 """The result of an evaluation as text: a header with its settings, and a line per number."""
 
+from typing import Any
+
 from roboarm_nmp.envs.arm_env import STANDARD_RULES
 from roboarm_nmp.envs.robots.panda import PANDA
 
+NUMBERS = (
+    ("mean steps", "mean_steps", "of successful episodes"),
+    ("path length", "path_length", "rad"),
+    ("smoothness", "smoothness", "rad/step^2"),
+    ("end effector's path", "ee_path_length", "m"),
+    ("duration", "duration", "s"),
+    ("mean jerk", "mean_jerk", "rad/s^3"),
+    ("smallest clearance", "min_clearance", "m"),
+    ("time per action", "ms_per_action", "ms"),
+    ("planning time", "planning_seconds", "s"),
+    ("  ... if found", "planning_seconds_solved", "s"),
+)
+"""Lines of the text: label, name in the result, and unit."""
 
-def report(result):
+
+def report(result: dict[str, Any]) -> str:
     """The text that `roboarm evaluate` prints of a result (dict) of `evaluation.evaluate`.
 
     docs/guide/evaluation.md describes its lines.
     """
-
-    def row(name, value, unit="", interval=None):
-        number = "-" if value is None else f"{value:.4g}" if unit else f"{value:.4f}"
-        between = f"[{interval[0]:.4f}, {interval[1]:.4f}]" if interval else unit
-        return f"  {name:<24}{number:>9}  {between}"
-
-    count, split = f"{result['num_queries']:,}", result["split"]
-    lines = [f"{result['policy']} on {result['task']}: {count} {split} queries"]
+    count = f"{result['num_queries']:,}"
+    lines = [f"{result['policy']} on {result['task']}: {count} {result['split']} queries"]
     if problems := result.get("problems"):
         lines = [f"{result['policy']} on {problems['file']}: {count} problems"]
-    settings = _settings(result)
-    lines += [f"  {name:<24}{value}" for name, value in settings.items() if value is not None]
-    lines += [
-        f"  not comparable: {name} is {value}, not {STANDARD_RULES[name]}"
-        for name, value in result["deviations"].items()
-    ]
+    for name, value in _settings(result).items():
+        if value is not None:
+            lines.append(f"  {name:<24}{value}")
+    for name, value in result["deviations"].items():
+        lines.append(f"  not comparable: {name} is {value}, not {STANDARD_RULES[name]}")
     for label, name in (
         ("success", "success_rate"),
         ("collision-free success", "collision_free_success_rate"),
         ("collision", "collision_rate"),
     ):
-        lines.append(row(label, result[name], interval=result[f"{name}_interval"]))
-    lines += [
-        row("mean steps", result["mean_steps"], "of successful episodes"),
-        row("path length", result["path_length"], "rad"),
-        row("smoothness", result["smoothness"], "rad/step^2"),
-        row("end effector's path", result["ee_path_length"], "m"),
-        row("duration", result["duration"], "s"),
-        row("mean jerk", result["mean_jerk"], "rad/s^3"),
-    ]
-    if result["min_clearance"] is not None:
-        lines.append(row("smallest clearance", result["min_clearance"], "m"))
-    lines.append(row("time per action", result["ms_per_action"], "ms"))
-    if result["planning_seconds"] is not None:
-        lines += [
-            row("planning time", result["planning_seconds"], "s"),
-            row("  ... if found", result["planning_seconds_solved"], "s"),
-        ]
-    lines += [row("free motion", result["free_motion_rate"])] * (result["tries"] is not None)
+        low, high = result[f"{name}_interval"]
+        lines.append(f"  {label:<24}{result[name]:>9.4f}  [{low:.4f}, {high:.4f}]")
+    for label, name, unit in NUMBERS:
+        if name.startswith("planning") and result["planning_seconds"] is None:
+            continue
+        value = result[name]
+        if name == "min_clearance" and value is None:
+            continue
+        number = "-" if value is None else f"{value:.4g}"
+        lines.append(f"  {label:<24}{number:>9}  {unit}")
+    if result["free_motion_rate"] is not None:
+        lines.append(f"  {'free motion':<24}{result['free_motion_rate']:>9.4f}  ")
     return "\n".join(lines)
 
 
@@ -55,18 +58,13 @@ def _settings(result):
     """What distinguishes this evaluation from others, in words; None where a policy lacks it."""
     from roboarm_nmp.envs.perception.point_clouds import NUM_POINTS
 
-    env, safety_filter = result["env"], result["safety_filter"]
-    encoder, margin = env.get("encoder") or "none", "none"
+    env = result["env"]
+    encoder = env.get("encoder") or "none"
     if encoder == "point_cloud":
         encoder += f", {env.get('num_points', NUM_POINTS)} points"
-    if safety_filter is not None:
-        escape = "escapes local minima" if safety_filter["escape"] else "no escape"
-        margin = f"margin {safety_filter['margin']:g} m, {escape}"
-        margin += ", approach paths" * ("approach" in safety_filter)
-        if "lookahead" in safety_filter:
-            ahead = safety_filter["lookahead"]
-            margin += ", no obstacle velocities" if ahead is None else f", {ahead:g} s ahead"
-    limit, noise = result["time_limit"], result.get("sensor_noise", {})
+    noise = result.get("sensor_noise", {})
+    observe_every = result.get("observe_every")
+    limit = result["time_limit"]
     return {
         "robot": None if result["robot"] == PANDA.name else result["robot"],
         "queries": result["queries"],
@@ -74,15 +72,29 @@ def _settings(result):
         "encoder": encoder,
         "geometry source": result["geometry_source"] or "none",
         "privileged": "yes" if result["privileged"] else None,
-        "safety filter": margin,
+        "safety filter": _safety_filter(result["safety_filter"]),
         "replans": "when stuck" if result.get("replan") else None,
-        "observed every": f"{result['observe_every']} steps" if "observe_every" in result else None,
+        "observed every": f"{observe_every} steps" if observe_every else None,
         "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",
         "tries": result["tries"],
         "action delay": _delay(result["action_delay"]),
         "seed": result["seed"],
     }
+
+
+def _safety_filter(options):
+    """The filter's options in words."""
+    if options is None:
+        return "none"
+    words = [f"margin {options['margin']:g} m"]
+    words.append("escapes local minima" if options["escape"] else "no escape")
+    if options.get("approach"):
+        words.append("approach paths")
+    if "lookahead" in options:
+        ahead = options["lookahead"]
+        words.append("no obstacle velocities" if ahead is None else f"{ahead:g} s ahead")
+    return ", ".join(words)
 
 
 def _delay(steps):

@@ -17,10 +17,10 @@ from typing import TypeVar
 import numpy as np
 
 from roboarm_nmp.datasets.queries import Query
-from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.motions.trajectories import Trajectory
-from roboarm_nmp.policies.baselines import Observation, Policy
+from roboarm_nmp.policies.baselines import Policy
 
 AnyPolicy = TypeVar("AnyPolicy", bound=Policy)
 REAL_TIME = "real_time"
@@ -184,7 +184,9 @@ def rollouts(
             yield episode.trajectory()
 
 
-def render_strip(env, query, actions, steps):
+def render_strip(
+    env: RoboArmEnv, query: Query, actions: np.ndarray, steps: Sequence[int]
+) -> np.ndarray:
     """Images of an episode side by side, uint8 (h, n * w, 3). The episode is replayed, exactly.
 
     Args:

@@ -22,13 +22,21 @@ the present step. `space-time` always has the ground truth, the future included.
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from roboarm_nmp.datasets.queries import Query
+from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv
 from roboarm_nmp.envs.goals import GOAL_TYPES
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.policies.pose_goals import goal_configuration, observed_at_start
+
+if TYPE_CHECKING:  # Numba takes a while to import
+    from roboarm_nmp.envs.collision.checker import CollisionChecker
 
 SPACE_TIME = "space-time"
 OMPL_PLANNERS = ("planner", SPACE_TIME)
@@ -42,11 +50,8 @@ BASELINES = ("go-to-goal", "random", *CHECKING)
 TRIES = 16  # of `via-points`, by default
 TIME_LIMIT = 5.0  # s, of `planner`, by default
 
-
-Observation = dict[str, np.ndarray]
-"""An observation of `RoboArmEnv`."""
 Policy = Callable[[Observation], np.ndarray]
-"""A policy in one episode: from an observation to an action (n,)."""
+"""A policy in one episode: a function from an observation to an action (n,)."""
 
 
 class EpisodePolicy(NamedTuple):
@@ -60,23 +65,38 @@ class EpisodePolicy(NamedTuple):
     plan_found: bool | None = None
 
 
-def make_baseline(name, env, seed, tries, time_limit, geometry_source):
-    """A baseline in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
+BeginEpisode = Callable[[int, Query], EpisodePolicy]
+"""A policy in an environment: a function that is called with a query and its number, once per
+episode, before the environment's reset to the query."""
+GeometrySource = Callable[[Scene], "CollisionChecker"]
+
+
+def make_baseline(
+    name: str,
+    env: RoboArmEnv,
+    seed: int,
+    tries: int,
+    time_limit: float,
+    geometry_source: str | Path,
+) -> BeginEpisode:
+    """A baseline in an environment.
 
     Args:
         name: one of `BASELINES`.
         env, seed, tries, time_limit, geometry_source: see `policies.registry.make_policy`.
 
     Raises:
-        ValueError: the environment's actions are not displacements, there is no such geometry
-            source, or `planner` lacks OMPL.
+        ValueError: the environment's actions are not displacements, or there is no such geometry
+            source.
     """
     robot = env.robot
     if name == "random":
-        joints = robot.num_joints
-        return lambda number, query: EpisodePolicy(
-            _random(np.random.default_rng([seed, number]), joints)
-        )
+
+        def begin_random(number, query):
+            rng = np.random.default_rng([seed, number])
+            return EpisodePolicy(lambda observation: rng.uniform(-1.0, 1.0, robot.num_joints))
+
+        return begin_random
     if env.action_mode != "relative":
         raise ValueError(f"{name} gives displacements, not actions of mode {env.action_mode!r}")
     if name == "go-to-goal":
@@ -99,14 +119,6 @@ def make_baseline(name, env, seed, tries, time_limit, geometry_source):
     return _planner(env, seed, time_limit, source)
 
 
-def check_ompl(name):
-    """Raise ValueError unless OMPL, which the baseline `name` needs, can be imported."""
-    try:
-        import ompl  # noqa: F401
-    except ImportError as error:
-        raise ValueError(f"the policy {name} needs OMPL: {error}") from error
-
-
 def _goal(env, query, checker=None):
     """The goal's configuration (n,), rad; None if the goal is a pose, and there is none."""
     if env.goal_type != "pose":
@@ -121,21 +133,18 @@ def _go_to_goal(goal, robot, observes_goal=False):
     target = robot.normalise(goal)
 
     def act(observation):
-        state, to = observation["observation"][: len(target)], target
+        desired = target
         if observes_goal:
-            observed = observation["desired_goal"][: len(target)]
             # It is another one where an approach path begins (`planning.approach_path`).
-            to = target if np.abs(observed - target).max() < 1e-5 else observed
-        return to - state
+            observed = observation["desired_goal"][: len(target)]
+            if np.abs(observed - target).max() >= 1e-5:
+                desired = observed
+        return desired - observation["observation"][: len(target)]
 
     return act
 
 
-def _random(rng, num_joints):
-    return lambda observation: rng.uniform(-1.0, 1.0, num_joints)
-
-
-def _via_points(env, seed, tries, geometry_source):
+def _via_points(env: RoboArmEnv, seed: int, tries: int, geometry_source: GeometrySource):
     robot = env.robot
 
     # Without a margin, which would reject more than it saves: with 3 mm, collision-free success was
@@ -149,9 +158,8 @@ def _via_points(env, seed, tries, geometry_source):
         start, goal = np.clip(robot.normalise([query.start, configuration]), -1.0, 1.0)
         if checker.is_motion_free(start, goal):
             return EpisodePolicy(_go_to_goal(configuration, robot), plan_found=True)
-        for via in np.random.default_rng([seed, number]).uniform(
-            -1.0, 1.0, (tries, robot.num_joints)
-        ):
+        rng = np.random.default_rng([seed, number])
+        for via in rng.uniform(-1.0, 1.0, (tries, robot.num_joints)):
             if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
                 path = robot.denormalise(np.stack([start, via, goal]))
                 return EpisodePolicy(_follow(path, robot), plan_found=True)
@@ -160,8 +168,8 @@ def _via_points(env, seed, tries, geometry_source):
     return begin
 
 
-def make_replanning(env, seed, geometry_source):
-    """As `make_baseline` of `replanning`; `geometry_source`: a function from a scene."""
+def make_replanning(env: RoboArmEnv, seed: int, geometry_source: GeometrySource) -> BeginEpisode:
+    """The baseline `replanning`; `geometry_source` is a function from a scene to a checker."""
     from roboarm_nmp.envs.wrappers import observed_scene
     from roboarm_nmp.policies.replanning import Replanning
 
@@ -183,24 +191,29 @@ def make_replanning(env, seed, geometry_source):
     return begin
 
 
-def _planner(env, seed, time_limit, geometry_source):
+def _planner(env: RoboArmEnv, seed: int, time_limit: float, geometry_source: GeometrySource):
     from roboarm_nmp.planning.planner import Planner, PlanningError
 
-    scene = None  # that of the query, as it is observed
-    planner = Planner(env, geometry_source=geometry_source)
+    planner_of_scenes = Planner(env, geometry_source=geometry_source)
 
     def begin(number, query):
-        nonlocal planner, scene
-        if (observed := observed_at_start(env, query)) is not query.scene:
+        planner = planner_of_scenes
+        observed = observed_at_start(env, query)
+        if observed is not query.scene:
             # A planner has one checker per scene, but this one is of a single episode.
-            scene = observed
-            planner = Planner(env, geometry_source=lambda _: geometry_source(scene))
-        options, given = {"seed": [seed, number], "time_limit": time_limit}, query
+            planner = Planner(env, geometry_source=lambda _: geometry_source(observed))
+        goal, goal_pose = query.goal, None
         if env.goal_type == "pose":
-            options["goal_pose"] = env.robot.end_effector_pose(query.goal)
-            given = query._replace(goal=None)
+            goal, goal_pose = None, env.robot.end_effector_pose(query.goal)
         try:
-            path = planner.plan(*given, **options)
+            path = planner.plan(
+                query.start,
+                goal,
+                query.scene,
+                seed=[seed, number],
+                time_limit=time_limit,
+                goal_pose=goal_pose,
+            )
         except PlanningError:
             return EpisodePolicy(None, plan_found=False)
         return EpisodePolicy(_follow(path, env.robot), plan_found=True)
@@ -208,7 +221,7 @@ def _planner(env, seed, time_limit, geometry_source):
     return begin
 
 
-def _space_time(env, seed, time_limit):
+def _space_time(env: RoboArmEnv, seed: int, time_limit: float):
     from roboarm_nmp.planning.planner import PlanningError
     from roboarm_nmp.planning.space_time import SpaceTimePlanner
 
@@ -224,8 +237,8 @@ def _space_time(env, seed, time_limit):
     return begin
 
 
-def _follow(path, robot):
+def _follow(path: np.ndarray, robot: Robot) -> Policy:
     """One sub-goal per step along a path (k, n), rad; at its end the goal, repeatedly."""
     targets = subgoals(path, robot)[1:]
-    left = itertools.chain(targets, itertools.repeat(targets[-1]))
-    return lambda observation: next(left) - observation["observation"][: robot.num_joints]
+    remaining = itertools.chain(targets, itertools.repeat(targets[-1]))
+    return lambda observation: next(remaining) - observation["observation"][: robot.num_joints]

@@ -12,9 +12,11 @@ include one. Baselines: `policies.baselines`. Whole episodes: `evaluation.rollou
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.policies.baselines import (
     BASELINES,
@@ -22,13 +24,18 @@ from roboarm_nmp.policies.baselines import (
     REPLANNING,
     TIME_LIMIT,
     TRIES,
+    BeginEpisode,
     EpisodePolicy,
-    check_ompl,
+    Policy,
     make_baseline,
     make_replanning,
 )
 from roboarm_nmp.policies.pose_goals import ConfigurationGoals
 from roboarm_nmp.utils.names import suggest
+
+if TYPE_CHECKING:  # PyTorch and Numba take a while to import
+    from roboarm_nmp.networks.exported_networks import ExportedNetwork
+    from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 # The arguments of an environment that a policy's metadata may contain. Tolerances and horizon are
 # not among them: they define what a success is.
@@ -45,12 +52,12 @@ class PolicyError(ValueError):
     """A policy that cannot be found or used; the message says why."""
 
 
-def pretrained_policies():
+def pretrained_policies() -> dict[str, Path]:
     """The trained policies that come with the project: dict of name -> path."""
     return {path.stem: path for path in sorted(PRETRAINED.glob("*.pt"))}
 
 
-def policy_file(name):
+def policy_file(name: str | Path) -> Path:
     """The path of a trained policy: of a file, a run's folder, or a name of `pretrained_policies`.
 
     Raises PolicyError if it is none of these.
@@ -62,14 +69,16 @@ def policy_file(name):
         return path
     pretrained = pretrained_policies()
     if str(name) not in pretrained:
-        otherwise = f"expected {', '.join(BASELINES)}, a policy network, a folder with a policy.pt "
-        otherwise += "in it, or a name that `roboarm policies` lists"
+        otherwise = (
+            f"expected {', '.join(BASELINES)}, a policy network, a folder with a policy.pt in it, "
+            "or a name that `roboarm policies` lists"
+        )
         hint = suggest(name, [*BASELINES, *pretrained], otherwise)
         raise PolicyError(f"no such policy: {path}: {hint}")
     return pretrained[str(name)]
 
 
-def find_policy(name):
+def find_policy(name: str | Path) -> tuple[str | Path, dict[str, Any]]:
     """The policy as `make_policy` takes it, and the arguments of `envs.make` it was trained with.
 
     Args:
@@ -81,43 +90,46 @@ def find_policy(name):
     """
     if name in OMPL_PLANNERS:
         try:
-            check_ompl(name)
-        except ValueError as error:
-            raise PolicyError(str(error)) from error
+            import ompl  # noqa: F401
+        except ImportError as error:
+            raise PolicyError(f"the policy {name} needs OMPL (docs/install.md): {error}") from error
     if name in BASELINES:
         return name, {}
     path = policy_file(name)
-    return path, _load(path)[1]
+    return path, _load(path).env_arguments
 
 
-def own_safety_filter(policy):
+def own_safety_filter(policy: str | Path | Policy) -> "SafetyFilter | None":
     """The `policies.safety_filter.SafetyFilter` that a policy includes; None without one.
 
     `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
     """
-    return None if callable(policy) or policy in BASELINES else _load(policy)[2]
+    return None if callable(policy) or policy in BASELINES else _load(policy).safety_filter
 
 
-def filter_around(policy, safety_filter, replan=False):
+def filter_around(
+    policy: str | Path | Policy,
+    safety_filter: "SafetyFilter | Literal[False] | None",
+    replan: bool = False,
+) -> "SafetyFilter | Literal[False] | None":
     """A safety filter as it acts around a policy: a policy that replans needs no escapes."""
-    replan = replan or (not callable(policy) and policy == REPLANNING)
-    if safety_filter and replan:
+    if safety_filter and (replan or policy == REPLANNING):
         return replace(safety_filter, escape=False)
     return safety_filter
 
 
-def own_task(policy):
+def own_task(policy: str | Path | Policy) -> str | None:
     """The task that a trained policy was trained on, a name or path; None for other policies.
 
     `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
     """
     if callable(policy) or policy in BASELINES:
         return None
-    task = _load(policy)[0].metadata.get("task")
+    task = _load(policy).network.metadata.get("task")
     return task if isinstance(task, str) else None
 
 
-def recurrent_size(policy):
+def recurrent_size(policy: Any) -> int:
     """The size of a trained policy's recurrent state; 0 for none.
 
     Args:
@@ -140,15 +152,15 @@ def recurrent_size(policy):
 
 
 def make_policy(
-    policy,
-    env,
-    seed=0,
-    tries=TRIES,
-    time_limit=TIME_LIMIT,
-    geometry_source="ground_truth",
-    safety_filter=None,
-    replan=False,
-):
+    policy: str | Path | Policy,
+    env: RoboArmEnv,
+    seed: int = 0,
+    tries: int = TRIES,
+    time_limit: float = TIME_LIMIT,
+    geometry_source: str | Path = "ground_truth",
+    safety_filter: "SafetyFilter | Literal[False] | None" = None,
+    replan: bool = False,
+) -> BeginEpisode:
     """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
 
     It is called once per episode, before the environment's reset to the query: `planner` moves the
@@ -166,7 +178,7 @@ def make_policy(
         time_limit: seconds that `planner` may search per query.
         geometry_source: where `via-points`, `planner` and `replanning` take the obstacles from:
             `ground_truth`, `point_cloud` or an encoder's name (`envs.perception.geometry_source`).
-        safety_filter: an `policies.safety_filter.SafetyFilter` around the policy; None for the
+        safety_filter: a `policies.safety_filter.SafetyFilter` around the policy; None for the
             one that a trained policy includes, if any; False for none. The environment must have
             `link_distances`, whose geometry source is the filter's.
         replan: whenever the policy is stuck, follow a plan for a while
@@ -177,7 +189,7 @@ def make_policy(
     """
     as_observed = None
     if callable(policy):
-        begin = _same(policy)
+        begin = lambda number, query: EpisodePolicy(policy)  # noqa: E731
     elif policy in BASELINES:
         try:
             begin = make_baseline(policy, env, seed, tries, time_limit, geometry_source)
@@ -194,10 +206,6 @@ def make_policy(
     return begin if as_observed is None else _translated(begin, as_observed)
 
 
-def _same(act):
-    return lambda number, query: EpisodePolicy(act)
-
-
 def _filtered(begin, env, seed, safety_filter):
     # Here, because Numba takes a while to import.
     from roboarm_nmp.policies.safety_filter import check_env
@@ -209,8 +217,10 @@ def _filtered(begin, env, seed, safety_filter):
 
     def begin_filtered(number, query):
         act, plan_found = begin(number, query)
-        rng = np.random.default_rng([seed, number])
-        return EpisodePolicy(act and safety_filter.filter_policy(act, env, rng), plan_found)
+        if act is not None:
+            rng = np.random.default_rng([seed, number])
+            act = safety_filter.filter_policy(act, env, rng)
+        return EpisodePolicy(act, plan_found)
 
     return begin_filtered
 
@@ -231,8 +241,10 @@ def _replanned(begin, env, seed, geometry_source):
 
     def begin_replanned(number, query):
         act, plan_found = begin(number, query)
-        replanning, goal = begin_replanning(number, query).act, env.robot.normalise(query.goal)
-        return EpisodePolicy(act and ReplanWhenStuck(act, replanning, goal), plan_found)
+        replanning = begin_replanning(number, query).act
+        if act is not None:
+            act = ReplanWhenStuck(act, replanning, env.robot.normalise(query.goal))
+        return EpisodePolicy(act, plan_found)
 
     return begin_replanned
 
@@ -252,8 +264,16 @@ def _translated(begin, goals):
 # --- Trained policies. PyTorch is imported only here: it takes seconds.
 
 
-def _load(path):
-    """A policy network, the arguments of the environment it was trained in, its safety filter."""
+class _TrainedPolicy(NamedTuple):
+    """A policy network, and what its metadata say."""
+
+    network: "ExportedNetwork"
+    env_arguments: dict[str, Any]
+    safety_filter: "SafetyFilter | None"
+    recurrent_size: int
+
+
+def _load(path: str | Path) -> _TrainedPolicy:
     from roboarm_nmp.networks.exported_networks import load_network
     from roboarm_nmp.networks.operations import NetworkError
     from roboarm_nmp.policies.safety_filter import SafetyFilter
@@ -261,7 +281,7 @@ def _load(path):
     try:
         network = load_network(path)
         safety_filter = SafetyFilter.from_metadata(network.metadata)
-        recurrent_size(network)  # or it raises
+        size = recurrent_size(network)
     except NetworkError as error:
         raise PolicyError(str(error)) from error
     except ValueError as error:
@@ -269,10 +289,10 @@ def _load(path):
     trained = network.metadata.get("env")
     if network.metadata.get("kind") != "policy" or not isinstance(trained, dict):
         raise PolicyError(f"{path}: a network, but not a policy")
-    if "goal_type" not in trained:
+    if trained.get("goal_type") not in GOAL_TYPES:
         raise PolicyError(f"{path}: does not say which goal type it was trained with")
     arguments = {name: trained[name] for name in ENV_ARGUMENTS if name in trained}
-    return network, arguments, safety_filter
+    return _TrainedPolicy(network, arguments, safety_filter, size)
 
 
 def _trained(path, env):
@@ -282,7 +302,7 @@ def _trained(path, env):
     from roboarm_nmp.envs.robots.metadata import check_robot
     from roboarm_nmp.networks.operations import NetworkError
 
-    network, trained, _ = _load(path)
+    network, trained, _, size = _load(path)
     robot = env.unwrapped.robot
     try:
         check_robot(path, network.metadata, robot)
@@ -291,7 +311,6 @@ def _trained(path, env):
     mode = trained.get("action_mode", "relative")
     if mode != env.action_mode:
         raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
-    size = recurrent_size(network)
 
     def begin(number, query):
         recurrent_state = np.zeros(size, np.float32)
@@ -300,8 +319,9 @@ def _trained(path, env):
         # a gain of a tenth of the time at most.
         def act(observation):
             nonlocal recurrent_state
-            given = observation | {"recurrent_state": recurrent_state} if size else observation
-            inputs = {name: torch.from_numpy(given[name])[None] for name in network.inputs}
+            if size:
+                observation = observation | {"recurrent_state": recurrent_state}
+            inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
             if not size:
                 return network.predict_one(inputs, robot.num_joints)
             action, recurrent_state = network.predict_one(inputs, (robot.num_joints, size))
@@ -309,17 +329,21 @@ def _trained(path, env):
 
         return EpisodePolicy(act)
 
-    example = {name: np.zeros(one.shape, np.float32) for name, one in env.observation_space.items()}
+    example = {
+        name: np.zeros(space.shape, np.float32) for name, space in env.observation_space.items()
+    }
     as_observed = None
     if env.goal_type == "pose" and GOAL_TYPES[trained["goal_type"]].has_configuration:
         as_observed = ConfigurationGoals(env, trained["goal_type"])
         as_observed.begin_anywhere()
         example = as_observed(example)
-    unknown = set(network.inputs) - {*example, *(["recurrent_state"] if size else [])}
+    unknown = set(network.inputs) - set(example)
+    if size:
+        unknown -= {"recurrent_state"}
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
     try:
-        begin(0, None).act(example)
+        begin(0, None).act(example)  # to see whether that raises
     except NetworkError as error:
         raise PolicyError(str(error)) from error
     return begin, as_observed
