@@ -199,7 +199,9 @@ def _safety_filter(args):
         safety_filter = own_safety_filter(find_policy(args.policy)[0])
     else:
         safety_filter = None  # the policy's own
-    if changes and not safety_filter:
+    if not changes:
+        return safety_filter
+    if not safety_filter:
         [flag, *_] = changes
         if args.safety_margin == 0:
             raise ValueError(f"{flag}: there is no safety filter with --safety-margin 0")

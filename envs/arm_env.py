@@ -171,6 +171,7 @@ class RoboArmEnv(gym.Env):
         "render_modes": ["rgb_array", "human"],
         "render_fps": round(1 / TIME_STEP / SUBSTEPS),
     }
+    observation_space: gym.spaces.Dict
 
     def __init__(
         self,
@@ -249,6 +250,11 @@ class RoboArmEnv(gym.Env):
         # Generators are made at their first use: here at the latest, so that copies share them.
         _ = self.np_random, self.action_space.np_random
         return vars(self).copy()
+
+    @property
+    def unwrapped(self) -> "RoboArmEnv":
+        """This environment, without wrappers."""
+        return self
 
     # --- The world
 

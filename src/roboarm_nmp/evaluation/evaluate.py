@@ -12,22 +12,22 @@ import contextlib
 import math
 import platform
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from roboarm_nmp import envs
-from roboarm_nmp.datasets.format import QueryScenes
+from roboarm_nmp.datasets.format import AnimatedScenes, QueryScenes
 from roboarm_nmp.datasets.problem_formats import Problem
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import Query, load_queries, validate
-from roboarm_nmp.envs.arm_env import RoboArmEnv, deviations
-from roboarm_nmp.envs.goals import GOAL_TYPES
+from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv, deviations
+from roboarm_nmp.envs.goals import GOAL_TYPES, GoalTypeName
 from roboarm_nmp.envs.perception.encoders import ORACLE
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.noise import SensorNoise
@@ -115,7 +115,7 @@ class EvaluationOptions:
         EvaluationError: a number is out of its range.
     """
 
-    goal_type: str | None = None
+    goal_type: GoalTypeName | None = None
     queries: Any = None
     problems: str | Path | None = None
     split: str = "test"
@@ -125,7 +125,7 @@ class EvaluationOptions:
     tries: int = TRIES
     time_limit: float = TIME_LIMIT
     geometry_source: str | None = None
-    safety_filter: SafetyFilter | bool | None = None
+    safety_filter: SafetyFilter | Literal[False] | None = None
     replan: bool = False
     observe_every: int | None = None
     sensor_noise: SensorNoise | None = None
@@ -133,7 +133,7 @@ class EvaluationOptions:
     real_time: bool = False
     measure_clearance: bool = False
     workers: int = 1
-    env: dict | None = None
+    env: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
         for name in ("workers", "tries"):
@@ -231,7 +231,7 @@ def is_privileged(env_arguments: dict[str, Any]) -> bool:
 # --- Metrics
 
 
-def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+def wilson_interval(successes: float, n: int) -> tuple[float, float]:
     """The 95% Wilson score interval (low, high) of a share, for `successes` out of `n` >= 1."""
     z = 1.959964
     share = successes / n
@@ -242,6 +242,9 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
 
 
 # --- Arguments
+
+
+Scenes = Sequence[Scene] | QueryScenes | AnimatedScenes
 
 
 @dataclass(frozen=True)
@@ -258,7 +261,7 @@ class _Job:
     options: EvaluationOptions
     start: np.ndarray
     goal: np.ndarray
-    scenes: Sequence[Scene]
+    scenes: Scenes
     problems: dict[str, str] | None = None
 
     def make(self, render_mode: str | None = None) -> tuple[RoboArmEnv, BeginEpisode]:
@@ -302,7 +305,9 @@ def _prepare(policy, task, options: EvaluationOptions) -> _Job:
     return job
 
 
-def _make_job(policy, task, options):
+def _make_job(
+    policy: str | Path | Policy, task: str | Path | None, options: EvaluationOptions
+) -> _Job:
     if task is not None:
         get_task(task)  # to see whether that raises
     if not callable(policy):
@@ -310,14 +315,13 @@ def _make_job(policy, task, options):
         if task is None:
             task = own_task(policy)
         own = trained.get("goal_type")
-        by_kinematics = (
-            options.goal_type == "pose" and trained and GOAL_TYPES[own].has_configuration
-        )
-        if trained and options.goal_type not in (None, own) and not by_kinematics:
-            raise EvaluationError(
-                f"{policy} was trained with the goal type {own!r}, it cannot be evaluated with "
-                f"{options.goal_type!r}"
-            )
+        if own is not None and options.goal_type not in (None, own):
+            by_kinematics = options.goal_type == "pose" and GOAL_TYPES[own].has_configuration
+            if not by_kinematics:
+                raise EvaluationError(
+                    f"{policy} was trained with the goal type {own!r}, it cannot be evaluated with "
+                    f"{options.goal_type!r}"
+                )
         options = replace(options, env=trained or options.env)
     problems = None
     if options.problems is not None:
@@ -366,7 +370,7 @@ def _with_one_goal(problem: Problem) -> Problem:
     from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 
     robot, checker = problem.scene.robot, ground_truth_checker(problem.scene)
-    if len(problem.goals) == 0:
+    if problem.goal_pose is not None and not len(problem.goals):
         goal = goal_configuration(robot, problem.goal_pose, problem.start, checker)
         if goal is None:
             raise EvaluationError(f"problem {problem.name}: its goal pose cannot be reached freely")
@@ -381,7 +385,7 @@ def _with_one_goal(problem: Problem) -> Problem:
 
 def _in_use(policy, options):
     """The options with environment, safety filter and geometry source as they will be used."""
-    env = dict(options.env or {})
+    env = dict(options.env)
     env["goal_type"] = options.goal_type or env.get("goal_type", "ee")
     env["stop_on_collision"] = options.stop_on_collision
     if options.replan and policy == REPLANNING:
@@ -453,6 +457,18 @@ Outcome = dict[str, float]
 """Of an episode: its success, contact and times, and if it was successful its `LENGTHS`."""
 
 
+class _Counted:
+    """A policy, and how many actions it has chosen: not as many as steps where there is a delay."""
+
+    def __init__(self, act: Policy):
+        self.act = act
+        self.actions = 0
+
+    def __call__(self, observation: Observation) -> np.ndarray:
+        self.actions += 1
+        return self.act(observation)
+
+
 class _Worker:
     """Runs the queries of a job, chunk by chunk."""
 
@@ -476,19 +492,12 @@ class _Worker:
         began = time.perf_counter()
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
-        actions = 0  # fewer than there are steps where they are delayed
-
-        def counted(observation):
-            nonlocal actions
-            actions += 1
-            return act(observation)
-
-        policy = counted if act else None
+        policy = None if act is None else _Counted(act)
         trajectory = rollout(self.env, query, policy, self.job.delay, planning_seconds)
         outcome = {
             "success": trajectory.success,
             "collision": trajectory.collides,
-            "actions": actions,
+            "actions": 0 if policy is None else policy.actions,
             "policy_seconds": float(trajectory.times.sum()),
             "planning_seconds": planning_seconds,
             "plan_found": bool(plan_found),
@@ -534,7 +543,7 @@ def _run(job: _Job, progress: bool) -> list[Outcome]:
     return [outcomes[index] for index in range(count)]
 
 
-def _results(job, chunks) -> Iterator[tuple[range, list[Outcome]]]:
+def _results(job, chunks) -> Generator[tuple[range, list[Outcome]], None, None]:
     """Yield the chunks and their outcomes, in any order."""
     count = min(job.options.workers, len(chunks))
     if count == 1:

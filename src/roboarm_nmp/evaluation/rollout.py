@@ -196,9 +196,9 @@ def render_strip(
         steps: n numbers from 0 (the start) to T: the steps after which there is an image.
     """
     env.reset_specific(*query)
-    images = {0: env.render()}
+    images = {0: np.asarray(env.render())}
     for step, action in enumerate(actions, start=1):
         env.step(action)
         if step in steps:
-            images[step] = env.render()
+            images[step] = np.asarray(env.render())
     return np.concatenate([images[step] for step in steps], axis=1)

@@ -17,13 +17,16 @@ every row from becoming smaller (`policies.safety_filter`).
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
+from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv
 from roboarm_nmp.envs.collision.checker import self_distances
 from roboarm_nmp.envs.collision.filter_kernels import project
 from roboarm_nmp.envs.robots.inverse_kinematics import kinematic_chain
 from roboarm_nmp.envs.robots.kernels import move_back
+from roboarm_nmp.envs.robots.robot import Robot
 
 # The clearances were compared on validation queries, how paths climb on problems of
 # MotionBenchMaker: docs/lab_notebook.md, "Approach paths".
@@ -45,8 +48,16 @@ GIVE_UP = 150
 # nearer than TRACKING; the goal's path begins when the arm is nearer than REACHED to its free end.
 STRIDE, TRACKING, REACHED = 3, 0.006, 0.01
 
+LinkDistances = Callable[[np.ndarray], np.ndarray]
+"""A function like `CollisionChecker.link_distances`."""
 
-def approach_path(robot, state, link_distances_at, clearance=GOAL_CLEARANCE):
+
+def approach_path(
+    robot: Robot,
+    state: np.ndarray,
+    link_distances_at: LinkDistances,
+    clearance: float = GOAL_CLEARANCE,
+) -> np.ndarray:
     """A path from a configuration to a place with more clearance, normalised, float64 (k, n).
 
     Without enough room nearby, it ends after `MAX_STEPS`. Where there is room, k is 1.
@@ -77,7 +88,9 @@ def approach_path(robot, state, link_distances_at, clearance=GOAL_CLEARANCE):
     return np.array(path)
 
 
-def retreat_path(robot, state, arm, link_distances_at):
+def retreat_path(
+    robot: Robot, state: np.ndarray, arm: np.ndarray, link_distances_at: LinkDistances
+) -> np.ndarray:
     """A path straight back along the end effector's axis z, normalised, float64 (k, n).
 
     Link distances alone show no way out of a box or a compartment, and a hand has come in along
@@ -90,7 +103,9 @@ def retreat_path(robot, state, arm, link_distances_at):
         arm: the configuration (n,), normalised, that the path should lead to.
         link_distances_at: a function like `CollisionChecker.link_distances`.
     """
-    chain, path, positions = kinematic_chain(robot), [np.array(state, np.float64)], []
+    chain = kinematic_chain(robot)
+    path = [np.array(state, np.float64)]
+    positions = []
     room = link_distances_at(path[0])[:, 0].min()
     if room >= OPEN:
         return np.array(path)
@@ -108,8 +123,9 @@ def retreat_path(robot, state, arm, link_distances_at):
     else:
         return np.array(path[:1])
     has_room = link_distances_at(path[-1])[:, 0].min() >= room + MORE_ROOM
-    straight, left = (np.linalg.norm(path[i] - arm) for i in (0, -1))
-    is_on_the_way = STEP * (len(path) - 1) + left <= DETOUR * straight
+    straight = np.linalg.norm(path[0] - arm)
+    detour = STEP * (len(path) - 1) + np.linalg.norm(path[-1] - arm)
+    is_on_the_way = detour <= DETOUR * straight
     return np.array(path if has_room or is_on_the_way else path[:1])
 
 
@@ -126,7 +142,8 @@ def _move(robot, state, wanted, rows, link_distances_at, clearance):
 
 def _rows(robot, state, link_distances_at, clearance):
     """Link distances from the scene and, more than `SELF_CLEARANCE` apart, from other links."""
-    scene, links = link_distances_at(state), self_distances(robot, state, clearance)
+    scene = link_distances_at(state)
+    links = self_distances(robot, state, clearance)
     rows = np.concatenate([scene, links]).astype(np.float64)
     rows[len(scene) :, 0] += clearance - SELF_CLEARANCE
     return rows
@@ -134,9 +151,10 @@ def _rows(robot, state, link_distances_at, clearance):
 
 def _project(move, rows, least):
     """The nearest move (n,) after which no row is below `least`, to first order."""
-    moves, rows = move[None].copy(), np.ascontiguousarray(rows[None])
-    least, rates = least[None].copy(), np.zeros((1, len(least)))
-    project(moves, rows, least, rates, STEP, 1.0, np.inf, np.inf, PROJECTION_SWEEPS)
+    moves = move[None].copy()
+    rates = np.zeros((1, len(least)))
+    rows = np.ascontiguousarray(rows[None])
+    project(moves, rows, least[None].copy(), rates, STEP, 1.0, np.inf, np.inf, PROJECTION_SWEEPS)
     return moves[0]
 
 
@@ -150,16 +168,19 @@ class ApproachPaths:
         env: the `RoboArmEnv` of the episode, with link distances.
     """
 
-    def __init__(self, act, env):
-        self._act, self._env = act, env
+    def __init__(self, act: Callable[[Observation], np.ndarray], env: RoboArmEnv):
+        self._act = act
+        self._env = env
         self._at = env.get_wrapper_attr("link_distances_at")
         self._fine_at = env.get_wrapper_attr("fine_link_distances_at")
-        self._retreat = self._approach = None  # `_Following`, from the first observation on
+        self._retreat = None  # a `_Following`, from the first observation on
+        self._approach = None  # likewise, if the goal needs one
         self._free_end = {}  # what is observed of the goal until the arm is at its path's free end
-        self._retreats, self._steps = True, 0
+        self._retreats = True  # whether the goal's path goes back
+        self._steps = 0
         self._planned_for = None  # scene and goal: both may change during an episode
 
-    def __call__(self, observation):
+    def __call__(self, observation: Observation) -> np.ndarray:
         state = observation["observation"][: self._env.robot.num_joints].astype(np.float64)
         if self._retreat is None:
             path = approach_path(self._env.robot, state, self._fine_at, START_CLEARANCE)
@@ -173,17 +194,17 @@ class ApproachPaths:
                 self._planned_for = planned_for
                 self._plan_approach(observation["desired_goal"], state)
         action = self._retreat(state)
-        if action is not None:
-            return action
-        if self._approach is not None and self._approach.may_begin(state):
-            return self._approach(state)
-        return self._act(observation | self._free_end)
+        if action is None and self._approach is not None and self._approach.may_begin(state):
+            action = self._approach(state)
+        return self._act(observation | self._free_end) if action is None else action
 
     def _has_begun(self):
         return self._approach is not None and self._approach.has_begun
 
     def _plan_approach(self, goal, arm):
-        robot, self._approach, self._free_end = self._env.robot, None, {}
+        robot = self._env.robot
+        self._approach = None
+        self._free_end = {}
         path = approach_path(robot, goal[: robot.num_joints], self._fine_at)
         if self._retreats:
             retreat = retreat_path(robot, path[-1], arm, self._fine_at)
@@ -201,7 +222,10 @@ class _Following:
     """Actions along a path (k, n), normalised; at its end None, or if it `stays`, to its end."""
 
     def __init__(self, path, stays=False):
-        self._path, self._stays, self._due, self._ended = path, stays, 0, False
+        self._path = path
+        self._stays = stays
+        self._due = 0
+        self._ended = False
 
     @property
     def has_begun(self):

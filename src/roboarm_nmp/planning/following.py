@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
 
 # Share of the tolerances of every goal type within which the goal counts as reached: rounding the
@@ -32,7 +34,7 @@ class Execution:
     digest: int
 
 
-def follow(env, path, scene=None):
+def follow(env: RoboArmEnv, path: np.ndarray, scene: Scene | None = None) -> Execution:
     """Follow a path, one sub-goal per step, from its first configuration to its last.
 
     Args:

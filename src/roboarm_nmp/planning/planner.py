@@ -17,15 +17,20 @@ are feasible. Planning happens in the normalised configuration space [-1, 1]^n.
 import math
 import operator
 import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.robots.inverse_kinematics import NUM_SEEDS, inverse_kinematics
 from roboarm_nmp.envs.robots.panda import scale_of
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.utils.names import suggest
 
@@ -94,18 +99,27 @@ class Validity:
         max_checks: the number of checks at which the plan is exhausted.
     """
 
-    def __init__(self, checker, rules, deadline, max_checks):
-        self._checker, self._rules, self._later = checker, rules, list(rules)
-        self._deadline, self._max_checks = deadline, max_checks
+    def __init__(
+        self,
+        checker: CollisionChecker,
+        rules: list[tuple[int, dict[str, Any]]],
+        deadline: float,
+        max_checks: float,
+    ):
+        self._checker = checker
+        self._rules = rules
+        self._later = list(rules)
+        self._deadline = deadline
+        self._max_checks = max_checks
         self.checks = 0
         self._next_rule()
 
-    def __call__(self, state):
+    def __call__(self, state: Sequence[float]) -> bool:
         """Whether a configuration is free."""
         state = tuple(map(float, state))
         return self.motion_free(state, state)
 
-    def motion_free(self, start, end):
+    def motion_free(self, start: tuple[float, ...], end: tuple[float, ...]) -> bool:
         """Whether the straight motion from a configuration that is free to another is free.
 
         Both are tuples of n floats.
@@ -116,23 +130,23 @@ class Validity:
             self._next_rule()
         return checks > 0
 
-    def free(self, states):
+    def free(self, states: ArrayLike) -> np.ndarray:
         """Which configurations (..., n) are free: bool (...)."""
         free = self._checker.is_free(states, **self._rule)
         self._count(free.size)
         return free
 
-    def motions_free(self, starts, ends):
+    def motions_free(self, starts: ArrayLike, ends: ArrayLike) -> np.ndarray:
         """Which straight motions from `starts` (..., n) to `ends` (..., n) are free: bool (...)."""
         checks = self._checker.motion_checks(starts, ends, **self._rule)
         self._count(int(np.abs(checks).sum()))
         return checks > 0
 
-    def exhausted(self):
+    def exhausted(self) -> bool:
         """Whether the limits of this plan are reached."""
         return self.checks >= self._max_checks or time.monotonic() > self._deadline
 
-    def restore_margins(self):
+    def restore_margins(self) -> None:
         """Return to the full margins, for changes to a path that has been found."""
         self._later = [self._rules[0]]
         self._next_rule()
@@ -155,7 +169,8 @@ class _States(ob.StateValidityChecker):
 
     def __init__(self, space, is_valid):
         super().__init__(space)
-        self._is_valid, self._values = is_valid, _values_of(space)
+        self._is_valid = is_valid
+        self._values = _values_of(space)
 
     def isValid(self, state):  # noqa: N802 (OMPL's name)
         state = self._values(state)
@@ -167,13 +182,14 @@ class _Motions(ob.MotionValidator):
 
     def __init__(self, space, is_valid):
         super().__init__(space)
-        self._is_valid, self._values = is_valid, _values_of(space)
+        self._is_valid = is_valid
+        self._values = _values_of(space)
 
     def checkMotion(self, start, end):  # noqa: N802
         return self._is_valid.motion_free(self._values(start), self._values(end))
 
 
-def _values_of(space):
+def _values_of(space) -> Callable[[Any], tuple[float, ...]]:
     """A function from a state of OMPL's `SpaceInformation` to a tuple of its numbers."""
     joints = space.getStateDimension()
     if joints == 1:
@@ -214,14 +230,14 @@ class Planner:
 
     def __init__(
         self,
-        env,
-        planner="RRTConnect",
-        clearance=0.005,
-        planner_range=0.4,
-        simplify=1,
-        geometry_source=CollisionChecker,
-        max_checks=None,
-        limits="urdf",
+        env: RoboArmEnv,
+        planner: str | Callable[..., ArrayLike | None] = "RRTConnect",
+        clearance: float = 0.005,
+        planner_range: float = 0.4,
+        simplify: int = 1,
+        geometry_source: Callable[[Scene], CollisionChecker] = CollisionChecker,
+        max_checks: int | None = None,
+        limits: str = "urdf",
     ):
         if not callable(planner) and planner not in PLANNERS:
             raise ValueError(f"unknown planner {planner!r}: {suggest(planner, PLANNERS)}")
@@ -233,16 +249,22 @@ class Planner:
             raise ValueError(f"simplify must be a number of rounds, got {simplify!r}")
         if max_checks is not None and not max_checks > 0:
             raise ValueError(f"max_checks must be positive or None, got {max_checks!r}")
-        self.limits, self._bounds = limits, ()  # the URDF's are -1 and 1, without rounding
         bounds = env.robot.position_limits(limits)
+        self._bounds: tuple = ()  # those of the URDF are -1 and 1, without rounding
         if limits != "urdf":
             self._bounds = tuple(np.clip(env.robot.normalise(bounds), -1.0, 1.0))
         scale = scale_of(env.robot)
-        self.env, self.planner = env, planner
-        self.clearance, self.margin = scale * clearance, scale * MARGIN
-        self.planner_range, self.simplify = planner_range, simplify
-        self.max_checks, self._geometry_source = max_checks, geometry_source
-        self._scene, self._checker = env.scene, geometry_source(env.scene.at(0.0))
+        self.env = env
+        self.planner = planner
+        self.clearance = scale * clearance
+        self.margin = scale * MARGIN
+        self.planner_range = planner_range
+        self.simplify = simplify
+        self.max_checks = max_checks
+        self.limits = limits
+        self._geometry_source = geometry_source
+        self._scene = env.scene
+        self._checker = geometry_source(env.scene.at(0.0))
         # Compile here what is compiled at its first call: a plan's time is for planning.
         state = (0.0,) * env.robot.num_joints
         self._checker.signed_distances(state)
@@ -250,7 +272,16 @@ class Planner:
         self.checks = 0
         """Collision checks of the last plan."""
 
-    def plan(self, start, goal=None, scene=None, *, seed, time_limit=5.0, goal_pose=None):
+    def plan(
+        self,
+        start: ArrayLike,
+        goal: ArrayLike | None = None,
+        scene: Scene | None = None,
+        *,
+        seed: int | Sequence[int],
+        time_limit: float = 5.0,
+        goal_pose: ArrayLike | None = None,
+    ) -> np.ndarray:
         """A path from start to goal: float32 (k, n), rad; its ends are exactly start and goal.
 
         The same seed gives the same path on every machine, whatever was planned before, as long as
@@ -289,24 +320,26 @@ class Planner:
         if (goal is None) == (goal_pose is None):
             raise ValueError("either goal or goal_pose is needed, and not both")
         joints = self.env.robot.num_joints
-        if np.shape(goal) == (3,) != (joints,):  # a position, with which an episode may begin
-            raise ValueError(f"goal must have {joints} numbers, got shape (3,)")
         rng = np.random.default_rng(seed)
         # Bad queries are rejected here, as an episode would reject them.
-        if goal_pose is None and np.ndim(goal) != 2:
+        if goal is not None and np.ndim(goal) != 2:
+            if np.shape(goal) == (3,) != (joints,):  # a position, with which an episode may begin
+                raise ValueError(f"goal must have {joints} numbers, got shape (3,)")
             self.env.reset_specific(start, goal, scene)
-            start, goals = (np.asarray(x, dtype=np.float32) for x in (start, [goal]))
+            start = np.asarray(start, dtype=np.float32)
+            goals = np.asarray([goal], dtype=np.float32)
         else:
             if scene is not None:
                 self.env.set_scene(scene)
             start = self.env.check_configuration("start", start)
-            if goal_pose is not None:
-                goals = self._goals_of_pose(start, goal_pose, seed)
-            else:
+            if goal is not None:
                 goals = self._free_goals(start, goal)
+            else:
+                goals = self._goals_of_pose(start, goal_pose, seed)
         goals = self._goals_within_limits(start, goals)
         deadline = time.monotonic() + time_limit
-        self.checks, best = 0, None
+        self.checks = 0
+        best = None
         for _ in range(SEARCHES):
             path = self._search(start, goals, int(rng.integers(1, 2**32)), deadline)
             if path is None:
@@ -324,10 +357,12 @@ class Planner:
 
     def _free_goals(self, start, goals):
         """Those of a set of goals with which an episode can begin, nearest to the start first."""
-        joints, normalise = self.env.robot.num_joints, self.env.robot.normalise
+        joints = self.env.robot.num_joints
+        normalise = self.env.robot.normalise
         if np.shape(goals)[1] != joints or not len(goals):
             raise ValueError(f"a set of goals has shape (m, {joints}), got {np.shape(goals)}")
-        free, problem = [], None
+        free = []
+        problem = None
         for number, goal in enumerate(goals):
             try:
                 free.append(self.env.check_configuration(f"goal {number}", goal))
@@ -353,15 +388,18 @@ class Planner:
 
         If some have the clearance that a path keeps, only those.
         """
-        checker, robot = self._current_checker(), self.env.robot
+        checker = self._current_checker()
+        robot = self.env.robot
         for round_ in range(IK_ROUNDS):
-            number = NUM_SEEDS * 4**round_
-            given = {"seed": seed, "num_seeds": number, "checker": checker, "near": start}
-            goals = inverse_kinematics(robot, pose, **given).astype(np.float32)
+            num_seeds = NUM_SEEDS * 4**round_
+            goals = inverse_kinematics(
+                robot, pose, seed=seed, num_seeds=num_seeds, checker=checker, near=start
+            )
             if len(goals):
                 break
         else:
             raise PlanningError("no collision-free configuration has the goal pose")
+        goals = np.asarray(goals, dtype=np.float32)
         states = np.clip(robot.normalise(goals), -1.0, 1.0)
         for clearance in (self.margin + self.clearance, self.margin, EXACTNESS):
             wide = checker.is_free(states, margin=EXACTNESS, clearance=clearance - EXACTNESS)
@@ -375,8 +413,10 @@ class Planner:
 
     def _search(self, start, goals, seed, deadline):
         """The path of one search, float32 (k, n), rad; None: there was none within the limits."""
-        is_valid, robot = self._validity(start, goals, deadline), self.env.robot
-        start_state, goal_states = robot.normalise(start), robot.normalise(goals)
+        is_valid = self._validity(start, goals, deadline)
+        robot = self.env.robot
+        start_state = robot.normalise(start)
+        goal_states = robot.normalise(goals)
         # For the random number generators that OMPL makes from here on. Spaces make some, for the
         # projections of KPIECE1 and its kin; how many must not matter to the planner.
         ou.RNG.setSeed(seed)
@@ -389,8 +429,9 @@ class Planner:
                     path = _checked(path, start_state, state)
                     break
         else:
-            ends = start_state, goal_states
-            path = _solve(self._turns(), self.planner_range, space, is_valid, *ends)
+            path = _solve(
+                _turns(self.planner), self.planner_range, space, is_valid, start_state, goal_states
+            )
         if path is not None and self.simplify:
             is_valid.restore_margins()
             path = _simplify(space, path, self.simplify)
@@ -399,7 +440,8 @@ class Planner:
             return None
         reached = np.linalg.norm(goal_states - path[-1], axis=1).argmin()
         path = robot.denormalise(path).astype(np.float32)
-        path[0], path[-1] = start, goals[reached]
+        path[0] = start
+        path[-1] = goals[reached]
         return path
 
     def _current_checker(self):
@@ -410,10 +452,10 @@ class Planner:
 
     def _validity(self, start, goals, deadline):
         """The `Validity` of one search."""
-        self._current_checker()
+        checker = self._current_checker()
         ends = np.clip(self.env.robot.normalise([start, *goals]), -1.0, 1.0)
-        near = self._checker.signed_distances(ends).distance.min(-1)
-        from_scene = self._checker.signed_distances(ends, self_collisions=False).distance.min(-1)
+        near = checker.signed_distances(ends).distance.min(-1)
+        from_scene = checker.signed_distances(ends, self_collisions=False).distance.min(-1)
         clearance = self.clearance if from_scene.min() >= self.clearance else 0.0
         rules = []
         for checks, margin_scale in MARGIN_SCHEDULE:
@@ -425,8 +467,8 @@ class Planner:
                 "endpoint_margins": (ends, distances, MARGIN_GROWTH),
             }
             rules.append((checks, rule))
-        left = math.inf if self.max_checks is None else self.max_checks - self.checks
-        return Validity(self._checker, rules, deadline, left)
+        checks_left = math.inf if self.max_checks is None else self.max_checks - self.checks
+        return Validity(checker, rules, deadline, checks_left)
 
     def _space(self, is_valid):
         """OMPL's `SpaceInformation`, which asks `is_valid`."""
@@ -439,32 +481,33 @@ class Planner:
         information.setup()
         return information
 
-    def _turns(self):
-        """For `_solve`: RRT-Connect and the other planner alternate, any other planner works alone.
 
-        There are more turns than anybody has time for.
-        """
-        if self.planner != "RRTConnect":
-            yield self.planner, math.inf
-            return
-        checks, length = 0, FIRST_TURN
-        for _ in range(20):
-            for name, share in (("RRTConnect", length), (OTHER_PLANNER, length // 2)):
-                checks += share
-                yield name, checks
-            length *= 2
+def _turns(planner: str) -> Iterator[tuple[str, float]]:
+    """For `_solve`: RRT-Connect and the other planner alternate, any other planner works alone.
+
+    There are more turns than anybody has time for.
+    """
+    if planner != "RRTConnect":
+        yield planner, math.inf
+        return
+    checks = 0
+    length = FIRST_TURN
+    for _ in range(20):
+        for name, share in (("RRTConnect", length), (OTHER_PLANNER, length // 2)):
+            checks += share
+            yield name, checks
+        length *= 2
 
 
-def normalised_space(num_joints, lower=None, upper=None):
+def normalised_space(
+    num_joints: int, lower: Sequence[float] | None = None, upper: Sequence[float] | None = None
+) -> ob.RealVectorStateSpace:
     """OMPL's view of the normalised configuration space, or of a box (n,), (n,) in it."""
-    space = ob.RealVectorStateSpace(num_joints)
     bounds = ob.RealVectorBounds(num_joints)
-    bounds.setLow(-1.0)
-    bounds.setHigh(1.0)
-    if lower is not None:
-        for joint in range(num_joints):
-            bounds.setLow(joint, float(lower[joint]))
-            bounds.setHigh(joint, float(upper[joint]))
+    for joint in range(num_joints):
+        bounds.setLow(joint, -1.0 if lower is None else float(lower[joint]))
+        bounds.setHigh(joint, 1.0 if upper is None else float(upper[joint]))
+    space = ob.RealVectorStateSpace(num_joints)
     space.setBounds(bounds)
     return space
 

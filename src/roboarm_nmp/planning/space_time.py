@@ -16,13 +16,17 @@ the roadmap. Each plan is followed in the simulator, and only a plan without con
 import heapq
 import math
 import time
+from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.timed_checker import TimedChecker
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import MARGIN_GROWTH, PlanningError
@@ -43,10 +47,18 @@ class SpaceTimePlanner:
             resets it, so reset before the next step.
     """
 
-    def __init__(self, env):
+    def __init__(self, env: RoboArmEnv):
         self.env = env
 
-    def plan(self, start, goal, scene=None, *, seed, time_limit=60.0):
+    def plan(
+        self,
+        start: ArrayLike,
+        goal: ArrayLike,
+        scene: Scene | None = None,
+        *,
+        seed: int | Sequence[int],
+        time_limit: float = 60.0,
+    ) -> np.ndarray:
         """Where to be after each step, float32 (k, n), rad; its ends are start and goal.
 
         The same seed gives the same path, as long as the time suffices.
@@ -61,10 +73,13 @@ class SpaceTimePlanner:
             ValueError: start or goal is not n numbers inside the limits, or in collision.
             PlanningError: no path was found that can be followed without contact.
         """
-        rng, deadline = np.random.default_rng(seed), time.monotonic() + time_limit
+        rng = np.random.default_rng(seed)
+        deadline = time.monotonic() + time_limit
         self.env.reset_specific(start, goal, scene)
-        robot, scene = self.env.unwrapped.robot, self.env.unwrapped.scene
-        start, goal = (np.asarray(x, dtype=np.float32) for x in (start, goal))
+        robot = self.env.unwrapped.robot
+        scene = self.env.unwrapped.scene
+        start = np.asarray(start, dtype=np.float32)
+        goal = np.asarray(goal, dtype=np.float32)
         ends = np.clip(robot.normalise(np.stack([start, goal]).astype(np.float64)), -1.0, 1.0)
         for margin, clearance, num_nodes in ATTEMPTS:
             if time.monotonic() > deadline:
@@ -75,7 +90,8 @@ class SpaceTimePlanner:
             if states is None:
                 continue
             path = robot.denormalise(states).astype(np.float32)
-            path[0], path[-1] = start, goal
+            path[0] = start
+            path[-1] = goal
             execution = follow(self.env, path, scene)
             if execution.reached and not execution.collided:
                 return path
@@ -88,15 +104,15 @@ class SpaceTimePlanner:
         # whatever does not move.
         times = STEP_SECONDS * np.arange(0, horizon, 5)
         scenes = [scene] if scene.is_static else [scene.at(t) for t in times.tolist()]
-        checkers = [CollisionChecker(one) for one in scenes]
+        checkers = [CollisionChecker(scene) for scene in scenes]
         at_start = checkers[0].signed_distances(ends[0]).distance.min()
-        at_goal = max(one.signed_distances(ends[1]).distance.min() for one in checkers)
+        at_goal = max(checker.signed_distances(ends[1]).distance.min() for checker in checkers)
         distances = np.array([at_start, at_goal]) - 1e-5
-        given = margin, clearance, (ends, distances - clearance, MARGIN_GROWTH)
-        return TimedChecker(scene, horizon, STEP_SECONDS, *given)
+        endpoint_margins = ends, distances - clearance, MARGIN_GROWTH
+        return TimedChecker(scene, horizon, STEP_SECONDS, margin, clearance, endpoint_margins)
 
 
-def search(nodes, checker, last_step):
+def search(nodes: np.ndarray, checker: TimedChecker, last_step: int) -> np.ndarray | None:
     """The path of earliest arrival from nodes[0] to nodes[1], a state per step; None without one.
 
     Args:
@@ -115,8 +131,10 @@ def search(nodes, checker, last_step):
         return None
     neighbours = _neighbours(nodes)
     # Entries: least arrival at the goal, arrival, node, number of its interval; from where.
-    queue, came_from, closed = [(to_goal[0], 0, 0, 0)], {(0, 0): None}, set()
+    queue = [(to_goal[0], 0, 0, 0)]
+    came_from = {}
     arrivals = {(0, 0): 0}
+    closed = set()
     while queue:
         _, arrival, node, number = heapq.heappop(queue)
         if (node, number) in closed:
@@ -145,30 +163,31 @@ def search(nodes, checker, last_step):
                     there_at = departure + steps
                     arrivals[other, there] = there_at
                     came_from[other, there] = node, number, departure
-                    entry = there_at + to_goal[other], there_at, other, there
-                    heapq.heappush(queue, entry)
+                    heapq.heappush(queue, (there_at + to_goal[other], there_at, other, there))
     return None
 
 
 def _neighbours(nodes):
     """The nearest nodes of each node, both ways, and of the start also the goal: lists."""
-    near = cKDTree(nodes).query(nodes, NUM_NEIGHBOURS + 1)[1]  # one is the node itself
+    _, near = KDTree(nodes).query(nodes, NUM_NEIGHBOURS + 1)  # one is the node itself
     neighbours = [set() for _ in nodes]
-    for i, others in enumerate(near.tolist()):
+    for i, others in enumerate(np.asarray(near).tolist()):
         for j in others:
             if i != j:
                 neighbours[i].add(j)
                 neighbours[j].add(i)
     neighbours[0].add(1)
-    return [sorted(found) for found in neighbours]
+    return [sorted(others) for others in neighbours]
 
 
 class _Intervals:
     """Of each node, the intervals of steps (first, last) in which the arm may stand there."""
 
     def __init__(self, nodes, checker, last_step):
-        self._nodes, self._checker, self._known = nodes, checker, {}
+        self._nodes = nodes
+        self._checker = checker
         self._steps = np.arange(last_step + 1)
+        self._known = {}
 
     def of(self, node):
         if node not in self._known:
@@ -181,12 +200,14 @@ class _Intervals:
 
 def _states(nodes, came_from, arrivals, last):
     """The states of all steps until the arrival at the last node."""
-    pieces, here = [], last
-    while came_from[here] is not None:
+    pieces = []
+    here = last
+    while here in came_from:
         node, number, departure = came_from[here]
         steps = arrivals[here] - departure
         share = np.arange(1, steps + 1)[:, None] / steps
-        start, end = nodes[node], nodes[here[0]]
+        start = nodes[node]
+        end = nodes[here[0]]
         waits = np.repeat(start[None], departure - arrivals[node, number], axis=0)
         pieces.append(np.concatenate([waits, start + (end - start) * share]))
         here = node, number

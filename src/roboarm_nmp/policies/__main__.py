@@ -7,12 +7,13 @@ roboarm policies sac-ee-wall-p1-s1
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 
 from roboarm_nmp.policies.registry import PolicyError, pretrained_policies
 from roboarm_nmp.utils.signals import error_line
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command. Returns the exit code: 0, or 2 for a policy that does not exist."""
     parser = argparse.ArgumentParser(
         prog="roboarm policies",
@@ -50,22 +51,31 @@ def _policies(cards):
     from roboarm_nmp.policies.cards import observes
 
     rows = [
-        ["policy", "task", "goal", "observes of the scene", "safety filter"]
-        + ["success", "collision-free", "queries"]
+        ("policy", "task", "goal", "observes of the scene", "safety filter")
+        + ("success", "collision-free", "queries")
     ]
     for card in cards:
-        rates = f"{card['success_rate']:.3f}", f"{card['collision_free_success_rate']:.3f}"
-        row = [card["name"], card["task"], card["goal_type"], observes(card), _filter(card)]
-        rows.append([*row, *rates, f"{card['num_queries']:,}"])
+        rows.append(
+            (
+                card["name"],
+                card["task"],
+                card["goal_type"],
+                observes(card),
+                _filter(card),
+                f"{card['success_rate']:.3f}",
+                f"{card['collision_free_success_rate']:.3f}",
+                f"{card['num_queries']:,}",
+            )
+        )
     return _aligned(rows, numbers=3)
 
 
 def _encoders(cards):
-    rows = [["encoder", "receives", "trained on", "decoder", "scenes"]]
+    rows = [("encoder", "receives", "trained on", "decoder", "scenes")]
     for card in cards:
         receives = f"{card['receives']} of {card['sensors']} sensors"
         decoder = "yes" if card["has_decoder"] else "no"
-        rows.append([card["name"], receives, card["task"], decoder, f"{card['scenes']:,}"])
+        rows.append((card["name"], receives, card["task"], decoder, f"{card['scenes']:,}"))
     return _aligned(rows, numbers=1)
 
 
@@ -76,14 +86,13 @@ def _filter(card):
 def _aligned(rows, numbers):
     """Rows of strings as text in columns; the last `numbers` columns end at their right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    first = len(widths) - numbers
-    return "\n".join(
-        "  ".join(
-            text.ljust(width) if i < first else text.rjust(width)
-            for i, (text, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    )
+    lines = []
+    for row in rows:
+        cells = [text.ljust(width) for text, width in zip(row, widths, strict=True)]
+        for i in range(len(row) - numbers, len(row)):
+            cells[i] = row[i].rjust(widths[i])
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
 
 
 def _card(card):

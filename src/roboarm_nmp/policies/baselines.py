@@ -37,6 +37,7 @@ from roboarm_nmp.policies.pose_goals import goal_configuration, observed_at_star
 
 if TYPE_CHECKING:  # Numba takes a while to import
     from roboarm_nmp.envs.collision.checker import CollisionChecker
+    from roboarm_nmp.policies.replanning import Replanning
 
 SPACE_TIME = "space-time"
 OMPL_PLANNERS = ("planner", SPACE_TIME)
@@ -115,7 +116,8 @@ def make_baseline(
     if name == "via-points":
         return _via_points(env, seed, tries, source)
     if name == REPLANNING:
-        return make_replanning(env, seed, source)
+        begin_replanning = make_replanning(env, seed, source)
+        return lambda number, query: EpisodePolicy(begin_replanning(number, query))
     return _planner(env, seed, time_limit, source)
 
 
@@ -168,8 +170,10 @@ def _via_points(env: RoboArmEnv, seed: int, tries: int, geometry_source: Geometr
     return begin
 
 
-def make_replanning(env: RoboArmEnv, seed: int, geometry_source: GeometrySource) -> BeginEpisode:
-    """The baseline `replanning`; `geometry_source` is a function from a scene to a checker."""
+def make_replanning(
+    env: RoboArmEnv, seed: int, geometry_source: GeometrySource
+) -> Callable[[int, Query], "Replanning | None"]:
+    """A function that makes the `Replanning` of an episode; None for a pose without a goal."""
     from roboarm_nmp.envs.wrappers import observed_scene
     from roboarm_nmp.policies.replanning import Replanning
 
@@ -184,9 +188,9 @@ def make_replanning(env: RoboArmEnv, seed: int, geometry_source: GeometrySource)
     def begin(number, query):
         goal = _goal(env, query, geometry_source(observed_at_start(env, query)))
         if goal is None:
-            return EpisodePolicy(None)
+            return None
         rng = np.random.default_rng([seed, number])
-        return EpisodePolicy(Replanning(env.robot, goal, current_checker, rng))
+        return Replanning(env.robot, goal, current_checker, rng)
 
     return begin
 

@@ -8,6 +8,7 @@ that it includes, if any.
 """
 
 import json
+from typing import Any
 
 from roboarm_nmp.envs.perception import encoders
 from roboarm_nmp.envs.perception.point_clouds import NUM_POINTS, POINT_CLOUD
@@ -22,7 +23,7 @@ RESULTS = (
 )
 
 
-def policy_card(name):
+def policy_card(name: str) -> dict[str, Any]:
     """What is known of a pretrained policy: a dict that fits into JSON.
 
     - `name`, `trainer`, `task`, `goal_type`;
@@ -41,8 +42,8 @@ def policy_card(name):
         raise PolicyError(f"no such pretrained policy: {name}: {suggest(name, [*paths])}")
     metadata = load_network(paths[name]).metadata
     saved = json.loads(paths[name].with_suffix(".json").read_text())
-    env, args = metadata["env"], saved["args"]
-    encoder, link_distances = env.get("encoder"), bool(env.get("link_distances"))
+    env = metadata["env"]
+    encoder = env.get("encoder")
     return {
         "name": name,
         "trainer": metadata["script"],
@@ -50,32 +51,35 @@ def policy_card(name):
         "goal_type": env["goal_type"],
         "encoder": encoder,
         "num_points": env.get("num_points", NUM_POINTS) if encoder == POINT_CLOUD else None,
-        "link_distances": link_distances,
+        "link_distances": bool(env.get("link_distances")),
         "geometry_source": env.get("geometry_source"),
         "safety_filter": metadata.get("safety_filter"),
         **{key: saved[key] for key in RESULTS},
         "steps": metadata["step"],
-        "unit": "environment steps" if "total_timesteps" in args else "updates",
-        "args": args,
+        "unit": "environment steps" if "total_timesteps" in saved["args"] else "updates",
+        "args": saved["args"],
     }
 
 
-def observes(card):
+def observes(card: dict[str, Any]) -> str:
     """What a policy observes of the scene, in words."""
-    encoder, parts = card["encoder"], []
+    encoder = card["encoder"]
+    parts = []
     if encoder == POINT_CLOUD:
-        parts = [f"{card['num_points']} points"]
+        parts.append(f"{card['num_points']} points")
     elif encoder == encoders.ORACLE:
-        parts = ["ground-truth obstacles"]
+        parts.append("ground-truth obstacles")
     elif encoder is not None:
-        parts = [f"latent code of {encoder}"]
+        parts.append(f"latent code of {encoder}")
     if card["link_distances"]:
         parts.append("link distances")
+    if not parts:
+        return "nothing"
     source = f" from {card['geometry_source']}" if card["geometry_source"] else ""
-    return " and ".join(parts) + source if parts else "nothing"
+    return " and ".join(parts) + source
 
 
-def encoder_card(name):
+def encoder_card(name: str) -> dict[str, Any]:
     """What is known of a pretrained scene encoder: a dict that fits into JSON.
 
     - `name`, `task` (the scenes it was trained on), `scenes` (their number);

@@ -7,6 +7,8 @@ of Stable-Baselines3 see docs/reference/api.md. A function needs no file: `roboa
 """
 
 import copy
+from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -15,9 +17,16 @@ from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.networks.exported_networks import save_network
 from roboarm_nmp.networks.operations import NetworkError
 from roboarm_nmp.policies.registry import ENV_ARGUMENTS, PolicyError
+from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 
-def save_policy(path, module, task, safety_filter=None, **env_arguments):
+def save_policy(
+    path: str | Path,
+    module: torch.nn.Module,
+    task: str | Path,
+    safety_filter: SafetyFilter | None = None,
+    **env_arguments: Any,
+) -> None:
     """Write a module as a policy file.
 
     Args:
@@ -27,7 +36,7 @@ def save_policy(path, module, task, safety_filter=None, **env_arguments):
             (N, ...), and returns deterministic actions, float32 (N, n), in [-1, 1]. It may not
             branch on values or draw random numbers.
         task: name of the task it was trained on, or path of a scene file; or `TASK@ROBOT`.
-        safety_filter: an `policies.safety_filter.SafetyFilter` that belongs to the policy.
+        safety_filter: a `policies.safety_filter.SafetyFilter` that belongs to the policy.
         env_arguments: the arguments of `roboarm_nmp.make` it was trained with: those of
             `policies.registry.ENV_ARGUMENTS`. Others define success, and are not stored.
 
@@ -44,16 +53,19 @@ def save_policy(path, module, task, safety_filter=None, **env_arguments):
             f"{', '.join(ENV_ARGUMENTS)}"
         )
     env = envs.make(task, **env_arguments)
-    goal_type, robot = env.goal_type, env.unwrapped.robot
+    robot = env.unwrapped.robot
     observations = [env.reset(seed=seed)[0] for seed in (0, 1)]
     env.close()
     example = {
-        name: torch.stack([torch.from_numpy(one[name]) for one in observations])
+        name: torch.stack([torch.from_numpy(observation[name]) for observation in observations])
         for name in observations[0]
     }
-    metadata = {"kind": "policy", "task": str(task), "env": {"goal_type": goal_type}}
-    metadata["env"] |= env_arguments
-    metadata |= robot_metadata(robot)
+    metadata = {
+        "kind": "policy",
+        "task": str(task),
+        "env": {"goal_type": env.goal_type, **env_arguments},
+        **robot_metadata(robot),
+    }
     if safety_filter is not None:
         metadata["safety_filter"] = safety_filter.to_metadata()
     with torch.no_grad():

@@ -192,7 +192,7 @@ def make_policy(
         begin = lambda number, query: EpisodePolicy(policy)  # noqa: E731
     elif policy in BASELINES:
         try:
-            begin = make_baseline(policy, env, seed, tries, time_limit, geometry_source)
+            begin = make_baseline(str(policy), env, seed, tries, time_limit, geometry_source)
         except ValueError as error:
             raise PolicyError(str(error)) from error
     else:
@@ -241,8 +241,8 @@ def _replanned(begin, env, seed, geometry_source):
 
     def begin_replanned(number, query):
         act, plan_found = begin(number, query)
-        replanning = begin_replanning(number, query).act
-        if act is not None:
+        replanning = begin_replanning(number, query)
+        if act is not None and replanning is not None:
             act = ReplanWhenStuck(act, replanning, env.robot.normalise(query.goal))
         return EpisodePolicy(act, plan_found)
 
@@ -312,19 +312,24 @@ def _trained(path, env):
     if mode != env.action_mode:
         raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
 
+    # One observation at a time: in a batch its last bits would depend on the batch's size, for a
+    # gain of a tenth of the time at most.
+    def predict(observation, recurrent_state) -> tuple[np.ndarray, np.ndarray]:
+        if size:
+            observation = observation | {"recurrent_state": recurrent_state}
+        inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
+        if size:
+            action, recurrent_state = network.predict_one(inputs, (robot.num_joints, size))
+        else:
+            action = np.asarray(network.predict_one(inputs, robot.num_joints))
+        return action, recurrent_state
+
     def begin(number, query):
         recurrent_state = np.zeros(size, np.float32)
 
-        # One observation at a time: in a batch its last bits would depend on the batch's size, for
-        # a gain of a tenth of the time at most.
         def act(observation):
             nonlocal recurrent_state
-            if size:
-                observation = observation | {"recurrent_state": recurrent_state}
-            inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
-            if not size:
-                return network.predict_one(inputs, robot.num_joints)
-            action, recurrent_state = network.predict_one(inputs, (robot.num_joints, size))
+            action, recurrent_state = predict(observation, recurrent_state)
             return action
 
         return EpisodePolicy(act)
@@ -343,7 +348,7 @@ def _trained(path, env):
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
     try:
-        begin(0, None).act(example)  # to see whether that raises
+        predict(example, np.zeros(size, np.float32))  # to see whether that raises
     except NetworkError as error:
         raise PolicyError(str(error)) from error
     return begin, as_observed

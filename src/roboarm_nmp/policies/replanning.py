@@ -19,10 +19,15 @@ A limit of checks, unlike one of time, gives the same actions on every machine.
 """
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
+from roboarm_nmp.envs.arm_env import Observation
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING
+from roboarm_nmp.policies.baselines import Policy
 from roboarm_nmp.policies.safety_filter import (
     PATIENCE,
     PROGRESS,
@@ -73,34 +78,49 @@ class Replanning:
         plans: how many plans were made, failed ones included.
     """
 
-    def __init__(self, robot, goal, current_checker, rng):
-        self._robot, self._current_checker, self._rng = robot, current_checker, rng
+    def __init__(
+        self,
+        robot: Robot,
+        goal: np.ndarray,
+        current_checker: Callable[[], CollisionChecker],
+        rng: np.random.Generator,
+    ):
+        self._robot = robot
         self._goal = np.clip(robot.normalise(goal), -1.0, 1.0)
-        self._path = self._waits_at = None  # sub-goals (m, n); whether they lead to a waiting place
-        self._due, self._step, self._next_try, self._strayed = 0, 0, 0, False
-        self._approach, self._effort = ApproachRates(current_checker), 1
+        self._current_checker = current_checker
+        self._rng = rng
+        self._path = None  # sub-goals (m, n)
+        self._waits_at = None  # whether they lead to a waiting place
+        self._due = 0  # the sub-goal to go to
+        self._strayed = False
+        self._step = 0
+        self._next_try = 0  # the step of the next plan after one that failed
+        self._effort = 1
+        self._approach = ApproachRates(current_checker)
         self._trail = deque(maxlen=TRAIL)  # states, at least a sub-goal's spacing apart
         self._checked = None  # the checker against which the whole path was checked last
         self.plans = 0
 
-    def __call__(self, observation):
+    def __call__(self, observation: Observation) -> np.ndarray:
         state = observation["observation"][: self._robot.num_joints].astype(np.float64)
-        here, checker = np.clip(state, -1.0, 1.0), self._current_checker()
+        here = np.clip(state, -1.0, 1.0)
+        checker = self._current_checker()
         self._approach.observe()
         self._advance(state)
         if self._needs_plan(checker, here) and self._step >= self._next_try:
             self._plan(checker, here)
             self._advance(state)
         self._step += 1
-        if self._path is None or self._must_wait(checker, here):
+        if self._path is None or self._must_wait(checker, here, self._path):
             return self._retreat(checker, here)
         if not self._trail or np.linalg.norm(here - self._trail[-1]) >= SUBGOAL_SPACING:
             self._trail.append(here)
         return self._path[self._due] - state
 
-    def forget(self):
+    def forget(self) -> None:
         """Plan anew in the next step, after steps of another policy."""
-        self._path = self._waits_at = None
+        self._path = None
+        self._waits_at = None
         self._trail.clear()
 
     def _retreat(self, checker, here):
@@ -120,10 +140,10 @@ class Replanning:
                 return self._trail[-1] - here
         return np.zeros(len(here))
 
-    def _must_wait(self, checker, here):
+    def _must_wait(self, checker, here, path):
         """Whether one of the next sub-goals is blocked, or will be when the arm is there."""
-        left = self._path[self._due :]
-        if not self._free(checker, here, left[:HOLD], 0.0):
+        left = path[self._due :]
+        if not self._free(checker, here, path, left[:HOLD], 0.0):
             return True
         if not self._approach.any_motion:
             return False
@@ -148,25 +168,26 @@ class Replanning:
             self._due += 1
 
     def _needs_plan(self, checker, here):
+        path = self._path
         occupied = self._is_occupied(checker)
-        if self._path is None or self._strayed or self._waits_at != occupied:
+        if path is None or self._strayed or self._waits_at != occupied:
             return True
         if checker is self._checked:
             return False
-        left = self._path[self._due :]
+        left = path[self._due :]
         if self._step % WATCH_ALL_EVERY:
             left = left[:WATCHED]
         else:
             self._checked = checker
-        return not self._free(checker, here, left, CHECK_MARGIN)
+        return not self._free(checker, here, path, left, CHECK_MARGIN)
 
     def _is_occupied(self, checker):
         distance = checker.signed_distances(self._goal, self_collisions=False).distance
         return bool(distance.min() < OCCUPIED)
 
-    def _free(self, checker, here, states, margin):
-        """Whether the arm can be at all states, near `here` and the goal with less margin."""
-        near = self._endpoint_margins(checker, here, self._path[-1])
+    def _free(self, checker, here, path, states, margin):
+        """Whether the arm can be at all states; near `here` and the path's end with less margin."""
+        near = self._endpoint_margins(checker, here, path[-1])
         return bool(checker.is_free(states, margin, endpoint_margins=near).all())
 
     def _endpoint_margins(self, checker, *ends):
@@ -182,9 +203,15 @@ class Replanning:
         path = None
         for margin, clearance, max_checks in LEVELS if goal is not None else ():
             near = self._endpoint_margins(checker, here, goal)
-            margins = margin / self._effort, clearance / self._effort
-            limits = {"endpoint_margins": near, "max_checks": self._effort * max_checks}
-            path, _ = checker.find_path(here, goal, self._rng, *margins, **limits)
+            path, _ = checker.find_path(
+                here,
+                goal,
+                self._rng,
+                margin / self._effort,
+                clearance / self._effort,
+                endpoint_margins=near,
+                max_checks=self._effort * max_checks,
+            )
             if path is not None:
                 break
         if path is None:
@@ -192,8 +219,11 @@ class Replanning:
             self._effort = min(2 * self._effort, MAX_EFFORT)
             return
         self._effort = 1
-        self._path, self._waits_at = dense(path), occupied
-        self._due, self._strayed, self._checked = 0, False, None
+        self._path = dense(path)
+        self._waits_at = occupied
+        self._due = 0
+        self._strayed = False
+        self._checked = None
 
     def _waiting_place(self, checker, here):
         """A free configuration near the goal, (n,); None if none is found."""
@@ -220,11 +250,14 @@ class ReplanWhenStuck:
         goal: normalised, (n,).
     """
 
-    def __init__(self, act, replanning, goal):
-        self._act, self._replanning, self._goal = act, replanning, goal
-        self._states, self._left = deque(maxlen=PATIENCE + 1), 0
+    def __init__(self, act: Policy, replanning: Replanning, goal: np.ndarray):
+        self._act = act
+        self._replanning = replanning
+        self._goal = goal
+        self._states = deque(maxlen=PATIENCE + 1)
+        self._left = 0  # steps of the plan
 
-    def __call__(self, observation):
+    def __call__(self, observation: Observation) -> np.ndarray:
         state = observation["observation"][: len(self._goal)]
         self._states.append(state)
         if self._left == 0 and len(self._states) > PATIENCE:
@@ -241,7 +274,7 @@ class ReplanWhenStuck:
         return self._replanning(observation)
 
 
-def dense(path):
+def dense(path: np.ndarray) -> np.ndarray:
     """Sub-goals along a normalised path (k, n), at most `SUBGOAL_SPACING` apart: (m, n)."""
     points = [path[:1]]
     for start, end in zip(path, path[1:], strict=False):

@@ -39,16 +39,20 @@ walk escapes (Barraquand and Latombe, 1991), and a virtual obstacle then keeps t
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.checker import self_distances
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.collision.checker import CollisionChecker, self_distances
 from roboarm_nmp.envs.collision.filter_kernels import project
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.planning.approach_path import ApproachPaths
+from roboarm_nmp.policies.baselines import Policy
 
 # Of the filter's behaviour, recorded in results. 1: other escapes, no virtual obstacles. 2: slow
 # arrivals counted as local minima, and the gain was the same near a goal as elsewhere. 3: approach
@@ -109,7 +113,7 @@ class SafetyFilter:
     approach: bool = False
     lookahead: float | None = LOOKAHEAD
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         lookahead = 0.0 if self.lookahead is None else self.lookahead
         if not (is_number(lookahead) and 0 <= lookahead <= MAX_LOOKAHEAD):
             raise ValueError(
@@ -122,7 +126,7 @@ class SafetyFilter:
                 raise ValueError(f"{name} must be a bool, got {getattr(self, name)!r}")
 
     @classmethod
-    def from_metadata(cls, metadata):
+    def from_metadata(cls, metadata: dict[str, Any]) -> "SafetyFilter | None":
         """The `SafetyFilter` of a policy, from its file's metadata; None if it has none.
 
         Its options are in `safety_filter`, a dict with `margin`, `escape` and possibly `approach`
@@ -133,14 +137,17 @@ class SafetyFilter:
         if options is None:
             return None
         try:
-            flags = bool(options["escape"]), bool(options.get("approach", False))
             lookahead = options.get("lookahead", LOOKAHEAD)
-            lookahead = None if lookahead is None else float(lookahead)
-            return cls(float(options["margin"]), *flags, lookahead)
-        except (KeyError, TypeError, ValueError) as error:
+            return cls(
+                margin=float(options["margin"]),
+                escape=bool(options["escape"]),
+                approach=bool(options.get("approach", False)),
+                lookahead=None if lookahead is None else float(lookahead),
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"invalid safety_filter in its metadata: {options!r}") from error
 
-    def to_metadata(self):
+    def to_metadata(self) -> dict[str, Any]:
         """The options as `from_metadata` reads them."""
         options = {"margin": self.margin, "escape": self.escape}
         if self.approach:
@@ -151,13 +158,13 @@ class SafetyFilter:
 
     def __call__(
         self,
-        actions,
-        link_distances,
-        margins=None,
-        max_step=MAX_STEP,
-        cbf_gain=CBF_GAIN,
-        rates=None,
-    ):
+        actions: np.ndarray,
+        link_distances: np.ndarray,
+        margins: np.ndarray | None = None,
+        max_step: float = MAX_STEP,
+        cbf_gain: float = CBF_GAIN,
+        rates: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Actions (..., n), float32, that satisfy the constraints of all rows, to first order.
 
         They are close to the given actions, but not always the closest. Where the constraints
@@ -175,7 +182,8 @@ class SafetyFilter:
         actions = np.array(actions, np.float64)
         link_distances = np.asarray(link_distances, np.float64)
         rows = link_distances.shape[-2]
-        margins = self.margin if margins is None else margins
+        if margins is None:
+            margins = np.array(self.margin)
         margins = np.broadcast_to(margins, link_distances.shape[:-1]).astype(np.float64)
         rates = np.zeros(margins.shape) if rates is None else np.array(rates, np.float64)
         project(
@@ -191,81 +199,18 @@ class SafetyFilter:
         )
         return actions.astype(np.float32)
 
-    def filter_policy(self, act, env, rng):
+    def filter_policy(self, act: Policy, env: RoboArmEnv, rng: np.random.Generator) -> Policy:
         """A policy through this filter, for one episode.
 
         Args:
             act: the policy, a function from an observation to an action (n,).
             env: the `RoboArmEnv` of the episode. See `check_env`.
             rng: a NumPy Generator, for the directions of escapes.
-
-        Returns:
-            A function like `act`.
         """
-        act_safely = self._filter_actions(act, env, rng)
+        act_safely = _FilteredPolicy(self, act, env, rng)
         return ApproachPaths(act_safely, env) if self.approach else act_safely
 
-    def _filter_actions(self, act, env, rng):
-        """`filter_policy` without approach paths."""
-        link_distances_at, max_step = env.get_wrapper_attr("link_distances_at"), env.max_step
-        joints = env.robot.num_joints
-        local_minima, goal_distances = _LocalMinima(rng, max_step, joints), None
-        approach_rates = None
-        if self.lookahead is not None:
-            approach_rates = ApproachRates(env.get_wrapper_attr("current_checker"))
-            steps_ahead = self.lookahead / STEP_SECONDS
-
-        def predict(state, rows):
-            """Rates of rows of link distances; the rows are changed to those after `lookahead`."""
-            rates = np.zeros(len(rows))
-            if approach_rates is not None and approach_rates.any_motion:
-                scene = rows[: env.robot.link_distances_shape[0]]
-                rates[: len(scene)] = approach_rates(state, scene[:, 0])
-                rows[:, 0] += steps_ahead * rates
-            return rates
-
-        def act_safely(observation):
-            nonlocal goal_distances
-            robot = env.robot  # an episode's scene may have another gripper opening, or objects
-            state, goal = observation["observation"][:joints], None
-            here = np.concatenate([observation["link_distances"], _self_distances(robot, state)])
-            if approach_rates is not None:
-                approach_rates.observe()
-            rates_here = predict(state, here)
-            margins, cbf_gain = np.broadcast_to(self.margin, len(here)), CBF_GAIN
-            if "goal_link_distances" in observation:
-                goal = observation["desired_goal"][:joints]
-                moves = approach_rates is not None and approach_rates.any_motion
-                if goal_distances is None or moves:
-                    rows = observation["goal_link_distances"], _self_distances(robot, goal)
-                    goal_distances = np.concatenate(rows)[:, 0]
-                    if moves and goal_distances.min() < OCCUPIED:
-                        goal_distances = np.full(len(goal_distances), np.inf)
-                remaining = np.linalg.norm(state - goal)
-                margins = self.margins_near_goal(goal_distances, remaining)
-                cbf_gain = max(CBF_GAIN, 1.0 - (1.0 - CBF_GAIN) * remaining / ARRIVAL_DISTANCE)
-            action = local_minima.escape(state, goal) if self.escape else None
-            if action is None:
-                action = local_minima.add_momentum(act(observation))
-            # Virtual obstacles come first: the last projections of a sweep prevail.
-            virtual = local_minima.virtual_obstacles(state)
-            here = np.concatenate([virtual, here])
-            margins_here = np.concatenate([np.zeros(len(virtual)), margins])
-            rates_here = np.concatenate([np.zeros(len(virtual)), rates_here])
-            move = self(action, here, margins_here, max_step, cbf_gain, rates_here)
-            # Distances at the end of the step, extrapolated back to its start.
-            end = state + move
-            there = np.concatenate([link_distances_at(end), _self_distances(robot, end)])
-            rates = np.concatenate([rates_here, predict(end, there)])
-            there[:, 0] -= there[:, 1:] @ move
-            rows = np.concatenate([here, there])
-            margins = np.concatenate([margins_here, margins])
-            local_minima.last_action = self(action, rows, margins, max_step, cbf_gain, rates)
-            return local_minima.last_action
-
-        return act_safely
-
-    def margins_near_goal(self, goal_distances, remaining):
+    def margins_near_goal(self, goal_distances: np.ndarray, remaining: float) -> np.ndarray:
         """Margins of the links, m, (rows,): smaller near a goal that violates the filter's margin.
 
         Args:
@@ -273,6 +218,78 @@ class SafetyFilter:
             remaining: distance from the goal, L2, normalised.
         """
         return np.minimum(self.margin, goal_distances + MARGIN_GROWTH * remaining)
+
+
+class _FilteredPolicy:
+    """A policy through a `SafetyFilter`, without approach paths. See `filter_policy`."""
+
+    def __init__(self, safety_filter, act, env, rng):
+        self._filter = safety_filter
+        self._act = act
+        self._env = env
+        self._link_distances_at = env.get_wrapper_attr("link_distances_at")
+        self._max_step = env.max_step
+        self._joints = env.robot.num_joints
+        self._local_minima = _LocalMinima(rng, env.max_step, self._joints)
+        self._goal_distances = None
+        self._approach_rates = None
+        if safety_filter.lookahead is not None:
+            self._approach_rates = ApproachRates(env.get_wrapper_attr("current_checker"))
+
+    def __call__(self, observation):
+        local_minima = self._local_minima
+        robot = self._env.robot  # an episode's scene may have another gripper opening, or objects
+        state = observation["observation"][: self._joints]
+        here = np.concatenate([observation["link_distances"], _self_distances(robot, state)])
+        if self._approach_rates is not None:
+            self._approach_rates.observe()
+        rates_here = self._predict(state, here)
+        margins = np.broadcast_to(self._filter.margin, len(here))
+        cbf_gain = CBF_GAIN
+        goal = None
+        if "goal_link_distances" in observation:
+            goal = observation["desired_goal"][: self._joints]
+            self._update_goal_distances(observation["goal_link_distances"], robot, goal)
+            remaining = np.linalg.norm(state - goal)
+            margins = self._filter.margins_near_goal(self._goal_distances, remaining)
+            cbf_gain = max(CBF_GAIN, 1.0 - (1.0 - CBF_GAIN) * remaining / ARRIVAL_DISTANCE)
+        action = local_minima.escape(state, goal) if self._filter.escape else None
+        if action is None:
+            action = local_minima.add_momentum(self._act(observation))
+        # Virtual obstacles come first: the last projections of a sweep prevail.
+        virtual = local_minima.virtual_obstacles(state)
+        here = np.concatenate([virtual, here])
+        margins_here = np.concatenate([np.zeros(len(virtual)), margins])
+        rates_here = np.concatenate([np.zeros(len(virtual)), rates_here])
+        move = self._filter(action, here, margins_here, self._max_step, cbf_gain, rates_here)
+        # Distances at the end of the step, extrapolated back to its start.
+        end = state + move
+        there = np.concatenate([self._link_distances_at(end), _self_distances(robot, end)])
+        rates = np.concatenate([rates_here, self._predict(end, there)])
+        there[:, 0] -= there[:, 1:] @ move
+        rows = np.concatenate([here, there])
+        margins = np.concatenate([margins_here, margins])
+        safe_action = self._filter(action, rows, margins, self._max_step, cbf_gain, rates)
+        local_minima.last_action = safe_action
+        return safe_action
+
+    def _predict(self, state, rows):
+        """Rates of rows of link distances; the rows are changed to those after `lookahead`."""
+        rates = np.zeros(len(rows))
+        if self._approach_rates is not None and self._approach_rates.any_motion:
+            scene = rows[: self._env.robot.link_distances_shape[0]]
+            rates[: len(scene)] = self._approach_rates(state, scene[:, 0])
+            rows[:, 0] += self._filter.lookahead / STEP_SECONDS * rates
+        return rates
+
+    def _update_goal_distances(self, link_distances, robot, goal):
+        """Distances at the goal, (rows,): once, or in each step if obstacles move."""
+        moves = self._approach_rates is not None and self._approach_rates.any_motion
+        if self._goal_distances is None or moves:
+            distances = np.concatenate([link_distances, _self_distances(robot, goal)])[:, 0]
+            if moves and distances.min() < OCCUPIED:
+                distances = np.full(len(distances), np.inf)
+            self._goal_distances = distances
 
 
 class ApproachRates:
@@ -285,13 +302,15 @@ class ApproachRates:
             last observation, the same object as long as there is no new one.
     """
 
-    def __init__(self, current_checker):
+    def __init__(self, current_checker: Callable[[], CollisionChecker]):
         self._current_checker = current_checker
-        self._observed, self._step = deque(), 0  # pairs of a step and a checker
+        self._observed = deque()  # pairs of a step and a checker
+        self._step = 0
 
-    def observe(self):
+    def observe(self) -> None:
         """Take the present observation into account."""
-        checker, observed = self._current_checker(), self._observed
+        checker = self._current_checker()
+        observed = self._observed
         self._step += 1
         if not observed or checker is not observed[-1][1]:
             observed.append((self._step, checker))
@@ -303,11 +322,11 @@ class ApproachRates:
                 observed.popleft()
 
     @property
-    def any_motion(self):
+    def any_motion(self) -> bool:
         """Whether the last observations differ."""
         return len(self._observed) > 1
 
-    def __call__(self, state, distances):
+    def __call__(self, state: np.ndarray, distances: np.ndarray) -> np.ndarray:
         """Changes of link distances, m per step, (..., l), from -`MAX_APPROACH` to 0.
 
         Args:
@@ -323,11 +342,15 @@ class _LocalMinima:
     """The local minima of one episode: escapes from them, and virtual obstacles around them."""
 
     def __init__(self, rng, max_step, num_joints):
-        self.rng, self.max_step, self.num_joints = rng, max_step, num_joints
+        self.rng = rng
+        self.max_step = max_step
+        self.num_joints = num_joints
         self.num_escape_joints = max(num_joints - TURNING_JOINTS, 1)
         self.states = deque(maxlen=PATIENCE + 1)  # since the last escape
-        self.steps_left, self.direction = 0, None  # of an escape
-        self.momentum, self.last_action = 0.0, None
+        self.steps_left = 0  # of an escape
+        self.direction = np.zeros(num_joints)  # of an escape
+        self.momentum = 0.0
+        self.last_action = np.zeros(num_joints, np.float32)
         self.obstacles = []  # configuration of the escape joints, radius
 
     def escape(self, state, goal):
@@ -339,14 +362,16 @@ class _LocalMinima:
                 obstacles, which might contain it.
         """
         self.states.append(state)
-        moved, progress = np.linalg.norm(state - self.states[0]), PROGRESS
+        moved = np.linalg.norm(state - self.states[0])
+        progress = PROGRESS
         if goal is not None:
             remaining = np.linalg.norm(goal - self.states[0])
             progress = min(PROGRESS, PROGRESS_SHARE * remaining)
         if self.steps_left == 0 and len(self.states) > PATIENCE and moved < progress:
+            self.steps_left = ESCAPE_STEPS
             direction = self.rng.standard_normal(self.num_escape_joints)
-            self.steps_left, self.direction = ESCAPE_STEPS, np.zeros(self.num_joints)
             direction *= self.max_step / np.linalg.norm(direction)
+            self.direction = np.zeros(self.num_joints)
             self.direction[: self.num_escape_joints] = direction
             if goal is not None:
                 remaining = np.linalg.norm((goal - state)[: self.num_escape_joints])
@@ -379,8 +404,8 @@ class _LocalMinima:
         return rows
 
 
-def check_env(env):
-    """Raises ValueError if a safety filter cannot act in this environment."""
+def check_env(env: RoboArmEnv) -> None:
+    """Raise ValueError if a safety filter cannot act in this environment."""
     if "link_distances" not in env.observation_space.spaces:
         raise ValueError(
             "a safety filter needs link_distances in observations: "
