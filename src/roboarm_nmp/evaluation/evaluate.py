@@ -45,11 +45,10 @@ from roboarm_nmp.policies.baselines import (
     SPACE_TIME,
     TIME_LIMIT,
     TRIES,
-    Policy,
 )
+from roboarm_nmp.policies.policy import BeginEpisode, Policy
 from roboarm_nmp.policies.pose_goals import goal_configuration
 from roboarm_nmp.policies.registry import (
-    BeginEpisode,
     filter_around,
     find_policy,
     make_policy,

@@ -20,7 +20,7 @@ from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.motions.trajectories import Trajectory
-from roboarm_nmp.policies.baselines import Policy
+from roboarm_nmp.policies.policy import Policy
 
 AnyPolicy = TypeVar("AnyPolicy", bound=Policy)
 REAL_TIME = "real_time"

@@ -18,7 +18,7 @@ import math
 import operator
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -237,7 +237,7 @@ class Planner:
         simplify: int = 1,
         geometry_source: Callable[[Scene], CollisionChecker] = CollisionChecker,
         max_checks: int | None = None,
-        limits: str = "urdf",
+        limits: Literal["urdf", "datasheet"] = "urdf",
     ):
         if not callable(planner) and planner not in PLANNERS:
             raise ValueError(f"unknown planner {planner!r}: {suggest(planner, PLANNERS)}")
@@ -261,7 +261,7 @@ class Planner:
         self.planner_range = planner_range
         self.simplify = simplify
         self.max_checks = max_checks
-        self.limits = limits
+        self.limits: Literal["urdf", "datasheet"] = limits
         self._geometry_source = geometry_source
         self._scene = env.scene
         self._checker = geometry_source(env.scene.at(0.0))

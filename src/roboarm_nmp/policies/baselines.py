@@ -23,16 +23,17 @@ the present step. `space-time` always has the ground truth, the future included.
 import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from roboarm_nmp.datasets.queries import Query
-from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.policies.policy import BeginEpisode, EpisodePolicy, Policy
 from roboarm_nmp.policies.pose_goals import goal_configuration, observed_at_start
 
 if TYPE_CHECKING:  # Numba takes a while to import
@@ -51,24 +52,6 @@ BASELINES = ("go-to-goal", "random", *CHECKING)
 TRIES = 16  # of `via-points`, by default
 TIME_LIMIT = 5.0  # s, of `planner`, by default
 
-Policy = Callable[[Observation], np.ndarray]
-"""A policy in one episode: a function from an observation to an action (n,)."""
-
-
-class EpisodePolicy(NamedTuple):
-    """A policy in one episode.
-
-    act: act(observation) -> action (n,); None: the policy gives up.
-    plan_found: whether it found a motion; None if it does not look for one.
-    """
-
-    act: Policy | None
-    plan_found: bool | None = None
-
-
-BeginEpisode = Callable[[int, Query], EpisodePolicy]
-"""A policy in an environment: a function that is called with a query and its number, once per
-episode, before the environment's reset to the query."""
 GeometrySource = Callable[[Scene], "CollisionChecker"]
 
 

@@ -24,12 +24,10 @@ from roboarm_nmp.policies.baselines import (
     REPLANNING,
     TIME_LIMIT,
     TRIES,
-    BeginEpisode,
-    EpisodePolicy,
-    Policy,
     make_baseline,
     make_replanning,
 )
+from roboarm_nmp.policies.policy import BeginEpisode, EpisodePolicy, Policy
 from roboarm_nmp.policies.pose_goals import ConfigurationGoals
 from roboarm_nmp.utils.names import suggest
 

@@ -27,7 +27,7 @@ from roboarm_nmp.envs.arm_env import Observation
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING
-from roboarm_nmp.policies.baselines import Policy
+from roboarm_nmp.policies.policy import Policy
 from roboarm_nmp.policies.safety_filter import (
     PATIENCE,
     PROGRESS,

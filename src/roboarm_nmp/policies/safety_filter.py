@@ -52,7 +52,7 @@ from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.planning.approach_path import ApproachPaths
-from roboarm_nmp.policies.baselines import Policy
+from roboarm_nmp.policies.policy import Policy
 
 # Of the filter's behaviour, recorded in results. 1: other escapes, no virtual obstacles. 2: slow
 # arrivals counted as local minima, and the gain was the same near a goal as elsewhere. 3: approach

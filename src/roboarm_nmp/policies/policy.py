@@ -1,0 +1,28 @@
+"""What a policy is: a function from an observation to an action, made anew for each episode."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from roboarm_nmp.datasets.queries import Query
+from roboarm_nmp.envs.arm_env import Observation
+
+Policy = Callable[[Observation], np.ndarray]
+"""A policy in one episode: a function from an observation to an action (n,)."""
+
+
+class EpisodePolicy(NamedTuple):
+    """A policy in one episode.
+
+    act: act(observation) -> action (n,); None: the policy gives up.
+    plan_found: whether it found a motion; None if it does not look for one.
+    """
+
+    act: Policy | None
+    plan_found: bool | None = None
+
+
+BeginEpisode = Callable[[int, Query], EpisodePolicy]
+"""A policy in an environment: a function that is called with a query's number and the query, once
+per episode, before the environment's reset to the query."""
