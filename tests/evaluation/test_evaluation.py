@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +16,6 @@ import torch
 from paths import ROOT
 from torch import nn
 
-import roboarm_nmp
 from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import evaluate as command
 from roboarm_nmp.datasets.queries import load_queries, write_queries
@@ -116,10 +114,8 @@ def test_path_length_and_smoothness_equal_values_by_hand():
     # steps (3, 4), (0, 0), (0, 2); their differences (-3, -4), (0, 2)
     assert evaluation.path_length(configurations) == pytest.approx(5 + 0 + 2)
     assert evaluation.smoothness(configurations) == pytest.approx((5 + 2) / 2)
-    straight = np.linspace(np.zeros(7), np.ones(7), 11)
-    assert evaluation.path_length(straight) == pytest.approx(np.sqrt(7))
-    assert evaluation.smoothness(straight) == pytest.approx(0.0, abs=1e-12)
-    assert evaluation.path_length(straight[:1]) == evaluation.smoothness(straight[:2]) == 0.0
+    assert evaluation.path_length(configurations[:1]) == 0.0
+    assert evaluation.smoothness(configurations[:2]) == 0.0
 
 
 def test_metrics_of_an_evaluation_equal_those_of_its_episodes(queries):
@@ -150,19 +146,11 @@ def test_metrics_of_an_evaluation_equal_those_of_its_episodes(queries):
     assert json.loads(json.dumps(result)) == result
 
 
-def test_start_at_the_goal_is_a_success_of_no_steps():
-    start = np.array([[0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0]], np.float32)
-    result = evaluate(
-        "go-to-goal", "no_obstacles", queries=SimpleNamespace(start=start, goal=start)
-    )
-    assert result["success_rate"] == 1.0
-    assert result["mean_steps"] == result["path_length"] == result["smoothness"] == 0.0
-    assert result["ms_per_action"] is None
-
-
 def test_stop_on_collision_leaves_collision_free_successes_only(queries):
-    free = evaluate("go-to-goal", "no_obstacles", queries=queries)
-    stopped = evaluate("go-to-goal", "no_obstacles", queries=queries, stop_on_collision=True)
+    few = {"queries": queries, "num_queries": 20}
+    free = evaluate("go-to-goal", "no_obstacles", **few)
+    stopped = evaluate("go-to-goal", "no_obstacles", **few, stop_on_collision=True)
+    assert free["collision_rate"] > 0
     assert (
         stopped["success_rate"]
         == stopped["collision_free_success_rate"]
@@ -174,10 +162,8 @@ def test_stop_on_collision_leaves_collision_free_successes_only(queries):
 # --- Reproducibility
 
 
-def test_result_does_not_depend_on_the_number_of_workers(queries):
-    alone = evaluate("random", "no_obstacles", queries=queries, num_queries=12, seed=3)
-    assert alone["success_rate"] == 0 and alone["mean_steps"] is None
-    options = {"split": "validation", "num_queries": 30, "seed": 5}
+def test_result_does_not_depend_on_the_number_of_workers():
+    options = {"split": "validation", "num_queries": 12, "seed": 5}
     alone = evaluate("via-points", "wall", **options)
     shared = evaluate("via-points", "wall", **options, workers=2)
     assert _numbers(alone) == _numbers(shared)
@@ -200,12 +186,12 @@ def test_network_function_and_baseline_with_the_same_actions_agree(queries, tmp_
     def straight(observation):
         return observation["desired_goal"] - observation["observation"][:7]
 
-    few = {"queries": queries, "num_queries": 15}
+    few = {"queries": queries, "num_queries": 5}
     threads = torch.get_num_threads()
     baseline = evaluate("go-to-goal", "no_obstacles", goal_type="config", **few)
     function = evaluate(straight, "no_obstacles", goal_type="config", **few)
     network = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
-    folder = evaluate(str(tmp_path), "no_obstacles", **few, workers=2)
+    folder = evaluate(str(tmp_path), "no_obstacles", **few)
     assert torch.get_num_threads() == threads
     assert _numbers(network) == _numbers(folder)
     assert function["policy"] == "straight"
@@ -255,17 +241,6 @@ def test_via_points_go_around_the_wall():
     assert (result["tries"], result["time_limit"]) == (200, None)
 
 
-def test_via_points_go_straight_if_that_is_free_or_no_motion_is_found():
-    both = _queries((LEFT, HIGHER), (LEFT, RIGHT))
-    straight = evaluate("go-to-goal", "wall", queries=both)
-    # The one random configuration of this seed is no way to the second goal.
-    result = evaluate("via-points", "wall", queries=both, tries=1)
-    assert result["free_motion_rate"] == 0.5 and result["collision_free_success_rate"] == 0.5
-    for name in ("success_rate", "collision_rate", "mean_steps", "path_length"):
-        assert result[name] == straight[name]
-    assert 0 < result["planning_seconds_solved"] != result["planning_seconds"]
-
-
 def test_planner_solves_double_walls_and_follows_its_plan():
     queries = load_queries("double_walls", "validation")[:4]
     straight = evaluate("go-to-goal", "double_walls", queries=queries)
@@ -294,44 +269,35 @@ def test_planner_solves_double_walls_and_follows_its_plan():
 def test_safety_filter_lowers_collisions_and_escapes_raise_success(tmp_path):
     results = {}
     for name, flags in {
-        "bare": [],
-        "none": ["--safety-margin", "0"],
+        "bare": ["--safety-margin", "0"],
         "filter": ["--safety-margin", "0.01", "--no-escape"],
         "escape": ["--safety-margin", "0.01"],
-        "points": ["--safety-margin", "0.015", "--geometry-source", "point_cloud"],
     }.items():
-        arguments = ["--policy", "go-to-goal", "--task", HARD, "--num-queries", "12"]
+        arguments = ["--policy", "go-to-goal", "--task", HARD, "--num-queries", "8"]
         arguments += ["--split", "validation", "--goal-type", "combined"]
         assert command.main([*arguments, *flags, "--json", str(tmp_path / "result.json")]) == 0
         results[name] = json.loads((tmp_path / "result.json").read_text())
-    assert _numbers(results["none"]) == _numbers(results["bare"])
     assert results["bare"]["collision_rate"] > 0.5
     filters = {name: result["safety_filter"] for name, result in results.items()}
-    assert filters["bare"] is filters["none"] is None
+    assert filters["bare"] is None
     assert filters["filter"] == {"margin": 0.01, "escape": False, "version": VERSION}
     assert filters["escape"] == {"margin": 0.01, "escape": True, "version": VERSION}
-    assert filters["points"] == {"margin": 0.015, "escape": True, "version": VERSION}
-    for name in ("filter", "escape", "points"):
+    for name in ("filter", "escape"):
         assert results[name]["collision_rate"] < 0.6 * results["bare"]["collision_rate"]
     rates = {name: result["success_rate"] for name, result in results.items()}
     assert rates["bare"] < rates["filter"] < rates["escape"]
-    assert results["points"]["seed"] == 0 and results["bare"]["seed"] is None
+    assert results["escape"]["seed"] == 0 and results["bare"]["seed"] is None
 
 
-def test_no_escape_changes_the_filter_that_a_policy_includes(tmp_path):
-    arguments = ["--policy", POLICY, "--task", "wall", "--num-queries", "1", "--no-escape"]
+def test_flags_change_the_filter_that_a_policy_includes(tmp_path, capsys):
+    arguments = ["--policy", POLICY, "--task", "wall", "--num-queries", "1"]
+    arguments += ["--approach", "--no-escape", "--no-obstacle-velocities"]
     assert command.main([*arguments, "--json", str(tmp_path / "result.json")]) == 0
     result = json.loads((tmp_path / "result.json").read_text())
-    assert result["safety_filter"] == {"margin": 0.01, "escape": False, "version": VERSION}
-
-
-def test_approach_adds_paths_to_the_filter_that_a_policy_includes(tmp_path, capsys):
-    arguments = ["--policy", POLICY, "--task", "wall", "--num-queries", "1", "--approach"]
-    assert command.main([*arguments, "--json", str(tmp_path / "result.json")]) == 0
-    result = json.loads((tmp_path / "result.json").read_text())
-    kept = {"margin": 0.01, "escape": True, "approach": True, "version": VERSION}
-    assert result["safety_filter"] == kept
-    assert "escapes local minima, approach paths" in capsys.readouterr().out
+    changed = {"margin": 0.01, "escape": False, "approach": True, "lookahead": None}
+    assert result["safety_filter"] == changed | {"version": VERSION}
+    words = "margin 0.01 m, no escape, approach paths, no obstacle velocities\n"
+    assert words in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("source", [None, "point_cloud"])
@@ -366,19 +332,15 @@ FILTER = SafetyFilter(margin=0.01)
     ("policy", "options", "source", "privileged"),
     [
         ("go-to-goal", {}, None, False),
-        ("random", {}, None, False),
         ("sac-ee-wall-p1-s1", {}, None, False),
         ("bc-combined-oracle-random_boxes_hard-s1", {}, None, True),
         (POLICY, {}, "point_cloud", False),
-        (POLICY, {"safety_filter": False}, "point_cloud", False),
         (POLICY, {"geometry_source": "ground_truth"}, "ground_truth", True),
         (POLICY, {"geometry_source": "field"}, "field", False),
-        ("via-points", {}, "ground_truth", True),
         ("planner", {}, "ground_truth", True),
         ("planner", {"geometry_source": "point_cloud"}, "point_cloud", False),
         # A filter without a geometry source of its own takes the ground truth.
         ("go-to-goal", {"safety_filter": FILTER}, "ground_truth", True),
-        ("sac-ee-wall-p1-s1", {"safety_filter": FILTER}, "ground_truth", True),
         ("go-to-goal", {"safety_filter": FILTER, "geometry_source": "field"}, "field", False),
     ],
 )
@@ -390,43 +352,6 @@ def test_result_and_header_say_whether_ground_truth_was_used(policy, options, so
     assert header.get("privileged", "no") == ("yes" if privileged else "no")
 
 
-def test_headers_of_different_evaluations_differ():
-    cases = [
-        ("go-to-goal", {}),
-        ("go-to-goal", {"goal_type": "config"}),
-        ("go-to-goal", {"safety_filter": FILTER}),
-        ("go-to-goal", {"safety_filter": SafetyFilter(FILTER.margin / 2)}),
-        ("go-to-goal", {"safety_filter": SafetyFilter(FILTER.margin, escape=False)}),
-        ("go-to-goal", {"safety_filter": FILTER, "geometry_source": "point_cloud"}),
-        ("random", {"seed": 1}),
-        ("random", {"seed": 2}),
-        ("via-points", {"tries": 1}),
-        ("via-points", {"tries": 2}),
-        ("planner", {"time_limit": 1.0}),
-        ("planner", {"time_limit": 2.5}),
-        (POLICY, {}),
-        (POLICY, {"safety_filter": False}),
-    ]
-    headers = [
-        (policy, header_of(evaluate(policy, "wall", num_queries=1, **options)))
-        for policy, options in cases
-    ]
-    assert all(headers.count(header) == 1 for header in headers)
-    (policy, last) = headers[-2]
-    assert last["encoder"] == "point_cloud, 32 points"
-    assert last["safety filter"] == "margin 0.01 m, escapes local minima"
-    assert headers[0][1]["encoder"] == headers[0][1]["safety filter"] == "none"
-    assert headers[-3][1]["time limit"] == "2.5 s per query"
-
-
-def test_header_says_once_how_the_filter_takes_moving_obstacles():
-    for lookahead, words in ((0.5, ", 0.5 s ahead"), (None, ", no obstacle velocities")):
-        safety_filter = SafetyFilter(FILTER.margin, lookahead=lookahead)
-        result = evaluate("go-to-goal", "wall", num_queries=1, safety_filter=safety_filter)
-        expected = "margin 0.01 m, escapes local minima" + words
-        assert header_of(result)["safety filter"] == expected
-
-
 def test_task_defaults_to_that_of_the_policy(tmp_path):
     (tmp_path / "run").mkdir()
     path = _save(tmp_path / "run" / "policy.pt", task="boxes")
@@ -436,17 +361,6 @@ def test_task_defaults_to_that_of_the_policy(tmp_path):
     for policy in ("go-to-goal", _no_motion):
         with pytest.raises(EvaluationError, match="has no task of its own"):
             evaluate(policy)
-
-
-def test_points_without_link_distances_are_not_privileged():
-    env = {"encoder": "point_cloud", "num_points": 8}
-    still = {"policy": _no_motion, "task": "wall", "num_queries": 1}
-    result = evaluate(**still, env=env)
-    assert (result["geometry_source"], result["privileged"]) == ("point_cloud", False)
-    result = evaluate(**still, env=env, geometry_source="field")
-    assert (result["geometry_source"], result["privileged"]) == ("field", False)
-    with pytest.raises(EvaluationError, match="geometry_source is for via-points, planner, a safe"):
-        evaluate(**still, env=env, geometry_source="ground_truth")
 
 
 def _no_motion(observation):
@@ -510,7 +424,7 @@ def _write_scenes(folder, base, scenes):
     return str(task), path
 
 
-@pytest.mark.parametrize("policy", ["go-to-goal", "via-points", "planner"])
+@pytest.mark.parametrize("policy", ["via-points", "planner"])
 def test_each_query_is_in_its_own_scene(policy, tmp_path):
     task, path = _write_scenes(tmp_path, Scene(), [Scene(), BLOCKED, Scene(), BLOCKED])
     result = evaluate(policy, task, tries=1, time_limit=60.0)
@@ -582,34 +496,23 @@ def test_errors_of_the_command_are_one_line_before_any_work(
     policy = str(_save(tmp_path / "policy.pt"))
     (tmp_path / "broken.pt").write_bytes(Path(policy).read_bytes()[:500])
     encoder = str(_save(tmp_path / "encoder.pt", kind="encoder"))
-    arguments = {"goal_type": "config", "action_mode": "subgoal"}
-    subgoal = str(_save(tmp_path / "subgoal.pt", env=arguments))
     unsaid = str(_save(tmp_path / "unsaid.pt", env={}))
     unfit = str(_save(tmp_path / "unfit.pt", env={"goal_type": "ee"}))
-    (tmp_path / "empty").mkdir()
     cases = [
         ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol: did you mean go-to-goal?"),
-        ({"policy": "sac-ee-wal-p1"}, "did you mean sac-ee-wall-p1-s1?"),
-        ({"task": "wal"}, "unknown task 'wal': did you mean wall?"),
-        ({"policy": str(tmp_path / "empty")}, "no such policy"),
         ({"policy": str(tmp_path / "broken.pt")}, "broken.pt: not a network file"),
         ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
+        ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
+        ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
+        ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
+        ({"task": "wal"}, "unknown task 'wal': did you mean wall?"),
+        ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),
+        ({"num-queries": "31"}, "num_queries must be 1 to 30, got 31"),
+        ({"split": "original"}, "has no original queries"),
         ({"geometry-source": "point_cloud"}, "geometry_source is for via-points, planner, a safe"),
         ({"policy": "planner", "geometry-source": "vae"}, "vae has no decoder"),
-        (
-            {"policy": subgoal, "safety-margin": "0.01"},
-            "a safety filter needs action_mode 'relative'",
-        ),
-        (
-            {"policy": "go-to-goal", "safety-margin": "0.15"},
-            "margin must be in [0, 0.15) m, got 0.15",
-        ),
-        ({"policy": policy, "no-escape": None}, "--no-escape: the policy has no safety filter"),
         ({"policy": policy, "approach": None}, "--approach: the policy has no safety filter"),
-        (
-            {"safety-margin": "0", "approach": None},
-            "there is no safety filter with --safety-margin",
-        ),
+        ({"safety-margin": "0", "approach": None}, "there is no safety filter with --safety-mar"),
         (
             {"safety-margin": "0.01", "no-obstacle-velocities": None, "lookahead": "0.2"},
             "--lookahead needs the velocities that --no-obstacle-velocities leaves out",
@@ -617,30 +520,9 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         ({"policy": "replanning", "replan": None}, "replan: replanning plans again by itself"),
         ({"policy": "planner", "tries": "3"}, "--tries is for via-points"),
         ({"policy": "via-points", "time-limit": "3"}, "--time-limit is for planner and space-time"),
-        ({"observe-every": "5"}, "this policy observes nothing of the scene"),
-        ({"sensor-noise": "latency=3"}, "this policy observes nothing of the scene"),
-        ({"policy": unsaid}, "unsaid.pt: does not say which goal type"),
-        ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
-        ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
-        ({"task": "moon"}, "unknown task 'moon': one of no_obstacles"),
-        (
-            {"task": "part.stl"},
-            "scene files are .yaml or .scene (docs/customise/scene.md), got part",
-        ),
-        ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),
-        ({"queries": str(tmp_path / "no.h5")}, "no.h5"),
-        ({"num-queries": "31"}, "num_queries must be 1 to 30, got 31"),
-        ({"num-queries": "0"}, "--num-queries must be at least 1, got 0"),
-        ({"split": "validation", "num-queries": "11"}, "num_queries must be 1 to 10"),
-        ({"split": "original"}, "has no original queries"),
         ({"workers": "0"}, "--workers must be in [1, 256]"),
-        ({"tries": "0"}, "--tries must be at least 1, got 0"),
-        ({"time-limit": "0"}, "--time-limit must be above 0, and finite, got 0.0"),
-        ({"time-limit": "nan"}, "--time-limit must be above 0, and finite, got nan"),
         ({"json": str(tmp_path)}, "is a directory, not a file"),
-        ({"json": str(tmp_path / "no such folder" / "a.json")}, "cannot write"),
         ({"json": "a.json", "image": "a.json"}, "--json and --image are the same file"),
-        ({"image": str(tmp_path / "no such folder" / "a.png")}, "cannot write"),
     ]
     good = {"policy": "go-to-goal", "task": "no_obstacles", "queries": str(query_file)}
     for change, message in cases:
@@ -663,27 +545,16 @@ def test_dead_workers_give_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == error_line("workers died 5 times without a result") + "\n"
 
 
-def test_goal_type_that_does_not_exist_is_rejected():
-    with pytest.raises(SystemExit) as stop:
-        command.main(["--policy", "random", "--task", "wall", "--goal-type", "poses"])
-    assert stop.value.code == 2
-
-
-def test_device_files_are_written_to_and_never_replaced(query_file, tmp_path):
+def test_json_is_written_to_device_files(query_file):
     flags = ["--policy", "go-to-goal", "--task", "no_obstacles", "--queries", str(query_file)]
     # With buffered output, as by default.
     run = ["env", "-u", "PYTHONUNBUFFERED", sys.executable, SCRIPT, *flags]
     run += ["--num-queries", "1", "--json"]
     shown = subprocess.run([*run, "/dev/stdout"], capture_output=True, text=True, check=True)
     assert json.loads(shown.stdout[shown.stdout.index("{") :])["num_queries"] == 1
-    with open(tmp_path / "out.txt", "w") as file:  # the table, and the JSON after it
-        subprocess.run([*run, "/dev/stdout"], stdout=file, check=True)
-    text = (tmp_path / "out.txt").read_text()
-    assert "success" in text[: text.index("{")] and text.rstrip().endswith("}")
     full = subprocess.run([*run, "/dev/full"], capture_output=True, text=True)
     assert full.returncode == 2 and "Traceback" not in full.stderr
     assert full.stderr.rstrip().endswith("cannot write: [Errno 28] No space left on device")
-    assert not Path("/dev/stdout").is_file() or Path("/dev/stdout").is_symlink()
 
 
 def test_refused_query_is_named(queries):
@@ -705,10 +576,6 @@ def test_options_out_of_range_and_unknown_options_are_refused():
             evaluate("go-to-goal", "wall", **{name: value})
     with pytest.raises(TypeError, match="encoder"):
         evaluate("go-to-goal", "wall", encoder="point_cloud")
-
-
-def test_evaluate_is_available_at_the_top_level(queries):
-    assert roboarm_nmp.evaluate is evaluate
 
 
 def test_moving_obstacles_are_evaluated_and_a_delay_is_noted(tmp_path, capsys):
@@ -742,26 +609,10 @@ def test_moving_obstacles_are_evaluated_and_a_delay_is_noted(tmp_path, capsys):
             evaluate("go-to-goal", "wall", action_delay=delay)
 
 
-def test_header_names_each_option_of_a_filter_once(queries):
-    options = {"queries": queries, "num_queries": 1, "goal_type": "combined"}
-    safety_filter = SafetyFilter(escape=False, lookahead=None)
-    text = report(evaluate("go-to-goal", "no_obstacles", safety_filter=safety_filter, **options))
-    assert "margin 0.01 m, no escape, no obstacle velocities\n" in text
-
-
-def test_time_per_action_does_not_depend_on_the_delay(queries):
-    def slow(observation):
-        time.sleep(0.01)
-        return observation["desired_goal"] - observation["observation"][:7]
-
-    few = {"queries": queries, "num_queries": 1, "goal_type": "config"}
-    for delay in (0, 8):
-        result = evaluate(slow, "no_obstacles", action_delay=delay, **few)
-        assert result["success_rate"] == 1 and result["ms_per_action"] > 10
-
-
-@pytest.mark.parametrize("given", [{"observe_every": 5}, {"sensor_noise": SensorNoise(latency=2)}])
-@pytest.mark.parametrize("policy", ["go-to-goal", "space-time"])
-def test_sensors_of_a_policy_that_observes_no_scene_are_refused(policy, given):
-    with pytest.raises(EvaluationError, match="observes nothing of the scene"):
-        evaluate(policy, "moving_boxes_easy", **given)
+def test_sensors_of_a_policy_that_observes_no_scene_are_refused():
+    for policy, options in (
+        ("go-to-goal", {"observe_every": 5}),
+        ("space-time", {"sensor_noise": SensorNoise(latency=2)}),
+    ):
+        with pytest.raises(EvaluationError, match="observes nothing of the scene"):
+            evaluate(policy, "moving_boxes_easy", **options)

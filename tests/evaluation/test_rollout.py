@@ -7,8 +7,8 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
-from roboarm_nmp.evaluation import rollout as rollouts
-from roboarm_nmp.evaluation.rollout import Episode, render_strip, rollout
+from roboarm_nmp.evaluation import rollout as module
+from roboarm_nmp.evaluation.rollout import Episode, render_strip, rollout, rollouts
 from roboarm_nmp.policies.registry import make_policy
 
 BENT = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
@@ -29,7 +29,7 @@ def straight(query):
 
 def test_trajectory_equals_the_steps_of_the_environment(env):
     outcomes = set()
-    for query in load_queries("wall", "validation")[:6]:
+    for query in load_queries("wall", "validation")[:3]:
         trajectory = rollout(env, query, straight(query))
         observation, info = env.reset_specific(*query)
         states, actions, contacts = [observation["observation"][:7]], [], []
@@ -70,6 +70,28 @@ def test_start_at_the_goal_and_a_policy_that_gives_up_make_no_step(env):
         assert trajectory.states.shape == (1, 7) and trajectory.actions.shape == (0, 7)
 
 
+def test_episodes_at_once_are_those_of_single_rollouts():
+    queries = [*load_queries("wall", "validation")[:3], Query(BENT, BENT, Scene())]
+    several = [envs.make("wall", horizon=60) for _ in range(2)]
+    together = []
+
+    def predict(policies, observations):
+        assert len(policies) == len(observations)
+        together.append(len(policies))
+
+    def begin(env, number):
+        return straight(queries[number])
+
+    trajectories = list(rollouts(several, queries, begin, predict))
+    alone = [rollout(several[0], query, straight(query)) for query in queries]
+    assert sorted(map(len, trajectories)) == sorted(map(len, alone))
+    for trajectory in trajectories:
+        assert any(np.array_equal(trajectory.states, other.states) for other in alone)
+    assert max(together) == 2 and sum(together) == sum(map(len, alone))
+    for env in several:
+        env.close()
+
+
 def test_actions_are_copied(env):
     action = np.zeros(7)
 
@@ -93,7 +115,7 @@ def test_refused_query_and_refused_action_are_errors(env):
 
 
 def test_replay_renders_what_the_rollout_went_through():
-    env = envs.make("wall", render_mode="rgb_array", render_size=(64, 48))
+    env = envs.make("wall", horizon=20, render_mode="rgb_array", render_size=(64, 48))
     query = load_queries("wall", "validation")[1]
     act, plan_found = make_policy("random", env, seed=3)(0, query)
     assert plan_found is None
@@ -152,7 +174,7 @@ def test_held_arm_stays_where_it_is_in_mode_subgoal():
 
 def test_real_time_delays_by_the_time_that_an_action_takes(monkeypatch):
     env, query, clock = envs.RoboArmEnv(), Query(BENT, AT_THE_SIDE, Scene()), [0.0]
-    monkeypatch.setattr(rollouts.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
 
     def act(observation):
         clock[0] += 0.070  # s, which are three steps of 1/30 s

@@ -116,24 +116,6 @@ def test_goal_that_is_a_position_has_no_path():
     assert np.array_equal(with_paths.actions, without.actions)
 
 
-def test_goal_and_scene_may_change_during_an_episode():
-    env = envs.make("no_obstacles", goal_type="config", **WITH_DISTANCES)
-    observation, _ = env.reset_specific(FREE, IN_SHELF, shelf(gap=0.015))
-    asked = []
-
-    def act(observation):
-        asked.append(observation["desired_goal"])
-        return np.zeros(7)
-
-    act_safely = SafetyFilter(approach=True).filter_policy(act, env, np.random.default_rng(0))
-    act_safely(observation)
-    other = PANDA.normalise(FREE + np.float32(0.2)).astype(np.float32)
-    act_safely(observation | {"desired_goal": other})
-    env.close()
-    assert np.abs(asked[0] - PANDA.normalise(IN_SHELF)).max() > 0.01
-    assert np.array_equal(asked[1], other)
-
-
 def open_box(lid=False):
     """A box around the hand of `IN_BOX`, 30 cm wide inside, whose walls are 25 cm high."""
     walls = [Box((0.55 + x, 0.0, 0.125), (0.02, 0.34, 0.25)) for x in (-0.16, 0.16)]

