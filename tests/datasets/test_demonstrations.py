@@ -13,7 +13,6 @@ from roboarm_nmp.datasets import demonstrations
 from roboarm_nmp.datasets import format as dataset_format
 from roboarm_nmp.datasets.demonstrations import (
     QUANTUM,
-    demo_path,
     describe,
     load_demos,
     write_demos,
@@ -331,15 +330,6 @@ def test_bad_demonstrations_are_not_written(path, change, complaint):
         write_demos(path, **arguments)
     assert str(path) in str(caught.value)
     assert path.read_bytes() == before
-
-
-def test_unknown_task_is_rejected(path):
-    with pytest.raises(ValueError, match="unknown task 'wal'"):
-        write_demos(path, **hand_made() | {"task": "wal"})
-    with pytest.raises(ValueError, match="unknown task 'wal'"):
-        demo_path("wal")
-    with pytest.raises(DatasetError, match="wal: no such file or task"):
-        load_demos("wal")
 
 
 # --- Bad files

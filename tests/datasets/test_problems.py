@@ -141,7 +141,7 @@ def test_written_problems_are_read_as_they_were(tmp_path):
 
 
 def test_file_of_another_arm_is_rejected(tmp_path):
-    write_problems(tmp_path / "a.h5", everything(tmp_path))
+    write_problems(tmp_path / "a.h5", load_problems(write_file(tmp_path / "vamp.json", VAMP)))
     with pytest.raises(DatasetError, match="a.h5: made for the robot 'panda'"):
         load_problems(tmp_path / "a.h5", replace(PANDA, name="other"))
 

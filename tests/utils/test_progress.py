@@ -61,8 +61,3 @@ def test_bar_stays_in_a_terminal_below_other_lines(monkeypatch):
     bar.close()
     lines = terminal.getvalue().splitlines()
     assert "a worker died" in lines and "100%" in lines[-1] and "3/3" in lines[-1]
-
-
-def test_disabled_bar_shows_nothing(capsys):
-    assert list(progress_bar(range(3), disable=True)) == [0, 1, 2]
-    assert capsys.readouterr().err == ""

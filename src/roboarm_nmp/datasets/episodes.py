@@ -141,7 +141,9 @@ class DemoQueriesWrapper(gym.Wrapper):
         self.demos = demos
         self.demo: Demo | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
+    def reset(
+        self, *, seed: int | None = None, options: dict | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """As `RoboArmEnv.reset`."""
         if seed is not None:
             self.env.reset(seed=seed)

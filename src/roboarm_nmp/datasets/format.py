@@ -586,14 +586,16 @@ def attribute(file: h5py.File, name: str) -> Any:
     return value.decode() if isinstance(value, bytes) else value
 
 
-def check_schema(path: str | Path, file: h5py.File, contents: str, schema: str, version: int):
+def check_schema(
+    path: str | Path, file: h5py.File, contents: str, schema: str, version: int
+) -> None:
     """Raise DatasetError unless a file has a schema, for example of "a query file"."""
-    found = attribute(file, "schema")
-    if found != schema:
-        raise DatasetError(f"{path}: not {contents} (schema {found!r}, not {schema!r})")
-    found = attribute(file, "schema_version")
-    if found != version:
-        raise DatasetError(f"{path}: schema version {found}, this code reads {version}")
+    stored = attribute(file, "schema")
+    if stored != schema:
+        raise DatasetError(f"{path}: not {contents} (schema {stored!r}, not {schema!r})")
+    stored = attribute(file, "schema_version")
+    if stored != version:
+        raise DatasetError(f"{path}: schema version {stored}, this code reads {version}")
 
 
 def read_attributes(path: str | Path, file: h5py.File, types: dict[str, type]) -> dict[str, Any]:

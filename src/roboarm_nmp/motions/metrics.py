@@ -73,7 +73,7 @@ def motion_metrics(
         states = np.clip(robot.normalise(configurations), -1.0, 1.0)
         if isinstance(checker, Sequence):
             pairs = zip(checker, states, strict=True)
-            clearance = min(_clearance(one, state) for one, state in pairs)
+            clearance = min(_clearance(at_state, state) for at_state, state in pairs)
         else:
             clearance = _clearance(checker, states)
     return {

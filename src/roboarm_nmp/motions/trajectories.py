@@ -2,7 +2,7 @@
 
     save_trajectory("motion.yaml", trajectory)             # a `JointTrajectory`
     save_trajectory("episode.csv", trajectory)             # an episode of `evaluation.rollout`
-    save_joint_path("path.csv", configurations, times)     # a path of one's own
+    save_joint_path("path.csv", configurations, times)     # a path of your own
     trajectory = load_trajectory("motion.yaml", env.robot)            # of each of them
     times, configurations = load_joint_path("path.csv", env.robot)    # likewise, only these
 
