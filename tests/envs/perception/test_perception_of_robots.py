@@ -9,7 +9,7 @@ from paths import ROOT
 from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
-from roboarm_nmp.envs.perception.point_clouds import CELL, observed_points
+from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.perception.sensors import (
     OBSTACLE,
     ROBOT,
@@ -18,7 +18,6 @@ from roboarm_nmp.envs.perception.sensors import (
     observe_scene,
 )
 from roboarm_nmp.envs.robots.files import load_robot
-from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
 XARM6 = ROOT / "examples" / "robots" / "xarm6.yaml"
@@ -53,18 +52,6 @@ def test_points_of_the_arm_are_labelled_and_not_observed(robot):
     assert len(of_arm) > 500
     assert np.linalg.norm(of_arm[:, None] - line, axis=2).min(1).max() < 0.2
     assert all((one["labels"] == OBSTACLE).any() for one in clouds)
-
-
-def test_default_sensors_are_scaled_with_the_reach(robot):
-    scale = scale_of(robot)
-    for name, sensor in cardinal(PointCloud, robot).items():
-        of_panda = cardinal(PointCloud)[name]
-        np.testing.assert_allclose(sensor.eye, scale * np.array(of_panda.eye))
-        np.testing.assert_allclose(sensor.target, scale * np.array(of_panda.target))
-        assert sensor.far == pytest.approx(scale * of_panda.far)
-    assert cardinal() == cardinal(robot=PANDA)
-    cells = np.floor(observed_points(Scene((BOX,), robot=robot)) / (scale * CELL))
-    assert len(np.unique(cells, axis=0)) == len(cells)
 
 
 def test_observed_points_keep_the_arm_from_the_obstacles(robot):

@@ -1,6 +1,5 @@
 """The observed point cloud: its points, collision checks against it, and encodings."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -114,24 +113,3 @@ def test_distances_from_observed_points_are_close_to_those_from_obstacles(clutte
 def test_invalid_points_are_rejected(points, radius):
     with pytest.raises(ValueError, match="points"):
         CollisionChecker(EMPTY, points, radius)
-
-
-def test_vector_environment_observes_as_single_ones():
-    def make():
-        options = {"encoder": "point_cloud", "num_points": 8, "goal_type": "combined"}
-        options |= {"link_distances": True, "geometry_source": "point_cloud"}
-        return envs.make("random_boxes_hard", **options)
-
-    several, one = gym.vector.SyncVectorEnv([make, make]), make()
-    together, _ = several.reset(seed=[4, 5])
-    for row, seed in enumerate((4, 5)):
-        alone, _ = one.reset(seed=seed)
-        for name, value in alone.items():
-            np.testing.assert_array_equal(together[name][row], value)
-    assert together["link_distances"].shape == (2, 10, 8)
-    assert together["observation"].shape == (2, 34)
-    actions = np.full((2, 7), 0.01, np.float32)
-    stepped, *_ = several.step(actions)
-    after, *_ = one.step(actions[1])
-    np.testing.assert_array_equal(stepped["link_distances"][1], after["link_distances"])
-    several.close(), one.close()

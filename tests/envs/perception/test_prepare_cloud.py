@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.collision.checker import POINT, CollisionChecker
-from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import (
     ARM_DISTANCE,
     CELL,
@@ -20,7 +19,7 @@ from roboarm_nmp.envs.perception.point_clouds import (
 from roboarm_nmp.envs.perception.sensors import PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import save_scene
-from roboarm_nmp.envs.scenes.primitives import Box, ObservedScene, Scene, scene_to_json
+from roboarm_nmp.envs.scenes.primitives import ObservedScene, Scene, scene_to_json
 from roboarm_nmp.envs.tasks import get_task
 
 CONFIGURATION = np.array([0.0, -0.5, 0.0, -1.5, 0.0, 1.0, 0.8])  # rad
@@ -123,35 +122,6 @@ def test_observed_scene_is_a_value_that_cannot_be_changed_or_written(tmp_path):
     with pytest.raises(ValueError, match="points"):
         scene_to_json(scene)
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [{"points": [[0, 0]]}, {"points": [[0, 0, np.nan]]}, {"point_radius": -0.01}],
-)
-def test_invalid_observed_scene_is_rejected(arguments):
-    with pytest.raises(ValueError, match="point"):
-        ObservedScene(**arguments)
-
-
-def test_points_are_the_obstacles_of_checkers_and_geometry_sources():
-    states = np.random.default_rng(2).uniform(-1, 1, (2000, 7))
-    scene = ObservedScene(points=WALL, point_radius=0.015)
-    expected = CollisionChecker(Scene(), WALL, 0.015).signed_distances(states)
-    assert (expected.geometry == POINT).mean() > 0.05
-    sources = [find_geometry_source(name) for name in ("ground_truth", "point_cloud")]
-    for checker in (
-        CollisionChecker.from_points(WALL, 0.015),
-        CollisionChecker(scene),
-        *(source(scene) for source in sources),
-    ):
-        np.testing.assert_allclose(
-            checker.signed_distances(states).distance, expected.distance, atol=1e-6
-        )
-    # Other obstacles of the scene are the ground truth's only.
-    boxed = ObservedScene((Box((-0.5, 0.0, 0.4), (0.2, 0.2, 0.2)),), points=WALL)
-    truth, observed = (source(boxed).is_free(states) for source in sources)
-    assert (truth <= observed).all() and truth.sum() < observed.sum()
 
 
 def test_environment_of_points_observes_them():

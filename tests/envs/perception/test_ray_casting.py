@@ -134,19 +134,6 @@ def test_depths_are_exact():
     assert (depth[classes == NOTHING] == np.float32(camera.far)).all()
 
 
-def test_camera_inside_the_walls_of_a_room_observes_them():
-    """Surfaces extend behind the camera and beyond its image."""
-    walls = [Box((2.0 * s, 0.0, 0.5), (0.2, 6.0, 6.0)) for s in (-1, 1)]
-    camera = Camera((1.0, 0.0, 0.8), (2.0, 0.0, 0.8), field_of_view=120.0, size=(40, 40))
-    depth, classes = cast(Scene(walls, table=None), HOME, camera)
-    middle = depth[:, 20]
-    assert (classes[:20] == OBSTACLE).all() and np.abs(middle[:20] - 0.9).max() < 1e-6
-    assert set(np.unique(classes)) <= {OBSTACLE, STATIC}
-    assert (classes[-1] == STATIC).all()
-    inside = Camera((2.0, 0.0, 1.0), (3.0, 0.0, 1.0), size=(8, 8))  # nothing hides from inside
-    assert (cast(Scene(walls, table=None, floor=None), HOME, inside)[1] == NOTHING).all()
-
-
 def test_nearest_and_farthest_distance_limit_what_is_observed():
     box = Box((1.0, 0.0, 0.5), (0.2, 0.2, 0.2))
     scene = Scene((box,), table=None, floor=None)

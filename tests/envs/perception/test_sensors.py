@@ -61,28 +61,6 @@ def test_images_do_not_depend_on_how_pybullet_was_built(world, monkeypatch):
         assert as_built[name] in camera.space[name] and of_tuples[name] in camera.space[name]
 
 
-def test_ball_appears_where_a_pinhole_camera_projects_it(world):
-    size = (160, 120)
-    fov = 40.0
-    world.show(Scene((BALL,)), HOME)
-    # Looks along -x, so that the image's right is +y and its upper edge +z.
-    camera = Camera((2.0, 0.2, 0.7), (0.0, 0.2, 0.7), (0, 0, 1), fov, size, outputs=OUTPUTS)
-    observed = camera.observe(world)
-    rows, columns = np.nonzero(observed["segmentation"] == OBSTACLE)
-    focal = size[1] / 2 / math.tan(math.radians(fov) / 2)  # pixels
-    distance = 2.0 - BALL.position[0]
-    # A ball's outline is a little larger than its cross-section through the centre.
-    column = size[0] / 2 + focal * (BALL.position[1] - 0.2) / distance
-    row = size[1] / 2 - focal * (BALL.position[2] - 0.7) / distance
-    radius = focal * BALL.radius / math.sqrt(distance**2 - BALL.radius**2)
-    assert abs(columns.min() + columns.max() - 2 * column) / 2 < 1.5
-    assert abs(rows.min() + rows.max() - 2 * row) / 2 < 1.5
-    assert len(rows) == pytest.approx(math.pi * radius**2, rel=0.08)
-    centre = observed["depth"][round(row), round(column)]
-    assert 0 <= centre - (distance - BALL.radius) < 0.01  # drawn as a polyhedron, inside
-    assert observed["rgb"].shape == (*size[::-1], 3) and observed["rgb"].dtype == np.uint8
-
-
 @pytest.mark.parametrize("name", ["front", "right"])
 def test_points_lie_on_surfaces_of_their_class(world, name):
     pole = Cylinder((0.0, -0.5, 0.4), 0.05, 0.8)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 from problem_files import (
@@ -18,7 +17,6 @@ from problem_files import (
     write_file,
 )
 
-from roboarm_nmp.datasets import observations, roadmap_paths
 from roboarm_nmp.datasets.format import DatasetError, read_scenes, scene_arrays
 from roboarm_nmp.datasets.problems import load_problems, write_problems
 from roboarm_nmp.datasets.queries import load_queries, write_queries
@@ -215,29 +213,6 @@ def test_queries_keep_their_hulls(tmp_path):
     ]:
         with pytest.raises(DatasetError, match=f"{path}: obstacles: .*{reason}"):
             read_scenes(path, base, arrays | change)
-
-
-def test_observations_and_roadmap_paths_keep_their_hulls(tmp_path):
-    base = TASKS["random_boxes_hard"].scene.base
-    scenes = [replace(base, obstacles=o) for o in (MIXED, (), OTHER)]
-    camera = {"front": Camera((1, 0, 1), (0, 0, 0))}
-    image = [{"front/rgb": np.zeros((2, 2, 3), np.uint8)}] * 3
-    q = np.zeros((3, 7))
-    contents = observations.shard_bytes(
-        "random_boxes_hard", 0, 0, camera, scenes, q, image, "made by a test"
-    )
-    (tmp_path / "shard_00000.h5").write_bytes(contents)
-    assert observations.Observations(tmp_path).scenes(0) == scenes
-    paths = [[np.zeros((2, 7), np.float32)]] * 3
-    for number, some in ((0, scenes), (1, scenes[::-1])):
-        contents = roadmap_paths.shard_bytes("random_boxes_hard", 0, 0, some, paths, "by a test")
-        (tmp_path / f"shard_{number:05}.h5").write_bytes(contents)
-    loaded = roadmap_paths.load_roadmap_paths(tmp_path)
-    assert [loaded.scenes[i] for i in range(6)] == [*scenes, *scenes[::-1]]
-    contents = roadmap_paths.shard_bytes("random_boxes_hard", 0, 0, scenes[1:2], paths[:1], "test")
-    (tmp_path / "shard_00000.h5").write_bytes(contents)
-    with h5py.File(tmp_path / "shard_00000.h5") as file:
-        assert "hull_vertices" not in file  # as before there were hulls
 
 
 # --- Meshes
