@@ -19,6 +19,7 @@ from roboarm_nmp.envs.scenes.random_boxes import (
     FRICTION,
     KEEP_CLEAR,
     TURN,
+    Rng,
     distance_to_robot,
     rounded,
 )
@@ -93,11 +94,11 @@ class Containers:
 
     base: Scene = Scene(friction=FRICTION, table=None, floor=None)
 
-    def sample(self, rng: np.random.Generator) -> Scene:
+    def sample(self, rng: Rng) -> Scene:
         """A `Scene` drawn with a NumPy Generator."""
         return self.sample_with_places(rng)[0]
 
-    def sample_with_places(self, rng: np.random.Generator) -> tuple[Scene, list[Place]]:
+    def sample_with_places(self, rng: Rng) -> tuple[Scene, list[Place]]:
         """The same, and a list of its `Place`s."""
         scale = scale_of(self.base.robot)
         obstacles = []
@@ -131,7 +132,7 @@ class Containers:
 Furniture = tuple[list[tuple[Any, ...]], list[tuple[Vector, Vector, Vector]], float, float]
 
 
-def _open_box(rng: np.random.Generator) -> Furniture:
+def _open_box(rng: Rng) -> Furniture:
     near, base, depth, width, height, thickness = _drawn(rng, OPEN_BOX)
     front = height * rng.uniform(*FRONT)
     middle = base + height / 2
@@ -162,7 +163,7 @@ def _open_box(rng: np.random.Generator) -> Furniture:
     return parts, [place], near, depth
 
 
-def _shelf(rng: np.random.Generator) -> Furniture:
+def _shelf(rng: Rng) -> Furniture:
     near, base, depth, width, spacing, thickness = _drawn(rng, SHELF)
     boards = int(rng.integers(BOARDS[0], BOARDS[1] + 1))
     heights = [base + thickness / 2 + level * spacing for level in range(boards)]
@@ -193,7 +194,7 @@ def _shelf(rng: np.random.Generator) -> Furniture:
     return parts, places, near, depth
 
 
-def _table(rng: np.random.Generator) -> Furniture:
+def _table(rng: Rng) -> Furniture:
     near, base, depth, width, thickness = _drawn(rng, TABLE)
     parts = [((0.0, 0.0, base), (depth, width, thickness))]
     top = base + thickness / 2
@@ -210,12 +211,12 @@ def _table(rng: np.random.Generator) -> Furniture:
 _KINDS = (_open_box, _open_box, _shelf, _table)
 
 
-def _drawn(rng: np.random.Generator, ranges: dict[str, tuple[float, float]]) -> list[float]:
+def _drawn(rng: Rng, ranges: dict[str, tuple[float, float]]) -> list[float]:
     return [rng.uniform(*limits) for limits in ranges.values()]
 
 
 def _objects(
-    rng: np.random.Generator,
+    rng: Rng,
     count: int,
     centre: tuple[float, float],
     area: tuple[float, float],

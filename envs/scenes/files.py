@@ -350,8 +350,29 @@ def _shapes(
     fields = _fields(value, kind, *_KEYS[kind], more=more)
     if kind == "mesh":
         return _mesh(fields, folder), fields
-    read = {"box": _box, "cylinder": _cylinder, "sphere": _sphere, "convex_hull": _convex_hull}
-    return (replace(read[kind](fields, kind), motion=_motion(fields, kind)),), fields
+    return (_shape(fields, kind),), fields
+
+
+def _shape(fields: dict[str, Node], kind: str) -> Obstacle:
+    if kind == "box":
+        return _box(fields, kind)
+    position = numbers(fields["position"], f"position of {kind}", 3, MAX_LENGTH)
+    motion = _motion(fields, kind)
+    if kind == "sphere":
+        return Sphere(position, _size(fields, "radius", kind), motion)
+    orientation = _orientation(fields, kind)
+    if kind == "cylinder":
+        radius = _size(fields, "radius", kind)
+        return Cylinder(position, radius, _size(fields, "length", kind), orientation, motion)
+    vertices = fields["vertices"]
+    points = _list(vertices, "vertices")
+    if len(points) > MAX_HULL_VERTICES:
+        raise Mistake(vertices, f"{kind} has at most {MAX_HULL_VERTICES} vertices")
+    points = [numbers(point, f"a vertex of {kind}", 3, MAX_LENGTH) for point in points]
+    hull = ConvexHull(position, tuple(points), orientation, motion)
+    with errors_at(vertices):
+        check_obstacle(hull)
+    return hull
 
 
 def _box(fields: dict[str, Node], what: str) -> Box:
@@ -359,46 +380,19 @@ def _box(fields: dict[str, Node], what: str) -> Box:
         numbers(fields["position"], f"position of {what}", 3, MAX_LENGTH),
         numbers(fields["size"], f"size of {what}", 3, MAX_LENGTH, positive=True),
         _orientation(fields, what),
+        _motion(fields, what),
     )
 
 
-def _cylinder(fields: dict[str, Node], what: str) -> Cylinder:
-    return Cylinder(
-        numbers(fields["position"], f"position of {what}", 3, MAX_LENGTH),
-        number(fields["radius"], f"radius of {what}", MAX_LENGTH, positive=True),
-        number(fields["length"], f"length of {what}", MAX_LENGTH, positive=True),
-        _orientation(fields, what),
-    )
-
-
-def _sphere(fields: dict[str, Node], what: str) -> Sphere:
-    return Sphere(
-        numbers(fields["position"], f"position of {what}", 3, MAX_LENGTH),
-        number(fields["radius"], f"radius of {what}", MAX_LENGTH, positive=True),
-    )
-
-
-def _convex_hull(fields: dict[str, Node], what: str) -> ConvexHull:
-    vertices = fields["vertices"]
-    if not isinstance(vertices.value, list):
-        raise Mistake(vertices, f"vertices must be a list of points, got {describe(vertices)}")
-    if len(vertices.value) > MAX_HULL_VERTICES:
-        raise Mistake(vertices, f"{what} has at most {MAX_HULL_VERTICES} vertices")
-    hull = ConvexHull(
-        numbers(fields["position"], f"position of {what}", 3, MAX_LENGTH),
-        tuple(numbers(one, f"a vertex of {what}", 3, MAX_LENGTH) for one in vertices.value),
-        _orientation(fields, what),
-    )
-    with errors_at(vertices):
-        check_obstacle(hull)
-    return hull
+def _size(fields: dict[str, Node], key: str, what: str) -> float:
+    return number(fields[key], f"{key} of {what}", MAX_LENGTH, positive=True)
 
 
 def _mesh(fields: dict[str, Node], folder: Path) -> tuple[ConvexHull, ...]:
     file = documents.text(fields["file"], "file")
     scale = 1.0
     if "scale" in fields:
-        scale = number(fields["scale"], "scale of mesh", MAX_LENGTH, positive=True)
+        scale = _size(fields, "scale", "mesh")
     decompose = False
     if "decompose" in fields:
         decompose = switch(fields["decompose"])

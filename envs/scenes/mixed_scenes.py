@@ -8,12 +8,10 @@ tasks' own, except for the random boxes (docs/guide/tasks.md).
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.numbers import Vector
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Obstacle, Scene
-from roboarm_nmp.envs.scenes.random_boxes import FRICTION, TURN, RandomBoxes, rounded
+from roboarm_nmp.envs.scenes.random_boxes import FRICTION, TURN, RandomBoxes, Rng, rounded
 
 FEWEST = 2
 MOST_BOXES = 8
@@ -59,7 +57,7 @@ class MixedScenes:
 
     base: Scene = Scene(friction=FRICTION)
 
-    def sample(self, rng: np.random.Generator) -> Scene:
+    def sample(self, rng: Rng) -> Scene:
         """A `Scene` drawn with a NumPy Generator."""
         kind = rng.integers(3)
         if kind == 0:
@@ -70,7 +68,7 @@ class MixedScenes:
         return replace(self.base, obstacles=tuple(obstacles))
 
 
-def _walls(rng: np.random.Generator, scale: float) -> list[Obstacle]:
+def _walls(rng: Rng, scale: float) -> list[Obstacle]:
     count = int(rng.integers(1, WALLS + 1))
     azimuth = rng.uniform(-math.pi, math.pi)
     opposite = rng.random() < OPPOSITE
@@ -88,7 +86,7 @@ def _walls(rng: np.random.Generator, scale: float) -> list[Obstacle]:
     return walls
 
 
-def _racks(rng: np.random.Generator, scale: float) -> list[Obstacle]:
+def _racks(rng: Rng, scale: float) -> list[Obstacle]:
     count = int(rng.integers(1, RACKS + 1))
     first = rng.uniform(-math.pi, math.pi)
     parts = []

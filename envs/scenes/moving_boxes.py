@@ -29,6 +29,7 @@ from roboarm_nmp.envs.scenes.random_boxes import (
     FRICTION,
     KEEP_CLEAR,
     RandomBoxes,
+    Rng,
     distance_to_robot,
     rounded,
 )
@@ -78,13 +79,11 @@ class MovingScenes:
     boxes: tuple[int, int] = (4, 8)  # as in `random_boxes_hard`
     check_times = np.arange(0.0, DURATION, 0.1)
 
-    def sample(self, rng: np.random.Generator) -> Scene:
+    def sample(self, rng: Rng) -> Scene:
         """A `Scene` at rest, drawn with a NumPy Generator."""
         return RandomBoxes(*self.boxes, self.base).sample(rng)
 
-    def animate(
-        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
-    ) -> Scene:
+    def animate(self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: Rng) -> Scene:
         """The scene with motions, drawn for a start and a goal (n,), rad."""
         raise NotImplementedError
 
@@ -108,9 +107,7 @@ class MovingBoxes(MovingScenes):
     share: float = 0.5
     periods: tuple[float, float] = (3.0, 8.0)
 
-    def animate(
-        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
-    ) -> Scene:
+    def animate(self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: Rng) -> Scene:
         boxes = list(scene.obstacles)
         scale = scale_of(scene.robot)
         for i in _choose(boxes, self.share, rng):
@@ -121,7 +118,7 @@ class MovingBoxes(MovingScenes):
                     break
         return replace(scene, obstacles=boxes)
 
-    def _oscillation(self, rng: np.random.Generator, scale: float) -> Oscillation:
+    def _oscillation(self, rng: Rng, scale: float) -> Oscillation:
         direction = rng.normal(size=3) * (1.0, 1.0, RISE)
         length = scale * rng.uniform(*AMPLITUDE) / np.linalg.norm(direction)
         amplitude = rounded(*(length * direction))
@@ -134,9 +131,7 @@ class MovingBoxes(MovingScenes):
 class AppearingBoxes(MovingScenes):
     """Half of the boxes appear in the first seconds. The goal is free at all times."""
 
-    def animate(
-        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
-    ) -> Scene:
+    def animate(self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: Rng) -> Scene:
         boxes = list(scene.obstacles)
         robot = scene.robot
         first, last = robot.normalise(np.array([start, goal]))
@@ -166,9 +161,7 @@ class BlockedGoals(MovingScenes):
 
     boxes: tuple[int, int] = (3, 6)  # as in `random_boxes_medium`
 
-    def animate(
-        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
-    ) -> Scene:
+    def animate(self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: Rng) -> Scene:
         box, away, duration = _visitor(scene.robot, goal, rng)
         (leaves,) = rounded(rng.uniform(*LEAVES))
         motion = Waypoints((leaves, leaves + duration), ((0.0, 0.0, 0.0), away))
@@ -185,9 +178,7 @@ class ChasedGoals(MovingScenes):
 
     boxes: tuple[int, int] = (3, 6)
 
-    def animate(
-        self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: np.random.Generator
-    ) -> Scene:
+    def animate(self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: Rng) -> Scene:
         visitors = []
         for _ in range(rng.integers(1, 3)):
             box, away, duration = _visitor(scene.robot, goal, rng)
@@ -207,7 +198,7 @@ class ChasedGoals(MovingScenes):
         return self._starts(start_free) and bool(often)
 
 
-def _choose(boxes: Sequence[Obstacle], share: float, rng: np.random.Generator) -> np.ndarray:
+def _choose(boxes: Sequence[Obstacle], share: float, rng: Rng) -> np.ndarray:
     """The indices of a share of the boxes, at random."""
     return rng.permutation(len(boxes))[: round(share * len(boxes))]
 
@@ -230,7 +221,7 @@ def _distances(box: Box, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.maximum(np.abs(local) - np.divide(box.size, 2), 0.0), axis=1)
 
 
-def _visitor(robot: Robot, goal: np.ndarray, rng: np.random.Generator) -> tuple[Box, Vector, float]:
+def _visitor(robot: Robot, goal: np.ndarray, rng: Rng) -> tuple[Box, Vector, float]:
     """A box at the goal, how it goes away (m, and the time it takes, s)."""
     scale = scale_of(robot)
     position = robot.forward_kinematics(goal)

@@ -14,6 +14,7 @@ import numpy as np
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
+Rng = np.random.Generator
 # Positions and sizes are multiples of this (m), about a millimetre, and yaws of a 256th of a turn,
 # so that files are small.
 GRID = 2.0**-10
@@ -46,7 +47,7 @@ class RandomBoxes:
     most: int
     base: Scene = Scene(friction=FRICTION)
 
-    def sample(self, rng: np.random.Generator) -> Scene:
+    def sample(self, rng: Rng) -> Scene:
         """A `Scene` drawn with a NumPy Generator."""
         count = int(rng.integers(self.fewest, self.most + 1))
         scale = scale_of(self.base.robot)
@@ -62,7 +63,7 @@ class RandomBoxes:
         return replace(self.base, obstacles=tuple(boxes))
 
 
-def _sample_box(rng: np.random.Generator, azimuth: float, scale: float) -> Box:
+def _sample_box(rng: Rng, azimuth: float, scale: float) -> Box:
     def shape_of(ranges: dict[str, tuple[float, float]]) -> dict[str, float]:
         return {name: scale * rng.uniform(*limits) for name, limits in ranges.items()}
 
