@@ -59,17 +59,10 @@ def place_arm(q, chain, bodies, frames, centres):
         if chain[frame, PRISMATIC] == 0.0:
             c, s, slide = math.cos(value), math.sin(value), 0.0
         x, y, z = chain[frame, POSITION], chain[frame, POSITION + 1], chain[frame, POSITION + 2]
-        xx, xy, xz = chain[frame, ROTATION], chain[frame, ROTATION + 1], chain[frame, ROTATION + 2]
-        yx, yy, yz = (
-            chain[frame, ROTATION + 3],
-            chain[frame, ROTATION + 4],
-            chain[frame, ROTATION + 5],
-        )
-        zx, zy, zz = (
-            chain[frame, ROTATION + 6],
-            chain[frame, ROTATION + 7],
-            chain[frame, ROTATION + 8],
-        )
+        n = ROTATION
+        xx, xy, xz = chain[frame, n], chain[frame, n + 1], chain[frame, n + 2]
+        yx, yy, yz = chain[frame, n + 3], chain[frame, n + 4], chain[frame, n + 5]
+        zx, zy, zz = chain[frame, n + 6], chain[frame, n + 7], chain[frame, n + 8]
         for i in range(0, 9, 3):
             rx, ry, rz = frames[parent, i], frames[parent, i + 1], frames[parent, i + 2]
             # Rotated into the frame, then by the joint about its z.

@@ -376,8 +376,9 @@ def link_distances_batch(states, rows, self_collisions, within, arm, world):
     distance, geometry = np.empty(batch), np.empty(batch, np.int64)
     normal, witness = np.empty((batch[0], batch[1], 3)), np.empty((batch[0], batch[1], 3))
     gradient = np.empty((batch[0], batch[1], states.shape[1]))
-    found = distance, normal, witness, gradient, geometry
-    signed_distances_batch(clipped, self_collisions, within, arm, world, *found)
+    signed_distances_batch(
+        clipped, self_collisions, within, arm, world, distance, normal, witness, gradient, geometry
+    )
     for i in range(batch[0]):
         for link in range(batch[1]):
             rows[i, link, 0] = min(distance[i, link], within)

@@ -41,11 +41,9 @@ def sphere_gap(rows, j, centres, k):
 def box_gap(bodies, k, frames, centres, points, j, pose):
     """Distance (m) of a point from the box around a body. Writes its position to `pose`."""
     f = frames[int(bodies[k, FRAME])]
-    x, y, z = (
-        points[j, 0] - centres[k, 0],
-        points[j, 1] - centres[k, 1],
-        points[j, 2] - centres[k, 2],
-    )
+    x = points[j, 0] - centres[k, 0]
+    y = points[j, 1] - centres[k, 1]
+    z = points[j, 2] - centres[k, 2]
     pose[9] = f[0] * x + f[3] * y + f[6] * z
     pose[10] = f[1] * x + f[4] * y + f[7] * z
     pose[11] = f[2] * x + f[5] * y + f[8] * z
@@ -134,13 +132,13 @@ def _farthest(vertices, cells, k, x, y, z):
         i = min(int((u / size + 1.0) * (0.5 * CELLS)), CELLS - 1)
         j = min(int((v / size + 1.0) * (0.5 * CELLS)), CELLS - 1)
         cell = ((k * 6 + face) * CELLS + i) * CELLS + j
-    best, found = -FAR, 0
+    most, farthest = -FAR, 0
     for n in range(cells[cell], cells[cell + 1]):
         i = cells[n]
         value = vertices[i, 0] * x + vertices[i, 1] * y + vertices[i, 2] * z
-        if value > best:
-            best, found = value, i
-    return found
+        if value > most:
+            most, farthest = value, i
+    return farthest
 
 
 @uncounted

@@ -49,8 +49,8 @@ def is_free(
     chain, bodies, pairs, vertices, cells = arm
     rows, points, groups, ball = world
     frames, centres, pose, s, other = memory
-    lists, above, given = known
-    joints, count, shapes = endpoint_margins.shape[1] - 1, 0, rows.shape[0]
+    lists, above, num_known = known
+    joints, shapes, count = endpoint_margins.shape[1] - 1, rows.shape[0], 0
     touching = rows.shape[1] > ROW
     margin, clearance, growth = rule[0], rule[1], rule[2]
     for i in range(endpoint_margins.shape[0]):
@@ -63,8 +63,8 @@ def is_free(
     i = -1
     while True:
         i += 1
-        if given >= 0:
-            if i == given:
+        if num_known >= 0:
+            if i == num_known:
                 break
             k, j = lists[above, i, 0], lists[above, i, 1]
         elif k >= 0:
@@ -156,8 +156,8 @@ def _sweeps(start, end, chain, bodies, pairs):
 @compiled
 def free_batch(states, rule, endpoint_margins, arm, world, free):
     """Write `CollisionChecker.is_free` of states (m, n) to `free` (m,)."""
-    memory, sweeps = working_memory(arm[0], arm[1]), np.empty(0)
-    axes, lists = np.empty((0, 3)), np.empty((0, 0, 2), np.int64)
+    memory = working_memory(arm[0], arm[1])
+    axes, sweeps, lists = np.empty((0, 3)), np.empty(0), np.empty((0, 0, 2), np.int64)
     for i in range(states.shape[0]):
         margins = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
         known = lists, 0, -1
@@ -176,7 +176,8 @@ def motion(rule, endpoint_margins, arm, world, end_known, start, end):
     """Number of states of a motion that were checked, without its start; negative: not free."""
     chain, bodies, pairs, _, _ = arm
     joints = len(start)
-    memory, q = working_memory(chain, bodies), np.empty(joints)
+    memory = working_memory(chain, bodies)
+    q = np.empty(joints)
     squared = 0.0
     for j in range(joints):
         squared += (end[j] - start[j]) ** 2

@@ -49,21 +49,15 @@ def moved_rows(motions, centres, shapes, t, rows):
         x, y, z, w = pose[3], pose[4], pose[5], pose[6]
         norm = math.sqrt(x * x + y * y + z * z + w * w)
         x, y, z, w = x / norm, y / norm, z / norm, w / norm
-        row[4], row[5], row[6] = (
-            1.0 - 2.0 * (y * y + z * z),
-            2.0 * (x * y - z * w),
-            2.0 * (x * z + y * w),
-        )
-        row[7], row[8], row[9] = (
-            2.0 * (x * y + z * w),
-            1.0 - 2.0 * (x * x + z * z),
-            2.0 * (y * z - x * w),
-        )
-        row[10], row[11], row[12] = (
-            2.0 * (x * z - y * w),
-            2.0 * (y * z + x * w),
-            1.0 - 2.0 * (x * x + y * y),
-        )
+        row[4] = 1.0 - 2.0 * (y * y + z * z)
+        row[5] = 2.0 * (x * y - z * w)
+        row[6] = 2.0 * (x * z + y * w)
+        row[7] = 2.0 * (x * y + z * w)
+        row[8] = 1.0 - 2.0 * (x * x + z * z)
+        row[9] = 2.0 * (y * z - x * w)
+        row[10] = 2.0 * (x * z - y * w)
+        row[11] = 2.0 * (y * z + x * w)
+        row[12] = 1.0 - 2.0 * (x * x + y * y)
         a, b, c = centres[i, 0], centres[i, 1], centres[i, 2]
         for j in range(3):
             row[1 + j] = pose[j] + row[4 + 3 * j] * a + row[5 + 3 * j] * b + row[6 + 3 * j] * c

@@ -12,14 +12,14 @@ from roboarm_nmp.utils.numba_cache import compiled
 @compiled
 def _nearest_node(nodes, count, q):
     """Index of the nearest of the first `count` nodes (L2), and its distance."""
-    least, found = FAR, 0
+    least, nearest = FAR, 0
     for i in range(count):
         squared = 0.0
         for j in range(q.shape[0]):
             squared += (nodes[i, j] - q[j]) ** 2
         if squared < least:
-            least, found = squared, i
-    return found, math.sqrt(least)
+            least, nearest = squared, i
+    return nearest, math.sqrt(least)
 
 
 @compiled
@@ -48,7 +48,8 @@ def rrt_connect(start, goals, samples, reach, max_checks, rule, endpoint_margins
     nodes, parents = np.empty((2, capacity, n)), np.full((2, capacity), -1)
     size = np.array([1, m])
     nodes[0, 0], nodes[1, :m] = start, goals
-    new, checks, tree = np.empty(n), 0, 0
+    new = np.empty(n)
+    checks = tree = 0
     for i in range(m + samples.shape[0]):
         if checks >= max_checks:
             break
@@ -93,13 +94,17 @@ def _joined_path(nodes, parents, a, b):
 
     Both nodes are the same state.
     """
-    length, node = 0, parents[0, a]
+    length = 0
+    node = parents[0, a]
     while node >= 0:
-        length, node = length + 1, parents[0, node]
+        length += 1
+        node = parents[0, node]
     before, node = length, b
     while node >= 0:
-        length, node = length + 1, parents[1, node]
-    path, node = np.empty((length, nodes.shape[2])), parents[0, a]
+        length += 1
+        node = parents[1, node]
+    path = np.empty((length, nodes.shape[2]))
+    node = parents[0, a]
     for i in range(before - 1, -1, -1):
         path[i] = nodes[0, node]
         node = parents[0, node]

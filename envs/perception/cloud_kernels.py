@@ -84,11 +84,9 @@ def first_in_cells(points, cell):
     """
     cubes = np.empty(points.shape[0], np.int32)
     table = np.full(1024, -1, np.int64)  # of indices of cubes; twice as many as fit into `cells`
-    cells, first, count = (
-        np.empty((512, 3), np.int64),
-        np.empty(512, np.int64),
-        np.zeros(512, np.int64),
-    )
+    cells = np.empty((512, 3), np.int64)
+    first = np.empty(512, np.int64)
+    count = np.zeros(512, np.int64)
     m = 0
     for i in range(points.shape[0]):
         x = int(math.floor(points[i, 0] / cell))
@@ -112,14 +110,12 @@ def first_in_cells(points, cell):
     around = np.zeros(m, np.int64)
     for n in range(m):
         for i in range(27):
-            x, y, z = (
-                cells[n, 0] + i // 9 - 1,
-                cells[n, 1] + i // 3 % 3 - 1,
-                cells[n, 2] + i % 3 - 1,
-            )
-            found = table[_slot(table, cells, x, y, z)]
-            if found >= 0:
-                around[n] += count[found]
+            x = cells[n, 0] + i // 9 - 1
+            y = cells[n, 1] + i // 3 % 3 - 1
+            z = cells[n, 2] + i % 3 - 1
+            neighbour = table[_slot(table, cells, x, y, z)]
+            if neighbour >= 0:
+                around[n] += count[neighbour]
     return first[:m], cubes, around
 
 
@@ -132,7 +128,7 @@ def farthest(points, chosen):
     n = points.shape[0]
     nearest = np.empty(n, np.float32)
     for k in range(min(chosen.shape[0], n)):
-        best, found = np.float32(-1.0), 0
+        most, best = np.float32(-1.0), 0
         for i in range(n):
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             if k > 0:
@@ -140,10 +136,7 @@ def farthest(points, chosen):
             distance = np.sqrt(x * x + y * y + z * z)
             if k < 2 or distance < nearest[i]:
                 nearest[i] = distance
-            if nearest[i] > best:
-                best, found = nearest[i], i
-        chosen[k, 0], chosen[k, 1], chosen[k, 2] = (
-            points[found, 0],
-            points[found, 1],
-            points[found, 2],
-        )
+            if nearest[i] > most:
+                most, best = nearest[i], i
+        for j in range(3):
+            chosen[k, j] = points[best, j]

@@ -132,9 +132,9 @@ def _project(view, height, width, point):
 @compiled
 def _clip(view, height, width, polygon, n):
     """Write the part of `polygon[0]`, n corners, that is not too near to `polygon[1]`."""
-    given, left, count = polygon[0], polygon[1], 0
+    corners, left, count = polygon[0], polygon[1], 0
     for i in range(n):
-        one, other = given[i], given[(i + 1) % n]
+        one, other = corners[i], corners[(i + 1) % n]
         if one[2] >= view[NEAREST]:
             left[count] = one
             count += 1
@@ -299,7 +299,8 @@ def edge_pixels(depth, classes, nothing, edge):
     Returns two arrays, float32 (height, width), m; zeros where there is no edge.
     """
     height, width = depth.shape
-    front, back = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    front = np.zeros((height, width), np.float32)
+    back = np.zeros((height, width), np.float32)
     for row in range(height):
         for column in range(width):
             if classes[row, column] == nothing:

@@ -39,21 +39,15 @@ def _place(state, chain, rotation, joints):
         a, b, c = row[ROTATION], row[ROTATION + 1], row[ROTATION + 2]
         d, e, f = row[ROTATION + 3], row[ROTATION + 4], row[ROTATION + 5]
         g, h, i = row[ROTATION + 6], row[ROTATION + 7], row[ROTATION + 8]
-        t00, t01, t02 = (
-            r00 * a + r01 * d + r02 * g,
-            r00 * b + r01 * e + r02 * h,
-            r00 * c + r01 * f + r02 * i,
-        )
-        t10, t11, t12 = (
-            r10 * a + r11 * d + r12 * g,
-            r10 * b + r11 * e + r12 * h,
-            r10 * c + r11 * f + r12 * i,
-        )
-        t20, t21, t22 = (
-            r20 * a + r21 * d + r22 * g,
-            r20 * b + r21 * e + r22 * h,
-            r20 * c + r21 * f + r22 * i,
-        )
+        t00 = r00 * a + r01 * d + r02 * g
+        t01 = r00 * b + r01 * e + r02 * h
+        t02 = r00 * c + r01 * f + r02 * i
+        t10 = r10 * a + r11 * d + r12 * g
+        t11 = r10 * b + r11 * e + r12 * h
+        t12 = r10 * c + r11 * f + r12 * i
+        t20 = r20 * a + r21 * d + r22 * g
+        t21 = r20 * b + r21 * e + r22 * h
+        t22 = r20 * c + r21 * f + r22 * i
         joint, cosine, sine = int(row[JOINT]), 1.0, 0.0
         if joint >= 0:
             value = row[MIDDLE] + row[SCALE] * state[joint]
