@@ -158,14 +158,14 @@ def _attach(robot, objects):
     own_pairs = [(new[a], new[b]) for a, b in robot.self_collision_pairs]
     pairs = []
     for i, attached in enumerate(objects):
-        own, frame = index[attached_name(i)], frames[new[carriers[i]]]
+        link, frame = index[attached_name(i)], frames[new[carriers[i]]]
         touching = {new[link] for link in touched[i]}
         for other, other_frame in frames.items():
             if other_frame != frame and other not in touching:
-                pairs.append((min(own, other), max(own, other)))
-        frames[own] = frame
+                pairs.append((min(link, other), max(link, other)))
+        frames[link] = frame
         _, rotation, position = link_placement(robot, attached.link)
-        links.append(Link(own, frame, link_steps(rotation, position)))
+        links.append(Link(link, frame, link_steps(rotation, position)))
     carrying = dataclasses.replace(
         carrying,
         bullet_joint_names=joint_names,

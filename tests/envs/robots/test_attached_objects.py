@@ -1,6 +1,5 @@
 """Objects attached to the arm: body, checks, distances, planning and files have them as links."""
 
-import copy
 import pickle
 from dataclasses import replace
 
@@ -10,7 +9,6 @@ import pytest
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.problem_formats import Problem
 from roboarm_nmp.datasets.problems import load_problems, write_problems
-from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import ARM, CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import obstacle_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
@@ -153,25 +151,6 @@ def test_plan_with_an_object_is_followed_without_contact():
     run = follow(env.unwrapped, path, scene)
     assert run.reached and not run.collided and env.unwrapped.robot == robot
     env.close()
-
-
-def test_episode_with_an_object_is_that_of_its_copy_and_of_a_new_environment():
-    scene = Scene(robot=with_attached(PANDA, MANY))
-
-    def episode(env):
-        observation, _ = env.reset_specific(START, GOAL, scene)
-        states = [observation["observation"]]
-        for _ in range(15):
-            states.append(env.step(PANDA.normalise(GOAL) - states[-1][:7])[0]["observation"])
-        return np.array(states)
-
-    env, fresh = RoboArmEnv(), RoboArmEnv(scene)
-    expected = episode(fresh)
-    np.testing.assert_array_equal(episode(env), expected)
-    other = copy.deepcopy(env)
-    one, two = (e.step(np.full(7, 0.01))[0]["observation"] for e in (env, other))
-    np.testing.assert_array_equal(one, two)
-    assert not np.array_equal(expected[0], expected[-1])
 
 
 def test_files_keep_objects(tmp_path):

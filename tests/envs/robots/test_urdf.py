@@ -169,13 +169,6 @@ def test_gradients_of_link_distances_agree_with_differences(arm):
     assert np.mean(agree) > 0.97
 
 
-def test_bodies_of_a_link_are_its_shapes(arm):
-    _, bodies, _, _, _ = arm_hulls(arm)
-    # Base two; one two; two one; three two; four and its finger, which no joint moves, one each.
-    assert len(bodies) == 9 and (bodies[:2, 9] == -1).all()
-    assert sorted(bodies[2:, 9].tolist()) == [0, 0, 1, 2, 2, 3, 4]
-
-
 def test_panda_from_its_urdf_is_the_panda():
     robot = robot_from_urdf(
         PANDA.urdf, end_effector="panda_grasptarget", fixed={"panda_finger_joint1": 0.04}
