@@ -5,11 +5,10 @@ import re
 
 import numpy as np
 from paths import ROOT
-from trainers import PATHS, TINY, load, run_here, succeeds_here
+from trainers import PATHS, TINIER, load, run_here, succeeds_here
 
 from roboarm_nmp import envs
 
-TINIER = f"{TINY} --horizon 20 --learning-starts 100 --eval-every 300 --total-timesteps 300"
 PAGE = (ROOT / "docs/customise/algorithm.md").read_text()
 
 

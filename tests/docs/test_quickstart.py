@@ -9,13 +9,13 @@ import pytest
 from paths import ROOT
 from PIL import Image
 from tensorboard import program
-from trainers import PATHS, TINY, run_here
+from trainers import PATHS, TINIER, run_here
 
 from roboarm_nmp import __main__
 
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", (ROOT / "docs/quickstart.md").read_text(), re.S | re.M)
 COMMANDS = [line for kind, text in BLOCKS if not kind for line in text.splitlines()]
-FEWER = {"evaluate": "--num-queries 5 --workers 1", "show": "--size 80 60"}
+FEWER = {"evaluate": "--num-queries 3 --workers 1", "show": "--size 80 60"}
 
 
 def run(command):
@@ -27,7 +27,7 @@ def run(command):
         with urllib.request.urlopen(board.launch() + "data/runs", timeout=30) as answer:
             print(answer.read().decode())
     elif words[:3] == ["roboarm", "train", "sac"]:
-        tiny = "--total-timesteps 1800" if "--resume" in words else TINY
+        tiny = "--total-timesteps 600" if "--resume" in words else TINIER
         run_here(PATHS["sac_her_mp"], *words[3:], *tiny.split())
     else:
         with pytest.raises(SystemExit) as end:
@@ -56,7 +56,7 @@ def test_page_works_from_top_to_bottom(tmp_path, monkeypatch, capsys):
         next(out for line, out in printed.items() if f"evaluate --policy {name}" in line)
         for name in ("runs/RUN", "dagger", "go-to-goal")
     )
-    assert folder.name in of_run and "on no_obstacles: 5 test queries" in of_run
+    assert folder.name in of_run and "on no_obstacles: 3 test queries" in of_run
     success = [
         float(re.search(r"^  success +(\S+)", out, re.M)[1]) for out in (pretrained, baseline)
     ]

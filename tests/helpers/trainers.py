@@ -25,6 +25,7 @@ NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees 
 GPU = pytest.param("cuda", marks=NO_GPU)  # a `--device`
 TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
 TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1200"
+TINIER = f"{TINY} --horizon 20 --learning-starts 100 --eval-every 300 --total-timesteps 300"
 TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --eval-queries 3"
 TINY_BC += " --test-queries 4 --total-updates 1200"
 TINY_DAGGER = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --pool-size 100"
