@@ -110,12 +110,6 @@ def test_free_start_and_goal_change_nothing():
     assert np.array_equal(with_paths.actions, without.actions)
 
 
-def test_goal_that_is_a_position_has_no_path():
-    query = Query(FREE, IN_SHELF, shelf(gap=0.03))
-    with_paths, without = (episode(query, approach, "ee") for approach in (True, False))
-    assert np.array_equal(with_paths.actions, without.actions)
-
-
 def open_box(lid=False):
     """A box around the hand of `IN_BOX`, 30 cm wide inside, whose walls are 25 cm high."""
     walls = [Box((0.55 + x, 0.0, 0.125), (0.02, 0.34, 0.25)) for x in (-0.16, 0.16)]

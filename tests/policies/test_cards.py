@@ -43,19 +43,15 @@ def test_encoder_cards_agree_with_the_encoders():
     assert encoder_card("field")["receives"] == "point clouds"
 
 
-def test_policies_are_listed_in_columns(capsys):
+def test_policies_and_encoders_are_listed(capsys):
     assert command.main([]) == 0
     policies, encoders = capsys.readouterr().out.strip().split("\n\n")
-    head, *rows = policies.splitlines()
+    rows = policies.splitlines()[1:]
     assert [row.split()[0] for row in rows] == list(pretrained_policies())
-    starts = {name: head.index(name) for name in ("task", "goal", "safety filter")}
     for row in rows:
         card = policy_card(row.split()[0])
-        assert row[starts["task"] :].startswith(card["task"])
-        assert row[starts["goal"] :].startswith(card["goal_type"])
-        margin = "margin 0.01 m" if card["safety_filter"] else "none"
-        assert row[starts["safety filter"] :].startswith(margin)
-        assert len(row) == len(head) and row.endswith(f" {card['num_queries']:,}")
+        assert card["task"] in row and row.endswith(f" {card['num_queries']:,}")
+        assert ("margin 0.01 m" in row) == (card["safety_filter"] is not None)
     assert [row.split()[0] for row in encoders.splitlines()[1:]] == pretrained_encoders()
 
 

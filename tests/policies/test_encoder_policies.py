@@ -48,28 +48,6 @@ def steps(env, length):
     return transitions
 
 
-def test_buffer_samples_have_the_latent_code_of_their_scene(env):
-    sac = load("sac_her_mp")
-    env.reset(seed=0)
-    buffer = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
-    assert buffer.arrays["observation"].shape[1] < 50  # stored without latents
-    stored = {}
-    for _ in range(8):  # the oldest ones are overwritten
-        episode = steps(env, 10)
-        stored |= {t["observation"][:10].tobytes(): t for t in episode}
-        buffer.add_episode(episode)
-    copy = sac.HerReplayBuffer(env, 60, 0.8, np.random.default_rng(0))
-    copy.load_state_dict(buffer.state_dict())
-    for one in (buffer, copy):
-        batch = one.sample(200)
-        assert batch["observation"].shape == (200, 10 + SIZE)
-        assert batch["observation"].dtype == np.float32
-        for row, following in zip(batch["observation"], batch["next_observation"], strict=True):
-            transition = stored[row[:10].tobytes()]
-            np.testing.assert_array_equal(row, transition["observation"])
-            np.testing.assert_array_equal(following, transition["next_observation"])
-
-
 def test_buffer_samples_have_the_latent_codes_of_moving_obstacles():
     env = envs.make(MOVING, encoder="oracle")
     env.reset(seed=0)
@@ -161,9 +139,3 @@ def test_file_that_is_no_encoder_is_rejected(tmp_path, capsys):
     given = ("--encoder", str(tmp_path / "encoder.pt"))
     message = refusal("bc", capsys, tmp_path / "runs", *given)
     assert "--encoder: " in message and "not a network file" in message
-
-
-def test_environments_of_a_process_share_one_encoder(env):
-    other = envs.make(HARD, encoder="oracle")
-    assert env.encoder is other.encoder is oracle
-    other.close()
