@@ -5,7 +5,7 @@ Paper: sections 2 and 4, appendix "Extended NMP goal-conditioned MDP description
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -301,7 +301,10 @@ class RoboArmEnv(gym.Env):
             self.start_configuration = None
 
     def in_collision(
-        self, configuration: ArrayLike, time: float = 0.0, moving: bool = True
+        self,
+        configuration: np.ndarray | Sequence[float],
+        time: float = 0.0,
+        moving: bool = True,
     ) -> bool:
         """As `World.in_collision`. Continue with a reset."""
         return self.world.in_collision(configuration, time, moving)

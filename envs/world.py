@@ -12,7 +12,6 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
@@ -167,7 +166,8 @@ class World:
             self._drawn = True
             self._make_again(self._snapshot())
 
-    def _load_arm(self):
+    def _load_arm(self) -> Body:
+        assert self.client is not None  # it was just opened
         return Body(self.robot, self.client, self._drawn)
 
     # --- Copies
@@ -356,7 +356,10 @@ class World:
     # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
 
     def in_collision(
-        self, configuration: ArrayLike, time: float = 0.0, moving: bool = True
+        self,
+        configuration: np.ndarray | Sequence[float],
+        time: float = 0.0,
+        moving: bool = True,
     ) -> bool:
         """Whether the arm at joint angles (n, rad, inside the limits) overlaps the scene or itself.
 
@@ -443,7 +446,7 @@ class World:
 
     # --- The arm
 
-    def place(self, configuration: ArrayLike, time: float = 0.0) -> None:
+    def place(self, configuration: np.ndarray | Sequence[float], time: float = 0.0) -> None:
         """Teleport the arm to joint angles (n, rad), at rest, leaving no old contact points.
 
         `time`: s, from which on obstacles move, as a multiple of `TIME_STEP`.
