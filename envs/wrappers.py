@@ -106,6 +106,7 @@ class SensorWrapper(_ArmWrapper):
     def _observe(self, number):
         env = self.unwrapped
         configuration = _configuration(env) if number else env.start_configuration
+        assert configuration is not None  # there was a reset
         self._world.show(env.current_scene, configuration, number)
         return {name: sensor.observe(self._world) for name, sensor in self.sensors.items()}
 

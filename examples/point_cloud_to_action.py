@@ -65,7 +65,9 @@ def main() -> None:
     query = Query(START, GOAL, scene)
     begin = make_policy(policy, env)  # its safety filter included
     observation, _ = env.reset_specific(*query)
-    print("first action:", begin(0, query).act(observation).round(4).tolist())
+    act = begin(0, query).act
+    assert act is not None  # only planners may give up
+    print("first action:", act(observation).round(4).tolist())
     trajectory = rollout(env, query, begin(0, query).act)
     reached = "reached" if trajectory.success else "not reached"
     print(f"goal {reached} in {len(trajectory)} steps")
