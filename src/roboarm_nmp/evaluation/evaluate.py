@@ -313,13 +313,15 @@ def _make_job(
         policy, trained = find_policy(policy)
         if task is None:
             task = own_task(policy)
-        own = trained.get("goal_type")
-        if own is not None and options.goal_type not in (None, own):
-            by_kinematics = options.goal_type == "pose" and GOAL_TYPES[own].has_configuration
+        trained_with = trained.get("goal_type")
+        if trained_with is not None and options.goal_type not in (None, trained_with):
+            by_kinematics = (
+                options.goal_type == "pose" and GOAL_TYPES[trained_with].has_configuration
+            )
             if not by_kinematics:
                 raise EvaluationError(
-                    f"{policy} was trained with the goal type {own!r}, it cannot be evaluated with "
-                    f"{options.goal_type!r}"
+                    f"{policy} was trained with the goal type {trained_with!r}, it cannot be "
+                    f"evaluated with {options.goal_type!r}"
                 )
         options = replace(options, env=trained or options.env)
     problems = None
@@ -368,7 +370,8 @@ def _with_one_goal(problem: Problem) -> Problem:
     # Here, because Numba takes a while to import.
     from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 
-    robot, checker = problem.scene.robot, ground_truth_checker(problem.scene)
+    robot = problem.scene.robot
+    checker = ground_truth_checker(problem.scene)
     if problem.goal_pose is not None and not len(problem.goals):
         goal = goal_configuration(robot, problem.goal_pose, problem.start, checker)
         if goal is None:
@@ -436,8 +439,9 @@ def _queries(task, options):
     available = len(queries.start)
     if options.num_queries is not None and not 1 <= options.num_queries <= available:
         raise EvaluationError(f"num_queries must be 1 to {available}, got {options.num_queries}")
-    scenes, scene = getattr(queries, "scenes", None), get_task(task).scene
+    scenes = getattr(queries, "scenes", None)
     if scenes is None:
+        scene = get_task(task).scene
         if not isinstance(scene, Scene):
             raise EvaluationError(f"{name} has random scenes: these queries need `scenes` as well")
         scenes = QueryScenes(scene)

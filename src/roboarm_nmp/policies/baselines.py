@@ -189,9 +189,11 @@ def _planner(env: RoboArmEnv, seed: int, time_limit: float, geometry_source: Geo
         if observed is not query.scene:
             # A planner has one checker per scene, but this one is of a single episode.
             planner = Planner(env, geometry_source=lambda _: geometry_source(observed))
-        goal, goal_pose = query.goal, None
+        goal = query.goal
+        goal_pose = None
         if env.goal_type == "pose":
-            goal, goal_pose = None, env.robot.end_effector_pose(query.goal)
+            goal = None
+            goal_pose = env.robot.end_effector_pose(query.goal)
         try:
             path = planner.plan(
                 query.start,
