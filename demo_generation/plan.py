@@ -129,7 +129,7 @@ def _task_scene(args: Args) -> Scene:
     return scene.sample(np.random.default_rng(args.seed))
 
 
-def _observed_scene(args: Args, robot: Robot) -> ObservedScene:
+def _observed_scene(args: Args, path: Path, robot: Robot) -> ObservedScene:
     """The `ObservedScene` of the cloud, which is prepared and described."""
     from roboarm_nmp.envs.perception.cloud_files import load_cloud
     from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
@@ -142,7 +142,7 @@ def _observed_scene(args: Args, robot: Robot) -> ObservedScene:
     frame = None if args.frame is None else _numbers("--frame", args.frame, 7)
     intrinsics = None
     if args.intrinsics is not None:
-        intrinsics = _numbers("--intrinsics", args.intrinsics, 4)
+        intrinsics = _numbers("--intrinsics", args.intrinsics, 4).tolist()
     table, floor = (TABLE, FLOOR) if args.table else (None, None)
     options = {
         name: getattr(args, name)
@@ -151,13 +151,13 @@ def _observed_scene(args: Args, robot: Robot) -> ObservedScene:
     }
     if args.workspace is not None:
         options["workspace"] = _numbers("--workspace", args.workspace, 6).reshape(2, 3)
-    cloud = load_cloud(args.cloud, args.units, frame, intrinsics)
+    cloud = load_cloud(path, args.units, frame, intrinsics)
     prepare_cloud(cloud[:0], robot, recorded_at)  # what happens once per arm, outside of the time
     began = time.perf_counter()
     points, removed = prepare_cloud(cloud, robot, recorded_at, table=table, floor=floor, **options)
     seconds = time.perf_counter() - began
     left_out = [f"{number:,} {step}" for step, number in removed.items() if number]
-    print(f"{args.cloud}: {len(cloud):,} points; left out: {', '.join(left_out) or 'none'}")
+    print(f"{path}: {len(cloud):,} points; left out: {', '.join(left_out) or 'none'}")
     print(f"{len(points):,} points remain, prepared in {1000 * seconds:.0f} ms")
     return ObservedScene(
         points=points, point_radius=args.point_radius, robot=robot, table=table, floor=floor
@@ -309,10 +309,10 @@ def _plan(args: Args) -> bool:
     if args.output is not None:
         check_ending(args.output)
         check_writable(args.output)
-    if args.task is not None:
-        scene = _task_scene(args)
+    if args.cloud is not None:
+        scene = _observed_scene(args, args.cloud, load_robot(args.robot or PANDA.name))
     else:
-        scene = _observed_scene(args, load_robot(args.robot or PANDA.name))
+        scene = _task_scene(args)
     start = _configuration("--start", args.start, scene.robot)
     checker = CollisionChecker(scene)
     goal = _goal(args, scene.robot, start)

@@ -10,8 +10,8 @@ from paths import ROOT
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
-from roboarm_nmp.datasets.queries import load_queries, query_path, validate
-from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
+from roboarm_nmp.datasets.queries import query_path, validate
+from roboarm_nmp.demo_generation import collect, roadmaps
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.demo_generation.verify import verify
 from roboarm_nmp.envs.collision.checker import CollisionChecker
@@ -102,15 +102,6 @@ def test_interrupted_collection_of_another_arm_continues_to_the_same_bytes(tmp_p
     collect.collect(again, 3, options, progress=False)
     assert again.read_bytes() == whole.read_bytes()
     assert verify(again, progress=False, task=task)["good"] == 3
-
-
-def test_goal_region_is_that_of_the_arm(tmp_path):
-    task, region = f"no_obstacles@{ROBOTS / 'xarm6.yaml'}", (0.2, 0.6, -0.4, 0.4, 0.2, 0.6)
-    path = tmp_path / "queries.h5"
-    make_queries.make_queries(path, task, 0, 3, 1, progress=False, goal_region=region)
-    goals = load_queries(path, task=task).goal_position
-    low, high = np.reshape(region, (3, 2)).T
-    assert goals.shape == (3, 3) and (low <= goals).all() and (goals <= high).all()
 
 
 def test_roadmaps_and_examples_have_the_joints_of_the_arm(tmp_path):

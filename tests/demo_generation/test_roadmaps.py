@@ -183,11 +183,6 @@ def test_roadmaps_do_not_import_ompl():
     assert subprocess.run([sys.executable, "-c", check], cwd=ROOT).returncode == 0
 
 
-def test_margin_below_that_of_the_nodes_is_rejected():
-    with pytest.raises(ValueError, match="margin"):
-        Roadmap(Scene(), np.random.default_rng(0), margin=0.001)
-
-
 # --- Places
 
 
@@ -340,9 +335,3 @@ def test_bad_flag_is_rejected(collected, changes, message):
         collect(replace(Args(collected, **SMALL), **changes), progress=False)
     assert files(collected) == before
     assert not (LIBRARY / "datasets" / "demos" / "new").exists()
-
-
-def test_task_with_one_scene_has_other_paths_each_time(tmp_path):
-    paths = collect(Args(tmp_path, task="wall", **SMALL | {"scenes": 2}), progress=False)
-    assert paths.scenes[0] == paths.scenes[1] == envs.get_task("wall").scene
-    assert not np.array_equal(paths.of_scene(0)[0], paths.of_scene(1)[0])

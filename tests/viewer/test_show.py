@@ -80,15 +80,6 @@ def test_goal_that_is_a_position_has_no_ghost(tmp_path):
     assert changed.sum() > 50
 
 
-def test_camera_looks_from_the_given_direction(tmp_path):
-    shown = []
-    for direction in ([], [0, -15], [-90, -90]):
-        flags = ["--camera", *direction] if direction else []
-        assert run("wall", "--output", tmp_path / "a.png", *SIZE, *flags) == 0
-        shown.append(pixels_of(tmp_path / "a.png").tobytes())
-    assert len(set(shown)) == 3
-
-
 def test_images_of_several_queries_form_a_grid(tmp_path, capsys):
     assert run("wall", "--output", tmp_path / "a.png", "--draws", 3, "--query", 5, *SIZE) == 0
     assert "test query 5 to 7" in capsys.readouterr().out

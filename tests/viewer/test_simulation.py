@@ -24,7 +24,7 @@ from roboarm_nmp.viewer.episodes import (
     task_episodes,
     trajectory_episodes,
 )
-from roboarm_nmp.viewer.simulation import PolicyArm, RecordedArm, Simulation, inverse_kinematics
+from roboarm_nmp.viewer.simulation import PolicyArm, RecordedArm, Simulation
 
 PRETRAINED = "dagger-combined-point_cloud-random_boxes_hard-s1"
 BLOCKED = 5  # number of a query of `wall` on which go-to-goal touches the wall
@@ -189,17 +189,6 @@ def test_point_cloud_policy_observes_an_obstacle_that_was_moved(simulation):
     assert not np.allclose(observed[0], observed[1], atol=1e-3)
 
 
-def test_planner_plans_again_after_an_edit(simulation):
-    shown = simulation("wall", "planner", number=BLOCKED, time_limit=30.0)
-    arm = shown.arms[0]
-    for _ in range(5):
-        shown.step()
-    shown.move_goal(PANDA.forward_kinematics(shown.query.goal) + [0.0, 0.0, 0.03])
-    assert arm.problem is None
-    run(shown)
-    assert arm.success and arm.contact_steps == 0
-
-
 def test_goal_in_collision_is_a_problem_and_ends_planning(simulation):
     shown = simulation("no_obstacles", "planner", "go-to-goal")
     shown.add_obstacle(Sphere(tuple(PANDA.forward_kinematics(shown.query.goal)), 0.05))
@@ -251,28 +240,6 @@ def test_query_that_does_not_exist_is_rejected(simulation, split, number):
     with pytest.raises(ValueError, match="quer"):
         shown.select(split, number)
     assert shown.number == 0
-
-
-def test_task_without_query_file_has_random_queries_of_a_seed(tmp_path):
-    scene = tmp_path / "mine.yaml"
-    scene.write_text("obstacles: []\n")
-    first, again, other = (
-        task_episodes(str(scene), seed).get("random", 2)[0] for seed in (1, 1, 2)
-    )
-    assert np.array_equal(first.start, again.start) and np.array_equal(first.goal, again.goal)
-    assert not np.array_equal(first.start, other.start)
-
-
-def test_inverse_kinematics_stays_within_limits_and_near_the_goal():
-    for query in load_queries("no_obstacles")[:10]:
-        here = PANDA.forward_kinematics(query.goal)
-        near = inverse_kinematics(PANDA, here, query.goal)
-        assert np.allclose(near, query.goal)
-        moved = inverse_kinematics(PANDA, 0.9 * here, query.goal)
-        assert np.all(moved >= PANDA.lower) and np.all(moved <= PANDA.upper)
-        assert np.abs(PANDA.forward_kinematics(moved) - 0.9 * here).max() < 1e-3
-        beyond = inverse_kinematics(PANDA, [0.0, 0.0, 3.0], query.goal)
-        assert np.isfinite(beyond).all() and np.all(np.abs(PANDA.normalise(beyond)) <= 1 + 1e-9)
 
 
 def test_file_of_a_trajectory_is_played_in_the_scene_of_each_query(tmp_path):

@@ -54,7 +54,7 @@ class Journal:
 
     def __init__(self, path: Path, options: Mapping[str, Any]):
         self.path = path
-        self.entries: dict[int, dict[str, Any]] = {}
+        self.entries: dict[int | str, dict[str, Any]] = {}
         scene = scene_to_json(get_task(options["task"]).base_scene)
         header = {"journal": VERSION, **options, "scene": scene}
         self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)

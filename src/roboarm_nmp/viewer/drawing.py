@@ -82,7 +82,7 @@ class ArmDrawing:
         self._root = scene.add_frame(
             name,
             show_axes=False,
-            position=robot.base_position,
+            position=np.array(robot.base_position),
             wxyz=_wxyz(robot.base_orientation),
         )
         self._meshes = {}  # link -> list of handles and their own colours

@@ -205,10 +205,13 @@ def _rounded(vertices):
     return np.round(vertices, 4).astype(np.float32)
 
 
-def _bullet_indices(robot):
-    """PyBullet's indices of joints and of links by their names, two dicts; -1 is the base."""
-    joints = {name: index for index, name in enumerate(robot.bullet_joint_names)}
-    return joints, {name: index for index, name in robot.link_names.items()}
+def _bullet_indices(robot: Robot) -> tuple[dict[str | None, int], dict[str | None, int]]:
+    """PyBullet's indices of joints and of links by their names; -1 is the base."""
+    joints: dict[str | None, int] = {}
+    for index, name in enumerate(robot.bullet_joint_names):
+        joints[name] = index
+    links: dict[str | None, int] = {name: index for index, name in robot.link_names.items()}
+    return joints, links
 
 
 def _link_name(joint, kind):
@@ -216,7 +219,7 @@ def _link_name(joint, kind):
     return joint.find(kind).get("link")
 
 
-def _numbers(element, name: str, default: Sequence[float] = ()) -> tuple[float, ...]:
+def _numbers(element, name: str, default: Sequence[float] | np.ndarray = ()) -> tuple[float, ...]:
     """The numbers of an attribute."""
     if element is None or element.get(name) is None:
         return tuple(default)
