@@ -232,7 +232,7 @@ def _rolled_out(
         options["link_distances"] = True
         options.setdefault("geometry_source", "ground_truth")
     scene = checker.scene
-    if goal is None:
+    if goal_pose is not None:
         goal = goal_configuration(scene.robot, goal_pose, start, checker)
     if goal is None:
         raise ValueError("--goal-pose: the arm reaches it only in collision")
