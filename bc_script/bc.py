@@ -20,7 +20,7 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.demonstrations import load_demo_files
 from roboarm_nmp.datasets.episodes import observed
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.training import cuda_graphs, protocol, runs
@@ -173,21 +173,20 @@ class Actor(nn.Module):
 
 
 # ALGO LOGIC: demonstrations
-def transitions(demos, goal_type, num_demos=None):
+def transitions(demos, goal_type):
     """Observations, goals and actions of demonstrations: float32 (m, o), (m, g), (m, n).
 
     And the index of each one's demonstration: int64 (m,). n is the number of joints. A
     demonstration is used to its end, also after its goal counts as reached. Actions are in units of
     `MAX_STEP`.
     """
-    number = len(demos) if num_demos is None else min(num_demos, len(demos))
-    demo_index = np.repeat(np.arange(number), np.diff(demos.offsets[: number + 1]))
+    demo_index = np.repeat(np.arange(len(demos)), np.diff(demos.offsets))
     has_action = np.ones(len(demo_index), bool)
-    has_action[demos.offsets[1 : number + 1] - 1] = False  # the last states
-    rows, demo_index = np.flatnonzero(has_action), demo_index[has_action]
+    has_action[demos.offsets[1:] - 1] = False  # the last states
+    demo_index = demo_index[has_action]
     robot = demos.scenes.base.robot
-    observation, _, goal = observed(demos.states[rows], demos.goal[:number], goal_type, robot)
-    return observation, goal[demo_index], demos.actions[rows] / MAX_STEP, demo_index
+    observation, _, goal = observed(demos.states[has_action], demos.goal, goal_type, robot)
+    return observation, goal[demo_index], demos.actions[has_action] / MAX_STEP, demo_index
 
 
 # ALGO LOGIC: one update
@@ -205,21 +204,13 @@ if __name__ == "__main__":
     device = runs.seed_torch(args)
     validation, test = protocol.load_task(args)
     with runs.errors_of("--demos"):
-        files = [load_demos(file, args.task) for file in args.demos or (args.task,)]
+        demos = load_demo_files(args.demos, args.task, args.num_demos)
     env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
     env_arguments["num_points"] = args.num_points
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
 
     # ALGO LOGIC: data
-    parts = [transitions(demos, args.goal_type, args.num_demos) for demos in files]
-    firsts = np.cumsum([0, *map(len, files[:-1])])
-    for first, (*_, demo_index) in zip(firsts, parts, strict=True):
-        demo_index += first  # indices continue from file to file
-    data = [
-        torch.as_tensor(np.concatenate(arrays), device=device)
-        for arrays in zip(*parts, strict=True)
-    ]
-    del parts
+    data = [torch.as_tensor(array, device=device) for array in transitions(demos, args.goal_type)]
 
     # ALGO LOGIC: network and optimiser
     actor = Actor(args, eval_envs[0]).to(device)
@@ -233,9 +224,9 @@ if __name__ == "__main__":
     latents = None  # the encoded scene of each demonstration; the first time takes minutes
     if args.encoder is not None:
         with runs.errors_of("--encoder"):
-            encoded = [eval_envs[0].encoder.encode_demos(demos) for demos in files]
-        latents = torch.as_tensor(np.concatenate(encoded), device=device)
-    del files
+            encoded = eval_envs[0].encoder.encode_demos(demos)
+        latents = torch.as_tensor(encoded, device=device)
+    del demos
     run.start(args.total_updates, "update")
     run.repeat_evaluation(actor_average)
 

@@ -46,8 +46,8 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     demo_prob: flags.Share | None = None
     """train on the queries of the task's demonstrations; when an episode fails, its demonstration
     enters the replay buffer with this probability (the paper's p). Without it: random queries"""
-    demos: Path | None = None
-    """demonstration file to use with --demo-prob; by default the task's own"""
+    demos: tuple[Path, ...] = ()
+    """demonstration files of the task, to use with --demo-prob; by default the task's own"""
     bc_weight: flags.NonNegativeFloat = 0.0
     """with --demo-prob, weight of behavioural cloning in the policy's loss: the squared difference
     from demonstrated actions, in units of the action scale (Fujimoto and Gu, 2021). Measured: 5, on

@@ -68,7 +68,7 @@ class Args(EncoderFlags):  # whose flags are in `training_data.py` and `roboarm_
     """batches of the whole run"""
     batch_size: PositiveInt = 32
     """scenes per batch"""
-    num_queries: PositiveInt = 256
+    num_query_points: PositiveInt = 256
     """points per scene and batch whose distance is predicted; half of them near obstacles"""
     spread: PositiveFloat = 0.05
     """standard deviation (m) of the noise that moves the latter away from an obstacle's inside"""
@@ -251,7 +251,7 @@ def update(model, optimizer, batch, args):
     Returns a dict of scalars: the weighted error, and the mean error near obstacles, m.
     """
     points, valid, obstacles = batch
-    queries = sample_queries(obstacles, args.num_queries, args.spread)
+    queries = sample_queries(obstacles, args.num_query_points, args.spread)
     truth = distances(obstacles, queries)
     points, queries = augment(points, queries)
     device = queries.device.type
@@ -321,7 +321,7 @@ if __name__ == "__main__":
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)  # the same queries to validate on in all runs
         obstacles = torch.as_tensor(data[-1][validation])
-        queries = sample_queries(obstacles, 4 * args.num_queries, args.spread)
+        queries = sample_queries(obstacles, 4 * args.num_query_points, args.spread)
 
     run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
     run.start(args.total_updates, "update")

@@ -62,7 +62,7 @@ class Args(training_data.EncoderFlags):
     """dimensions of z_E per sensor (paper: 16)"""
     num_points: PositiveInt = 256
     """points that the network receives, evenly spaced among those of a cloud above the table"""
-    num_queries: PositiveInt = 192
+    num_query_points: PositiveInt = 192
     """points that it classifies per cloud and batch"""
     num_centres: tuple[PositiveInt, PositiveInt] = (32, 12)
     """points that farthest point sampling leaves, level by level"""
@@ -229,7 +229,7 @@ class ExportedEncoder(nn.Module):
 
 def update(model, optimizer, batch, args):
     """One step on a batch of `batch_of`. Returns its loss, a scalar."""
-    logits, truth = model(batch, args.num_queries)
+    logits, truth = model(batch, args.num_query_points)
     loss = F.cross_entropy(
         torch.cat(logits).flatten(0, 1), torch.cat(truth).flatten(), ignore_index=IGNORED
     )

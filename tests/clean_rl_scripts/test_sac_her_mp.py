@@ -109,8 +109,8 @@ def test_network_inputs_of_goal_poses():
 def test_networks_fit_every_observation(goal_type, velocities, link_distances):
     shared = {"goal_type": goal_type, "velocities": velocities}
     source = "ground_truth" if link_distances else None
-    args = sac.Args(**shared, link_distances=source, num_hidden_layers=4)
     shared |= {"link_distances": link_distances, "geometry_source": source}
+    args = sac.Args(**shared, num_hidden_layers=4)
     env = envs.make("wall", **shared, append_link_distances=link_distances)
     batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
     actor = sac.Actor(args, env)

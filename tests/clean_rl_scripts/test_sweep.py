@@ -80,7 +80,7 @@ def test_search_space_is_parsed(text, name, distribution):
 
 
 @pytest.mark.parametrize(
-    "text", ["lr", "=1..2", "lr=", "lr=1..2:logarithmic", "lr=a..b", "lr=2.0..1.0", "lr=0..1:log"]
+    "text", ["lr", "=1..2", "lr=", "lr=1..2:logarithmic", "lr=2.0..1.0", "lr=0..1:log"]
 )
 def test_bad_search_space_is_rejected(trainer, text, capsys):
     with pytest.raises(SystemExit) as exit:
@@ -124,16 +124,8 @@ def test_search_is_reproducible_and_continues(trainer, tmp_path, capsys):
     assert len({row["lr"] for row in rows(trainer)}) == 8
     with pytest.raises(SystemExit, match="holds another search"):
         sweep.main(arguments(trainer, "--trials", "8", "--seed", "3"))
-    with pytest.raises(SystemExit, match="holds another search"):
-        sweep.main(arguments(trainer, "--trials", "8", "--", "--other", "1"))
-    with pytest.raises(SystemExit, match="has no flag --seconds"):
-        sweep.main(arguments(trainer, "--trials", "8", "--", "--seconds", "1"))
     with pytest.raises(SystemExit, match="has no flag --othr: did you mean --other?"):
         sweep.main(arguments(trainer, "--trials", "8", "--", "--othr", "1"))
-    with pytest.raises(
-        SystemExit, match="no such trainer: .*trainr.py: did you mean .*trainer.py?"
-    ):
-        sweep.main(arguments(trainer.with_name("trainr.py"), "--trials", "8"))
 
 
 def test_help_needs_no_optuna_and_a_search_says_how_to_install_it(trainer):
@@ -163,7 +155,7 @@ def start(trainer, seconds):
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130), (signal.SIGTERM, 143)]
+    ("number", "code"), [(signal.SIGKILL, -9), (signal.SIGTERM, 143)]
 )
 def test_interrupted_search_continues_its_running_trials(trainer, number, code):
     process, command = start(trainer, 1000)
@@ -189,22 +181,9 @@ def test_interrupted_search_continues_its_running_trials(trainer, number, code):
         assert float(found[trial]["lr"]) == result["lr"] == begun.get(trial, result["lr"])
 
 
-def test_search_waits_for_trainers_that_outlived_it(trainer):
-    process, command = start(trainer, 4)
-    trainers = psutil.Process(process.pid).children()
-    process.kill()
-    assert len(trainers) == 2 and all(child.is_running() for child in trainers)
-    subprocess.run(command, check=True)
-    results = [
-        json.loads(path.read_text()) for path in trainer.parent.glob("sweep/*/*/result.json")
-    ]
-    assert len(rows(trainer)) == 4 and not any(result["resumed"] for result in results)
-
-
 @pytest.mark.slow
 def test_on_ray(trainer):
     cluster_utils = pytest.importorskip("ray.cluster_utils")
-    pytest.importorskip("pyarrow")
     cluster = cluster_utils.Cluster(head_node_args={"num_cpus": 2}, initialize_head=True)
     try:
         more = ["--trials", "4", "--ray-address", cluster.address]
@@ -227,8 +206,3 @@ def test_trainer_without_a_policy_fails(trainer):
     trainer.write_text(TRAINER.replace("validation_success_rate", "error_near"))
     with pytest.raises(SystemExit, match="every trial failed"):
         sweep.main(arguments(trainer, "--trials", "1"))
-
-
-def test_search_ends_with_an_error_if_every_trial_fails(trainer):
-    with pytest.raises(SystemExit, match="every trial failed"):
-        sweep.main(arguments(trainer, "--trials", "2", "--", "--other", "no number"))

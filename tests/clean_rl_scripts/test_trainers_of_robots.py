@@ -24,9 +24,15 @@ EXAMPLE = ROOT / "examples" / "robots" / "xarm6.yaml"
 PANDAS = "sac-ee-wall-p1-s1"  # a pretrained policy
 SHORT = {
     "sac_her_mp": ["--total-timesteps", "400", "--goal-type", "combined", "--velocities"],
-    "td3_her_mp": ["--total-timesteps", "400", "--link-distances", "ground_truth"],
+    "td3_her_mp": [
+        "--total-timesteps",
+        "400",
+        "--geometry-source",
+        "ground_truth",
+        "--link-distances",
+    ],
     "bc": ["--total-updates", "300", "--eval-every", "300", "--num-modes", "2"],
-    "dagger": ["--task", "no_obstacles"],
+    "dagger": [],
 }
 SHORT["td3_her_mp"] += ["--demo-prob", "1", "--bc-weight", "2"]
 
@@ -65,11 +71,11 @@ def test_discount_factor_is_higher_where_a_joint_turns_all_the_way_round(script,
 @pytest.mark.parametrize("trainer", SHORT)
 def test_trainer_trains_another_arm(trainer, file, tmp_path, monkeypatch, short_episodes):
     monkeypatch.chdir(file.parent)
-    flags = ["--robot", "xarm6.yaml", *SHORT[trainer]]
+    flags = ["--task", "no_obstacles@xarm6.yaml", *SHORT[trainer]]
     flags += ["--encoder", "point_cloud"] if trainer == "dagger" else []
     run = run_script(trainer, tmp_path, *flags)
     args, result = (json.loads((run / f"{one}.json").read_text()) for one in ("args", "result"))
-    assert args["task"] == result["task"] == "no_obstacles@xarm6.yaml" and args["robot"] is None
+    assert args["task"] == result["task"] == "no_obstacles@xarm6.yaml"
     assert result["robot"] == "xarm6" and run.name.startswith("no_obstacles@xarm6__")
     robot = load_robot(file)
     metadata = load_network(run / "policy.pt").metadata
@@ -162,11 +168,9 @@ def test_baselines_move_another_arm(policy, source, file):
 
 
 def test_robot_that_cannot_be_used_is_rejected(file, capsys, tmp_path):
-    message = refusal("sac_her_mp", capsys, tmp_path, "--robot", "nothing.yaml")
+    message = refusal("sac_her_mp", capsys, tmp_path, "--task", "no_obstacles@nothing.yaml")
     assert "--task: nothing.yaml: No such file" in message
-    both = ["--robot", str(file), "--task", f"no_obstacles@{file}"]
-    assert "names a robot already" in refusal("sac_her_mp", capsys, tmp_path, *both)
-    message = refusal("bc", capsys, tmp_path, "--robot", str(file), "--task", "boxes")
-    assert "--task: boxes is the Panda's" in message
+    message = refusal("bc", capsys, tmp_path, "--task", f"boxes@{file}")
+    assert "is the Panda's" in message
     message = refusal("dagger", capsys, tmp_path, "--paths", str(file.parent / "roadmaps"))
     assert "--paths: " in message and "made for the robot 'xarm6' " in message

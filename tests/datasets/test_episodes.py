@@ -52,4 +52,4 @@ def test_episode_has_the_observations_of_the_environment():
 )
 def test_demonstrations_that_do_not_fit_are_rejected(arguments, message):
     with pytest.raises(DatasetError, match=message):
-        load_demos_for(envs.make("wall", **arguments), "wall", "wall")
+        load_demos_for(envs.make("wall", **arguments), (), "wall")

@@ -80,7 +80,7 @@ def test_demonstrations_among_moving_obstacles_cannot_have_observations_of_the_s
     ):
         env = envs.make(MOVING, **options)
         with pytest.raises(DatasetError, match="among moving obstacles"):
-            load_demos_for(env, "wall", "wall")
+            load_demos_for(env, (), "wall")
         env.close()
     with pytest.raises(ValueError, match="among moving obstacles"):
         oracle.encode_demos(Demos([None]))
@@ -124,7 +124,7 @@ def test_policy_with_an_encoder_is_trained_and_evaluated(
     flags = ["--task", HARD, "--encoder", "oracle", "--num-hidden-layers", "4"]
     flags += ["--goal-type", "combined", "--demos", few_demos, "--eval-queries", "1"]
     if trainer == "sac_her_mp":
-        flags += ["--demo-prob", "1", "--link-distances", "ground_truth"]
+        flags += ["--demo-prob", "1", "--geometry-source", "ground_truth", "--link-distances"]
     run = run_script(trainer, tmp_path, *flags)
     network = torch.load(run / "policy.pt", weights_only=True)
     assert network["metadata"]["env"]["encoder"] == "oracle"

@@ -78,7 +78,7 @@ def test_rotation_by_a_sector_rolls_the_latent_code():
 
 def test_one_update_follows_the_losses_written_out():
     torch.manual_seed(0)
-    args = field.Args(width=8, learning_rate=0.01, num_queries=30, latent_noise=0.1)
+    args = field.Args(width=8, learning_rate=0.01, num_query_points=30, latent_noise=0.1)
     model = field.Field(args)
     before, obstacles = copy.deepcopy(model), obstacle_rows().expand(3, -1, -1)
     points, valid = torch.rand(3, 20, 3) - 0.5, torch.rand(3, 20) < 0.8
@@ -119,7 +119,7 @@ def test_field_overfits_a_few_scenes(observations):
 
 
 def test_no_kernel_receives_two_floating_point_types():
-    args = field.Args(width=8, num_queries=12, bf16=True)
+    args = field.Args(width=8, num_query_points=12, bf16=True)
     points, valid = torch.rand(3, 20, 3) - 0.5, torch.rand(3, 20) < 0.8
     batch = points, valid, obstacle_rows().expand(3, -1, -1)
     with OneType():

@@ -15,7 +15,7 @@ pointnet2 = load("pointnet2")
 
 def test_one_update_follows_the_loss_written_out():
     torch.manual_seed(0)
-    sizes = {"num_points": 20, "num_centres": (8, 4), "num_neighbours": 4, "num_queries": 30}
+    sizes = {"num_points": 20, "num_centres": (8, 4), "num_neighbours": 4, "num_query_points": 30}
     args = pointnet2.Args(width=4, learning_rate=0.01, **sizes)
     model = pointnet2.PointNet2(2, args)
     before, batch = copy.deepcopy(model), []
@@ -41,7 +41,7 @@ def test_one_update_follows_the_loss_written_out():
 def test_pointnet2_overfits_a_few_scenes(observations):
     torch.manual_seed(0)
     rows = np.arange(20)
-    sizes = {"num_points": 32, "num_centres": (12, 6), "num_neighbours": 4, "num_queries": 60}
+    sizes = {"num_points": 32, "num_centres": (12, 6), "num_neighbours": 4, "num_query_points": 60}
     args = pointnet2.Args(width=8, **sizes)
     model, data = pointnet2.PointNet2(4, args), clouds.load_clouds(Observations(observations), 32)
 

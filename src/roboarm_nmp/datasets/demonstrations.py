@@ -245,6 +245,51 @@ def load_demos(task_or_path: str | Path, task: str | Path | None = None) -> Demo
     )
 
 
+class _JoinedScenes:
+    """The scenes of several files: query i has scene `which[i, 1]` of file `which[i, 0]`."""
+
+    def __init__(self, parts, which):
+        self.parts = parts
+        self.which = which
+        self.base = parts[0].base
+
+    def __getitem__(self, i):
+        part, number = self.which[i]
+        return self.parts[part][number]
+
+    def take(self, which):
+        """As `QueryScenes.take`."""
+        return _JoinedScenes(self.parts, self.which[which])
+
+
+def load_demo_files(files: Sequence[Path | str], task: str, number: int | None = None) -> Demos:
+    """The `Demos` of several files of a task as one, file after file.
+
+    In `made_by`, `parameters` and `seed` they are those of the first file.
+
+    Args:
+        files: paths; without any, the task's own demonstrations.
+        task: the task that they must be for.
+        number: of demonstrations to take from each file, the first ones; None for all.
+
+    Raises:
+        DatasetError: as `load_demos`.
+    """
+    parts = [load_demos(file, task) for file in files or (task,)]
+    if number is not None:
+        parts = [part[:number] for part in parts]
+    if len(parts) == 1:
+        return parts[0]
+    flat = ("start", "goal", "states", "actions", "plan", "plan_seed", "digest", "collided")
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in flat}
+    for name in ("offsets", "plan_offsets"):
+        lengths = [np.diff(getattr(part, name)) for part in parts]
+        arrays[name] = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
+    which = [(i, number) for i, part in enumerate(parts) for number in range(len(part))]
+    scenes = _JoinedScenes([part.scenes for part in parts], np.array(which))
+    return replace(parts[0], **arrays, scenes=scenes)
+
+
 def _is_finite(value):
     return isinstance(value, (int, float)) and math.isfinite(value)
 

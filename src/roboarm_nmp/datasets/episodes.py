@@ -5,13 +5,14 @@ observations, its achieved goals and the step that reaches the goal depend on th
 `config`, `combined` or `pose`. Trainers and the Minari export use these episodes.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from roboarm_nmp.datasets.demonstrations import Demo, Demos, load_demos
+from roboarm_nmp.datasets.demonstrations import Demo, Demos, load_demo_files
 from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.robots.robot import Robot
@@ -151,12 +152,12 @@ class DemoQueriesWrapper(gym.Wrapper):
         return self.env.reset_specific(self.demo.start, self.demo.goal, self.demo.scene)
 
 
-def load_demos_for(env: "RoboArmEnv", file: str | Path, task: str | Path) -> Demos:
-    """Load the demonstrations of a file or task, if they can be episodes of `env`.
+def load_demos_for(env: "RoboArmEnv", files: Sequence[str | Path], task: str) -> Demos:
+    """Load the demonstrations of a task's files, if they can be episodes of `env`.
 
     Args:
         env: an environment of `envs.make`.
-        file: a task's name, or the path of a scene file or a demonstration file.
+        files: paths of demonstration files; without any, the task's own.
         task: the task that they must be for.
 
     Raises:
@@ -171,7 +172,7 @@ def load_demos_for(env: "RoboArmEnv", file: str | Path, task: str | Path) -> Dem
         raise DatasetError(
             "demonstrations among moving obstacles have no observations of the scene"
         )
-    demos = load_demos(file, task)
+    demos = load_demo_files(files, task)
     if env.stop_on_collision and demos.collided.any():
         raise DatasetError("--stop-on-collision, but some of these demonstrations have contacts")
     return demos

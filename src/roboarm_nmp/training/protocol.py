@@ -11,7 +11,6 @@ message.
 import collections
 import sys
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -23,7 +22,7 @@ from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.arm_env import HORIZON, STANDARD_RULES, deviations
 from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.tasks import task_name, task_with_robot
+from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.rollout import render_strip, rollouts
 from roboarm_nmp.networks.exported_networks import (
     load_network,
@@ -53,19 +52,14 @@ class PolicyFlags(RunFlags):
     """The flags of every trainer of a policy: its run, task, updates and evaluations."""
 
     task: str = "no_obstacles"
-    """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
-    robot: Path | None = None
-    """another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md); same as TASK@FILE"""
+    """task to train on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md);
+    with another arm TASK@FILE, a robot's file (docs/customise/robot.md)"""
     compile: bool = True
     """on a GPU, repeat updates as CUDA graphs, which is several times faster"""
     eval_queries: PositiveInt = 200
     """validation queries per evaluation"""
     test_queries: NonNegativeInt = 1_000
     """test queries for the best policy at the end (0: no test)"""
-
-    def __post_init__(self):
-        # The task names the robot from here on: in files, messages and the run's flags.
-        self.task, self.robot = task_with_robot(self.task, self.robot), None
 
 
 @dataclass
@@ -89,18 +83,19 @@ class EnvFlags:
     `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/guide/perception.md),
     `point_cloud` for observed points, or `oracle` for the ground-truth obstacles; by default
     nothing"""
-    link_distances: str | None = None
-    """append the signed distance of each link from the nearest obstacle and its gradient to the
-    observation; the obstacles are those of a geometry source: `ground_truth`, `point_cloud`, or an
-    encoder with a decoder (`field`, or a path), which also gives the points of `point_cloud`"""
+    geometry_source: str | None = None
+    """where link distances take the obstacles from: `ground_truth`, `point_cloud`, or an encoder
+    with a decoder (`field`, or a path), which also gives the points of the encoder `point_cloud`"""
+    link_distances: bool = False
+    """append the signed distance of each link from the nearest obstacle of --geometry-source and
+    its gradient to the observation"""
 
 
 def env_arguments_of(args):
     """The `EnvFlags` in a trainer's flags as a dict, for `envs.make`."""
     arguments = {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
-    has_distances = args.link_distances is not None
-    arguments |= {"geometry_source": args.link_distances, "link_distances": has_distances}
-    return arguments | {"append_link_distances": has_distances}
+    arguments["append_link_distances"] = args.link_distances
+    return arguments
 
 
 def load_task(args):
@@ -154,7 +149,7 @@ def make_envs(task, number, **kwargs):
     try:
         return [envs.make(task, **kwargs) for _ in range(number)]
     except ValueError as error:
-        names = {"encoder": "--encoder", "geometry_source": "--link-distances"}
+        names = {"encoder": "--encoder", "geometry_source": "--geometry-source"}
         given = [flag for name, flag in names.items() if kwargs.get(name) is not None]
         flags = " or ".join(given)
         sys.exit(f"{flags}: {error}" if given else str(error))
@@ -169,13 +164,13 @@ def make_eval_envs(task, num_queries, **kwargs):
     return rendering + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
 
 
-def make_training_envs(args, demo_prob=None, demos=None, bc_weight=0.0):
+def make_training_envs(args, demo_prob=None, demos=(), bc_weight=0.0):
     """`args.num_envs` environments, with random queries or those of demonstrations (`demo_prob`).
 
     Args:
         args: the flags, with `EnvFlags` among them.
         demo_prob: value of the flag --demo-prob, if the trainer has it.
-        demos: value of the flag --demos, a file; by default the task's own.
+        demos: value of the flag --demos, files; by default the task's own.
         bc_weight: value of the flag --bc-weight, which needs demonstrations.
 
     Returns:
@@ -184,8 +179,8 @@ def make_training_envs(args, demo_prob=None, demos=None, bc_weight=0.0):
     Raises:
         SystemExit: an argument is rejected, or the demonstrations do not fit.
     """
-    if demo_prob is None and (demos is not None or bc_weight > 0):
-        flag = "--demos" if demos is not None else "--bc-weight"
+    if demo_prob is None and (demos or bc_weight > 0):
+        flag = "--demos" if demos else "--bc-weight"
         sys.exit(f"{flag} goes with --demo-prob")
     made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
     # A GPU waits for its environments; on a CPU they take less time than the updates.
@@ -193,7 +188,7 @@ def make_training_envs(args, demo_prob=None, demos=None, bc_weight=0.0):
     if demo_prob is None:
         return TrainingEnvs(made, processes=processes)
     try:
-        demos = load_demos_for(made[0], demos or args.task, args.task)
+        demos = load_demos_for(made[0], demos, args.task)
     except ValueError as error:
         sys.exit(f"--demo-prob: {error}")
     return TrainingEnvs([DemoQueriesWrapper(env, demos) for env in made], demo_prob, processes)

@@ -28,7 +28,6 @@ import contextlib
 import errno
 import functools
 import importlib.util
-import itertools
 import json
 import math
 import os
@@ -37,12 +36,15 @@ import sys
 import threading
 import time
 import typing
+from collections.abc import Collection, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
+from torch.utils import deterministic
 
 from roboarm_nmp.envs.robots.files import ROBOT_FILES
 from roboarm_nmp.utils import flags
@@ -75,12 +77,13 @@ class RunFlags:
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
+Flags = TypeVar("Flags", bound=RunFlags)
 MAY_CHANGE = {"resume", "runs_dir", "track"}  # they change no number
 SAME_INTERRUPT = 1.0  # s: `timeout` and `roboarm sweep` may both send a signal that one has sent
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
-def parse_args(Args, may_change=()):
+def parse_args(Args: type[Flags], may_change: Collection[str] = ()) -> Flags:
     """The flags of the command line; with --resume the run's, which must not be contradicted.
 
     A flag `bf16` that is None is decided: whether the hardware has bfloat16.
@@ -93,19 +96,17 @@ def parse_args(Args, may_change=()):
         SystemExit: bad flags, no such run, or other flags than the run's; no CUDA device, no wandb.
     """
     end_with_one_line("nothing was written")
+    args = flags.parse(Args)
     try:
-        args = flags.parse(Args)
         flags.check(args)
         if args.resume is not None:
             args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
             flags.check(args)
     except ValueError as error:
         sys.exit(str(error))
-    try:
-        if args.resume is None:
+    if args.resume is None:
+        with errors_of("--runs-dir"):
             check_folder(args.runs_dir)
-    except ValueError as error:
-        sys.exit(f"--runs-dir {error}")
     try:
         device = torch.device(args.device)
     except RuntimeError:
@@ -117,38 +118,42 @@ def parse_args(Args, may_change=()):
     if args.track and importlib.util.find_spec("wandb") is None:
         sys.exit("--track: wandb is not installed (pip install wandb)")
     if getattr(args, "bf16", False) is None:  # args.json has the choice: resuming keeps it
-        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
+        supported = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
+        args.bf16 = supported  # pyright: ignore[reportAttributeAccessIssue]
     return args
 
 
-def _args_of_run(Args, run, may_change):
+def _args_of_run(Args: type[Flags], run: Path, may_change: set[str]) -> Flags:
+    """The flags of a run and of the command line, which may change some of them."""
     if not (run / "args.json").exists():
         sys.exit(f"--resume: {run} is no run's folder (it has no args.json)")
     saved = json.loads((run / "args.json").read_text())
     kinds = typing.get_type_hints(Args)
     known = [field.name for field in fields(Args) if field.name in saved]
     begun_in = Path(saved.get("begun_in", "."))
-    defaults = Args(**{name: _from_json(saved[name], kinds[name], begun_in) for name in known})
+    values: dict = {name: _from_json(saved[name], kinds[name], begun_in) for name in known}
+    defaults = Args(**values)
     defaults.resume = run
     args = flags.parse(Args, default=defaults)
-    had, given = (json.loads(_to_json(asdict(one))) for one in (defaults, args))
+    before = json.loads(_to_json(asdict(defaults)))
+    now = json.loads(_to_json(asdict(args)))
     contradicted = [
-        f"--{name.replace('_', '-')} is {given[name]!r} now, the run had {had[name]!r}"
-        for name in given
-        if name not in may_change and given[name] != had[name]
+        f"--{name.replace('_', '-')} is {now[name]!r} now, the run had {before[name]!r}"
+        for name in now
+        if name not in may_change and now[name] != before[name]
     ]
     if contradicted:
         sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
     return args
 
 
-def _from_json(value, kind, begun_in):
+def _from_json(value, kind, begun_in: Path):
     """A flag's value as the dataclass has it: JSON has neither tuples nor paths.
 
     A file that does not exist from here is the one from the folder where the run began.
     """
     if isinstance(value, list):
-        return tuple(_from_json(one, kind, begun_in) for one in value)
+        return tuple(_from_json(item, kind, begun_in) for item in value)
     if not isinstance(value, str):
         return value
     if Path in (kind, *typing.get_args(kind)):
@@ -160,22 +165,22 @@ def _from_json(value, kind, begun_in):
     return "@".join(files)
 
 
-def _from_here(value, begun_in):
-    first = begun_in / value
-    return str(first) if first.exists() and not Path(value).exists() else value
+def _from_here(value: str, begun_in: Path) -> str:
+    file = begun_in / value
+    return str(file) if file.exists() and not Path(value).exists() else value
 
 
-def _to_json(content):
+def _to_json(content: dict) -> str:
     return json.dumps(content, indent=2, default=str)
 
 
-def write_json(path, content):
+def write_json(path: Path, content: dict) -> None:
     """Write a file with a dict, atomically; paths in it become strings."""
     write_atomically(path, _to_json(content).encode())
 
 
 @contextlib.contextmanager
-def errors_of(flag):
+def errors_of(flag: str) -> Iterator[None]:
     """Inside, a ValueError ends the program with a line that names the flag, e.g. "--paths"."""
     try:
         yield
@@ -183,12 +188,12 @@ def errors_of(flag):
         sys.exit(f"{flag}: {error}")
 
 
-def script_name():
+def script_name() -> str:
     """The name of the trainer's file without its ending: a part of the name of a run's folder."""
     return Path(sys.argv[0]).stem
 
 
-def run_folder(args, task):
+def run_folder(args: RunFlags, task: str) -> Path:
     """The run's folder: that of --resume, otherwise a new one, with the flags in `args.json`.
 
     Args:
@@ -199,18 +204,18 @@ def run_folder(args, task):
         clear_leftovers(args.resume)
         sys.excepthook = functools.partial(_say_plainly, args.resume)
         return args.resume
-    name = f"{task}__{script_name()}__{args.seed}__{int(time.time())}"
-    for again in itertools.count(1):  # another run may have begun in the same second
-        run = args.runs_dir / (name if again == 1 else f"{name}_{again}")
-        with contextlib.suppress(FileExistsError):
-            run.mkdir(parents=True)
-            break
+    first = run = args.runs_dir / f"{task}__{script_name()}__{args.seed}__{int(time.time())}"
+    number = 1
+    while run.exists():  # another run has begun in the same second
+        number += 1
+        run = first.with_name(f"{first.name}_{number}")
+    run.mkdir(parents=True)
     write_json(run / "args.json", asdict(args) | {"begun_in": Path.cwd()})
     sys.excepthook = functools.partial(_say_plainly, run)
     return run
 
 
-def _say_plainly(run, kind, error, trace):
+def _say_plainly(run: Path, kind, error, trace) -> None:
     """Python's `excepthook`: one or two lines for errors that are no mistake of the program."""
     checkpoint = ""
     if (run / "checkpoint.pt").exists():
@@ -231,7 +236,7 @@ def _say_plainly(run, kind, error, trace):
     print("\n".join(filter(None, ["", text, checkpoint])), file=sys.stderr)
 
 
-def seed_torch(args):
+def seed_torch(args: RunFlags) -> torch.device:
     """Seed PyTorch and make it deterministic. Returns the device."""
     if "OMP_NUM_THREADS" not in os.environ:  # one thread is fastest for small networks
         torch.set_num_threads(1)
@@ -239,11 +244,11 @@ def seed_torch(args):
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or cuBLAS is not deterministic
     torch.use_deterministic_algorithms(True)
     # Otherwise, deterministic mode also fills every new tensor with NaN, a check that costs time.
-    torch.utils.deterministic.fill_uninitialized_memory = False
+    deterministic.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]
     return torch.device(args.device)
 
 
-def check_finite(name, values):
+def check_finite(name: str, values: torch.Tensor | np.ndarray) -> None:
     """Raise FloatingPointError, which ends a run with a line, if training has diverged.
 
     Args:
@@ -254,7 +259,7 @@ def check_finite(name, values):
         raise FloatingPointError(f"{name} are no longer finite")
 
 
-def save_checkpoint(run, parts, device):
+def save_checkpoint(run: Path, parts: dict, device: torch.device | str) -> None:
     """Write `checkpoint.pt`: the states of the run's parts, and of torch's random numbers.
 
     Args:
@@ -281,7 +286,7 @@ def save_checkpoint(run, parts, device):
         raise OSError(errno.ENOSPC, str(error).splitlines()[0], "checkpoint.pt") from error
 
 
-def load_checkpoint(args, parts):
+def load_checkpoint(args: RunFlags, parts: dict) -> None:
     """Restore the parts from the checkpoint of --resume, if there is one.
 
     Args:
@@ -299,13 +304,13 @@ def load_checkpoint(args, parts):
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file leads to any of many
         sys.exit(f"--resume: {path} is damaged: {error}")
-    try:
-        for name, part in parts.items():
+    for name, part in parts.items():
+        try:
             _restore(part, state[name])
-    except KeyError as error:
-        sys.exit(f"--resume: {path} is of another version: it has no {error.args[0]}")
-    except RuntimeError:  # PyTorch's, which lists all weights
-        sys.exit(f"--resume: {path} is of another version: the layers of its {name} are others")
+        except KeyError as error:
+            sys.exit(f"--resume: {path} is of another version: it has no {error.args[0]}")
+        except RuntimeError:  # PyTorch's, which lists all weights
+            sys.exit(f"--resume: {path} is of another version: the layers of its {name} are others")
     torch.set_rng_state(state["torch_rng"])
     if "cuda_rng" in state:
         torch.cuda.set_rng_state(state["cuda_rng"], args.device)
@@ -319,7 +324,7 @@ def _state_of(part):
     return part if isinstance(part, dict) else part.state_dict()
 
 
-def _restore(part, state):
+def _restore(part, state) -> None:
     if isinstance(part, np.random.Generator):
         part.bit_generator.state = json.loads(state)
     elif isinstance(part, torch.Tensor):
@@ -335,19 +340,24 @@ def _restore(part, state):
                 group["lr"] = group["lr"].to(group["params"][0].device)
 
 
-def summary_writer(run, args, step):
+def summary_writer(run: Path, args: RunFlags, step: int):
     """TensorBoard's writer for a run that is at `step`, with a table of the flags.
 
     Events after `step`, from an earlier process, are hidden. With `args.track`, events go to
     Weights & Biases, too.
     """
     if args.track:
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]
 
-        config = json.loads(_to_json(asdict(args)))
-        # Under the run's name, so that a resumed run continues there, too.
-        names = {"project": "roboarm-nmp", "name": run.name, "id": run.name, "dir": str(run)}
-        wandb.init(**names, config=config, resume="allow", sync_tensorboard=True)
+        wandb.init(
+            project="roboarm-nmp",
+            name=run.name,
+            id=run.name,  # so that a resumed run continues there, too
+            dir=str(run),
+            config=json.loads(_to_json(asdict(args))),
+            resume="allow",
+            sync_tensorboard=True,
+        )
     from torch.utils.tensorboard import SummaryWriter  # slow to import, and not for --help
 
     writer = SummaryWriter(run, purge_step=step + 1)
@@ -370,7 +380,7 @@ class Run:
             the end of the current step.
     """
 
-    def __init__(self, args, name, state, device):
+    def __init__(self, args: RunFlags, name: str, state: dict, device: torch.device | str):
         """Make and print the run's folder. With --resume, restore `state` from its checkpoint.
 
         Args:
@@ -379,28 +389,52 @@ class Run:
             state: dict from names to the parts of the run, as for `save_checkpoint`.
             device: of the run.
         """
-        self.args, self.device = args, device
+        self.args = args
+        self.device = device
         self.folder = run_folder(args, name)
         print(f"run folder: {self.folder}", flush=True)
-        self._progress = {"step": 0, "seconds": 0.0}
-        self._progress |= {"best_step": 0, "best_score": -math.inf, "best_result": {}}
-        self._state = state | {"progress": self._progress}
+        self._progress: dict = {
+            "step": 0,
+            "seconds": 0.0,
+            "best_step": 0,
+            "best_score": -math.inf,
+            "best_result": {},
+        }
+        self._state = {**state, "progress": self._progress}
         load_checkpoint(args, self._state)
-        self._interrupt, self._may_raise = None, True
+        self._interrupt: KeyboardInterrupt | None = None
+        self._may_raise = True
 
-    step = property(lambda self: self._progress["step"])
-    seconds = property(lambda self: self._progress["seconds"])
-    best_step = property(lambda self: self._progress["best_step"])
-    best_score = property(lambda self: self._progress["best_score"])
-    best_result = property(lambda self: self._progress["best_result"])
-    interrupted = property(lambda self: self._interrupt is not None)
+    @property
+    def step(self) -> int:
+        return self._progress["step"]
 
-    def start(self, total, unit):
+    @property
+    def seconds(self) -> float:
+        return self._progress["seconds"]
+
+    @property
+    def best_step(self) -> int:
+        return self._progress["best_step"]
+
+    @property
+    def best_score(self) -> float:
+        return self._progress["best_score"]
+
+    @property
+    def best_result(self) -> dict:
+        return self._progress["best_result"]
+
+    @property
+    def interrupted(self) -> bool:
+        return self._interrupt is not None
+
+    def start(self, total: int, unit: str) -> None:
         """Open TensorBoard's writer and a progress bar of `total` steps; `unit` names one."""
         self.writer = summary_writer(self.folder, self.args, self.step)
         self._seconds_before = self.seconds
-        self._unit, options = unit, {"unit": unit, "smoothing": 0.05}
-        self._bar = progress_bar(None, "training", total, initial=self.step, **options)
+        self._unit = unit
+        self._bar = progress_bar(None, "training", total, unit, initial=self.step, smoothing=0.05)
         self._may_raise = False
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -417,26 +451,27 @@ class Run:
             raise interrupt
 
     @contextlib.contextmanager
-    def interruptible(self):
+    def interruptible(self) -> Iterator[None]:
         """Inside, the first signal raises KeyboardInterrupt at once."""
-        before, self._may_raise = self._may_raise, True
+        before = self._may_raise
+        self._may_raise = True
         try:
             yield
         finally:
             self._may_raise = before
 
-    def advance(self, number=1):
+    def advance(self, number: int = 1) -> int:
         """Count `number` more steps; returns `step`."""
         self._progress["step"] += number
         self._bar.update(number)
         return self.step
 
     @property
-    def rate(self):
+    def rate(self) -> float:
         """Mean steps per second since `start`."""
         return (self._bar.n - self._bar.initial) / self._bar.format_dict["elapsed"]
 
-    def log(self, values, step=None):
+    def log(self, values: dict, step: int | None = None) -> None:
         """Write a dict of numbers to TensorBoard. Of a tensor, its mean is written.
 
         `step`: of the training; by default the present one.
@@ -445,19 +480,19 @@ class Run:
             value = value.mean().item() if isinstance(value, torch.Tensor) else value
             self.writer.add_scalar(name, value, self.step if step is None else step)
 
-    def log_image(self, name, image):
+    def log_image(self, name: str, image: np.ndarray) -> None:
         """Write an image, uint8 (height, width, 3), to TensorBoard."""
         self.writer.add_image(name, image, self.step, dataformats="HWC")
 
-    def show(self, **values):
+    def show(self, **values) -> None:
         """Show values at the end of the progress bar."""
         self._bar.set_postfix(values)  # in their order
 
-    def reached(self, score):
+    def reached(self, score: float | None) -> bool:
         """Whether the best evaluation so far has this score; False for None."""
         return score is not None and self.best_score >= score
 
-    def is_best(self, score, result=None):
+    def is_best(self, score: float, result: dict | None = None) -> bool:
         """Note an evaluation. Returns whether no earlier one had a higher score.
 
         Args:
@@ -466,11 +501,10 @@ class Run:
         """
         if not score >= self.best_score:
             return False
-        best = {"best_step": self.step, "best_score": score, "best_result": result or {}}
-        self._progress |= best
+        self._progress.update(best_step=self.step, best_score=score, best_result=result or {})
         return True
 
-    def checkpoint(self):
+    def checkpoint(self) -> None:
         """Write `checkpoint.pt`. If the run was interrupted, end it with a line.
 
         Raises:
@@ -479,17 +513,17 @@ class Run:
         """
         self._progress["seconds"] = self._seconds_before + self._bar.format_dict["elapsed"]
         save_checkpoint(self.folder, self._state, self.device)
-        if self.interrupted:
+        if self._interrupt is not None:
             self.close()
             where = f"checkpoint at {self._unit} {self.step:,}"
             exit_interrupted(self._interrupt, f"{where}; --resume {self.folder} continues there")
 
-    def write_result(self, result):
+    def write_result(self, result: dict) -> None:
         """Write `result.json`: a dict, the trainer's name (`script`), and the flags."""
-        result = result | {"script": script_name(), "args": asdict(self.args)}
-        write_json(self.folder / "result.json", result)
+        content = {**result, "script": script_name(), "args": asdict(self.args)}
+        write_json(self.folder / "result.json", content)
 
-    def close(self):
+    def close(self) -> None:
         """Close progress bar and writer. From here on, a signal ends the program at once."""
         self._may_raise = True
         self._bar.close()
