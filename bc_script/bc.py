@@ -88,7 +88,9 @@ class Bf16Linear(nn.Linear):
 def polyak_update(target, network, tau):
     """target <- (1 - tau) target + tau network, all parameters at once."""
     with torch.no_grad():
-        torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
+            list(target.parameters()), list(network.parameters()), tau
+        )
 
 
 # END SHARED
@@ -97,10 +99,13 @@ def polyak_update(target, network, tau):
 # SHARED: MLP
 def mlp(num_inputs, num_outputs, args, layer_norm=False):
     """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
-    size, layers = args.hidden_size, []
+    size = args.hidden_size
+    layers = []
     for i in range(args.num_hidden_layers):
         layers.append(nn.Linear(num_inputs, size) if i == 0 else Bf16Linear(size, size, args.bf16))
-        layers += [nn.LayerNorm(size), nn.ReLU()] if layer_norm else [nn.ReLU()]
+        if layer_norm:
+            layers.append(nn.LayerNorm(size))
+        layers.append(nn.ReLU())
     return nn.Sequential(*layers, nn.Linear(size, num_outputs))
 
 
@@ -112,14 +117,16 @@ class Features(nn.Module):
 
     def __init__(self, args, env):
         super().__init__()
-        self.plain, self.goal_type = args.plain_networks, args.goal_type
-        robot, spaces = env.unwrapped.robot, env.observation_space
+        self.plain = args.plain_networks
+        self.goal_type = args.goal_type
+        robot = env.unwrapped.robot
         self.num_joints = robot.num_joints
         low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
-        example = (torch.zeros(1, *spaces[name].shape) for name in ("observation", "desired_goal"))
-        self.size = self(*example).shape[1]
+        observation = torch.zeros(1, *env.observation_space["observation"].shape)
+        goal = torch.zeros(1, *env.observation_space["desired_goal"].shape)
+        self.size = self(observation, goal).shape[1]
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""
@@ -145,7 +152,8 @@ class Actor(nn.Module):
     def __init__(self, args, env):
         super().__init__()
         self.features = Features(args, env)
-        self.num_joints, self.num_modes = self.features.num_joints, args.num_modes
+        self.num_joints = self.features.num_joints
+        self.num_modes = args.num_modes
         outputs = (2 * self.num_joints + 1) * args.num_modes
         self.mlp = mlp(self.features.size, outputs, args)
 
@@ -174,11 +182,13 @@ class Actor(nn.Module):
 
 # ALGO LOGIC: demonstrations
 def transitions(demos, goal_type):
-    """Observations, goals and actions of demonstrations: float32 (m, o), (m, g), (m, n).
+    """All transitions of `Demos`, m of an arm with n joints.
 
-    And the index of each one's demonstration: int64 (m,). n is the number of joints. A
-    demonstration is used to its end, also after its goal counts as reached. Actions are in units of
-    `MAX_STEP`.
+    A demonstration is used to its end, also after its goal counts as reached.
+
+    Returns:
+        Observations (m, o), goals (m, g) and actions (m, n), in units of `MAX_STEP`, float32; and
+        the numbers of their demonstrations, int64 (m,).
     """
     demo_index = np.repeat(np.arange(len(demos)), np.diff(demos.offsets))
     has_action = np.ones(len(demo_index), bool)
@@ -205,8 +215,11 @@ if __name__ == "__main__":
     validation, test = protocol.load_task(args)
     with runs.errors_of("--demos"):
         demos = load_demo_files(args.demos, args.task, args.num_demos)
-    env_arguments = {"goal_type": args.goal_type, "encoder": args.encoder}
-    env_arguments["num_points"] = args.num_points
+    env_arguments = {
+        "goal_type": args.goal_type,
+        "encoder": args.encoder,
+        "num_points": args.num_points,
+    }
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
 
     # ALGO LOGIC: data

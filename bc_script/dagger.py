@@ -129,7 +129,9 @@ class Bf16Linear(nn.Linear):
 def polyak_update(target, network, tau):
     """target <- (1 - tau) target + tau network, all parameters at once."""
     with torch.no_grad():
-        torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
+            list(target.parameters()), list(network.parameters()), tau
+        )
 
 
 # END SHARED
@@ -155,10 +157,15 @@ class Actor(nn.Module):
     max-pooling combines them (PointNet: Qi et al., 2017).
     """
 
+    middle: torch.Tensor
+    half_range: torch.Tensor
+
     def __init__(self, args, env):
         super().__init__()
-        robot, self.token_size = env.unwrapped.robot, env.encoder.token_size  # numbers per token
-        self.num_joints = joints = robot.num_joints
+        robot = env.unwrapped.robot
+        joints = robot.num_joints
+        self.num_joints = joints
+        self.token_size = env.encoder.token_size  # numbers per token
         self.goal_is_pose = args.goal_type == "pose"
         self.arm_size = joints + GOAL_TYPES[args.goal_type].end_effector_size  # in the observation
         low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
@@ -166,8 +173,9 @@ class Actor(nn.Module):
         self.register_buffer("half_range", ((high - low) / 2).float())
         goal_size = env.observation_space["desired_goal"].shape[0]
         # Sines, cosines and link distances; here and, unless it is a pose, at the goal.
-        size = 2 * joints + int(np.prod(robot.link_distances_shape))
-        size = self.arm_size + goal_size + (size + 6 if self.goal_is_pose else 2 * size)
+        computed = 2 * joints + int(np.prod(robot.link_distances_shape))
+        computed = computed + 6 if self.goal_is_pose else 2 * computed
+        size = self.arm_size + goal_size + computed
         self.token_in = nn.Linear(self.token_size, args.token_width)
         self.arm_in = nn.Linear(size, args.token_width)
         self.fuse = Bf16Linear(args.token_width, args.token_width, args.bf16)
@@ -181,10 +189,12 @@ class Actor(nn.Module):
 
     def features(self, observation, desired_goal, link_distances, goal_link_distances=None):
         """Features of the arm and of the goal (N, size)."""
-        joints, arm = self.num_joints, observation[:, : self.arm_size]
-        states, distances = arm[:, :joints], link_distances.unsqueeze(1)
+        joints = self.num_joints
+        arm = observation[:, : self.arm_size]
+        states = arm[:, :joints]
+        distances = link_distances.unsqueeze(1)
         inputs = [arm, desired_goal]
-        if self.goal_is_pose:
+        if goal_link_distances is None:  # the goal is a pose
             inputs.append(5.0 * pose_difference(arm[:, joints:], desired_goal))
         else:
             states = torch.cat([states, desired_goal[:, :joints]], dim=1)
@@ -245,7 +255,10 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
     Returns the new examples, and the share of queries on which the policy reached the goal.
     """
     rng = np.random.default_rng([args.seed, Stream.DAGGER_ROUNDS, step])
-    robot, parts, reached, visited = env.unwrapped.robot, [], [], []
+    robot = env.unwrapped.robot
+    parts = []
+    reached = []
+    visited = []
 
     def act(**observation):
         visited.append(observation["observation"][0, : robot.num_joints].cpu().numpy())
@@ -253,7 +266,8 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
 
     for _ in progress_bar(range(args.round_queries), "round", unit="query", transient=True):
         number, ends = examples.random_query(rng)
-        query = Query(*robot.denormalise(ends).astype(np.float32), examples.paths.scenes[number])
+        start, goal = robot.denormalise(ends).astype(np.float32)
+        query = Query(start, goal, examples.paths.scenes[number])
         visited.clear()
         seed = int(rng.integers(2**32))  # of the random-walk escapes
         result = protocol.evaluate(act, [env], [query], device, safety_filter, seed)
@@ -307,8 +321,13 @@ if __name__ == "__main__":
         find_checker = find_geometry_source(geometry_source, robot)
     with runs.errors_of("--paths"):
         paths = load_roadmap_paths(args.paths, robot)
-    env_arguments = {name: getattr(args, name) for name in ("goal_type", "encoder", "num_points")}
-    env_arguments |= {"geometry_source": geometry_source, "link_distances": True}
+    env_arguments = {
+        "goal_type": args.goal_type,
+        "encoder": args.encoder,
+        "num_points": args.num_points,
+        "geometry_source": geometry_source,
+        "link_distances": True,
+    }
     eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
     safety_filter = SafetyFilter(args.safety_margin, args.escape)
 
@@ -321,10 +340,15 @@ if __name__ == "__main__":
     optimizer = cuda_graphs.adam(actor.parameters(), args.learning_rate, args, device)
     learn = cuda_graphs.graphed(functools.partial(update, actor, optimizer), args, device)
     visited = {}  # examples of all rounds
-    state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
-    state |= {"visited": visited}
-    task = env_arguments, eval_envs, validation, safety_filter
-    run = protocol.PolicyRun(args, state, device, *task)
+    state = {
+        "actor": actor,
+        "actor_average": actor_average,
+        "optimizer": optimizer,
+        "visited": visited,
+    }
+    run = protocol.PolicyRun(
+        args, state, device, env_arguments, eval_envs, validation, safety_filter
+    )
     visited |= on_device(visited, device)
 
     # Here, because SciPy and Numba take a while to import, which --help would wait for.
@@ -338,7 +362,7 @@ if __name__ == "__main__":
     draws = workers.in_order(draw, itertools.count(run.step), args.workers)
     pool = [next(draws) for _ in progress_bar(range(num_draws), "drawing examples", unit="batch")]
     first = run.step % num_draws
-    pool = concat([on_device(one, device) for one in pool[-first:] + pool[:-first]])
+    pool = concat([on_device(part, device) for part in pool[-first:] + pool[:-first]])
     run.start(args.total_updates, "update")
     run.repeat_evaluation(actor_average)
 
@@ -367,8 +391,9 @@ if __name__ == "__main__":
         # ALGO LOGIC: a round of DAgger
         if args.round_every and step % args.round_every == 0 and step < args.total_updates:
             # (The first environment renders, and is slower to change its scene.)
-            given = (actor_average, eval_envs[-1], safety_filter, examples, args, step, device)
-            new, reached = dagger_round(*given)
+            new, reached = dagger_round(
+                actor_average, eval_envs[-1], safety_filter, examples, args, step, device
+            )
             visited |= concat([visited, new]) if visited else new
             run.log({"charts/round_success": reached})
 

@@ -107,7 +107,9 @@ class Bf16Linear(nn.Linear):
 def polyak_update(target, network, tau):
     """target <- (1 - tau) target + tau network, all parameters at once."""
     with torch.no_grad():
-        torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), tau)
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
+            list(target.parameters()), list(network.parameters()), tau
+        )
 
 
 # END SHARED
@@ -116,10 +118,13 @@ def polyak_update(target, network, tau):
 # SHARED: MLP
 def mlp(num_inputs, num_outputs, args, layer_norm=False):
     """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
-    size, layers = args.hidden_size, []
+    size = args.hidden_size
+    layers = []
     for i in range(args.num_hidden_layers):
         layers.append(nn.Linear(num_inputs, size) if i == 0 else Bf16Linear(size, size, args.bf16))
-        layers += [nn.LayerNorm(size), nn.ReLU()] if layer_norm else [nn.ReLU()]
+        if layer_norm:
+            layers.append(nn.LayerNorm(size))
+        layers.append(nn.ReLU())
     return nn.Sequential(*layers, nn.Linear(size, num_outputs))
 
 
@@ -132,8 +137,9 @@ class Features(nn.Module):
 
     def __init__(self, args, env):
         super().__init__()
-        self.plain, self.goal_type = args.plain_networks, args.goal_type
-        robot, spaces = env.unwrapped.robot, env.observation_space
+        self.plain = args.plain_networks
+        self.goal_type = args.goal_type
+        robot = env.unwrapped.robot
         self.num_joints = robot.num_joints
         self.jacobian = None
         if args.jacobian and not self.plain and self.goal_type != "config":
@@ -142,14 +148,16 @@ class Features(nn.Module):
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         # The configuration, velocities (or not) and the end effector's position or pose.
+        first = 2 * self.num_joints if args.velocities else self.num_joints
         end = env.unwrapped.observation_space["observation"].shape[0]
-        self.ee = slice(self.num_joints * (1 + args.velocities), end)
-        # Link distances follow, the first number of each link is the distance.
+        self.ee = slice(first, end)
+        # Link distances follow; the first number of each link is the distance.
         links, numbers = robot.link_distances_shape
         near = slice(end, end + links * numbers, numbers)
         self.distances = near if args.link_distances else None
-        example = (torch.zeros(1, *spaces[name].shape) for name in ("observation", "desired_goal"))
-        self.size = self(*example).shape[1]
+        observation = torch.zeros(1, *env.observation_space["observation"].shape)
+        goal = torch.zeros(1, *env.observation_space["desired_goal"].shape)
+        self.size = self(observation, goal).shape[1]
 
     def forward(self, observation, desired_goal):
         """(N, o), (N, g) -> (N, size)."""
@@ -185,8 +193,9 @@ class Critics(nn.Module):
     def __init__(self, args, features):
         super().__init__()
         self.action_scale = action_scale(args)
-        size, norm = features.size + features.num_joints, not args.plain_networks
-        self.mlps = nn.ModuleList(mlp(size, 1, args, norm) for _ in range(2))
+        size = features.size + features.num_joints
+        layer_norm = not args.plain_networks
+        self.mlps = nn.ModuleList(mlp(size, 1, args, layer_norm) for _ in range(2))
 
     def forward(self, features, action, number=2):
         """(N, f), (N, n) -> (number, N); of Q1 only with `number` 1."""
@@ -241,31 +250,45 @@ class HerReplayBuffer:
     """
 
     def __init__(self, env, capacity, her_probability, rng, her_exponent=1.0):
-        spaces, encoder = env.observation_space, getattr(env, "encoder", None)
+        spaces = env.observation_space
+        encoder = getattr(env, "encoder", None)
         latent_size = 0 if encoder is None else encoder.size
         observation_size = spaces["observation"].shape[0] - latent_size
         goal_size = spaces["desired_goal"].shape[0]
-        sizes = {"observation": observation_size, "next_observation": observation_size}
-        sizes |= {"next_achieved_goal": goal_size, "desired_goal": goal_size}
-        sizes |= {"action": env.action_space.shape[0], "collision": 1}
-        self.arrays = {name: np.zeros((capacity, n), np.float32) for name, n in sizes.items()}
-        numbers = "remaining", "latent", "next_latent"
-        self.arrays |= {name: np.zeros(capacity, np.int32) for name in numbers}
-        self.latents, self.latent_numbers = np.zeros((1, latent_size), np.float32), {}
-        self.env, self.capacity, self.rng = env.unwrapped, capacity, rng
-        self.her_probability, self.her_exponent = her_probability, her_exponent
-        self.position = self.size = 0
+        sizes = {
+            "observation": observation_size,
+            "next_observation": observation_size,
+            "next_achieved_goal": goal_size,
+            "desired_goal": goal_size,
+            "action": env.action_space.shape[0],
+            "collision": 1,
+        }
+        self.arrays: dict[str, np.ndarray] = {}
+        for name, size in sizes.items():
+            self.arrays[name] = np.zeros((capacity, size), np.float32)
+        for name in ("remaining", "latent", "next_latent"):
+            self.arrays[name] = np.zeros(capacity, np.int32)
+        self.latents = np.zeros((1, latent_size), np.float32)
+        self.latent_numbers = {}
+        self.env = env.unwrapped
+        self.capacity = capacity
+        self.rng = rng
+        self.her_probability = her_probability
+        self.her_exponent = her_exponent
+        self.position = 0
+        self.size = 0
 
     def add_episode(self, transitions):
         """`transitions`: a list of dicts with the float arrays' names as keys."""
         index = (self.position + np.arange(len(transitions))) % self.capacity
         for name in transitions[0]:
-            width = self.arrays[name].shape[1]  # that of an observation is without the latent
+            width = self.arrays[name].shape[1]  # an observation's is without the latent
             values = np.stack([np.atleast_1d(transition[name]) for transition in transitions])
             self.arrays[name][index] = values[:, :width]
             if name.endswith("observation"):
-                latents = map(self.latent_number, np.float32(values[:, width:]))
-                self.arrays[name.replace("observation", "latent")][index] = list(latents)
+                latents = values[:, width:].astype(np.float32)
+                numbers = [self.latent_number(latent) for latent in latents]
+                self.arrays[name.replace("observation", "latent")][index] = numbers
         self.arrays["remaining"][index] = np.arange(len(transitions))[::-1]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
@@ -287,10 +310,10 @@ class HerReplayBuffer:
         relabel = self.rng.random(batch_size) < self.her_probability
         hindsight_goal = self.arrays["next_achieved_goal"][later]
         data["desired_goal"] = np.where(relabel[:, None], hindsight_goal, data["desired_goal"])
-        goals = data["next_achieved_goal"], data["desired_goal"]
+        achieved, desired = data["next_achieved_goal"], data["desired_goal"]
         info = {"collision": data["collision"][:, 0] > 0}
-        data["reward"] = self.env.compute_reward(*goals, info).astype(np.float32)
-        data["terminated"] = self.env.compute_terminated(*goals, info).astype(np.float32)
+        data["reward"] = self.env.compute_reward(achieved, desired, info).astype(np.float32)
+        data["terminated"] = self.env.compute_terminated(achieved, desired, info).astype(np.float32)
         for name in ("", "next_"):
             latent = self.latents[data.pop(f"{name}latent")]
             data[f"{name}observation"] = np.hstack([data[f"{name}observation"], latent])
@@ -301,8 +324,8 @@ class HerReplayBuffer:
         for first in range(0, number, 64):
             data = self.sample(min(64, number - first) * batch_size)
             parts = [cuda_graphs.to_device(a, device).split(batch_size) for a in data.values()]
-            for batch in zip(*parts, strict=True):
-                yield dict(zip(data, batch, strict=True))
+            for tensors in zip(*parts, strict=True):
+                yield dict(zip(data, tensors, strict=True))
 
     def state_dict(self):
         arrays = {name: torch.from_numpy(a[: self.size]) for name, a in self.arrays.items()}
@@ -310,7 +333,8 @@ class HerReplayBuffer:
         return {"arrays": arrays, "latents": latents, "position": self.position}
 
     def load_state_dict(self, state):
-        self.size, self.position = len(state["arrays"]["remaining"]), state["position"]
+        self.size = len(state["arrays"]["remaining"])
+        self.position = state["position"]
         for name, array in state["arrays"].items():
             self.arrays[name][: self.size] = array.numpy()
         for latent in state["latents"].numpy():
@@ -318,9 +342,9 @@ class HerReplayBuffer:
 
 
 def buffer_of_demos(demos, env, args, rng):
-    """A `HerReplayBuffer` with all transitions of `Demos`, in which `env` has the same goals."""
-    size, exponent = int(demos.offsets[-1]), args.her_exponent
-    buffer = HerReplayBuffer(env, size, args.her_probability, rng, exponent)
+    """A `HerReplayBuffer` with all transitions of `Demos`, as `env` would have recorded them."""
+    size = int(demos.offsets[-1])
+    buffer = HerReplayBuffer(env, size, args.her_probability, rng, args.her_exponent)
     if args.encoder is not None:
         env.encoder.encode_demos(demos)  # the environments may have done so in other processes
     for demo in progress_bar(demos, "demonstrations", unit="demonstration", transient=True):
@@ -328,15 +352,16 @@ def buffer_of_demos(demos, env, args, rng):
     return buffer
 
 
-def joined(batches, more):
-    """Yield batches with the rows of those of `more` after their own."""
+def concat(batches, more):
+    """Yield each batch with the rows of the next one of `more` after its own."""
     for batch, rows in zip(batches, more, strict=True):
         yield {name: torch.cat([value, rows[name]]) for name, value in batch.items()}
 
 
 def updates_due(step, args):
     """Number of updates in the last `num_envs` steps; the first `learning_starts` have none."""
-    begin, end = (max(0, s - args.learning_starts) for s in (step - args.num_envs, step))
+    begin = max(0, step - args.num_envs - args.learning_starts)
+    end = max(0, step - args.learning_starts)
     return int(end * args.updates_per_step) - int(begin * args.updates_per_step)
 
 
@@ -356,26 +381,29 @@ def discount_factor(gamma, robot):
 # ALGO LOGIC: networks, optimisers and one update
 class SAC:
     def __init__(self, args, env, device):
-        self.args, self.target_entropy = args, args.target_entropy
+        self.args = args
         self.gamma = discount_factor(args.gamma, env.unwrapped.robot)
+        self.target_entropy = args.target_entropy
         if args.target_entropy == "auto":
             self.target_entropy = -float(env.action_space.shape[0])
         self.actor = Actor(args, env).to(device)
         self.actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
         self.actor_average.load_state_dict(self.actor.state_dict())
-        critics = (Critics(args, self.actor.features).to(device) for _ in range(2))
-        self.critics, self.critics_target = critics
+        self.critics = Critics(args, self.actor.features).to(device)
+        self.critics_target = Critics(args, self.actor.features).to(device)
         self.critics_target.load_state_dict(self.critics.state_dict())
         self.log_alpha = torch.full((1,), math.log(args.alpha), device=device, requires_grad=True)
-        parameters = [{"params": self.actor.parameters()}]
-        parameters += [{"params": [self.log_alpha], "lr": args.q_lr}]
+        parameters = [
+            {"params": self.actor.parameters()},
+            {"params": [self.log_alpha], "lr": args.q_lr},
+        ]
         self.actor_optimizer = cuda_graphs.adam(parameters, args.policy_lr, args, device)
         self.q_optimizer = cuda_graphs.adam(self.critics.parameters(), args.q_lr, args, device)
 
     def checkpoint_state(self):
         """The parts of a checkpoint, by name."""
-        flags = "args", "target_entropy", "gamma"
-        return {name: part for name, part in vars(self).items() if name not in flags}
+        constants = ("args", "target_entropy", "gamma")
+        return {name: part for name, part in vars(self).items() if name not in constants}
 
     @torch.no_grad()
     def explore(self, data):
@@ -388,7 +416,8 @@ class SAC:
 
     def update(self, data, of_policy):
         """An update on a batch, `of_policy` or not. Returns tensors whose means are logged."""
-        args, alpha = self.args, self.log_alpha.detach().exp()
+        args = self.args
+        alpha = self.log_alpha.detach().exp()
         both = torch.cat([data["observation"], data["next_observation"]])
         features = self.actor.features(both, data["desired_goal"].repeat(2, 1))
         features, next_features = features.chunk(2)
@@ -402,8 +431,14 @@ class SAC:
         self.q_optimizer.zero_grad()
         qf_losses.sum().backward()
         self.q_optimizer.step()
-        losses = {"qf1_values": qf_values[0], "qf2_values": qf_values[1], "alpha": alpha}
-        losses |= {"qf1_loss": qf_losses[0], "qf2_loss": qf_losses[1], "qf_loss": qf_losses}
+        losses = {
+            "qf1_values": qf_values[0],
+            "qf2_values": qf_values[1],
+            "qf1_loss": qf_losses[0],
+            "qf2_loss": qf_losses[1],
+            "qf_loss": qf_losses,
+            "alpha": alpha,
+        }
 
         if of_policy:
             self.critics.requires_grad_(False)  # they need no gradient of the policy's loss
@@ -416,14 +451,18 @@ class SAC:
                 bc_loss = (difference / self.actor.action_scale).square().sum(1).mean()
                 actor_loss = actor_loss + args.bc_weight * bc_loss
                 losses["bc_loss"] = bc_loss
-            surplus = log_pi.detach().mean() + (self.target_entropy or 0.0)
-            alpha_loss = -self.log_alpha.exp() * surplus * (self.target_entropy is not None)
+            if self.target_entropy is None:
+                alpha_loss = 0.0 * self.log_alpha.exp()
+            else:
+                surplus = log_pi.detach().mean() + self.target_entropy
+                alpha_loss = -self.log_alpha.exp() * surplus
             self.actor_optimizer.zero_grad()
             (actor_loss + alpha_loss).backward()
             self.actor_optimizer.step()
             self.critics.requires_grad_(True)
             polyak_update(self.actor_average, self.actor, args.policy_average)
-            losses |= {"actor_loss": actor_loss, "alpha_loss": alpha_loss}
+            losses["actor_loss"] = actor_loss
+            losses["alpha_loss"] = alpha_loss
         polyak_update(self.critics_target, self.critics, args.tau)
         return losses
 
@@ -440,16 +479,21 @@ if __name__ == "__main__":
 
     agent = SAC(args, eval_envs[0], device)
     # SHARED: run and episodes
-    explore, update = (cuda_graphs.graphed(f, args, device) for f in (agent.explore, agent.update))
+    explore = cuda_graphs.graphed(agent.explore, args, device)
+    update = cuda_graphs.graphed(agent.update, args, device)
     rng = np.random.default_rng(args.seed)
-    rb = HerReplayBuffer(eval_envs[0], BUFFER_SIZE, args.her_probability, rng, args.her_exponent)
-    counts, losses = {"updates": 0, "demos_injected": 0}, {}
-    state = agent.checkpoint_state() | {"buffer": rb, "rng": rng, "counts": counts}
+    buffer = HerReplayBuffer(
+        eval_envs[0], BUFFER_SIZE, args.her_probability, rng, args.her_exponent
+    )
+    counts = {"updates": 0, "demos_injected": 0}
+    losses = {}
+    state = agent.checkpoint_state() | {"buffer": buffer, "rng": rng, "counts": counts}
     run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
     envs.encode_demos()
     run.start(args.total_timesteps, "step")
+    demo_buffer = None
     if args.bc_weight > 0:
-        demo_rb = buffer_of_demos(envs.demos, eval_envs[0], args, rng)
+        demo_buffer = buffer_of_demos(envs.demos, eval_envs[0], args, rng)
     envs.begin_episodes(args.seed, run.step)
     run.repeat_evaluation(agent.actor_average)
     # END SHARED
@@ -465,18 +509,18 @@ if __name__ == "__main__":
         # SHARED: a step in every environment
         runs.check_finite("the policy's actions", actions)
         for episode in envs.step(actions):
-            rb.add_episode(episode.transitions)
+            buffer.add_episode(episode.transitions)
             if episode.demo is not None:
-                rb.add_episode(episode.demo)
+                buffer.add_episode(episode.demo)
                 counts["demos_injected"] += 1
-            run.log_episode(episode, counts["demos_injected"])
+            run.log_episode(episode, counts["demos_injected"] if args.demo_prob else None)
         global_step = run.advance(args.num_envs)
 
         # ALGO LOGIC: learn
-        due = updates_due(global_step, args) if rb.size > 0 else 0
-        batches = rb.batches(due, args.batch_size, device)
-        if args.bc_weight > 0:
-            batches = joined(batches, demo_rb.batches(due, args.demo_batch_size, device))
+        due = updates_due(global_step, args) if buffer.size > 0 else 0
+        batches = buffer.batches(due, args.batch_size, device)
+        if demo_buffer is not None:
+            batches = concat(batches, demo_buffer.batches(due, args.demo_batch_size, device))
         for data in batches:
             losses |= update(data, counts["updates"] % args.policy_frequency == 0)
             counts["updates"] += 1
@@ -491,7 +535,7 @@ if __name__ == "__main__":
         if evaluating or run.interrupted:
             # New episodes begin, in this run as in one that is resumed from the checkpoint.
             for transitions in envs.begin_episodes(args.seed, run.step):
-                rb.add_episode(transitions)
+                buffer.add_episode(transitions)
             run.checkpoint()
     run.final_test(test)
     # END SHARED

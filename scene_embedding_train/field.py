@@ -120,7 +120,8 @@ class CircularConv(nn.Module):
         self.linear = nn.Linear(3 * inputs, outputs)
 
     def forward(self, x):
-        before, after = torch.cat([x[:, -1:], x[:, :-1]], 1), torch.cat([x[:, 1:], x[:, :1]], 1)
+        before = torch.cat([x[:, -1:], x[:, :-1]], dim=1)
+        after = torch.cat([x[:, 1:], x[:, :1]], dim=1)
         return F.relu(self.linear(torch.cat([before, x, after], dim=2)))
 
 
@@ -182,7 +183,8 @@ class Field(nn.Module):
 
     def __init__(self, args):
         super().__init__()
-        self.encoder, self.decoder = Encoder(args), Decoder(args)
+        self.encoder = Encoder(args)
+        self.decoder = Decoder(args)
 
     def encode(self, points, valid):
         """Observed points -> z_E (n, latent), each scene's with mean 0 and standard deviation 1."""
@@ -201,7 +203,8 @@ def sample_queries(obstacles, number, spread):
     half of a sphere), with normal noise of standard deviation `spread`. Points beyond `REACH` are
     moved to a random distance below it from the robot's axis.
     """
-    n, half, device = len(obstacles), number // 2, obstacles.device
+    n, device = len(obstacles), obstacles.device
+    half = number // 2
     which = (torch.rand(n, half, device=device) * obstacles[..., 0].sum(1, keepdim=True)).long()
     chosen = obstacles.gather(1, which.unsqueeze(2).expand(-1, -1, obstacles.shape[2]))
     _, kind, position, quaternion, size = chosen.split((1, 1, 3, 4, 3), dim=2)
@@ -224,8 +227,8 @@ def augment(*points):
     angle = 2 * math.pi * torch.rand(n, 1, device=device)
     mirror = 2.0 * (torch.rand(n, 1, device=device) < 0.5) - 1.0
     c, s = angle.cos(), angle.sin()
-    for one in points:
-        x, y, z = one.unbind(2)
+    for part in points:
+        x, y, z = part.unbind(2)
         y = mirror * y
         yield torch.stack([c * x - s * y, s * x + c * y, z], dim=2)
 
@@ -277,9 +280,15 @@ def evaluate(model, data, queries, rows, batch_size, device):
         `error_20cm`, `error_40cm` of those up to that distance, from the previous one on. An error
         is 0 where there are no points.
     """
-    spans = {"near": (-1.0, NEAR), "5cm": (-1.0, 0.05), "10cm": (0.05, 0.1)}
-    spans |= {"20cm": (0.1, 0.2), "40cm": (0.2, 0.4)}
-    sums, counts = dict.fromkeys(spans, 0.0), dict.fromkeys(spans, 0)
+    spans = {
+        "near": (-1.0, NEAR),
+        "5cm": (-1.0, 0.05),
+        "10cm": (0.05, 0.1),
+        "20cm": (0.1, 0.2),
+        "40cm": (0.2, 0.4),
+    }
+    sums = dict.fromkeys(spans, 0.0)
+    counts = dict.fromkeys(spans, 0.0)
     for first in range(0, len(rows), batch_size):
         part = slice(first, first + batch_size)
         points, valid, obstacles = batch_of(data, rows[part], device)
@@ -291,7 +300,7 @@ def evaluate(model, data, queries, rows, batch_size, device):
             inside = (truth > low) & (truth <= high)
             sums[name] += (error * inside).sum().item()
             counts[name] += inside.sum().item()
-    return {f"error_{name}": sums[name] / max(1, counts[name]) for name in spans}
+    return {f"error_{name}": sums[name] / max(1.0, counts[name]) for name in spans}
 
 
 def batch_of(data, rows, device):

@@ -129,13 +129,14 @@ class Encoder(nn.Module):
 
     def __init__(self, args):
         super().__init__()
-        self.args, width = args, args.width
+        self.args = args
+        width = args.width
         self.levels = nn.ModuleList([mlp(3, width, 2 * width), mlp(2 * width + 3, 4 * width)])
         self.top = mlp(4 * width + 3 + 6 * args.num_waves, 8 * width)
         self.head = nn.Linear(8 * width, args.latent_size)
 
     def forward(self, points):
-        features = None
+        features: torch.Tensor | None = None
         for level, number, radius in zip(
             self.levels, self.args.num_centres, self.args.radii, strict=True
         ):
@@ -145,7 +146,9 @@ class Encoder(nn.Module):
             inputs = (gather(points, neighbours) - centres.unsqueeze(2)) / radius
             if features is not None:
                 inputs = torch.cat([inputs, gather(features, neighbours)], dim=3)
-            features, points = level(inputs).amax(2), centres
+            features = level(inputs).amax(2)
+            points = centres
+        assert features is not None
         positions = waves(points, self.args.num_waves)
         return self.head(self.top(torch.cat([positions, features], dim=2)).amax(1))
 
@@ -159,11 +162,13 @@ class Decoder(nn.Module):
 
     def __init__(self, args):
         super().__init__()
-        self.args, width = args, args.width
+        self.args = args
+        width = args.width
         inputs = args.latent_size + 3 + 6 * args.num_waves
         self.top = mlp(inputs, 4 * width, 4 * width)
-        sizes = inputs + 4 * width, 4 * width
-        self.levels = nn.ModuleList([mlp(*sizes, 4 * width), mlp(*sizes, 2 * width)])
+        coarse = mlp(inputs + 4 * width, 4 * width, 4 * width)
+        fine = mlp(inputs + 4 * width, 4 * width, 2 * width)
+        self.levels = nn.ModuleList([coarse, fine])
         self.head = nn.Linear(2 * width, NOTHING + 1)
 
     def forward(self, latent, points):
@@ -174,7 +179,8 @@ class Decoder(nn.Module):
         features = self.top(self.inputs(latent, points))
         for level, onto in zip(self.levels, reversed(finer), strict=True):
             near = interpolate(features, points, onto)
-            features, points = level(torch.cat([self.inputs(latent, onto), near], dim=2)), onto
+            features = level(torch.cat([self.inputs(latent, onto), near], dim=2))
+            points = onto
         return self.head(features)
 
     def inputs(self, latent, points):
@@ -197,7 +203,8 @@ class PointNet2(nn.Module):
 
         They are of all points of `queries_of`, or of `num_queries` of them.
         """
-        logits, truth = [], []
+        logits = []
+        truth = []
         for (points, labels, whole), encoder, decoder in zip(
             clouds, self.encoders, self.decoders, strict=True
         ):

@@ -117,6 +117,8 @@ class Decoder(nn.Module):
 class Codebook(nn.Module):
     """Quantises vectors: each becomes the nearest of `num_codes` codes."""
 
+    uses: torch.Tensor  # of each code, since the last restart
+
     def __init__(self, args):
         super().__init__()
         self.codes = nn.Parameter(torch.empty(args.num_codes, args.code_size).uniform_(-1.0, 1.0))
@@ -180,6 +182,14 @@ class VQVAE(nn.Module):
         """Cameras' latents, a list of (n, vectors, code_size) -> images."""
         pairs = zip(self.decoders, latents, strict=True)
         return torch.stack([decoder(latent.flatten(1)) for decoder, latent in pairs], dim=1)
+
+    def restart_codes(self, latents):
+        """`Codebook.restart` with the cameras' latents; the mean share of used codes."""
+        used = []
+        for codebook, vectors in zip(self.codebooks, latents, strict=True):
+            assert isinstance(codebook, Codebook)
+            used.append(codebook.restart(vectors.flatten(0, 1)))
+        return np.mean(used)
 
     def forward(self, images):
         """Images as they are decoded from z_E."""
@@ -254,14 +264,9 @@ if __name__ == "__main__":
         losses, latents = update(model, optimizer, batch, mean_image, args)
         step = run.advance()
         if step % args.restart_every == 0:
-            used = [
-                codebook.restart(vectors.flatten(0, 1))
-                for codebook, vectors in zip(model.codebooks, latents, strict=True)
-            ]
+            run.log({"charts/codes_used": model.restart_codes(latents)})
         if step % 100 == 0:
             run.log({f"losses/{name}": value for name, value in losses.items()})
-            if step % args.restart_every == 0:
-                run.log({"charts/codes_used": np.mean(used)})
             run.log({"charts/updates_per_second": run.rate})
 
         # SHARED: evaluate, keep the best encoder, checkpoint

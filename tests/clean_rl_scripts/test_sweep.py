@@ -154,9 +154,7 @@ def start(trainer, seconds):
     return process, command
 
 
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGKILL, -9), (signal.SIGTERM, 143)]
-)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGTERM, 143)])
 def test_interrupted_search_continues_its_running_trials(trainer, number, code):
     process, command = start(trainer, 1000)
     begun = {

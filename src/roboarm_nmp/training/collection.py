@@ -15,28 +15,26 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from roboarm_nmp.datasets.episodes import (
-    DemoQueriesWrapper,
-    demo_transitions,
-    transition,
-)
+from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, demo_transitions, transition
 from roboarm_nmp.utils.workers import begin_worker, starting_processes
 
 
 class FinishedEpisode(NamedTuple):
     """What an environment collected.
 
-    `number` is that of its environment; `transitions` a list, as of
-    `datasets.episodes.transition`; `episode_return` the sum of rewards; `info` that of the
-    last step; `demo` the transitions of a demonstration on the same query that a failure adds, or
-    None.
+    Attributes:
+        number: of its environment.
+        transitions: as `datasets.episodes.transition` makes them.
+        episode_return: the sum of rewards.
+        info: of the last step.
+        demo: the transitions of a demonstration on the same query, which a failure adds; or None.
     """
 
     number: int
-    transitions: list
+    transitions: list[dict]
     episode_return: float
     info: dict
-    demo: list | None
+    demo: list[dict] | None
 
 
 class TrainingEnvs:
@@ -55,50 +53,56 @@ class TrainingEnvs:
         processes: number of processes that share the environments; 0: they stay in this one.
     """
 
-    def __init__(self, envs, demo_prob=None, processes=0):
-        self._num_envs, self.observations = len(envs), []
+    def __init__(self, envs: list, demo_prob: float | None = None, processes: int = 0):
+        self._num_envs = len(envs)
+        self.observations: list[dict] = []
         self.demos = envs[0].demos if isinstance(envs[0], DemoQueriesWrapper) else None
         parts = np.array_split(np.arange(len(envs)), min(max(1, processes), len(envs)))
         groups = [_Group([envs[i] for i in part], int(part[0]), demo_prob) for part in parts]
         self._spans = [slice(part[0], part[-1] + 1) for part in parts]
         self._groups = [_Process(group) for group in groups] if processes else groups
 
-    def _call(self, name, *arguments):
-        """Call a method of every group, each with its own arguments; the results, a list."""
-        calls = zip(self._groups, zip(*arguments, strict=True), strict=True)
-        waiting = [getattr(group, name)(*given) for group, given in calls]
-        return [result() if callable(result) else result for result in waiting]
-
-    def encode_demos(self):
+    def encode_demos(self) -> None:
         """Encode the scenes of the demonstrations, if there are both encoder and demonstrations.
 
         It may take minutes, once; without it, scenes are encoded at their resets.
         """
         for group in self._groups:  # the first stores what the others load
-            done = group.encode_demos()
-            if callable(done):
-                done()
+            group.encode_demos()
+            if isinstance(group, _Process):
+                group.result()
 
-    def begin_episodes(self, seed, step):
+    def begin_episodes(self, seed: int, step: int) -> list[list[dict]]:
         """Begin new episodes, whose random numbers depend on `seed` and `step` only.
 
         A trainer that begins new episodes at every checkpoint continues exactly without saving the
         simulator's state.
 
         Returns:
-            The transitions of each episode that was running, a list of lists.
+            The transitions of each episode that was running.
         """
         seeds = np.random.SeedSequence([seed, step]).generate_state(self._num_envs).tolist()
         return self._collect("begin_episodes", [seeds[span] for span in self._spans])
 
-    def step(self, actions):
-        """One step with an action (n,) for each environment; the `FinishedEpisode`s, a list."""
+    def step(self, actions: np.ndarray) -> list[FinishedEpisode]:
+        """One step with an action (n,) for each environment; the episodes that end with it."""
         return self._collect("step", [actions[span] for span in self._spans])
 
-    def _collect(self, name, given):
-        episodes, observations = zip(*self._call(name, given), strict=True)
-        self.observations = [one for part in observations for one in part]
-        return [one for part in episodes for one in part]
+    def _collect(self, name, arguments):
+        """Call a method of every group with its own argument, all at once; their episodes."""
+        results = [
+            getattr(group, name)(argument)
+            for group, argument in zip(self._groups, arguments, strict=True)
+        ]
+        finished = []
+        self.observations = []
+        for group, result in zip(self._groups, results, strict=True):
+            if isinstance(group, _Process):
+                result = group.result()
+            episodes, observations = result
+            finished += episodes
+            self.observations += observations
+        return finished
 
 
 class _Group:
@@ -109,25 +113,31 @@ class _Group:
 
     def encode_demos(self):
         env = self._collectors[0].env
-        if isinstance(env, DemoQueriesWrapper) and hasattr(env.env, "encoder"):
-            env.env.encoder.encode_demos(env.demos)
+        if isinstance(env, DemoQueriesWrapper):
+            encoder = getattr(env.env, "encoder", None)
+            if encoder is not None:
+                encoder.encode_demos(env.demos)
 
     def begin_episodes(self, seeds):
-        begun = zip(self._collectors, seeds, strict=True)
-        running = [collector.begin_episode(seed=seed) for collector, seed in begun]
-        return [one for one in running if one], self._observations()
+        episodes = [
+            collector.begin_episode(seed=seed)
+            for collector, seed in zip(self._collectors, seeds, strict=True)
+        ]
+        return [episode for episode in episodes if episode], self._observations()
 
     def step(self, actions):
-        steps = zip(self._collectors, actions, strict=True)
-        ended = [collector.step(action) for collector, action in steps]
-        return [one for one in ended if one is not None], self._observations()
+        episodes = [
+            collector.step(action)
+            for collector, action in zip(self._collectors, actions, strict=True)
+        ]
+        return [episode for episode in episodes if episode is not None], self._observations()
 
     def _observations(self):
         return [collector.observation for collector in self._collectors]
 
 
 class _Process:
-    """A `_Group` in a process of its own: methods return functions that wait for the results."""
+    """A `_Group` in a process of its own: methods return at once, and `result` waits for theirs."""
 
     def __init__(self, group):
         self._connection, other = multiprocessing.Pipe()
@@ -153,9 +163,8 @@ class _Process:
     def _call(self, *call):
         with self._dying():
             self._connection.send(call)
-        return self._result
 
-    def _result(self):
+    def result(self):
         with self._dying():
             result = self._connection.recv()
         if isinstance(result, Exception):
@@ -185,12 +194,16 @@ class _Collector:
     """An environment and its running episode. The arguments are those of `TrainingEnvs`."""
 
     def __init__(self, env, number, demo_prob):
-        self.env, self.number, self.demo_prob = env, number, demo_prob
+        self.env = env
+        self.number = number
+        self.demo_prob = demo_prob
         self.transitions = []
 
     def begin_episode(self, seed=None):
         """Returns the transitions of the episode that was running."""
-        transitions, self.transitions, self.episode_return = self.transitions, [], 0.0
+        transitions = self.transitions
+        self.transitions = []
+        self.episode_return = 0.0
         self.observation, _ = self.env.reset(seed=seed)
         return transitions
 
@@ -202,9 +215,10 @@ class _Collector:
         self.episode_return += reward
         if not (terminated or truncated):
             return None
-        demo, episode_return = None, self.episode_return
+        demo = None
         may_add = self.demo_prob is not None and not info["is_success"]
         if may_add and self.env.np_random.random() < self.demo_prob:
             demo = demo_transitions(self.env.demo, self.env.env)
+        episode_return = self.episode_return
         transitions = self.begin_episode()
         return FinishedEpisode(self.number, transitions, episode_return, info, demo)

@@ -14,26 +14,28 @@ where they are, it has no `.item()`, and nothing on the CPU depends on its resul
 
 import collections
 import warnings
+from collections.abc import Callable, Iterable
 
+import numpy as np
 import torch
 
 WARM_UP = 3  # ordinary calls before a capture, in which libraries and optimisers allocate
 
 
-def uses_graphs(args, device):
+def uses_graphs(args, device: torch.device) -> bool:
     """Whether updates are graphs: on a GPU, with the flag `--compile`."""
     return args.compile and device.type == "cuda"
 
 
-def adam(parameters, learning_rate, args, device):
+def adam(parameters: Iterable, rate: float, args, device: torch.device) -> torch.optim.Adam:
     """Fused Adam; with graphs, one whose step and learning rate may be part of them."""
     if not uses_graphs(args, device):
-        return torch.optim.Adam(parameters, lr=learning_rate, fused=True)
-    learning_rate = torch.tensor(learning_rate, device=device)  # a graph would repeat a number
-    return torch.optim.Adam(parameters, lr=learning_rate, fused=True, capturable=True)
+        return torch.optim.Adam(parameters, lr=rate, fused=True)
+    tensor = torch.tensor(rate, device=device)  # a graph would repeat a number
+    return torch.optim.Adam(parameters, lr=tensor, fused=True, capturable=True)
 
 
-def set_learning_rate(optimizer, value):
+def set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
     """Change the learning rate, also of the graphs that have the optimiser's steps in them."""
     for group in optimizer.param_groups:
         if isinstance(group["lr"], torch.Tensor):
@@ -42,7 +44,7 @@ def set_learning_rate(optimizer, value):
             group["lr"] = value
 
 
-def graphed(function, args, device):
+def graphed(function: Callable, args, device: torch.device) -> Callable:
     """The function as a CUDA graph, or the function itself where there are no graphs.
 
     Args:
@@ -61,17 +63,21 @@ class Graphed:
     What it returns is overwritten by its next call with the same options.
     """
 
-    def __init__(self, function):
-        self._function, self._calls, self._graphs = function, collections.Counter(), {}
+    def __init__(self, function: Callable):
+        self._function = function
+        self._calls = collections.Counter()
+        self._graphs = {}
         self._stream = torch.cuda.Stream()
 
-    def __call__(self, tensors, *options):
+    def __call__(self, tensors: dict, *options) -> dict:
         if options not in self._graphs:
             if self._calls[options] < WARM_UP:
                 return self._warm_up(tensors, options)
             self._graphs[options] = self._capture(tensors, options)
         graph, inputs, outputs = self._graphs[options]
-        torch._foreach_copy_(list(inputs.values()), [tensors[name] for name in inputs])
+        torch._foreach_copy_(  # pyright: ignore[reportPrivateImportUsage]
+            list(inputs.values()), [tensors[name] for name in inputs]
+        )
         graph.replay()
         return outputs
 
@@ -99,9 +105,9 @@ def _detached(tensors):
     return {name: tensor.detach() for name, tensor in tensors.items()}
 
 
-def to_device(array, device):
+def to_device(array: np.ndarray, device: torch.device | str) -> torch.Tensor:
     """A NumPy array as a tensor on the device; on a GPU without waiting for the copy."""
-    tensor, device = torch.as_tensor(array), torch.device(device)
-    if device.type == "cuda":
+    tensor = torch.as_tensor(array)
+    if torch.device(device).type == "cuda":
         return tensor.pin_memory().to(device, non_blocking=True)
     return tensor.to(device)

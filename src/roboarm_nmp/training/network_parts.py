@@ -7,9 +7,11 @@ import torch.nn.functional as F
 
 from roboarm_nmp.envs.robots.inverse_kinematics import kinematic_chain
 from roboarm_nmp.envs.robots.kernels import JOINT, MIDDLE, POSITION, PRISMATIC, ROTATION, SCALE
+from roboarm_nmp.envs.robots.robot import Robot
 
 # With a row vector x, cos x ALONG + sin x ACROSS + x FIXED is x in a frame that is turned about z.
-ALONG, FIXED = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 1.0])
+ALONG = np.diag([1.0, 1.0, 0.0])
+FIXED = np.diag([0.0, 0.0, 1.0])
 ACROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
@@ -27,35 +29,55 @@ class JacobianTranspose(nn.Module):
         rotates: the vector has an angular part.
     """
 
-    def __init__(self, robot, rotates=False):
+    weights: torch.Tensor
+    biases: torch.Tensor
+    middle: torch.Tensor
+    per_state: torch.Tensor
+    is_prismatic: torch.Tensor
+
+    def __init__(self, robot: Robot, rotates: bool = False):
         super().__init__()
         self.size = 9 if rotates else 6  # position, vector, angular part
-        vectors, chain = np.eye(self.size // 3), kinematic_chain(robot)
+        chain = kinematic_chain(robot)
         moving = chain[chain[:, JOINT] >= 0]
-        parts, slides, weights, biases = (0 * ALONG, 0 * ACROSS, ALONG + FIXED), False, [], []
-        turn, origin = np.eye(3), np.zeros(3)
+        of_sliding_joint = (0 * ALONG, 0 * ACROSS, ALONG + FIXED)
+        parts = of_sliding_joint  # of the turn of the joint before
+        slides = False
+        weights = []
+        biases = []
+        turn = np.eye(3)
+        origin = np.zeros(3)
         for row in chain:
             # x in the frame of the joint before is x turn - origin in this one.
             rotation = row[ROTATION:].reshape(3, 3)
-            turn, origin = turn @ rotation, (origin + row[POSITION:ROTATION]) @ rotation
+            turn = turn @ rotation
+            origin = (origin + row[POSITION:ROTATION]) @ rotation
             if row[JOINT] < 0:
                 continue
             bias = np.zeros((3, self.size))
             bias[0, :3] = -turn[2] * slides  # times the value of the joint before
             bias[2, :3] = -origin
+            vectors = np.eye(self.size // 3)
             weights.append(np.hstack([np.kron(vectors, part @ turn) for part in parts]).T)
             biases.append(bias.ravel())
             slides = row[PRISMATIC] > 0
-            parts = (0 * ALONG, 0 * ACROSS, ALONG + FIXED) if slides else (ALONG, ACROSS, FIXED)
-            turn, origin = np.eye(3), np.zeros(3)
+            parts = of_sliding_joint if slides else (ALONG, ACROSS, FIXED)
+            turn = np.eye(3)
+            origin = np.zeros(3)
         per_state = moving[:, SCALE, None] * (moving[:, JOINT, None] == np.arange(robot.num_joints))
-        numbers = {"weights": weights, "biases": biases, "middle": moving[:, MIDDLE]}
-        numbers["per_state"] = per_state  # of joints' values, those of mimicking joints, too
+        numbers = {
+            "weights": weights,
+            "biases": biases,
+            "middle": moving[:, MIDDLE],
+            "per_state": per_state,  # of joints' values, those of mimicking joints, too
+        }
         for name, values in numbers.items():
             self.register_buffer(name, torch.tensor(np.array(values), dtype=torch.float32))
         self.register_buffer("is_prismatic", torch.tensor(moving[:, PRISMATIC] > 0))
 
-    def forward(self, state, position, vector):
+    def forward(
+        self, state: torch.Tensor, position: torch.Tensor, vector: torch.Tensor
+    ) -> torch.Tensor:
         """(N, n), (N, 3), (N, 3 or 6) -> (N, n): per unit of the normalised configuration.
 
         Position (m) and vector are in the world's axes.
@@ -78,16 +100,17 @@ class JacobianTranspose(nn.Module):
         return torch.where(self.is_prismatic, vz, turning) @ self.per_state
 
 
-def pose_difference(pose, goal):
-    """What is left from poses to goals: (N, 7), (N, 7) -> (N, 6).
+def pose_difference(pose: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+    """Differences from poses to goals: (N, 7), (N, 7) -> (N, 6).
 
-    Poses are positions (m) and quaternions (xyzw) of norm 1. The difference is that of the
-    positions (m), and the vector part of the rotation between them, in the world's axes: its axis
-    times the sine of half the angle. A quaternion and its negative give the same.
+    Poses are positions (m) and quaternions (xyzw) of norm 1. A difference consists of the
+    difference of positions (m) and the vector part of the rotation between the two, in the world's
+    axes: the axis times the sine of half the angle. A quaternion and its negative give the same.
     """
-    here, there = pose[:, 3:], goal[:, 3:]
-    x, y, z, w = here[:, 0:1], here[:, 1:2], here[:, 2:3], here[:, 3:4]
-    a, b, c, d = there[:, 0:1], there[:, 1:2], there[:, 2:3], there[:, 3:4]
+    here = pose[:, 3:]
+    there = goal[:, 3:]
+    x, y, z, w = here.split(1, dim=1)
+    a, b, c, d = there.split(1, dim=1)
     vector = torch.cat(
         [
             w * a - d * x + c * y - b * z,
@@ -96,5 +119,6 @@ def pose_difference(pose, goal):
         ],
         dim=1,
     )
-    is_longer = (here * there).sum(dim=1, keepdim=True) < 0.0  # than half a turn
-    return torch.cat([goal[:, :3] - pose[:, :3], torch.where(is_longer, -vector, vector)], dim=1)
+    over_half_a_turn = (here * there).sum(dim=1, keepdim=True) < 0.0
+    vector = torch.where(over_half_a_turn, -vector, vector)
+    return torch.cat([goal[:, :3] - pose[:, :3], vector], dim=1)

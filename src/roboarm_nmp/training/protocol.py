@@ -10,40 +10,38 @@ message.
 
 import collections
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, load_demos_for
-from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.datasets.queries import Queries, load_queries
 from roboarm_nmp.envs.arm_env import HORIZON, STANDARD_RULES, deviations
 from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.rollout import render_strip, rollouts
-from roboarm_nmp.networks.exported_networks import (
-    load_network,
-    save_network,
-)
+from roboarm_nmp.networks.exported_networks import load_network, save_network
 from roboarm_nmp.policies.registry import policy_file, recurrent_size
-from roboarm_nmp.training.collection import TrainingEnvs
+from roboarm_nmp.training.collection import FinishedEpisode, TrainingEnvs
 from roboarm_nmp.training.cuda_graphs import to_device
-from roboarm_nmp.training.runs import Run, RunFlags, check_finite, script_name
-from roboarm_nmp.utils.flags import (
-    CORES,
-    Horizon,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-)
+from roboarm_nmp.training.runs import Run, RunFlags, check_finite, errors_of, script_name
+from roboarm_nmp.utils.flags import CORES, Horizon, NonNegativeInt, PositiveFloat, PositiveInt
 from roboarm_nmp.utils.progress import progress_bar
+
+if TYPE_CHECKING:
+    from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 NUM_ENVS = 8  # at most, that an evaluation runs together; the first of them renders
 IMAGE_SIZE = (240, 180)
 # The rules of every test. The step length, a rule too, may be the policy's own.
+# Flags whose values `envs.make` may reject.
+OBSERVED = ("encoder", "geometry_source", "link_distances")
 RULES = [name for name in STANDARD_RULES if name != "max_step"]
 
 
@@ -91,14 +89,14 @@ class EnvFlags:
     its gradient to the observation"""
 
 
-def env_arguments_of(args):
+def env_arguments_of(args: EnvFlags) -> dict:
     """The `EnvFlags` in a trainer's flags as a dict, for `envs.make`."""
     arguments = {field.name: getattr(args, field.name) for field in fields(EnvFlags)}
     arguments["append_link_distances"] = args.link_distances
     return arguments
 
 
-def load_task(args):
+def load_task(args: PolicyFlags) -> tuple[Queries, Queries]:
     """The first validation queries and test queries, as many as the flags say, of `args.task`.
 
     Raises:
@@ -107,40 +105,38 @@ def load_task(args):
     try:
         if not envs.get_task(args.task).trainable:
             sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
-        return tuple(
-            _first(load_queries(args.task, split), f"--{flag}-queries", number)
-            for split, flag, number in (
-                ("validation", "eval", args.eval_queries),
-                ("test", "test", args.test_queries),
-            )
+        validation = load_queries(args.task, "validation")
+        test = load_queries(args.task, "test")
+        return (
+            _first(validation, "--eval-queries", args.eval_queries),
+            _first(test, "--test-queries", args.test_queries),
         )
     except ValueError as error:
         sys.exit(f"--task: {error}")
 
 
-def copy_weights(policy, module):
+def copy_weights(policy: str, module: torch.nn.Module) -> None:
     """Give a module the weights of a policy of the same sizes, a name or path: `--initial-policy`.
 
     Ends the program with a message where that cannot be.
     """
-    try:
-        given, own = load_network(policy_file(policy)).parameters(), list(module.parameters())
-        if [weights.shape for weights in given] != [weights.shape for weights in own]:
+    weights = list(module.parameters())
+    with errors_of("--initial-policy"):
+        initial = load_network(policy_file(policy)).parameters()
+        if [values.shape for values in initial] != [values.shape for values in weights]:
             raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
-    except ValueError as error:
-        sys.exit(f"--initial-policy: {error}")
     with torch.no_grad():
-        for weights, initial in zip(own, given, strict=True):
-            weights.copy_(initial)
+        for target, source in zip(weights, initial, strict=True):
+            target.copy_(source)
 
 
-def _first(queries, flag, number):
+def _first(queries: Queries, flag: str, number: int) -> Queries:
     if number > len(queries):
         print(f"{flag} {number}: there are {len(queries)}, all of them are used", file=sys.stderr)
-    return queries[:number]
+    return queries[:number]  # pyright: ignore[reportReturnType]
 
 
-def make_envs(task, number, **kwargs):
+def make_envs(task: str, number: int, **kwargs) -> list:
     """A list of environments of a task; `kwargs` as for `envs.make`.
 
     Raises:
@@ -149,26 +145,30 @@ def make_envs(task, number, **kwargs):
     try:
         return [envs.make(task, **kwargs) for _ in range(number)]
     except ValueError as error:
-        names = {"encoder": "--encoder", "geometry_source": "--geometry-source"}
-        given = [flag for name, flag in names.items() if kwargs.get(name) is not None]
-        flags = " or ".join(given)
-        sys.exit(f"{flags}: {error}" if given else str(error))
+        flags = [f"--{name.replace('_', '-')}" for name in OBSERVED if kwargs.get(name)]
+        sys.exit(f"{' or '.join(flags)}: {error}" if flags else str(error))
 
 
-def make_eval_envs(task, num_queries, **kwargs):
+def make_eval_envs(task: str, num_queries: int, **kwargs) -> list:
     """The environments for evaluations on `num_queries` queries; arguments as for `make_envs`.
 
     At least two, which `PolicyRun.save_policy` needs.
     """
+    number = max(min(num_queries, NUM_ENVS), 2)
     rendering = make_envs(task, 1, render_mode="rgb_array", render_size=IMAGE_SIZE, **kwargs)
-    return rendering + make_envs(task, max(min(num_queries, NUM_ENVS), 2) - 1, **kwargs)
+    return rendering + make_envs(task, number - 1, **kwargs)
 
 
-def make_training_envs(args, demo_prob=None, demos=(), bc_weight=0.0):
+def make_training_envs(
+    args,
+    demo_prob: float | None = None,
+    demos: Sequence[Path] = (),
+    bc_weight: float = 0.0,
+) -> TrainingEnvs:
     """`args.num_envs` environments, with random queries or those of demonstrations (`demo_prob`).
 
     Args:
-        args: the flags, with `EnvFlags` among them.
+        args: the flags: `EnvFlags`, `task`, `num_envs` and `device`.
         demo_prob: value of the flag --demo-prob, if the trainer has it.
         demos: value of the flag --demos, files; by default the task's own.
         bc_weight: value of the flag --bc-weight, which needs demonstrations.
@@ -185,24 +185,30 @@ def make_training_envs(args, demo_prob=None, demos=(), bc_weight=0.0):
     made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
     # A GPU waits for its environments; on a CPU they take less time than the updates.
     processes = min(args.num_envs, CORES) if torch.device(args.device).type == "cuda" else 0
-    if demo_prob is None:
-        return TrainingEnvs(made, processes=processes)
-    try:
-        demos = load_demos_for(made[0], demos, args.task)
-    except ValueError as error:
-        sys.exit(f"--demo-prob: {error}")
-    return TrainingEnvs([DemoQueriesWrapper(env, demos) for env in made], demo_prob, processes)
+    if demo_prob is not None:
+        with errors_of("--demo-prob"):
+            loaded = load_demos_for(made[0], demos, args.task)
+        made = [DemoQueriesWrapper(env, loaded) for env in made]
+    return TrainingEnvs(made, demo_prob, processes)
 
 
-def stack(observations, device):
-    """List of observation dicts -> dict of float32 tensors (N, ...)."""
+def stack(observations: list[dict], device: torch.device | str) -> dict[str, torch.Tensor]:
+    """Observations -> float32 tensors (N, ...) by name."""
     return {
         name: to_device(np.stack([o[name] for o in observations]), device)
         for name in observations[0]
     }
 
 
-def evaluate(policy, envs, queries, device, safety_filter=None, seed=0, description=None):
+def evaluate(
+    policy: Callable,
+    envs: list,
+    queries: Queries | list,
+    device: torch.device | str,
+    safety_filter: "SafetyFilter | None" = None,
+    seed: int = 0,
+    description: str | None = None,
+) -> dict[str, float]:
     """Run a deterministic policy on every query, each env one at a time; mean results.
 
     Args:
@@ -217,18 +223,22 @@ def evaluate(policy, envs, queries, device, safety_filter=None, seed=0, descript
         description: of a progress bar that disappears at the end; None for no bar.
 
     Returns:
-        A dict of floats: `success_rate`, `collision_free_success_rate`, `collision_rate`, and
-        `episode_length` in steps.
+        `success_rate`, `collision_free_success_rate`, `collision_rate`, and `episode_length` in
+        steps.
 
     Raises:
         FloatingPointError: the policy's actions or its recurrent state are not finite.
     """
     trajectories = _rollouts(policy, envs, queries, device, safety_filter, seed)
-    bar = {"unit": "query", "transient": True, "disable": description is None}
-    results = [
-        (trajectory.success, trajectory.collides, len(trajectory))
-        for trajectory in progress_bar(trajectories, description, len(queries), **bar)
-    ]
+    bar = progress_bar(
+        trajectories,
+        description or "",
+        len(queries),
+        "query",
+        transient=True,
+        disable=description is None,
+    )
+    results = [(trajectory.success, trajectory.collides, len(trajectory)) for trajectory in bar]
     success, collides, steps = np.array(results, dtype=np.float64).T
     return {
         "success_rate": float(success.mean()),
@@ -249,7 +259,7 @@ class _NetworkPolicy:
 
     def __init__(self, recurrent_size):
         self.recurrent_state = np.zeros(recurrent_size, np.float32)
-        self.prediction = None
+        self.prediction: tuple = ()
         self.act = self.predicted
 
     def predicted(self, observation):
@@ -316,26 +326,38 @@ class PolicyRun(Run):
             None.
     """
 
+    args: PolicyFlags
+
     def __init__(
-        self, args, state, device, env_arguments, eval_envs, validation, safety_filter=None
+        self,
+        args: PolicyFlags,
+        state: dict,
+        device: torch.device | str,
+        env_arguments: dict,
+        eval_envs: list,
+        validation: Queries | list,
+        safety_filter: "SafetyFilter | None" = None,
     ):
         super().__init__(args, task_name(args.task), state, device)
-        self.env_arguments, self.eval_envs = env_arguments, eval_envs
-        self.validation, self.safety_filter = validation, safety_filter
+        self.env_arguments = env_arguments
+        self.eval_envs = eval_envs
+        self.validation = validation
+        self.safety_filter = safety_filter
         self._recent = collections.deque(maxlen=100)  # outcomes of training episodes
 
-    def log_episode(self, episode, demos_injected):
-        """Log a `FinishedEpisode`, and with --demo-prob how many demonstrations were added."""
+    def log_episode(self, episode: FinishedEpisode, demos_injected: int | None = None) -> None:
+        """Log an episode, and how many demonstrations were added so far (None: not logged)."""
         self._recent.append(episode.info["is_success"])
-        values = {"episodic_return": episode.episode_return}
-        values |= {"episodic_length": episode.info["elapsed_steps"]}
-        if self.args.demo_prob is not None:
-            values["demos_injected"] = demos_injected
-        values["success"] = np.mean(self._recent)
-        step = self.step + episode.number + 1  # every environment's step counts
-        self.log({f"charts/{name}": value for name, value in values.items()}, step)
+        values = {
+            "charts/episodic_return": episode.episode_return,
+            "charts/episodic_length": episode.info["elapsed_steps"],
+            "charts/success": np.mean(self._recent),
+        }
+        if demos_injected is not None:
+            values["charts/demos_injected"] = demos_injected
+        self.log(values, self.step + episode.number + 1)  # every environment's step counts
 
-    def validate(self, policy):
+    def validate(self, policy) -> bool:
         """Evaluate a policy on the validation queries, and log results and images of the first.
 
         With a safety filter, the policy is evaluated without it, too: `eval/..._without_filter`.
@@ -344,52 +366,57 @@ class PolicyRun(Run):
             policy: as for `evaluate`.
 
         Returns:
-            Whether no policy of the run was better so far. False if a signal has interrupted the
-            evaluation: the resumed run repeats it (`repeat_evaluation`).
+            Whether this is the best policy of the run so far. False if a signal has interrupted
+            the evaluation: the resumed run repeats it (`repeat_evaluation`).
         """
         queries, envs, device = self.validation, self.eval_envs, self.device
-        bar = {"description": "validation"}
+        safety_filter = self.safety_filter
         self._progress["unfinished_evaluation"] = True
         if self.interrupted:
             return False
         try:
             with self.interruptible():
-                result = evaluate(policy, envs, queries, device, self.safety_filter, **bar)
+                result = evaluate(
+                    policy, envs, queries, device, safety_filter, description="validation"
+                )
                 self.log({f"eval/{name}": value for name, value in result.items()})
-                if self.safety_filter is not None:
-                    bar = {"description": "validation without filter"}
-                    bare = evaluate(policy, envs, queries, device, **bar)
+                if safety_filter is not None:
+                    description = "validation without filter"
+                    bare = evaluate(policy, envs, queries, device, description=description)
                     self.log({f"eval/{name}_without_filter": v for name, v in bare.items()})
-                image = rollout_image(policy, envs[0], queries[0], device, self.safety_filter)
+                image = rollout_image(policy, envs[0], queries[0], device, safety_filter)
                 self.log_image("eval/rollout", image)
         except KeyboardInterrupt:
             return False
         del self._progress["unfinished_evaluation"]
         is_best = self.is_best(result["success_rate"])
-        values = {"validation success": result["success_rate"], "best": self.best_score}
-        self.show(**{name: f"{value:.3f}" for name, value in values.items()})
+        success = f"{result['success_rate']:.3f}"
+        self.show(**{"validation success": success, "best": f"{self.best_score:.3f}"})
         return is_best
 
-    def repeat_evaluation(self, policy):
+    def repeat_evaluation(self, policy) -> None:
         """At the start of a resumed run: the evaluation that a signal ended, if there was one."""
         if "unfinished_evaluation" in self._progress:
             if self.validate(policy):
                 self.save_policy(policy)
             self.checkpoint()
 
-    def save_policy(self, policy):
+    def save_policy(self, policy: torch.nn.Module) -> None:
         """Write `policy.pt` for `evaluate.py` and others.
 
         Args:
             policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else
                 is observed; with a `recurrent_size`, its `recurrent_state`, too.
         """
-        args = self.args
-        metadata = {"kind": "policy", "task": args.task, "env": self.env_arguments}
-        metadata |= robot_metadata(self.eval_envs[0].unwrapped.robot)
+        metadata = {
+            "kind": "policy",
+            "task": self.args.task,
+            "env": self.env_arguments,
+            **robot_metadata(self.eval_envs[0].unwrapped.robot),
+        }
         if self.safety_filter is not None:
             metadata["safety_filter"] = self.safety_filter.to_metadata()
-        metadata |= {"script": script_name(), "seed": args.seed, "step": self.step}
+        metadata.update(script=script_name(), seed=self.args.seed, step=self.step)
         example = stack([env.reset(seed=0)[0] for env in self.eval_envs[:2]], self.device)
         if size := recurrent_size(policy):
             metadata["recurrent_size"] = size
@@ -397,7 +424,7 @@ class PolicyRun(Run):
             example["recurrent_state"] = torch.zeros(number, size, device=self.device)
         save_network(self.folder / "policy.pt", policy, example, metadata)
 
-    def final_test(self, queries):
+    def final_test(self, queries: Queries) -> None:
         """Test `policy.pt` on test queries: `result.json`, and a line on the console. Ends the run.
 
         Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed,
@@ -407,36 +434,48 @@ class PolicyRun(Run):
         and line have no results of one.
         """
         self.close()
-        args = self.args
-        result, text = self._test(queries) if len(queries) else ({}, "no test, --test-queries 0")
-        result |= {"task": args.task, "robot": self.eval_envs[0].unwrapped.robot.name}
-        result |= {"goal_type": args.goal_type, "num_queries": len(queries)}
-        result |= {"policy": str(self.folder / "policy.pt"), "policy_step": self.best_step}
-        result |= {"validation_success_rate": self.best_score, "steps": self.step}
-        self.write_result(result | {"seconds": round(self.seconds)})
+        result, text = {}, "no test, --test-queries 0"
+        if len(queries):
+            result, text = self._test(queries)
+        task, goal_type = self.args.task, self.env_arguments["goal_type"]
+        result.update(
+            task=task,
+            robot=self.eval_envs[0].unwrapped.robot.name,
+            goal_type=goal_type,
+            num_queries=len(queries),
+            policy=str(self.folder / "policy.pt"),
+            policy_step=self.best_step,
+            validation_success_rate=self.best_score,
+            steps=self.step,
+            seconds=round(self.seconds),
+        )
+        self.write_result(result)
         print(
-            f"{args.task}, goal {args.goal_type}, {text}; validation success {self.best_score:.3f} "
-            f"at {self.best_step}; {self.step} steps in {self.seconds:.0f} s. "
+            f"{task}, goal {goal_type}, {text}; validation success {self.best_score:.3f} at "
+            f"{self.best_step}; {self.step} steps in {self.seconds:.0f} s. "
             f"{self.folder / 'result.json'}"
         )
 
-    def _test(self, queries):
+    def _test(self, queries: Queries) -> tuple[dict, str]:
         """The results of a test as a dict, and the most important ones in words."""
         # Here, because Numba takes a while to import, which --help would wait for.
         from roboarm_nmp.evaluation.evaluate import is_privileged
         from roboarm_nmp.policies.safety_filter import SafetyFilter
 
         policy = load_network(self.folder / "policy.pt").to(self.device)
-        own = {name: value for name, value in self.env_arguments.items() if name not in RULES}
-        test_envs = make_eval_envs(self.args.task, len(queries), **own)
+        arguments = {name: value for name, value in self.env_arguments.items() if name not in RULES}
+        test_envs = make_eval_envs(self.args.task, len(queries), **arguments)
         safety_filter = SafetyFilter.from_metadata(policy.metadata)
-        bar = {"description": "test"}
-        result = evaluate(policy, test_envs, queries, self.device, safety_filter, **bar)
+        result: dict = evaluate(
+            policy, test_envs, queries, self.device, safety_filter, description="test"
+        )
         success, collision_free = result["success_rate"], result["collision_free_success_rate"]
         rules = {name: getattr(test_envs[0], name) for name in RULES}
-        trained = rules | {n: self.env_arguments[n] for n in RULES if n in self.env_arguments}
-        result |= {"rules": rules, "rules_in_training": trained, "deviations": deviations(own)}
-        result |= {"privileged": is_privileged(own)}
+        trained = {name: self.env_arguments.get(name, rules[name]) for name in RULES}
+        result["rules"] = rules
+        result["rules_in_training"] = trained
+        result["deviations"] = deviations(arguments)
+        result["privileged"] = is_privileged(arguments)
         if rules != trained:
             print(
                 f"trained with {_words(trained)}; tested under the standard rules, {_words(rules)}:"
@@ -450,6 +489,6 @@ class PolicyRun(Run):
         )
 
 
-def _words(rules):
+def _words(rules: dict) -> str:
     contacts = "ended by a contact" if rules["stop_on_collision"] else "contacts allowed"
     return f"{rules['horizon']} steps, {contacts}"
