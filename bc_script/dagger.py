@@ -13,7 +13,6 @@ your own, copy this file and change the parts under `# ALGO LOGIC`; `# SHARED` i
 
 import functools
 import itertools
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -311,7 +310,7 @@ if __name__ == "__main__":
     validation, test = protocol.load_task(args)
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:
-        sys.exit("--pool-size must be at least --examples-per-update")
+        runs.fail("--pool-size must be at least --examples-per-update")
     robot = validation.scenes.base.robot
     with runs.errors_of("--encoder"):
         encoder = make_encoder(args.encoder, args.num_points)

@@ -5,15 +5,18 @@ Clouds are thinned out to save time: the loaders thin out those of a training se
 """
 
 import math
-import sys
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from torch import Tensor, nn
 
+from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE, PointCloud, deproject
 from roboarm_nmp.scene_embedding_train.training_data import unpack
+from roboarm_nmp.training.runs import fail
 
 MAX_RADIUS = 1.1  # m from the robot's axis: the arm does not reach further
 TABLE_TOP = 0.01  # m: table and floor are most of a cloud, so points above it are sampled apart
@@ -35,30 +38,36 @@ class Clouds(NamedTuple):
         depths: of all samples, uint16 (scenes, sensors, samples), see `ray_ends`.
     """
 
-    sensors: dict
+    sensors: dict[str, PointCloud]
     points: np.ndarray
     labels: np.ndarray
     depths: np.ndarray
 
 
-def load_clouds(observations, num_points):
+def load_clouds(observations: Observations, num_points: int) -> Clouds:
     """The `Clouds` of `Observations`, thinned out to `num_points` points once.
 
     Raises:
         SystemExit: there are no clouds, or they differ in size.
     """
-    sensors = {k: one for k, one in observations.sensors.items() if isinstance(one, PointCloud)}
-    samples = {one.num_samples for one in sensors.values()}
+    sensors = {
+        name: sensor
+        for name, sensor in observations.sensors.items()
+        if isinstance(sensor, PointCloud)
+    }
+    samples = {sensor.num_samples for sensor in sensors.values()}
     if len(samples) != 1:
         why = "the clouds differ in size" if sensors else "no clouds (collect with --sensors)"
-        sys.exit(f"--observations: {observations.folder}: {why}")
+        fail(f"--observations: {observations.folder}: {why}")
     shards = (
         _clouds_of_shard(observations, shard, sensors, num_points)
         for shard in range(len(observations.offsets) - 1)
     )
-    shape = (len(sensors), 2, num_points)
-    arrays = {"points": (np.float32, (*shape, 3)), "labels": (np.uint8, shape)}
-    arrays["depths"] = (np.uint16, (len(sensors), samples.pop()))
+    arrays = {
+        "points": (np.float32, (len(sensors), 2, num_points, 3)),
+        "labels": (np.uint8, (len(sensors), 2, num_points)),
+        "depths": (np.uint16, (len(sensors), samples.pop())),
+    }
     return Clouds(sensors, **unpack(observations, f"clouds_{num_points}", arrays, shards))
 
 
@@ -67,15 +76,15 @@ def _clouds_of_shard(observations, shard, names, num_points):
     rows = {"points": [], "labels": [], "depths": []}
     for name in names:
         points, labels = whole_clouds(observations, shard, name)
-        chosen = torch.stack([thin_out(one, num_points) for one in hits(points, labels)], dim=1)
+        chosen = torch.stack([thin_out(mask, num_points) for mask in hits(points, labels)], dim=1)
         rows["points"].append(gather(points, chosen))
         rows["labels"].append(gather(labels.unsqueeze(2), chosen).squeeze(-1))
         depths = torch.from_numpy(observations.read(shard, f"{name}/depth"))
         rows["depths"].append(depths.flatten(1))
-    return {output: torch.stack(one, dim=1).numpy() for output, one in rows.items()}
+    return {output: torch.stack(parts, dim=1).numpy() for output, parts in rows.items()}
 
 
-def batch_of(clouds, rows, device):
+def batch_of(clouds: Clouds, rows: np.ndarray, device: torch.device | str) -> list[tuple]:
     """Rows of `Clouds`: a list of (points, labels, whole) per sensor.
 
     Labels are int64; `whole`, (n, samples, 3), are the points before thinning.
@@ -90,7 +99,9 @@ def batch_of(clouds, rows, device):
     ]
 
 
-def load_obstacle_points(observations, num_points):
+def load_obstacle_points(
+    observations: Observations, num_points: int
+) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Evenly spaced points on obstacles, `num_points` of each cloud, thinned out once.
 
     Returns:
@@ -101,9 +112,11 @@ def load_obstacle_points(observations, num_points):
     Raises:
         SystemExit: there are no clouds.
     """
-    sensors = [k for k, one in observations.sensors.items() if isinstance(one, PointCloud)]
+    sensors = [
+        name for name, sensor in observations.sensors.items() if isinstance(sensor, PointCloud)
+    ]
     if not sensors:
-        sys.exit(f"--observations: {observations.folder}: no clouds (collect with --sensors)")
+        fail(f"--observations: {observations.folder}: no clouds (collect with --sensors)")
 
     def rows(shard):
         clouds = [whole_clouds(observations, shard, name) for name in sensors]
@@ -118,7 +131,7 @@ def load_obstacle_points(observations, num_points):
     return sensors, unpacked["points"], unpacked["valid"]
 
 
-def obstacle_points(clouds, num_points):
+def obstacle_points(clouds: list[tuple], num_points: int) -> tuple[Tensor, Tensor]:
     """Of each cloud `num_points` points on obstacles within `MAX_RADIUS`, evenly spaced.
 
     Args:
@@ -128,7 +141,8 @@ def obstacle_points(clouds, num_points):
         Points (n, sensors * num_points, 3), and which are valid: bool (n, sensors * num_points),
         none of a cloud without such points.
     """
-    all_points, all_valid = [], []
+    all_points = []
+    all_valid = []
     for points, labels in clouds:
         wanted = (labels == OBSTACLE) & (points[..., :2].square().sum(2) < MAX_RADIUS**2)
         chosen = thin_out(wanted, num_points)
@@ -137,44 +151,46 @@ def obstacle_points(clouds, num_points):
     return torch.cat(all_points, dim=1), torch.cat(all_valid, dim=1)
 
 
-def example_clouds(observations, names):
+def example_clouds(observations: Observations, names: Iterable[str]) -> dict[str, Tensor]:
     """Two scenes' whole clouds, as an encoder receives them: a dict of tensors.
 
     `<name>_points`, float32 (2, samples, 3), m, and `<name>_labels`, uint8 (2, samples).
     """
     example = {}
     for name in names:
-        points, labels = (one[:2].clone() for one in whole_clouds(observations, 0, name))
-        example |= {f"{name}_points": points, f"{name}_labels": labels}
+        points, labels = whole_clouds(observations, 0, name)
+        example[f"{name}_points"] = points[:2].clone()
+        example[f"{name}_labels"] = labels[:2].clone()
     return example
 
 
-def scene_cloud(observations, scene, name):
+def scene_cloud(observations: Observations, scene: int, name: str) -> tuple[Tensor, Tensor]:
     """A sensor's whole cloud of one scene: points (p, 3), m, that hit something, and labels (p)."""
-    shard = np.searchsorted(observations.offsets, scene, side="right") - 1
+    shard = int(np.searchsorted(observations.offsets, scene, side="right")) - 1
     row = scene - observations.offsets[shard]
-    points, labels = (one[row] for one in whole_clouds(observations, shard, name))
-    hit = labels != NOTHING
-    return points[hit], labels[hit]
+    points, labels = whole_clouds(observations, shard, name)
+    hit = labels[row] != NOTHING
+    return points[row][hit], labels[row][hit]
 
 
-def whole_clouds(observations, shard, name):
+def whole_clouds(observations: Observations, shard: int, name: str) -> tuple[Tensor, Tensor]:
     """A sensor's clouds of the scenes of a shard, as the environment's `PointCloud` returns them.
 
     Points, float32 (n, samples, 3), m, and labels, uint8 (n, samples).
     """
     sensor = observations.sensors[name]
-    images = (observations.read(shard, f"{name}/{output}") for output in ("depth", "segmentation"))
+    depths = observations.read(shard, f"{name}/depth")
+    segmentations = observations.read(shard, f"{name}/segmentation")
     clouds = [
         sensor.points(depth * (sensor.far / NO_HIT), segmentation)
-        for depth, segmentation in zip(*images, strict=True)
+        for depth, segmentation in zip(depths, segmentations, strict=True)
     ]
-    return tuple(
-        torch.from_numpy(np.stack([one[key] for one in clouds])) for key in ("points", "labels")
-    )
+    points = np.stack([cloud["points"] for cloud in clouds])
+    labels = np.stack([cloud["labels"] for cloud in clouds])
+    return torch.from_numpy(points), torch.from_numpy(labels)
 
 
-def ray_ends(sensor, depths):
+def ray_ends(sensor: PointCloud, depths: Tensor) -> Tensor:
     """Where a `PointCloud`'s rays end: float32 (n, samples, 3), m; far away if they hit nothing.
 
     `depths` (n, samples), float32, are in the units in which they are stored.
@@ -186,19 +202,19 @@ def ray_ends(sensor, depths):
     return eye + metres.unsqueeze(2) * torch.as_tensor(rays, dtype=torch.float32, device=eye.device)
 
 
-def gather(values, indices):
+def gather(values: Tensor, indices: Tensor) -> Tensor:
     """Rows of values (n, p, f) at indices (n, ...), each scene's at its own: (n, ..., f)."""
     flat = indices.flatten(1).unsqueeze(-1).expand(-1, -1, values.shape[2])
     return torch.gather(values, 1, flat).unflatten(1, indices.shape[1:])
 
 
-def hits(points, labels):
+def hits(points: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Which points (n, p, 3), labels (n, p), hit something, and which of them above the table."""
     hit = labels != NOTHING
     return hit, hit & (points[:, :, 2] > TABLE_TOP)
 
 
-def thin_out(mask, number):
+def thin_out(mask: Tensor, number: int) -> Tensor:
     """Indices (n, number) evenly spaced among those where mask (n, p) is true.
 
     Fewer are repeated; where none is true, all are the first index.
@@ -210,7 +226,7 @@ def thin_out(mask, number):
     return order.gather(1, (steps * counts).div(number, rounding_mode="floor"))
 
 
-def distances_to(points, clouds):
+def distances_to(points: Tensor, clouds: Tensor) -> Tensor:
     """From points (n, p, 3) to the nearest of each scene's cloud (n, q, 3): distances (n, p)."""
     squares = [  # without those of the points; a scene at a time, for the CPU's cache
         torch.addmm(cloud.square().sum(1), scene, cloud.T, alpha=-2).amin(1)
@@ -219,7 +235,9 @@ def distances_to(points, clouds):
     return (torch.stack(squares) + points.square().sum(2)).clamp(min=0).sqrt()
 
 
-def queries_of(points, labels, whole, number=None):
+def queries_of(
+    points: Tensor, labels: Tensor, whole: Tensor, number: int | None = None
+) -> tuple[Tensor, Tensor]:
     """Points to classify (n, q, 3) and their classes (n, q), from one sensor's of `batch_of`.
 
     They are the scene's own, (n, 2, p), and those above the table of the scene before it in the
@@ -235,13 +253,15 @@ def queries_of(points, labels, whole, number=None):
         chosen = torch.randperm(others.shape[1], device=own.device)[: number // 3]
         others, other_labels = others[:, chosen], other_labels[:, chosen]
     absent = (other_labels == OBSTACLE) & (distances_to(others, whole) > ABSENT_DISTANCE)
-    truth = [torch.where(classes == NOTHING, IGNORED, classes)]
-    truth.append(torch.where(absent, NOTHING, IGNORED))
-    return torch.cat([own, others], dim=1), torch.cat(truth, dim=1)
+    classes = torch.where(classes == NOTHING, IGNORED, classes)
+    other_classes = torch.where(absent, NOTHING, IGNORED)
+    return torch.cat([own, others], dim=1), torch.cat([classes, other_classes], dim=1)
 
 
 @torch.no_grad()
-def classification_scores(model, clouds, rows, batch_size, device):
+def classification_scores(
+    model: nn.Module, clouds: Clouds, rows: np.ndarray, batch_size: int, device: torch.device | str
+) -> dict[str, float]:
     """How well points of scenes `rows` are classified.
 
     Returns:
@@ -252,38 +272,43 @@ def classification_scores(model, clouds, rows, batch_size, device):
     model.eval()
     number = clouds.points.shape[3]
     confusion = torch.zeros(NOTHING, NOTHING + 1, dtype=torch.int64)  # truth, prediction
-    predicted_absent = all_absent = 0
+    predicted_absent = 0
+    all_absent = 0
     for start in range(0, len(rows), batch_size):
         batch = batch_of(clouds, rows[start : start + batch_size], device)
         for logits, truth in zip(*model(batch), strict=True):
             predicted = logits.argmax(2)
             one_hot = F.one_hot(predicted, NOTHING + 1)[:, :number]
-            own = [(truth[:, :number] == label).unsqueeze(2) for label in range(NOTHING)]
-            confusion += torch.stack([(one * one_hot).sum((0, 1)) for one in own]).cpu()
+            masks = [(truth[:, :number] == label).unsqueeze(2) for label in range(NOTHING)]
+            confusion += torch.stack([(mask * one_hot).sum((0, 1)) for mask in masks]).cpu()
             absent = truth == NOTHING
             all_absent += absent.sum().item()
             predicted_absent += (absent & (predicted == NOTHING)).sum().item()
     model.train()
     both = confusion.diagonal()
     iou = both / (confusion[:, :NOTHING].sum(0) + confusion.sum(1) - both).clamp(min=1)
-    result = {"accuracy": (both.sum() / confusion.sum().clamp(min=1)).item()}
-    result["absent"] = predicted_absent / max(1, all_absent)
-    names = ("iou_robot", "iou_static", "iou_obstacle")
-    return result | dict(zip(names, iou.tolist(), strict=True))
+    robot, static, obstacle = iou.tolist()
+    return {
+        "accuracy": (both.sum() / confusion.sum().clamp(min=1)).item(),
+        "absent": predicted_absent / max(1, all_absent),
+        "iou_robot": robot,
+        "iou_static": static,
+        "iou_obstacle": obstacle,
+    }
 
 
-def comparison(points, truth, predicted, size=160):
+def comparison(points: Tensor, truth: Tensor, predicted: Tensor, size: int = 160) -> np.ndarray:
     """A figure, uint8 (size, 2 size, 3): points (p, 3), m, from above, true classes on the left.
 
     Robot red, table and floor orange, obstacles yellow, as in the paper's figure; nothing grey.
     """
-    points, truth, predicted = (one.cpu().numpy() for one in (points, truth, predicted))
+    places = points.cpu().numpy()
+    order = np.argsort(places[:, 2])  # the highest is drawn last
+    pixels = ((1.2 - places[order, :2]) / 2.4 * size).astype(int)
+    inside = ((pixels >= 0) & (pixels < size - 1)).all(1)
     images = []
-    for labels in (truth, predicted):
+    for labels in (truth.cpu().numpy(), predicted.cpu().numpy()):
         image = np.full((size, size, 3), 255, np.uint8)
-        order = np.argsort(points[:, 2])  # the highest is drawn last
-        pixels = ((1.2 - points[order, :2]) / 2.4 * size).astype(int)
-        inside = ((pixels >= 0) & (pixels < size - 1)).all(1)
         for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
             image[tuple((pixels[inside] + shift).T)] = COLOURS[labels[order][inside]]
         images.append(image)

@@ -22,7 +22,6 @@ parts under `# MODEL`.
 import contextlib
 import functools
 import math
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +49,7 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     load_observations,
     write_result,
 )
-from roboarm_nmp.training.runs import Run, check_finite, parse_args, seed_torch
+from roboarm_nmp.training.runs import Run, check_finite, fail, parse_args, seed_torch
 from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 # The field is around the robot's axis, m.
@@ -315,7 +314,7 @@ def batch_of(data, rows, device):
 if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     if args.latent_size % SECTORS:
-        sys.exit(f"--latent-size must be a multiple of {SECTORS}, got {args.latent_size}")
+        fail(f"--latent-size must be a multiple of {SECTORS}, got {args.latent_size}")
     observations, num_training, validation = load_observations(args)
     names, *data = load_obstacle_points(observations, args.num_points)
     data.append(load_obstacles(observations))

@@ -4,15 +4,19 @@ Obstacles are float32 (n, k, 12), n scenes with room for k. An obstacle's row is
 `envs.scenes.primitives.to_array`; unused rows are zeros.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
+from torch import Tensor
 
+from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.scenes.primitives import padded_rows
 
 MIN_DISTANCE, MAX_DISTANCE = -0.05, 0.4  # m: distances are clipped to this range
 
 
-def load_obstacles(observations):
+def load_obstacles(observations: Observations) -> np.ndarray:
     """The ground-truth obstacles: float32 (scenes, n, 12), n of the scene that has most.
 
     An obstacle's row is 1 and its row of `to_array`, with a quaternion of length 1; the rows after
@@ -27,7 +31,7 @@ def load_obstacles(observations):
     return obstacles
 
 
-def rotation_matrices(quaternions):
+def rotation_matrices(quaternions: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), x, y, z, w."""
     x, y, z, w = quaternions.unbind(-1)
     rows = (
@@ -38,7 +42,7 @@ def rotation_matrices(quaternions):
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def distances(obstacles, points):
+def distances(obstacles: Tensor, points: Tensor) -> Tensor:
     """Distances (n, q), m, from points (n, q, 3), m, to the nearest of obstacles (n, k, 12).
 
     Obstacles are rows of `load_obstacles`. Distances are negative inside an obstacle, and clipped
@@ -63,7 +67,7 @@ def distances(obstacles, points):
 
 
 @torch.no_grad()
-def comparison(obstacles, field, reach, size=96):
+def comparison(obstacles: Tensor, field: Callable, reach: float, size: int = 96) -> np.ndarray:
     """A figure of a distance field at three heights, truth above: uint8 (2 size, 3 size, 3).
 
     Seen from above, x up. Dark is near, and the inside of obstacles is red.

@@ -19,7 +19,6 @@ codes side by side. To make an encoder of your own, copy this file and change th
 """
 
 import math
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +42,7 @@ from roboarm_nmp.scene_embedding_train.clouds import (
     scene_cloud,
     thin_out,
 )
-from roboarm_nmp.training.runs import Run, check_finite, parse_args, seed_torch
+from roboarm_nmp.training.runs import Run, check_finite, fail, parse_args, seed_torch
 from roboarm_nmp.utils.flags import PositiveFloat, PositiveInt, Width
 
 
@@ -250,9 +249,9 @@ if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     many, few = args.num_centres
     if not args.num_points >= many >= max(few, args.num_neighbours):
-        sys.exit("--num-points must be at least --num-centres, and these --num-neighbours")
+        fail("--num-points must be at least --num-centres, and these --num-neighbours")
     if few < NEAREST:
-        sys.exit(f"--num-centres must be at least {NEAREST}")
+        fail(f"--num-centres must be at least {NEAREST}")
     observations, num_training, validation = training_data.load_observations(args)
     clouds = load_clouds(observations, args.num_points)
     example = example_clouds(observations, clouds.sensors)

@@ -5,20 +5,19 @@ These functions are for scripts: on a mistake of the user, they end the program 
 
 import contextlib
 import hashlib
-import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.envs.perception.sensors import sensors_to_json
-from roboarm_nmp.envs.robots.files import RobotError, load_robot
+from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.training.runs import RunFlags, script_name
+from roboarm_nmp.training.runs import Run, RunFlags, errors_of, fail, script_name
 from roboarm_nmp.utils.files import new_contents
 from roboarm_nmp.utils.flags import PositiveInt, Share
 from roboarm_nmp.utils.progress import progress_bar
@@ -40,7 +39,7 @@ class EncoderFlags(RunFlags):
     """validation scenes per evaluation"""
 
 
-def load_observations(args):
+def load_observations(args: EncoderFlags) -> tuple[Observations, int, np.ndarray]:
     """The observations to train and to validate on.
 
     Args:
@@ -53,42 +52,52 @@ def load_observations(args):
     Raises:
         SystemExit: there are no observations, or too few, or they are damaged, or another robot's.
     """
-    try:
+    with errors_of("--robot"):
         robot = PANDA if args.robot is None else load_robot(args.robot)
+    with errors_of("--observations"):
         observations = Observations(args.observations, robot)
-    except RobotError as error:
-        sys.exit(f"--robot: {error}")
-    except DatasetError as error:
-        sys.exit(f"--observations: {error}")
     num_training = len(observations) - max(1, round(args.validation_share * len(observations)))
     if num_training < 1:
-        sys.exit(f"--observations: {len(observations)} scenes are too few")
+        fail(f"--observations: {len(observations)} scenes are too few")
     validation = np.arange(num_training, len(observations))[: args.eval_scenes]
     return observations, num_training, validation
 
 
-def encoder_metadata(args, observations, names):
+def encoder_metadata(args: EncoderFlags, observations: Observations, names: Iterable[str]) -> dict:
     """The metadata of an encoder that receives the outputs of the sensors `names`: a dict."""
     sensors = sensors_to_json({name: observations.sensors[name] for name in names})
-    metadata = {"kind": "encoder", "script": script_name(), "task": observations.task}
-    metadata |= robot_metadata(observations.base_scene.robot)
-    return metadata | {"sensors": sensors, "seed": args.seed}
+    return {
+        "kind": "encoder",
+        "script": script_name(),
+        "task": observations.task,
+        **robot_metadata(observations.base_scene.robot),
+        "sensors": sensors,
+        "seed": args.seed,
+    }
 
 
-def write_result(run, num_training):
+def write_result(run: Run, num_training: int) -> dict:
     """Write `result.json`: the best evaluation and the size of the run. Returns its dict.
 
     Args:
         run: the `Run`, whose `best_result` is a dict of the best evaluation.
         num_training: number of scenes that it trained on.
     """
-    result = run.best_result | {"scenes": num_training, "encoder": str(run.folder / "encoder.pt")}
-    result |= {"updates": run.step, "best_update": run.best_step, "seconds": round(run.seconds)}
+    result = {
+        **run.best_result,
+        "scenes": num_training,
+        "encoder": str(run.folder / "encoder.pt"),
+        "updates": run.step,
+        "best_update": run.best_step,
+        "seconds": round(run.seconds),
+    }
     run.write_result(result)
     return result
 
 
-def unpack(observations, name, arrays, shards):
+def unpack(
+    observations: Observations, name: str, arrays: dict, shards: Iterable[dict]
+) -> dict[str, np.ndarray]:
     """Arrays with a row per scene, made once, kept in files beside the shards and memory-mapped.
 
     The files, `<name>_<array>_<key>.npy`, may be larger than the memory. The key is a hash of the
@@ -105,32 +114,27 @@ def unpack(observations, name, arrays, shards):
         A dict from an array's name to the array, which is read-only.
     """
     key = contents_key(observations)
-    paths = {one: observations.folder / f"{name}_{one}_{key}.npy" for one in arrays}
+    paths = {array: observations.folder / f"{name}_{array}_{key}.npy" for array in arrays}
     if not all(path.exists() for path in paths.values()):
         # Several trainers may do this at once: the last one replaces the files by equal ones.
         with contextlib.ExitStack() as stack:
-            whole = {
-                one: np.lib.format.open_memmap(
-                    stack.enter_context(new_contents(paths[one])),
-                    "w+",
-                    dtype,
-                    (len(observations), *shape),
-                )
-                for one, (dtype, shape) in arrays.items()
-            }
-            spans = zip(observations.offsets, observations.offsets[1:], strict=False)
+            files = {}
+            for array, (dtype, shape) in arrays.items():
+                path = stack.enter_context(new_contents(paths[array]))
+                shape = (len(observations), *shape)
+                files[array] = np.lib.format.open_memmap(path, "w+", dtype, shape)
             total = len(observations.offsets) - 1
-            spans = zip(spans, shards, strict=True)
-            bar = progress_bar(spans, f"unpacking {name}", total, unit="shard")
-            for (begin, end), rows in bar:
-                for one, array in whole.items():
-                    array[begin:end] = rows[one]
-            for array in whole.values():
-                array.flush()
-    return {one: np.load(path, mmap_mode="r") for one, path in paths.items()}
+            bar = progress_bar(shards, f"unpacking {name}", total, unit="shard")
+            for number, rows in enumerate(bar):
+                begin, end = observations.offsets[number : number + 2]
+                for array, values in rows.items():
+                    files[array][begin:end] = values
+            for file in files.values():
+                file.flush()
+    return {array: np.load(path, mmap_mode="r") for array, path in paths.items()}
 
 
-def contents_key(observations):
+def contents_key(observations: Observations) -> str:
     """A hash of the contents of all shards of `Observations`, a string."""
     digest = hashlib.sha256()
     for shard in range(len(observations.offsets) - 1):

@@ -10,7 +10,6 @@ mean of z_E. To make an encoder of your own, copy this file and change the parts
 Parts between `# SHARED` and `# END SHARED` are those of `vqvae.py`.
 """
 
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +33,7 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     load_observations,
     write_result,
 )
-from roboarm_nmp.training.runs import Run, parse_args, seed_torch
+from roboarm_nmp.training.runs import Run, fail, parse_args, seed_torch
 from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 
@@ -179,7 +178,7 @@ if __name__ == "__main__":
     # SHARED: images to train on
     size = args.image_size
     if num_halvings(size) == 0:
-        sys.exit(f"--image-size {size}: 8, 16, 32, 64, 128, ... pixels")
+        fail(f"--image-size {size}: 8, 16, 32, 64, 128, ... pixels")
     observations, num_training, validation = load_observations(args)
     images, cameras = load_images(observations, size)
     example = example_images(observations, cameras)
@@ -209,8 +208,9 @@ if __name__ == "__main__":
         # SHARED: evaluate, keep the best encoder, checkpoint
         evaluating = step % args.eval_every == 0 or step == args.total_updates
         if evaluating:
-            errors = (model, images, validation, mean_image, args.batch_size, device)
-            result = reconstruction_errors(*errors)
+            result = reconstruction_errors(
+                model, images, validation, mean_image, args.batch_size, device
+            )
             run.log({f"eval/{name}": value for name, value in result.items()})
             figure = comparison(model, batch_of(images, validation[:1], device))
             run.log_image("eval/reconstruction", figure)

@@ -11,7 +11,6 @@ own, copy this file and change the parts under `# MODEL`. Parts between `# SHARE
 `# END SHARED` are those of `vae.py`.
 """
 
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +35,7 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     load_observations,
     write_result,
 )
-from roboarm_nmp.training.runs import Run, parse_args, seed_torch
+from roboarm_nmp.training.runs import Run, fail, parse_args, seed_torch
 from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 
@@ -235,12 +234,12 @@ def update(model, optimizer, batch, mean_image, args):
 if __name__ == "__main__":
     args = parse_args(Args, may_change={"observations"})
     if args.latent_size % args.code_size:
-        sys.exit(f"--latent-size {args.latent_size} is no multiple of --code-size {args.code_size}")
+        fail(f"--latent-size {args.latent_size} is no multiple of --code-size {args.code_size}")
 
     # SHARED: images to train on
     size = args.image_size
     if num_halvings(size) == 0:
-        sys.exit(f"--image-size {size}: 8, 16, 32, 64, 128, ... pixels")
+        fail(f"--image-size {size}: 8, 16, 32, 64, 128, ... pixels")
     observations, num_training, validation = load_observations(args)
     images, cameras = load_images(observations, size)
     example = example_images(observations, cameras)
@@ -272,8 +271,9 @@ if __name__ == "__main__":
         # SHARED: evaluate, keep the best encoder, checkpoint
         evaluating = step % args.eval_every == 0 or step == args.total_updates
         if evaluating:
-            errors = (model, images, validation, mean_image, args.batch_size, device)
-            result = reconstruction_errors(*errors)
+            result = reconstruction_errors(
+                model, images, validation, mean_image, args.batch_size, device
+            )
             run.log({f"eval/{name}": value for name, value in result.items()})
             figure = comparison(model, batch_of(images, validation[:1], device))
             run.log_image("eval/reconstruction", figure)

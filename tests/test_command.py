@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import tyro
@@ -36,34 +35,36 @@ def test_planning_without_ompl_is_refused_in_one_line(name, monkeypatch, capsys)
     assert f"roboarm {name} needs OMPL" in message and message.count("\n") == 1
 
 
+@pytest.fixture
+def same_process(monkeypatch):
+    """What a command changes in its process."""
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules")
 @pytest.mark.parametrize("name", NAMES)
-def test_every_subcommand_has_help_with_an_example_and_groups(name):
-    done = run(*name.split(), "--help")
-    assert done.returncode == 0, done.stderr
-    assert f"usage: roboarm {name} [-h]" in done.stdout
-    examples = [line for line in done.stdout.splitlines() if "usage:" not in line]
+def test_every_subcommand_has_help_with_an_example_and_groups(name, same_process, capsys):
+    with pytest.raises(SystemExit) as end:
+        command.main([*name.split(), "--help"])
+    assert not end.value.code
+    shown = capsys.readouterr().out
+    assert f"usage: roboarm {name} [-h]" in shown
+    examples = [line for line in shown.splitlines() if "usage:" not in line]
     assert any(f"roboarm {name} " in f"{line} " for line in examples)
     if name not in WITHOUT_GROUPS:
-        groups = re.findall(r"[a-z-]+ options ─", done.stdout)
+        groups = re.findall(r"[a-z-]+ options ─", shown)
         assert groups and len(set(groups)) == len(groups)
         assert ("algorithm options ─" in groups) == name.startswith("train ")
-    if name.startswith("train "):
-        assert {"evaluation options ─", "run options ─"} <= {*groups}
 
 
 def test_help_of_a_script_has_the_scripts_name():
     script = ROOT / "clean_rl_scripts" / "evaluate.py"
     done = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True)
     assert "usage: evaluate.py [-h]" in done.stdout, done.stderr
-
-
-def test_robot_without_check_prints_its_usage():
-    for arguments, code in ((["--help"], 0), ([], 2), (["chekc"], 2)):
-        done = run("robot", *arguments)
-        assert (done.returncode, done.stdout) == (
-            code,
-            "usage: roboarm robot check FILE [--help]\n",
-        )
 
 
 def test_help_is_quick_and_lists_all_subcommands():
@@ -76,30 +77,21 @@ def test_help_is_quick_and_lists_all_subcommands():
 
 
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules")
-@pytest.mark.parametrize(
-    ("number", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "term")]
-)
 @pytest.mark.parametrize("name", NAMES)
-def test_signal_ends_every_subcommand_with_one_line(name, number, code, word, monkeypatch, capsys):
+def test_signal_ends_every_subcommand_with_one_line(name, same_process, monkeypatch, capsys):
     def parse(*_, **__):  # the first thing that a script does
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(60)
 
     monkeypatch.setattr(tyro, "cli", parse)
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
-    monkeypatch.setattr(sys, "argv", sys.argv)
-    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(KeyboardInterrupt) as interrupt:
-            command.main(name.split())
-        with pytest.raises(SystemExit) as end:
-            sys.excepthook(interrupt.type, interrupt.value, interrupt.tb)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert end.value.code == code
+    with pytest.raises(KeyboardInterrupt) as interrupt:
+        command.main(name.split())
+    with pytest.raises(SystemExit) as end:
+        sys.excepthook(interrupt.type, interrupt.value, interrupt.tb)
+    assert end.value.code == 143
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(word) and "; " in line
+    assert line.startswith("terminated; ")
 
 
 @pytest.mark.parametrize(
@@ -136,10 +128,3 @@ def test_unknown_subcommand_is_rejected_in_one_line(arguments, text):
     done = run(*arguments)
     assert done.returncode == 2 and text in done.stderr.splitlines()[-1]
     assert not done.stdout
-
-
-def test_modules_of_subcommands_exist_where_the_command_says():
-    for module, _ in [*command.COMMANDS.values(), *command.TRAINERS.values()]:
-        if module is not None:
-            path = command.__file__.replace("__main__.py", module.replace(".", "/"))
-            assert Path(f"{path}.py").exists() or Path(path, "__main__.py").exists(), module

@@ -27,7 +27,7 @@ from roboarm_nmp.evaluation.evaluate import evaluate
 from roboarm_nmp.networks.exported_networks import load_network
 from roboarm_nmp.policies.registry import PolicyError, find_policy, make_policy
 from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
-from roboarm_nmp.training import protocol, runs
+from roboarm_nmp.training import protocol
 
 dagger = load("dagger")
 HARD = "random_boxes_hard"
@@ -123,16 +123,6 @@ def test_order_of_tokens_and_rows_of_zeros_do_not_matter(setting):
         torch.testing.assert_close(one, other)
     inputs["observation"] = torch.cat([inputs["observation"][:, :10], 0.0 * more], dim=1)
     assert (actor.outputs(**inputs)[0] - direction).abs().max() > 1e-3  # other tokens matter
-
-
-def test_bfloat16_is_used_in_training_only(setting):
-    actor, _, batch = copy.deepcopy(setting[0]), *setting[1:]
-    exact = actor.outputs(**inputs_of(batch))[0]
-    for module in actor.modules():
-        module.bf16 = True
-    rough = actor.outputs(**inputs_of(batch))[0]
-    assert 1e-4 < (rough - exact).abs().max() < 0.05 * exact.abs().max()
-    torch.testing.assert_close(actor.eval().outputs(**inputs_of(batch))[0], exact)
 
 
 def test_saved_policy_has_its_safety_filter_and_acts_alone_as_in_a_batch(
@@ -233,30 +223,6 @@ def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_
     bare = evaluate(whole, HARD, split="validation", num_queries=2, safety_filter=False)
     assert bare["safety_filter"] is None and bare["mean_steps"] != result["mean_steps"]
     assert bare["collision_rate"] >= result["collision_rate"]
-
-
-def test_interrupted_run_continues_bit_for_bit(tmp_path, folder, monkeypatch, short_episodes):
-    flags = ["--paths", str(folder)]
-    whole = run_script("dagger", tmp_path / "whole", *flags)
-    advance = runs.Run.advance
-
-    def advance_and_signal(run, count=1):
-        step = advance(run, count)
-        if step == 17:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return step
-
-    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(runs.Run, "advance", advance_and_signal)
-        run_script("dagger", tmp_path / "stopped", *flags)
-    assert end.value.code == 143
-    (stopped,) = (tmp_path / "stopped").iterdir()
-    assert torch.load(stopped / "checkpoint.pt", weights_only=True)["progress"]["step"] == 17
-    run_here(PATHS["dagger"], "--resume", stopped)
-    one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, stopped))
-    for name in ("actor", "actor_average", "visited"):
-        assert one[name].keys() == other[name].keys() and one[name]
-        assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
 
 
 def test_run_begins_with_the_weights_of_another_policy(tmp_path, folder, short_episodes):

@@ -28,14 +28,13 @@ def num_updates(state):
     return state["counts"]["updates"] if "counts" in state else state["progress"]["step"]
 
 
-@pytest.mark.parametrize("encoded", [False, True])
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_update_evaluation_and_resume_on_another_device(
-    trainer, encoded, tmp_path, another_device, short_episodes, few_demos
+    trainer, tmp_path, another_device, short_episodes, few_demos
 ):
-    more = [*ENCODED, "--demos", few_demos] if encoded else ["--goal-type", "ee"]
-    if encoded and trainer != "bc":
-        more = [*more, "--demo-prob", "1", "--bc-weight", "2"]
+    more = [*ENCODED, "--demos", few_demos]
+    if trainer != "bc":
+        more += ["--demo-prob", "1", "--bc-weight", "2"]
     run_here(*command(trainer, tmp_path, *flags(trainer), "--device", another_device, *more)[1:])
     (run,) = tmp_path.iterdir()
     state = torch.load(run / "checkpoint.pt", weights_only=True)

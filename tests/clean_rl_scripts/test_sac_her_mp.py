@@ -15,7 +15,7 @@ from roboarm_nmp.datasets.episodes import demo_transitions
 from roboarm_nmp.datasets.format import QueryScenes
 from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.training import cuda_graphs, protocol
+from roboarm_nmp.training import cuda_graphs
 from roboarm_nmp.training.network_parts import JacobianTranspose
 from roboarm_nmp.training.protocol import stack
 
@@ -103,9 +103,10 @@ def test_network_inputs_of_goal_poses():
     np.testing.assert_allclose(inputs[:21], np.hstack([observation, there]), atol=1e-6)
 
 
-@pytest.mark.parametrize("goal_type", ["ee", "config", "combined", "pose"])
-@pytest.mark.parametrize("velocities", [False, True])
-@pytest.mark.parametrize("link_distances", [False, True])
+@pytest.mark.parametrize(
+    ("goal_type", "velocities", "link_distances"),
+    [("ee", True, True), ("config", False, True), ("combined", True, False), ("pose", True, True)],
+)
 def test_networks_fit_every_observation(goal_type, velocities, link_distances):
     shared = {"goal_type": goal_type, "velocities": velocities}
     source = "ground_truth" if link_distances else None
@@ -140,13 +141,6 @@ def test_actions_are_within_twice_the_longest_step(flags, scale):
         actor.mlp[-1].bias.fill_(100.0)  # saturated
         action = actor(torch.zeros(1, 10), None, torch.zeros(1, 3))
     torch.testing.assert_close(action, torch.full((1, 7), scale))
-
-
-def test_plain_critics_have_no_layer_norm():
-    for plain in (False, True):
-        args = sac.Args(plain_networks=plain)
-        modules = sac.Critics(args, sac.Features(args, panda_env())).modules()
-        assert any(isinstance(one, torch.nn.LayerNorm) for one in modules) is not plain
 
 
 def episode(length, offset, env):
@@ -231,13 +225,6 @@ def test_ring_overwrites_the_oldest_and_keeps_episodes_apart():
     assert (now // 100 == goal // 100).all() and (goal >= now).all()
 
 
-def test_million_transitions_fit_into_400_mb():
-    for arguments in ({}, {"goal_type": "combined", "velocities": True}):
-        env = envs.make("no_obstacles", **arguments)
-        buffer = sac.HerReplayBuffer(env, 1_000_000, 0.8, np.random.default_rng(0))
-        assert sum(array.nbytes for array in buffer.arrays.values()) < 400e6
-
-
 def test_bfloat16_products_stay_close_to_float32():
     torch.manual_seed(0)
     args = sac.Args(bf16=True)
@@ -255,19 +242,6 @@ def test_updates_fall_due_evenly_after_learning_starts():
     assert all(number == 0 for step, number in due.items() if step <= 200)
     assert sum(due.values()) == int((7000 - 200) * 0.3)
     assert set(list(due.values())[30:]) == {2, 3}  # 2.1 per seven steps
-
-
-def test_batches_are_sampled_together(monkeypatch):
-    env, drawn = envs.make("no_obstacles"), []
-    buffer = sac.HerReplayBuffer(env, 1000, 0.8, np.random.default_rng(0))
-    buffer.add_episode(episode(4, 0, env))
-    sample = buffer.sample
-    monkeypatch.setattr(buffer, "sample", lambda size: drawn.append(size) or sample(size))
-    found = list(buffer.batches(150, 8, "cpu"))
-    assert len(found) == 150 and sum(drawn) == 150 * 8 and max(drawn) <= 64 * 8
-    assert all(len(tensor) == 8 for batch in found for tensor in batch.values())
-    assert len({batch["observation"].numpy().tobytes() for batch in found}) > 140
-    assert list(buffer.batches(0, 8, "cpu")) == []
 
 
 # --- Demonstrations
@@ -371,7 +345,7 @@ def demo_run(folder, demo_file, prob):
     return {name: a.numpy() for name, a in state["buffer"]["arrays"].items()}, events
 
 
-@pytest.mark.parametrize("prob", ["1", "0.4", "0"])
+@pytest.mark.parametrize("prob", ["1", "0.4"])
 def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, demo_file, prob):
     demos = load_demos(demo_file)
     arrays, events = demo_run(tmp_path, demo_file, prob)
@@ -387,32 +361,18 @@ def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, de
     ]
     failures = len(events.Scalars("charts/episodic_length"))  # so short a run never succeeds
     assert events.Scalars("charts/success")[-1].value == 0
-    assert failures > 10
+    assert failures > 5
     assert sum(injected) == events.Scalars("charts/demos_injected")[-1].value
     if prob == "0.4":
-        assert 0.1 * failures < sum(injected) < 0.7 * failures
+        assert 0 < sum(injected) < failures
     else:
         assert sum(injected) == float(prob) * failures
-
-
-def test_successful_episodes_inject_no_demonstration(tmp_path, demo_file, monkeypatch):
-    make_envs, easy = protocol.make_envs, {"ee_tolerance": 0.3}  # m
-    monkeypatch.setattr(protocol, "make_envs", lambda *args, **kw: make_envs(*args, **kw | easy))
-    _, events = demo_run(tmp_path, demo_file, "1")
-    episodes = len(events.Scalars("charts/episodic_length"))
-    assert episodes <= 100  # as many as `success` is the mean of
-    failures = round(episodes * (1 - events.Scalars("charts/success")[-1].value))
-    assert 0 < failures < episodes
-    assert events.Scalars("charts/demos_injected")[-1].value == failures
 
 
 CLONING = ["--demo-prob", "1", "--bc-weight", "5", "--demo-batch-size", "6"]
 
 
-@pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
-def test_cloning_adds_demonstrated_transitions_to_every_batch(
-    trainer, tmp_path, demo_file, monkeypatch
-):
+def test_cloning_adds_demonstrated_transitions_to_every_batch(tmp_path, demo_file, monkeypatch):
     batches, graphed = [], cuda_graphs.graphed
 
     def recorded(function, args, device):
@@ -426,13 +386,13 @@ def test_cloning_adds_demonstrated_transitions_to_every_batch(
     monkeypatch.setattr(cuda_graphs, "graphed", recorded)
     # A goal is reached where it is the last of its episode: none is relabelled.
     flags = [*CLONING, "--demos", str(demo_file), "--her-probability", "0", *ONE_EVALUATION]
-    run_script(trainer, tmp_path, *flags)
+    run_script("sac_her_mp", tmp_path, *flags)
     env, demos = panda_env(), load_demos(demo_file)
     episodes = [demo_transitions(demo, env) for demo in demos]
     entries = [(transition, episode[-1]) for episode in episodes for transition in episode]
     seen, names = set(), ("observation", "action", "next_observation", "desired_goal")
     stacked = {name: np.float32([one[name] for one, _ in entries]) for name in names}
-    assert len(batches) == 100
+    assert len(batches) == 40
     for batch in batches:
         assert all(len(value) == 16 + 6 for value in batch.values())
         rows = {name: value[-6:].numpy() for name, value in batch.items()}
@@ -442,15 +402,16 @@ def test_cloning_adds_demonstrated_transitions_to_every_batch(
             seen.add(which)
             one, last = entries[which]
             assert rows["terminated"][i] == (one is last) and rows["reward"][i] == (one is last) - 1
-    assert len(seen) > 0.8 * min(len(entries), 600 / 2)  # all of them, not the first alone
+    assert len(seen) > 0.5 * min(len(entries), 240)  # all of them, not the first alone
 
 
-@pytest.mark.parametrize("trainer", ["sac_her_mp", "td3_her_mp"])
-def test_resumed_run_with_cloning_is_the_same(trainer, tmp_path, demo_file):
-    flags = [*CLONING, "--demos", str(demo_file), "--eval-queries", "1", "--test-queries", "0"]
-    whole = run_script(trainer, tmp_path / "whole", *flags)
-    parts = run_script(trainer, tmp_path / "parts", *flags, "--total-timesteps", "600")
-    run_here(PATHS[trainer], "--resume", parts, "--total-timesteps", "1200")
+def test_resumed_run_with_cloning_is_the_same(tmp_path, demo_file):
+    # Two files, as one and in parts.
+    flags = [*CLONING, "--demos", str(demo_file), str(demo_file)]
+    flags += ["--eval-queries", "1", "--test-queries", "0"]
+    whole = run_script("td3_her_mp", tmp_path / "whole", *flags)
+    parts = run_script("td3_her_mp", tmp_path / "parts", *flags, "--total-timesteps", "300")
+    run_here(PATHS["td3_her_mp"], "--resume", parts, "--total-timesteps", "600")
     one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, parts))
     for name in ("actor", "actor_average", "critics"):
         for key, tensor in one[name].items():
@@ -461,7 +422,7 @@ def test_resumed_run_with_cloning_is_the_same(trainer, tmp_path, demo_file):
 
 
 def test_losses_are_logged_with_subgoal_actions_and_constant_alpha(tmp_path):
-    flags = "--action-mode subgoal --updates-per-step 1 --goal-type config --target-entropy None"
+    flags = "--action-mode subgoal --updates-per-step 3 --goal-type config --target-entropy None"
     run = run_script("sac_her_mp", tmp_path, *flags.split())
     events = EventAccumulator(str(run))
     events.Reload()

@@ -24,15 +24,15 @@ TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
 GPU = pytest.param("cuda", marks=NO_GPU)  # a `--device`
 TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
-TINY += " --horizon 50 --eval-every 600 --eval-queries 3 --test-queries 4 --total-timesteps 1200"
+TINY += " --horizon 50 --eval-every 300 --eval-queries 2 --test-queries 2 --total-timesteps 600"
 TINIER = f"{TINY} --horizon 20 --learning-starts 100 --eval-every 300 --total-timesteps 300"
-TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 600 --eval-queries 3"
-TINY_BC += " --test-queries 4 --total-updates 1200"
+TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 300 --eval-queries 2"
+TINY_BC += " --test-queries 2 --total-updates 600"
 TINY_DAGGER = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --pool-size 100"
 TINY_DAGGER += " --examples-per-update 10 --total-updates 40 --round-every 15 --round-queries 1"
 TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1 --workers 0"
 # For tests of what training leaves in the checkpoint: one evaluation, on one query.
-ONE_EVALUATION = ["--eval-every", "1200", "--eval-queries", "1", "--test-queries", "0"]
+ONE_EVALUATION = ["--eval-every", "600", "--eval-queries", "1", "--test-queries", "0"]
 
 
 def load(trainer):

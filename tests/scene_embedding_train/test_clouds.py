@@ -74,18 +74,6 @@ def test_points_far_from_the_whole_cloud_are_labelled_as_nothing(observations):
     assert differing > 0
 
 
-def test_random_queries_are_a_subset_with_equal_labels():
-    points, labels = torch.rand(3, 2, 20, 3), torch.randint(4, (3, 2, 20))
-    cloud = (points, labels, points.flatten(1, 2))
-    queries, classes = clouds.queries_of(*cloud)
-    chosen, labelled = clouds.queries_of(*cloud, 12)
-    assert chosen.shape == (3, 12, 3) and labelled.shape == (3, 12)
-    for i in range(3):
-        found = [queries[i].tolist().index(point) for point in chosen[i].tolist()]
-        assert len(set(found)) == 12 and [one >= 40 for one in found] == [False] * 8 + [True] * 4
-        assert torch.equal(labelled[i], classes[i, found])
-
-
 def test_scores_of_the_evaluation_equal_their_definitions(observations):
     thinned = clouds.load_clouds(Observations(observations), 64)
     ignored = clouds.IGNORED

@@ -18,7 +18,6 @@ from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.sensors import PointCloud
 from roboarm_nmp.networks.exported_networks import load_network
 from roboarm_nmp.scene_embedding_train import clouds, images
-from roboarm_nmp.training.runs import Run
 
 
 @pytest.fixture(scope="module", params=SCRIPTS)
@@ -103,44 +102,17 @@ def test_latent_size_that_sectors_do_not_divide_is_rejected(observations, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_terminated_run_writes_a_checkpoint_after_its_update(
-    name, observations, tmp_path, monkeypatch, capsys
-):
-    """SIGTERM in update 2, before the first evaluation."""
-    advance = Run.advance
-
-    def advance_and_terminate(self, number=1):
-        step = advance(self, number)
-        if step == 2:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return step
-
-    monkeypatch.setattr(Run, "advance", advance_and_terminate)
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with pytest.raises(SystemExit) as end:
-            run_here(*command(name, observations, tmp_path)[1:])
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    assert end.value.code == 143 and "terminated; checkpoint" in capsys.readouterr().err
-    (folder,) = tmp_path.iterdir()
-    checkpoint = torch.load(folder / "checkpoint.pt", weights_only=True)
-    assert checkpoint["progress"]["step"] == 2 and not (folder / "encoder.pt").exists()
-
-
 @pytest.mark.parametrize("device", ["cpu", GPU])
 def test_killed_and_resumed_is_bit_identical_to_uninterrupted(
     run, observations, tmp_path, device, capsys
 ):
     name, finished = run
+    if name not in ("vqvae", "field"):  # one of images, and one of point clouds
+        pytest.skip("resumes as the others do")
     if device != "cpu":
         whole = tmp_path / "whole"
         run_here(*command(name, observations, whole, "--device", device)[1:])
         (finished,) = whole.iterdir()
-    if name == "field":  # also for a resume on another machine
-        assert isinstance(json.loads((finished / "args.json").read_text())["bf16"], bool)
     killed = tmp_path / "killed"
     process = subprocess.Popen(
         command(name, observations, killed, "--device", device),
@@ -155,16 +127,13 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(
     process.wait()
     folder = next(killed.iterdir())
     assert not (folder / "result.json").exists()
-    resume = [FOLDER / f"{name}.py", "--resume", folder]
-    run_here(*resume)
+    run_here(FOLDER / f"{name}.py", "--resume", folder)
     one, other = (
         torch.load(path / "checkpoint.pt", weights_only=True)["model"]
         for path in (folder, finished)
     )
     for key in one:
         assert torch.equal(one[key], other[key]), key
-    message = error_here(capsys, *resume, "--width", "8")
-    assert "--width is 8 now, the run had 4" in message
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -188,7 +157,7 @@ def test_update_evaluation_and_resume_run_on_another_device(
     assert {tensor.device.type for tensor in weights} == {another_device}
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("name", ["vae", "pointnet2"])
 def test_diverged_run_ends_with_an_error(name, observations, tmp_path):
     flags = ("--learning-rate", "1e30", "--total-updates", "3", "--eval-every", "3")
     with pytest.raises(FloatingPointError, match="are no longer finite"):
@@ -196,7 +165,6 @@ def test_diverged_run_ends_with_an_error(name, observations, tmp_path):
     assert not list(tmp_path.glob("*/encoder*.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_folder_without_observations_is_rejected(name, tmp_path, capsys):
-    message = error_here(capsys, *command(name, tmp_path, tmp_path)[1:])
-    assert "no observations" in message
+def test_folder_without_observations_is_rejected(tmp_path, capsys):
+    message = error_here(capsys, *command("vae", tmp_path, tmp_path)[1:])
+    assert message.startswith("vae.py: --observations: ") and "no observations" in message

@@ -56,7 +56,7 @@ def test_vae_overfits_a_few_scenes(observations):
     check_learning(vae, model, images.batch_of(data, rows, "cpu"), (mean_image,), args, error)
 
 
-@pytest.mark.parametrize(("size", "halvings"), [(224, 5), (64, 4), (112, 4), (16, 2), (8, 1)])
+@pytest.mark.parametrize(("size", "halvings"), [(112, 4), (16, 2), (8, 1)])
 def test_networks_fit_images_of_any_allowed_size(size, halvings):
     assert vae.num_halvings(size) == halvings
     args = vae.Args(width=2)
@@ -64,12 +64,3 @@ def test_networks_fit_images_of_any_allowed_size(size, halvings):
     images = torch.rand(3, 4, 3, size, size)
     assert model(images).shape == images.shape
     assert model.encode(images)[0].shape == (3, 64)
-
-
-def test_each_decoder_depends_on_all_cameras():
-    images = torch.rand(1, 4, 3, 16, 16)
-    changed = images.clone()
-    changed[:, 2] = torch.rand(3, 16, 16)
-    torch.manual_seed(0)
-    model = vae.VAE(4, 16, vae.Args(width=4))
-    assert (model(images) != model(changed)).flatten(2).any(2)[0].tolist() == [True] * 4

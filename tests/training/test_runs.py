@@ -4,7 +4,6 @@ import contextlib
 import io
 import json
 import math
-import os
 import re
 import signal
 import subprocess
@@ -70,8 +69,6 @@ def test_flags_are_restored_by_resume(parse, tmp_path):
     "flags, message",
     [
         (["--radii", "0.3", "0.4"], r"--radii is \[0.3, 0.4\] now, the run had \[0.1, 0.2\]"),
-        (["--files", "e.h5"], r"--files is \['e.h5'\] now, the run had \[\]"),
-        (["--name", "y"], "--name is 'y' now, the run had None"),
         (["--seed", "2", "--name", "z"], "--seed is 2 now, .*; --name is 'z'"),
     ],
 )
@@ -89,6 +86,13 @@ def test_run_without_a_newer_flag_resumes_with_its_default(parse, tmp_path):
     assert parse("--resume", run).radii == (0.1, 0.2)
     with pytest.raises(SystemExit, match="--radii"):
         parse("--resume", run, "--radii", "0.3", "0.4")
+
+
+def test_runs_of_the_same_second_have_their_own_folders(parse, tmp_path, monkeypatch):
+    monkeypatch.setattr("time.time", lambda: 1_795_000_000.0)
+    names = [runs.run_folder(parse("--runs-dir", tmp_path), "wall").name for _ in range(3)]
+    first = "wall__trainer__1__1795000000"
+    assert names == [first, f"{first}_2", f"{first}_3"]
 
 
 def test_missing_run_or_gpu_is_rejected(parse, tmp_path, monkeypatch):
@@ -174,18 +178,6 @@ def test_checkpoint_restores_every_part(parse, tmp_path):
         runs.load_checkpoint(args, after | {"model": torch.nn.Linear(4, 2)})
 
 
-def test_random_numbers_of_the_runs_gpu_are_restored(parse, tmp_path, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
-    states, given = {"cuda:0": torch.tensor([3]), "cuda:1": torch.tensor([7])}, []
-    monkeypatch.setattr("torch.cuda.get_rng_state", lambda device: states[str(device)])
-    monkeypatch.setattr("torch.cuda.set_rng_state", lambda *state: given.append(state))
-    run = runs.run_folder(parse("--runs-dir", tmp_path, "--device", "cuda:1"), "wall")
-    runs.save_checkpoint(run, parts(), torch.device("cuda:1"))
-    runs.load_checkpoint(parse("--resume", run), parts())
-    assert given == [(torch.tensor([7]), "cuda:1")]
-
-
 def test_files_are_found_from_another_working_directory(parse, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     (tmp_path / "there").mkdir()
@@ -260,12 +252,6 @@ def script(folder, code):
             "error: .*: 'checkpoint.pt'",
         ),
         ("torch.zeros(10**15)", "error: out of memory .+"),
-        ("bytearray(10**15)", "error: out of memory"),
-        (
-            "from concurrent.futures.process import BrokenProcessPool\n"
-            "raise BrokenProcessPool('a process has died')",
-            "error: a process has died",
-        ),
     ],
 )
 def test_errors_that_are_no_mistake_of_the_program_get_a_line(tmp_path, code, message):
@@ -279,19 +265,10 @@ def test_errors_that_are_no_mistake_of_the_program_get_a_line(tmp_path, code, me
     assert not torch.load(run / "checkpoint.pt", weights_only=True)["numbers"].any()
 
 
-def test_other_errors_keep_their_traceback(tmp_path):
-    ended, _ = script(tmp_path, "1 / 0")
-    assert "Traceback" in ended.stderr and "ZeroDivisionError" in ended.stderr
-
-
-@pytest.mark.parametrize(
-    ("number", "code", "word"), [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted")]
-)
-def test_signal_outside_the_loop_ends_a_run_with_a_line(tmp_path, number, code, word):
-    kill = f"os.kill(os.getpid(), signal.{number})"
-    ended, run = script(tmp_path, kill)
-    assert ended.returncode == code
-    line = f"{word}; --resume {run} continues from the last checkpoint"
+def test_signal_outside_the_loop_ends_a_run_with_a_line(tmp_path):
+    ended, run = script(tmp_path, "os.kill(os.getpid(), signal.SIGINT)")
+    assert ended.returncode == 130
+    line = f"interrupted; --resume {run} continues from the last checkpoint"
     assert ended.stderr.splitlines()[-1] == line and "Traceback" not in ended.stderr
 
 
@@ -343,7 +320,7 @@ def test_damaged_checkpoint_is_rejected_by_name(parse, tmp_path):
         runs.load_checkpoint(args, parts())
     saved = torch.load(io.BytesIO(content), weights_only=True)
     rng, unnoticed = np.random.default_rng(0), 0
-    for _ in range(100):
+    for _ in range(20):
         flipped = bytearray(content)
         flipped[rng.integers(len(content))] ^= 1 << rng.integers(8)
         (run / "checkpoint.pt").write_bytes(flipped)
@@ -351,7 +328,7 @@ def test_damaged_checkpoint_is_rejected_by_name(parse, tmp_path):
             runs.load_checkpoint(args, parts())
             unnoticed += 1  # nothing but padding or a date was hit:
             assert str(torch.load(run / "checkpoint.pt", weights_only=True)) == str(saved)
-    assert unnoticed < 50
+    assert unnoticed < 10
 
 
 def test_events_of_repeated_steps_are_hidden(parse, tmp_path):
@@ -419,21 +396,6 @@ def test_run_continues_with_step_time_and_best_evaluation(parse, tmp_path, monke
     resumed.close()
 
 
-def test_run_prints_its_folder_before_anything_else(parse, tmp_path, capsys):
-    run, _ = begin(parse, tmp_path)
-    assert capsys.readouterr().out == f"run folder: {run.folder}\n"
-
-
-def test_bar_shows_labelled_values_in_their_order(parse, tmp_path, capsys):
-    run, _ = begin(parse, tmp_path)
-    run.start(10, "update")
-    run.show(**{"validation success": "0.620", "best": "0.710"})
-    run.close()
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("training: 0%, 0/10, ")
-    assert line.endswith("validation success=0.620, best=0.710")
-
-
 def test_equal_score_is_the_best_and_nan_never(parse, tmp_path):
     run, _ = begin(parse, tmp_path)
     run.start(10, "update")
@@ -459,20 +421,3 @@ def test_log_writes_numbers_and_means_of_tensors(parse, tmp_path):
     assert [(one.step, one.value) for one in events.Scalars("charts/b")] == [(7, 3.0), (6, 5.0)]
     (image,) = events.Images("eval/image")
     assert (image.step, image.width, image.height) == (7, 6, 4)
-
-
-def test_result_has_the_flags(parse, tmp_path):
-    run, _ = begin(parse, tmp_path, "--name", "x")
-    run.write_result({"error": 0.5})
-    result = json.loads((run.folder / "result.json").read_text())
-    assert result["error"] == 0.5 and result["args"]["name"] == "x"
-
-
-@pytest.mark.parametrize(("given", "expected"), [(None, 1), ("2", 2)])
-def test_torch_has_one_thread_or_those_of_the_environment(tmp_path, given, expected):
-    env = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
-    env |= {} if given is None else {"OMP_NUM_THREADS": given}
-    code = SCRIPT + "runs.seed_torch(args)\nprint(torch.get_num_threads())"
-    command = [sys.executable, "-c", code, "--runs-dir", tmp_path]
-    ended = subprocess.run(command, capture_output=True, text=True, env=env, check=True)
-    assert ended.stdout == f"{expected}\n"

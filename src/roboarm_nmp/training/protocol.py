@@ -30,7 +30,7 @@ from roboarm_nmp.networks.exported_networks import load_network, save_network
 from roboarm_nmp.policies.registry import policy_file, recurrent_size
 from roboarm_nmp.training.collection import FinishedEpisode, TrainingEnvs
 from roboarm_nmp.training.cuda_graphs import to_device
-from roboarm_nmp.training.runs import Run, RunFlags, check_finite, errors_of, script_name
+from roboarm_nmp.training.runs import Run, RunFlags, check_finite, errors_of, fail, script_name
 from roboarm_nmp.utils.flags import CORES, Horizon, NonNegativeInt, PositiveFloat, PositiveInt
 from roboarm_nmp.utils.progress import progress_bar
 
@@ -104,7 +104,7 @@ def load_task(args: PolicyFlags) -> tuple[Queries, Queries]:
     """
     try:
         if not envs.get_task(args.task).trainable:
-            sys.exit(f"{args.task} is for testing only: nothing may be learned from it")
+            fail(f"{args.task} is for testing only: nothing may be learned from it")
         validation = load_queries(args.task, "validation")
         test = load_queries(args.task, "test")
         return (
@@ -112,7 +112,7 @@ def load_task(args: PolicyFlags) -> tuple[Queries, Queries]:
             _first(test, "--test-queries", args.test_queries),
         )
     except ValueError as error:
-        sys.exit(f"--task: {error}")
+        fail(f"--task: {error}")
 
 
 def copy_weights(policy: str, module: torch.nn.Module) -> None:
@@ -146,7 +146,7 @@ def make_envs(task: str, number: int, **kwargs) -> list:
         return [envs.make(task, **kwargs) for _ in range(number)]
     except ValueError as error:
         flags = [f"--{name.replace('_', '-')}" for name in OBSERVED if kwargs.get(name)]
-        sys.exit(f"{' or '.join(flags)}: {error}" if flags else str(error))
+        fail(f"{' or '.join(flags)}: {error}" if flags else error)
 
 
 def make_eval_envs(task: str, num_queries: int, **kwargs) -> list:
@@ -181,7 +181,7 @@ def make_training_envs(
     """
     if demo_prob is None and (demos or bc_weight > 0):
         flag = "--demos" if demos else "--bc-weight"
-        sys.exit(f"{flag} goes with --demo-prob")
+        fail(f"{flag} goes with --demo-prob")
     made = make_envs(args.task, args.num_envs, **env_arguments_of(args))
     # A GPU waits for its environments; on a CPU they take less time than the updates.
     processes = min(args.num_envs, CORES) if torch.device(args.device).type == "cuda" else 0

@@ -40,7 +40,7 @@ from collections.abc import Collection, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import numpy as np
 import torch
@@ -57,7 +57,7 @@ from roboarm_nmp.utils.files import (
 )
 from roboarm_nmp.utils.flags import Seed
 from roboarm_nmp.utils.progress import progress_bar
-from roboarm_nmp.utils.signals import Terminated, end_with_one_line, exit_interrupted
+from roboarm_nmp.utils.signals import Terminated, end_with_one_line, error_line, exit_interrupted
 
 
 @dataclass
@@ -103,20 +103,20 @@ def parse_args(Args: type[Flags], may_change: Collection[str] = ()) -> Flags:
             args = _args_of_run(Args, args.resume, MAY_CHANGE | set(may_change))
             flags.check(args)
     except ValueError as error:
-        sys.exit(str(error))
+        fail(error)
     if args.resume is None:
         with errors_of("--runs-dir"):
             check_folder(args.runs_dir)
     try:
         device = torch.device(args.device)
     except RuntimeError:
-        sys.exit(f"--device must be `cpu` or `cuda`, got {args.device!r}")
+        fail(f"--device must be `cpu` or `cuda`, got {args.device!r}")
     if device.type == "cuda":
         number = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if (device.index or 0) >= number:
-            sys.exit(f"--device {args.device}: PyTorch sees {number or 'no'} CUDA device(s) here")
+            fail(f"--device {args.device}: PyTorch sees {number or 'no'} CUDA device(s) here")
     if args.track and importlib.util.find_spec("wandb") is None:
-        sys.exit("--track: wandb is not installed (pip install wandb)")
+        fail("--track: wandb is not installed (pip install wandb)")
     if getattr(args, "bf16", False) is None:  # args.json has the choice: resuming keeps it
         supported = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
         args.bf16 = supported  # pyright: ignore[reportAttributeAccessIssue]
@@ -126,7 +126,7 @@ def parse_args(Args: type[Flags], may_change: Collection[str] = ()) -> Flags:
 def _args_of_run(Args: type[Flags], run: Path, may_change: set[str]) -> Flags:
     """The flags of a run and of the command line, which may change some of them."""
     if not (run / "args.json").exists():
-        sys.exit(f"--resume: {run} is no run's folder (it has no args.json)")
+        fail(f"--resume: {run} is no run's folder (it has no args.json)")
     saved = json.loads((run / "args.json").read_text())
     kinds = typing.get_type_hints(Args)
     known = [field.name for field in fields(Args) if field.name in saved]
@@ -143,7 +143,7 @@ def _args_of_run(Args: type[Flags], run: Path, may_change: set[str]) -> Flags:
         if name not in may_change and now[name] != before[name]
     ]
     if contradicted:
-        sys.exit("--resume: the run has another configuration: " + "; ".join(contradicted))
+        fail("--resume: the run has another configuration: " + "; ".join(contradicted))
     return args
 
 
@@ -179,13 +179,18 @@ def write_json(path: Path, content: dict) -> None:
     write_atomically(path, _to_json(content).encode())
 
 
+def fail(message: object) -> NoReturn:
+    """End the program with a line that begins with its command: `roboarm train sac: …`."""
+    sys.exit(error_line(message))
+
+
 @contextlib.contextmanager
 def errors_of(flag: str) -> Iterator[None]:
     """Inside, a ValueError ends the program with a line that names the flag, e.g. "--paths"."""
     try:
         yield
     except ValueError as error:
-        sys.exit(f"{flag}: {error}")
+        fail(f"{flag}: {error}")
 
 
 def script_name() -> str:
@@ -303,14 +308,14 @@ def load_checkpoint(args: RunFlags, parts: dict) -> None:
         check_archive(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file leads to any of many
-        sys.exit(f"--resume: {path} is damaged: {error}")
+        fail(f"--resume: {path} is damaged: {error}")
     for name, part in parts.items():
         try:
             _restore(part, state[name])
         except KeyError as error:
-            sys.exit(f"--resume: {path} is of another version: it has no {error.args[0]}")
+            fail(f"--resume: {path} is of another version: it has no {error.args[0]}")
         except RuntimeError:  # PyTorch's, which lists all weights
-            sys.exit(f"--resume: {path} is of another version: the layers of its {name} are others")
+            fail(f"--resume: {path} is of another version: the layers of its {name} are others")
     torch.set_rng_state(state["torch_rng"])
     if "cuda_rng" in state:
         torch.cuda.set_rng_state(state["cuda_rng"], args.device)
