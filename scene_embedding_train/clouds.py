@@ -179,6 +179,7 @@ def whole_clouds(observations: Observations, shard: int, name: str) -> tuple[Ten
     Points, float32 (n, samples, 3), m, and labels, uint8 (n, samples).
     """
     sensor = observations.sensors[name]
+    assert isinstance(sensor, PointCloud)
     depths = observations.read(shard, f"{name}/depth")
     segmentations = observations.read(shard, f"{name}/segmentation")
     clouds = [

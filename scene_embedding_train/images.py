@@ -26,12 +26,13 @@ def load_images(observations: Observations, size: int) -> tuple[np.ndarray, list
     Raises:
         SystemExit: there are no images, or their size does not fit.
     """
-    sensors = observations.sensors
-    cameras = [name for name, sensor in sensors.items() if isinstance(sensor, Camera)]
+    cameras = {
+        name: sensor for name, sensor in observations.sensors.items() if isinstance(sensor, Camera)
+    }
     if not cameras:
         fail(f"--observations: {observations.folder} has no images (collect with --sensors)")
-    sizes = {sensors[name].size for name in cameras}
-    if len(sizes) > 1 or any("rgb" not in sensors[name].outputs for name in cameras):
+    sizes = {camera.size for camera in cameras.values()}
+    if len(sizes) > 1 or any("rgb" not in camera.outputs for camera in cameras.values()):
         fail(f"--observations: {observations.folder}: the cameras differ in size, or lack rgb")
     width, height = sizes.pop()
     if width != height or width % size:
@@ -41,7 +42,7 @@ def load_images(observations: Observations, size: int) -> tuple[np.ndarray, list
         for shard in range(len(observations.offsets) - 1)
     )
     arrays = {"rgb": (np.uint8, (len(cameras), size, size, 3))}
-    return unpack(observations, f"images_{size}", arrays, shards)["rgb"], cameras
+    return unpack(observations, f"images_{size}", arrays, shards)["rgb"], list(cameras)
 
 
 def _images_of_shard(observations, shard, cameras, size):
