@@ -7,6 +7,7 @@ to bottom, and the processes that it spawns find it under its module's name.
 import gc
 import runpy
 import sys
+from collections.abc import Sequence
 
 from roboarm_nmp.utils.names import suggest
 from roboarm_nmp.utils.signals import end_with_one_line
@@ -43,20 +44,23 @@ COMMANDS = {
 }
 
 
-def _usage(prog, commands):
+def _usage(prog: str, commands: dict) -> str:
     rows = [f"  {name:<14}{summary}" for name, (_, summary) in commands.items()]
     return "\n".join([f"usage: {prog} COMMAND [--help] ...", "", *rows])
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run a subcommand.
 
     Returns the exit code: 0, 1 without a package that it needs, 2 for an unknown command.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    prog, commands = "roboarm", COMMANDS
+    prog = "roboarm"
+    commands = COMMANDS
     if arguments[:1] == ["train"]:
-        prog, commands, arguments = "roboarm train", TRAINERS, arguments[1:]
+        prog = "roboarm train"
+        commands = TRAINERS
+        arguments = arguments[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage(prog, commands))
         return 0 if arguments else 2
