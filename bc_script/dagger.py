@@ -40,7 +40,8 @@ from roboarm_nmp.utils.random_streams import Stream
 class Args(protocol.PolicyFlags):
     # More flags: `roboarm_nmp.training.protocol` (task), `roboarm_nmp.training.runs` (run).
     task: str = "random_boxes_hard"
-    """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md)"""
+    """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md);
+    with another arm TASK@FILE, a robot's file (docs/customise/robot.md)"""
     goal_type: Literal["config", "combined", "pose"] = "combined"
     """what the goal is: configuration, that and end-effector position, or end-effector pose"""
     paths: tuple[Path, ...] = (Path("roadmaps"),)
@@ -117,7 +118,8 @@ class Block(nn.Module):
     def __init__(self, size, bf16):
         super().__init__()
         self.norm = nn.LayerNorm(size)
-        self.first, self.second = Bf16Linear(size, size, bf16), Bf16Linear(size, size, bf16)
+        self.first = Bf16Linear(size, size, bf16)
+        self.second = Bf16Linear(size, size, bf16)
 
     def forward(self, x):
         return x + self.second(F.relu(self.first(self.norm(x))))
