@@ -46,7 +46,7 @@ def test_flag_out_of_range_is_rejected_by_name(script, flag, value, args_of, mon
     monkeypatch.setattr(sys, "argv", [script, flag, *value.split()])
     with pytest.raises(SystemExit) as ended:
         runs.parse_args(args_of[script])
-    assert str(ended.value.code).startswith(f"{script}: {flag} ")
+    assert str(ended.value.code).startswith(f"{script}: {flag}")
     assert str(ended.value.code).count("\n") == 0
     assert not list(tmp_path.iterdir())
 
