@@ -131,7 +131,7 @@ def _task_scene(args: Args) -> Scene:
 
 def _observed_scene(args: Args, path: Path, robot: Robot) -> ObservedScene:
     """The `ObservedScene` of the cloud, which is prepared and described."""
-    from roboarm_nmp.envs.perception.cloud_files import load_cloud
+    from roboarm_nmp.datasets.cloud_files import load_cloud
     from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
     from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE
 

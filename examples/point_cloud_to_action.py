@@ -15,9 +15,9 @@ import argparse
 import numpy as np
 
 import roboarm_nmp
+from roboarm_nmp.datasets.cloud_files import load_cloud
 from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.perception.cloud_files import load_cloud
 from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
 from roboarm_nmp.envs.scenes.primitives import ObservedScene
 from roboarm_nmp.evaluation.rollout import rollout

@@ -8,7 +8,6 @@ import pytest
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.collision.timed_checker import TimedChecker
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence, Waypoints
@@ -18,6 +17,7 @@ from roboarm_nmp.planning import space_time
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import PlanningError
 from roboarm_nmp.planning.space_time import SpaceTimePlanner
+from roboarm_nmp.planning.timed_checker import TimedChecker
 from roboarm_nmp.policies.registry import PolicyError, make_policy
 from roboarm_nmp.policies.safety_filter import (
     CBF_GAIN,

@@ -23,10 +23,10 @@ import numpy as np
 
 from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv
 from roboarm_nmp.envs.collision.checker import self_distances
-from roboarm_nmp.envs.collision.filter_kernels import project
 from roboarm_nmp.envs.robots.inverse_kinematics import kinematic_chain
 from roboarm_nmp.envs.robots.kernels import move_back
 from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.planning.projection_kernels import project
 
 # The clearances were compared on validation queries, how paths climb on problems of
 # MotionBenchMaker: docs/lab_notebook.md, "Approach paths".

@@ -24,12 +24,12 @@ from scipy.spatial import KDTree
 
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.collision.timed_checker import TimedChecker
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import MARGIN_GROWTH, PlanningError
+from roboarm_nmp.planning.timed_checker import TimedChecker
 
 # m: what attempts keep clear, between links and from obstacles, from obstacles in addition. Each
 # attempt has a roadmap of its own, of so many nodes.

@@ -47,11 +47,11 @@ import numpy as np
 
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker, self_distances
-from roboarm_nmp.envs.collision.filter_kernels import project
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.planning.approach_path import ApproachPaths
+from roboarm_nmp.planning.projection_kernels import project
 from roboarm_nmp.policies.policy import Policy
 
 # Of the filter's behaviour, recorded in results. 1: other escapes, no virtual obstacles. 2: slow

@@ -9,7 +9,6 @@ from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.moving import free_over_time
-from roboarm_nmp.envs.collision.timed_checker import TimedChecker
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.variants import with_attached
@@ -32,6 +31,7 @@ from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.planning.timed_checker import TimedChecker
 from roboarm_nmp.utils.documents import DocumentError
 
 START = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from attacks.children import RAN, REFUSED
-from roboarm_nmp.envs.perception.cloud_files import CloudError, load_cloud
+from roboarm_nmp.datasets.cloud_files import CloudError, load_cloud
 from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
 
 POINTS = np.random.default_rng(0).uniform(-0.8, 0.8, (40, 3)).astype(np.float32)

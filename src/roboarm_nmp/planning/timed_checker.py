@@ -18,8 +18,8 @@ from roboarm_nmp.envs.collision.hulls import (
     world_shapes,
 )
 from roboarm_nmp.envs.collision.moving import motion_arrays
-from roboarm_nmp.envs.collision.timed_kernels import first_departure, free_in_time, rows_in_time
 from roboarm_nmp.envs.scenes.primitives import Scene, floor_box
+from roboarm_nmp.planning.timed_kernels import first_departure, free_in_time, rows_in_time
 
 
 class TimedChecker:

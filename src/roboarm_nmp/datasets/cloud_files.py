@@ -30,7 +30,7 @@ from typing import IO
 import numpy as np
 from PIL import Image
 
-from roboarm_nmp.envs.perception.lzf_kernels import decompress_lzf
+from roboarm_nmp.datasets.lzf_kernels import decompress_lzf
 from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.numbers import is_number, unit_quaternion
 

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from roboarm_nmp.envs.perception import cloud_files
-from roboarm_nmp.envs.perception.cloud_files import CloudError, load_cloud
+from roboarm_nmp.datasets import cloud_files
+from roboarm_nmp.datasets.cloud_files import CloudError, load_cloud
 
 POINTS = np.array([[0.5, -0.25, 0.125], [1.0, 2.0, -3.0], [0.0, 0.0, 0.75]])
 
