@@ -284,7 +284,7 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
         (["wall", *gif, "--policy", "go-to-gaol"], "no such policy: go-to-gaol"),
         (["wall", *gif, "--policy", tmp_path / "broken.pt"], "broken.pt: not a network file"),
         (["wall", *gif, "--policy", unfit], "unfit.pt: aten.sub.Tensor failed"),
-        (["wall", *gif, "--policy", strange], "goal_type must be one of"),
+        (["wall", *gif, "--policy", strange], "strange.pt: does not say which goal type"),
         (["wall", *gif, "--policy", policy, "--goal-type", "ee"], "with the goal type 'config'"),
         (["benchmaker_bookshelf_tall", *gif, "--policy", "demo"], "has no demonstrations"),
         (["wall", *gif, "--trajectory", tmp_path / "none.csv"], "none.csv: No such file"),
