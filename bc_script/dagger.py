@@ -170,9 +170,10 @@ class Actor(nn.Module):
         states = arm[:, :joints]
         distances = link_distances.unsqueeze(1)
         inputs = [arm, desired_goal]
-        if goal_link_distances is None:  # the goal is a pose
+        if self.goal_is_pose:
             inputs.append(5.0 * pose_difference(arm[:, joints:], desired_goal))
         else:
+            assert goal_link_distances is not None
             states = torch.cat([states, desired_goal[:, :joints]], dim=1)
             distances = torch.stack([link_distances, goal_link_distances], dim=1)
         angles = (states.unflatten(1, (-1, joints)) * self.half_range + self.middle).flatten(1)
