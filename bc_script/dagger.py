@@ -8,7 +8,7 @@ A policy for new scenes. It imitates the directions of a roadmap's smoothed path
 configurations near such paths and from those that the policy itself visits (DAgger: Ross et al.,
 2011). It observes the encoded scene (`--encoder`) and the signed distance of each link, here and at
 the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a safety filter. For an algorithm of
-your own, copy this file and change the parts under `# ALGO LOGIC`.
+your own, copy this file and change the parts under `# ALGO LOGIC`; `# SHARED` is as in `bc.py`.
 """
 
 import functools
@@ -30,7 +30,7 @@ from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
 from roboarm_nmp.training import cuda_graphs, protocol, runs
-from roboarm_nmp.training.network_parts import Bf16Linear, polyak_update, pose_difference
+from roboarm_nmp.training.network_parts import Bf16Linear, pose_difference
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.progress import progress_bar
 from roboarm_nmp.utils.random_streams import Stream
@@ -112,6 +112,18 @@ class Args(protocol.PolicyFlags):
 
 
 # ALGO LOGIC: the policy
+# SHARED: averaging
+def polyak_update(target, network, tau):
+    """target <- (1 - tau) target + tau network, all parameters at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
+            list(target.parameters()), list(network.parameters()), tau
+        )
+
+
+# END SHARED
+
+
 class Block(nn.Module):
     """A residual block."""
 

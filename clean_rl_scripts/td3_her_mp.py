@@ -20,9 +20,8 @@ import torch.nn as nn
 from roboarm_nmp.datasets.episodes import demo_transitions
 from roboarm_nmp.training import cuda_graphs, protocol, runs
 from roboarm_nmp.training.network_parts import (
+    Bf16Linear,
     JacobianTranspose,
-    mlp,
-    polyak_update,
     pose_difference,
 )
 from roboarm_nmp.utils import flags
@@ -94,6 +93,34 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
 
 
 # ALGO LOGIC: networks
+# SHARED: averaging
+def polyak_update(target, network, tau):
+    """target <- (1 - tau) target + tau network, all parameters at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
+            list(target.parameters()), list(network.parameters()), tau
+        )
+
+
+# END SHARED
+
+
+# SHARED: MLP
+def mlp(num_inputs, num_outputs, args, layer_norm=False):
+    """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
+    size = args.hidden_size
+    layers = []
+    for i in range(args.num_hidden_layers):
+        layers.append(nn.Linear(num_inputs, size) if i == 0 else Bf16Linear(size, size, args.bf16))
+        if layer_norm:
+            layers.append(nn.LayerNorm(size))
+        layers.append(nn.ReLU())
+    return nn.Sequential(*layers, nn.Linear(size, num_outputs))
+
+
+# END SHARED
+
+
 # SHARED: features and critics
 class Features(nn.Module):
     """Network inputs: observation, goal and, unless plain, functions of them that ease learning."""

@@ -1,4 +1,4 @@
-"""Parts of policies' networks: layers, an arm's kinematics and differences of poses as inputs."""
+"""Parts of policies' networks: a layer, an arm's kinematics and differences of poses as inputs."""
 
 import numpy as np
 import torch
@@ -26,29 +26,6 @@ class Bf16Linear(nn.Linear):
         if not (self.bf16 and self.training):
             return super().forward(x)
         return F.linear(x.bfloat16(), self.weight.bfloat16(), self.bias.bfloat16()).float()
-
-
-def mlp(num_inputs: int, num_outputs: int, args, layer_norm: bool = False) -> nn.Sequential:
-    """Hidden layers, as the flags say, and a head.
-
-    The first layer is in float32: 2 cm need more than bfloat16's 8 bits.
-    """
-    size = args.hidden_size
-    layers = []
-    for i in range(args.num_hidden_layers):
-        layers.append(nn.Linear(num_inputs, size) if i == 0 else Bf16Linear(size, size, args.bf16))
-        if layer_norm:
-            layers.append(nn.LayerNorm(size))
-        layers.append(nn.ReLU())
-    return nn.Sequential(*layers, nn.Linear(size, num_outputs))
-
-
-def polyak_update(target: nn.Module, network: nn.Module, tau: float) -> None:
-    """target <- (1 - tau) target + tau network, all parameters at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
-            list(target.parameters()), list(network.parameters()), tau
-        )
 
 
 class JacobianTranspose(nn.Module):
