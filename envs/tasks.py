@@ -97,20 +97,6 @@ def split_robot(task: str | Path) -> tuple[str, str | None]:
     return text, None
 
 
-def task_with_robot(task, robot):
-    """`TASK@ROBOT`, of the flags `--task` and `--robot`; the task itself if the robot is None.
-
-    Raises ValueError: the task names a robot, too, or there is a robot without a task.
-    """
-    if robot is None:
-        return task
-    if task is None:
-        raise ValueError("--robot goes with --task")
-    if split_robot(task)[1] is not None:
-        raise ValueError(f"--robot {robot}: the task names a robot already, {task}")
-    return f"{task}@{robot}"
-
-
 def with_robot(scene: Any, robot: Robot) -> Any:
     """A `Scene`, or a distribution of scenes, with another robot."""
     if isinstance(scene, Scene):

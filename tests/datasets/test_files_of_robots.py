@@ -157,29 +157,26 @@ def test_file_of_the_panda_is_rejected_for_another_robot(file, tmp_path):
 
 
 def test_missing_file_names_the_command_that_makes_it(file):
-    task, flags = f"random_boxes_easy@{file}", f"--task random_boxes_easy --robot {file}"
-    with pytest.raises(DatasetError, match=f"no such file; make it with: roboarm queries {flags}"):
-        load_queries(task)
-    with pytest.raises(DatasetError, match=f"no such file; make it with: roboarm collect {flags}"):
-        load_demos(task)
+    task = f"random_boxes_easy@{file}"
+    for load, command in ((load_queries, "queries"), (load_demos, "collect")):
+        hint = f"no such file; make it with: roboarm {command} --task {task}"
+        with pytest.raises(DatasetError, match=hint):
+            load(task)
 
 
 def test_data_command_takes_a_robot(file, capsys):
     task = f"no_obstacles@{file}"
     write_some_queries(query_path(task), task)
     write_some_demos(demo_path(task), task)
-    robot = ["--robot", str(file)]
-    assert main(["validate", "no_obstacles", *robot]) == 0
-    assert main(["validate", str(query_path(task)), "--task", "no_obstacles", *robot]) == 0
-    assert main(["describe", "no_obstacles", *robot]) == 0
+    assert main(["validate", task]) == 0
+    assert main(["validate", str(query_path(task)), "--task", task]) == 0
+    assert main(["describe", task]) == 0
     assert "demonstrations | 3" in capsys.readouterr().out
-    for arguments, message in (
-        ([str(query_path(task))], "name the robot's file, as TASK@ROBOT or --robot"),
-        ([str(query_path(task)), *robot], "--robot of a file needs its --task"),
-        ([task, *robot], "the task names a robot already"),
-        (["wall", *robot], "wall is the Panda's"),
+    for wrong, message in (
+        (str(query_path(task)), "name the robot's file, as TASK@FILE"),
+        (f"wall@{file}", "wall is the Panda's"),
     ):
-        assert main(["validate", *arguments]) == 1
+        assert main(["validate", wrong]) == 1
         assert message in capsys.readouterr().err
 
 

@@ -2,7 +2,7 @@
 
 roboarm data validate src/roboarm_nmp/datasets/data/wall.h5 --simulate
 roboarm data describe wall boxes
-roboarm data describe no_obstacles --robot ur5.yaml
+roboarm data describe no_obstacles@ur5.yaml
 """
 
 import argparse
@@ -13,7 +13,7 @@ from pathlib import Path
 from roboarm_nmp.datasets.demonstrations import demo_path, describe, load_demos
 from roboarm_nmp.datasets.format import locate
 from roboarm_nmp.datasets.queries import query_path, validate
-from roboarm_nmp.envs.tasks import get_task, is_task, task_with_robot
+from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 
@@ -22,7 +22,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         if options.task is not None:
-            options.task = task_with_robot(options.task, options.robot)
             get_task(options.task)
     except ValueError as error:
         print(error_line(f"--task: {error}"), file=sys.stderr)
@@ -36,12 +35,9 @@ def _parser():
     files = argparse.ArgumentParser(add_help=False)
     files.add_argument("files", nargs="+", metavar="FILE", help="path of a file, or task")
     files.add_argument(
-        "--task", help="the task the files must be for; files of arms other than the Panda need it"
-    )
-    files.add_argument(
-        "--robot",
-        metavar="FILE",
-        help="another arm: a robot's file (.urdf, .yaml; docs/customise/robot.md), as TASK@FILE",
+        "--task",
+        help="the task the files must be for; files of arms other than the Panda need it, as "
+        "TASK@FILE with a robot's file (.urdf, .yaml; docs/customise/robot.md)",
     )
     parser = argparse.ArgumentParser(
         prog="roboarm data",
@@ -75,11 +71,7 @@ def _parser():
 def _locate(
     file: str, path_of_task: Callable[[str], Path], options: argparse.Namespace
 ) -> tuple[Path, str | None]:
-    """(path, task it must be for) of a file, or of a task with the robot of `--robot`."""
-    if is_task(file):
-        file = task_with_robot(file, options.robot)
-    elif options.robot is not None and options.task is None:
-        raise ValueError(f"{file}: --robot of a file needs its --task")
+    """(path, task it must be for) of a file, or of a task."""
     path, task = locate(file, path_of_task)
     return path, options.task or task
 

@@ -348,7 +348,7 @@ def check_robot(path: str | Path, name: str, fingerprint: str, arm: Robot) -> No
     if name == arm.name:
         hint = ": its description is another one, so make the file again"
     elif arm == PANDA:
-        hint = ": name the robot's file, as TASK@ROBOT or --robot"
+        hint = ": name the robot's file, as TASK@FILE"
     raise DatasetError(
         f"{path}: made for the robot {name!r} ({fingerprint[:12]}), not for {arm.name!r} "
         f"({arm.fingerprint[:12]}){hint}"
@@ -474,10 +474,8 @@ def _command_for(schema, task):
     """The command that makes a task's file, for a message; nothing where there is none."""
     if schema == DEMO_SCHEMA and not get_task(task).trainable:
         return ""
-    name, robot = split_robot(task)
     command = "queries" if schema == QUERY_SCHEMA else "collect"
-    flags = f"--task {name}" if robot is None else f"--task {name} --robot {robot}"
-    return f"; make it with: roboarm {command} {flags}"
+    return f"; make it with: roboarm {command} --task {task}"
 
 
 def _read_open(path, file, schema, task, robot):

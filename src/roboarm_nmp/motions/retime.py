@@ -32,9 +32,9 @@ class Args:
     output: Path
     """the file to write"""
     task: str | None = None
-    """a task, or a scene file (.yaml): check collisions in its scene"""
+    """a task, or a scene file (.yaml): check collisions in its scene. Another arm is TASK@FILE"""
     robot: Path | None = None
-    """another arm than the Panda, or than the task's: a robot's file (.urdf, .yaml;
+    """without --task, another arm than the Panda: a robot's file (.urdf, .yaml;
     docs/customise/robot.md)"""
     query: NonNegativeInt = 0
     """where scenes vary: in the scene of the query with this number"""
@@ -74,6 +74,8 @@ def retime(args: Args) -> str:
     check_writable(args.output)
     checker = None
     robot = PANDA
+    if args.task is not None and args.robot is not None:
+        raise ValueError(f"--robot goes without --task: name the arm by --task {args.task}@FILE")
     if args.task is not None:
         checker = _checker(args)
         robot = checker.robot
@@ -113,12 +115,10 @@ def _checker(args):
     from roboarm_nmp.datasets.queries import load_queries
     from roboarm_nmp.envs.collision.checker import CollisionChecker
     from roboarm_nmp.envs.scenes.primitives import Scene
-    from roboarm_nmp.envs.tasks import task_with_robot
 
-    task = task_with_robot(args.task, args.robot)
-    scene = envs.get_task(task).scene
+    scene = envs.get_task(args.task).scene
     if not isinstance(scene, Scene):
-        queries = load_queries(task, args.split)
+        queries = load_queries(args.task, args.split)
         if args.query >= len(queries):
             raise ValueError(f"--query: the numbers are 0 to {len(queries) - 1}, got {args.query}")
         scene = queries[args.query].scene
