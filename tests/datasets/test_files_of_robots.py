@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from paths import ROOT
 
-from roboarm_nmp.datasets import roadmap_paths
 from roboarm_nmp.datasets.__main__ import main
 from roboarm_nmp.datasets.demonstrations import demo_path, describe, load_demos, write_demos
 from roboarm_nmp.datasets.format import DatasetError
@@ -16,7 +15,6 @@ from roboarm_nmp.datasets.queries import (
     write_queries,
 )
 from roboarm_nmp.envs.robots.files import load_robot
-from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.tasks import get_task, is_task, split_robot, task_name
@@ -112,19 +110,6 @@ def test_demonstrations_of_six_joints_round_trip(file):
     assert describe(demos)["path_length"] == pytest.approx(np.mean(lengths), rel=1e-3)
 
 
-def test_other_widths_and_limits_are_those_of_the_robot(file, tmp_path):
-    task, path = f"no_obstacles@{file}", tmp_path / "queries.h5"
-    rng, robot = np.random.default_rng(0), load_robot(file)
-    good = tuple(random_configurations(robot, rng, 3) for _ in range(2))
-    for bad, message in (
-        (tuple(random_configurations(PANDA, rng, 3) for _ in range(2)), r"shape \(n, 6\)"),
-        ((good[0] + np.float32(7.0), good[1]), "outside the joint limits"),
-    ):
-        with pytest.raises(DatasetError, match=message):
-            write_queries(path, task, 0, {"test": bad, "validation": good}, "", {})
-    assert not path.exists()
-
-
 @pytest.mark.parametrize("load", [load_queries, load_demos])
 def test_file_of_another_robot_is_rejected(load, file, tmp_path):
     task, path = f"no_obstacles@{file}", tmp_path / "file.h5"
@@ -144,26 +129,6 @@ def test_file_of_another_robot_is_rejected(load, file, tmp_path):
         load(path, task=f"no_obstacles@{changed}")
 
 
-def test_file_of_the_panda_is_rejected_for_another_robot(file, tmp_path):
-    write_some_queries(tmp_path / "queries.h5", "no_obstacles")
-    with pytest.raises(DatasetError, match="for the task 'no_obstacles', not 'no_obstacles@xarm6'"):
-        load_queries(tmp_path / "queries.h5", task=f"no_obstacles@{file}")
-    scene = tmp_path / "empty.yaml"
-    save_scene(Scene(), scene)
-    write_some_queries(query_path(scene), scene)
-    scene.write_text(f"robot: {file}\n" + scene.read_text())
-    with pytest.raises(DatasetError, match="made for the robot 'panda' .*, not for 'xarm6'"):
-        load_queries(scene)
-
-
-def test_missing_file_names_the_command_that_makes_it(file):
-    task = f"random_boxes_easy@{file}"
-    for load, command in ((load_queries, "queries"), (load_demos, "collect")):
-        hint = f"no such file; make it with: roboarm {command} --task {task}"
-        with pytest.raises(DatasetError, match=hint):
-            load(task)
-
-
 def test_data_command_takes_a_robot(file, capsys):
     task = f"no_obstacles@{file}"
     write_some_queries(query_path(task), task)
@@ -178,17 +143,3 @@ def test_data_command_takes_a_robot(file, capsys):
     ):
         assert main(["validate", wrong]) == 1
         assert message in capsys.readouterr().err
-
-
-def test_roadmap_paths_belong_to_their_robot(file, tmp_path):
-    task, rng = f"random_boxes_hard@{file}", np.random.default_rng(0)
-    scenes = [get_task(task).scene.sample(rng) for _ in range(2)]
-    paths = [[rng.uniform(-1, 1, (k, 6)).astype(np.float32) for k in (2, 5)], []]
-    contents = roadmap_paths.shard_bytes(task, 0, 0, scenes, paths, "made by a test")
-    (tmp_path / "shard_00000.h5").write_bytes(contents)
-    loaded = roadmap_paths.load_roadmap_paths(tmp_path, load_robot(file))
-    assert [loaded.scenes[i] for i in range(2)] == scenes
-    for one, other in zip(loaded.of_scene(0), paths[0], strict=True):
-        np.testing.assert_array_equal(one, other)
-    with pytest.raises(DatasetError, match="made for the robot 'xarm6' .*, not for 'panda'"):
-        roadmap_paths.load_roadmap_paths(tmp_path)

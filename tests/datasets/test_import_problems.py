@@ -88,24 +88,6 @@ def test_goals_that_cannot_be_reached_are_left_out(tmp_path):
     assert not rejected and kept[0].goals.tolist() == GOALS[1:]
 
 
-def test_gripper_that_does_not_fit_rejects_a_problem(tmp_path):
-    """A box beside the hand at the goal, which only the wider gripper meets."""
-    position, rotation = roboarm_nmp.make("wall").robot.frame_poses(GOALS[0])[6]
-    side = rotation @ (np.sqrt(0.5) * np.array([1.0, 1.0, 0.0]))
-    centre = (position + 0.2 * rotation[:, 2] + 0.08 * side).tolist()
-    box = f"""
-    - id: beside
-      primitives: [{{type: box, dimensions: [0.005, 0.005, 0.005]}}]
-      primitive_poses: [{{position: {centre}, orientation: [0, 0, 0, 1]}}]
-"""
-    folder = write_folder(tmp_path / "shelf", scene=MOVEIT_SCENE + box)
-    narrow = MOVEIT_REQUEST.replace("0.065", "0.04")
-    write_folder(folder, "0002", scene=MOVEIT_SCENE + box, request=narrow)
-    kept, [rejected] = import_problems([folder])
-    assert [problem.name for problem in kept] == ["shelf/0002"]
-    assert rejected.reason == "goal in collision: the arm with obstacle 3"
-
-
 def test_file_is_replaced_only_if_asked(folder, tmp_path):
     output = write_file(tmp_path / "problems.h5", "mine")
     with pytest.raises(SystemExit, match="exists; --overwrite replaces it"):

@@ -1,11 +1,5 @@
 """Collecting observations: the same files after any interruption, and exact when read back."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
-
 import numpy as np
 import pytest
 
@@ -74,13 +68,6 @@ def test_stored_observations_are_those_of_the_sensors(whole):
     env.close()
 
 
-def test_scenes_and_configurations_are_all_different(whole):
-    observations = Observations(whole)
-    scenes = {scene for shard in range(3) for scene in observations.scenes(shard)}
-    poses = np.concatenate([observations.read(shard, "configuration") for shard in range(3)])
-    assert len(scenes) == len(np.unique(poses, axis=0)) == 5
-
-
 def test_sensors_are_stored_exactly():
     sensors = {**cardinal(size=(64, 48), outputs=("depth",)), "cloud": PointCloud((1, 2, 3))}
     assert sensors_from_json(sensors_to_json(sensors)) == sensors
@@ -107,31 +94,9 @@ def test_files_do_not_depend_on_workers_or_on_earlier_shards(whole, tmp_path, mo
     assert made == [(1, 2, 4), (2, 4, 5)] and shards(tmp_path) == shards(whole)
 
 
-@pytest.mark.slow
-def test_terminated_command_continues_to_the_same_files(whole, tmp_path):
-    command = [sys.executable, "-m", "roboarm_nmp", "observations", "--output", str(tmp_path)]
-    command += ["--num", "5", "--shard-size", "2", "--workers", "1"]
-    command += ["--image-size", "16", "--num-samples", "100"]
-    process = subprocess.Popen(
-        command, start_new_session=True, stderr=subprocess.PIPE, text=True, cwd=tmp_path
-    )
-    until = time.time() + 100
-    while not shard_path(tmp_path, 0).exists():
-        assert time.time() < until
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGTERM)
-    _, stderr = process.communicate()
-    assert process.returncode == 143 and "Traceback" not in stderr
-    assert stderr.splitlines()[-1] == "terminated; the same command continues from here"
-    result = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path)
-    assert "5 scenes" in result.stdout
-    assert {k: v for k, v in shards(tmp_path).items() if k.endswith(".h5")} == shards(whole)
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"num": 0}, "--num must be at least 1"),
         ({"task": "three_shelves"}, "for testing only"),
         ({"num_samples": 10}, "square number"),
     ],
@@ -154,16 +119,11 @@ def test_shards_of_another_collection_are_rejected(whole, tmp_path):
 
 
 def test_damaged_shard_is_rejected_by_name(whole, tmp_path):
-    with pytest.raises(DatasetError, match="no observations"):
-        Observations(tmp_path)
     for name, contents in shards(whole).items():
         (tmp_path / name).write_bytes(contents)
     good = (tmp_path / "shard_00001.h5").read_bytes()
     (tmp_path / "shard_00001.h5").write_bytes(good[: len(good) // 2])
     with pytest.raises(DatasetError, match=r"shard_00001\.h5: truncated or corrupt"):
-        Observations(tmp_path)
-    (tmp_path / "shard_00001.h5").unlink()
-    with pytest.raises(DatasetError, match=r"shard_00001\.h5: no such file"):
         Observations(tmp_path)
     bad = bytearray(good)
     at = good.index(Observations(whole).read(1, "configuration").tobytes())
@@ -171,9 +131,3 @@ def test_damaged_shard_is_rejected_by_name(whole, tmp_path):
     (tmp_path / "shard_00001.h5").write_bytes(bad)
     with pytest.raises(DatasetError, match=r"shard_00001\.h5: configuration is missing or corrupt"):
         Observations(tmp_path).read(1, "configuration")
-
-
-@pytest.mark.slow
-def test_cluster_makes_the_same_files(whole, tmp_path, cluster):
-    collect.collect(args(tmp_path, ray_address=cluster.address), progress=False)
-    assert shards(tmp_path) == shards(whole)

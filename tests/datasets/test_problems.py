@@ -25,7 +25,6 @@ from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.formats import load_world
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.world import World
-from roboarm_nmp.utils import documents
 from roboarm_nmp.utils.bullet import pybullet as p
 
 
@@ -161,10 +160,8 @@ def test_damaged_hdf5_is_rejected(tmp_path):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"start": np.full(7, np.nan)}, "start has numbers that are not finite"),
         ({"goals": np.empty((0, 7))}, "a problem has no goal"),
         ({"goal_pose": np.ones(7)}, "must have norm 1"),
-        ({"start": np.zeros(6)}, "inhomogeneous|start must have shape"),
     ],
 )
 def test_problems_that_cannot_be_are_not_written(change, reason, tmp_path):
@@ -180,21 +177,14 @@ def edited(text, old, new):
 
 
 REQUESTS = [
-    (edited(MOVEIT_REQUEST, "{joint_name: panda_joint2, position: -0.3}", "{}"), 6,
-     "a joint constraint lacks joint_name"),
     (edited(MOVEIT_REQUEST, "      - {joint_name: panda_joint6, position: 1.7}\n", ""), 3,
      "the goal lacks panda_joint6"),
     (edited(MOVEIT_REQUEST, "panda_finger_joint2", "thumb"), 13, "panda has no joint 'thumb'"),
-    (edited(MOVEIT_REQUEST, "0.785, 0.065]", "0.785]"), 13, "9 joints have 8 positions"),
     (edited(MOVEIT_REQUEST, "group_name: panda_arm", "path_constraints: {name: upright}"), 1,
      "path_constraints are not supported"),
-    (edited(MOVEIT_REQUEST, "  - joint_constraints:", "  - position_constraints: [{x: 1}]\n    "
-     "joint_constraints:"), 3, "position_constraints are not supported"),
-    ("group_name: x\n", 1, "a request lacks start_state"),
     ("group_name: !!python/object/apply:os.system ['touch hacked']\n", 1,
      "a request lacks start_state"),
     ("a: [1\n", 2, "while parsing a flow sequence"),
-    ("a: 1\na: 2\n", 2, "the key 'a' stands twice"),
 ]  # fmt: skip
 
 
@@ -237,10 +227,7 @@ def test_problems_of_robometrics_that_cannot_be_used_are_reported(tmp_path):
 
 FILES = [
     ("a.yaml", MOVEIT_SCENE, "a.yaml:1: a world without starts and goals"),
-    ("a.yaml", "shelf: []", "a.yaml:1: no problems"),
-    ("a.json", {"problems": {}}, "a.json:1: no problems"),
     ("a.json", {"problems": 3}, "a.json:1: problems must be a list, got 3"),
-    ("a.json", '{"problems": [', "a.json:2: while parsing a flow node"),
     ("a.pkl", "", "a.pkl: problems are in .yaml, .json and .h5 files"),
 ]
 
@@ -260,13 +247,3 @@ def test_missing_files_are_named(tmp_path):
             load_problems(tmp_path / name)
     with pytest.raises(ValueError, match="no request####.yaml"):
         load_problems(tmp_path)
-
-
-def test_sizes_are_limited(tmp_path, monkeypatch):
-    path = write_file(tmp_path / "set.yaml", ROBOMETRICS)
-    monkeypatch.setattr(documents, "MAX_NODES", 50)
-    with pytest.raises(ValueError, match="more than 50 values"):
-        load_problems(path)
-    monkeypatch.setattr(documents, "MAX_FILE", 100)
-    with pytest.raises(ValueError, match="set.yaml: more than"):
-        load_problems(path)

@@ -34,25 +34,6 @@ def test_short_transient_work_leaves_nothing_in_a_log_file(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_bar_inside_another_leaves_only_its_lines_in_a_log_file(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "LOG_INTERVAL", 0)
-    training = progress_bar(None, "training", total=2)
-    list(progress_bar(range(2), "validation", transient=True))
-    training.update(2)
-    training.close()
-    error = capsys.readouterr().err
-    assert "validation: 100%" in error and "training: 100%" in error
-    assert "\x1b" not in error and all(line.strip() for line in error.splitlines())
-
-
-def test_transient_bar_disappears_from_a_terminal(monkeypatch):
-    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
-    assert list(progress_bar(range(3), "validation", unit="query", transient=True)) == [0, 1, 2]
-    shown = terminal.getvalue()
-    assert "validation" in shown and "0/3" in shown and "\n" not in shown
-    assert shown.rsplit("\r", 2)[1].strip() == "" and shown.endswith("\r")
-
-
 def test_bar_stays_in_a_terminal_below_other_lines(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     bar = progress_bar(total=3, unit="query")
