@@ -278,12 +278,6 @@ def test_writer_killed_in_the_middle_leaves_the_old_file(path):
 # --- Commands
 
 
-def command(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True
-    )
-
-
 def test_validate_command_names_bad_files(made, path, capsys):
     truncate(path)
     assert data_command(["validate", str(made), "--task", "wall", "--simulate"]) == 0
@@ -294,23 +288,22 @@ def test_validate_command_names_bad_files(made, path, capsys):
     assert "truncated" in error and str(made) in output.out
 
 
-def test_make_queries_command_repeats_itself(tmp_path):
+def test_make_queries_command_replaces_a_file_and_says_how_it_was_made(tmp_path):
     path = tmp_path / "wall.h5"
     made_by = "roboarm queries --task wall --seed 5 --num-test 12 --num-validation 3"
-    again = ["roboarm_nmp", *made_by.split()[1:], "--output", path, "--workers", 1]
-    result = command(*again)
+    path.write_bytes(b"old")
+    command = [sys.executable, "-m", "roboarm_nmp", *made_by.split()[1:]]
+    command += ["--output", path, "--workers", "1", "--overwrite"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     with h5py.File(path) as file:
         assert file.attrs["made_by"].decode() == made_by
         assert json.loads(file.attrs["parameters"].decode())["hold_steps"] == 24
-    first = path.read_bytes()
-    path.write_bytes(b"old")
-    assert command(*again, "--overwrite").returncode == 0
-    assert path.read_bytes() == first
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path):
+def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path, monkeypatch):
+    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
     path, region = tmp_path / "in_the_shelf.h5", (0.4, 0.65, -0.4, 0.4, 0.24, 0.46)
     make_queries.make_queries(path, "three_shelves", 0, 6, 2, progress=False, goal_region=region)
     splits = validate(path, "three_shelves", simulate=True)
@@ -325,7 +318,8 @@ def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path):
         assert "--goal-region 0.4 0.65 -0.4 0.4 0.24 0.46" in file.attrs["made_by"].decode()
 
 
-def test_queries_inside_the_limits_of_the_datasheet_are_a_share_of_all(tmp_path):
+def test_queries_inside_the_limits_of_the_datasheet_are_a_share_of_all(tmp_path, monkeypatch):
+    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
     path = tmp_path / "queries.h5"
     rejected = make_queries.make_queries(
         path, "no_obstacles", 0, 12, 2, progress=False, limits="datasheet"
