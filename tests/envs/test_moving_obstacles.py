@@ -82,25 +82,6 @@ def test_moving_obstacle_pushes_the_arm():
     assert depth > -0.005
 
 
-def test_contact_has_the_obstacles_velocity():
-    """A ball in front of a moving box gets its speed, and keeps out of it."""
-    env = RoboArmEnv(Scene((Box((0.5, -0.5, 0.3), (0.1, 0.1, 0.1), motion=ACROSS),)))
-    shape = p.createCollisionShape(p.GEOM_SPHERE, radius=0.02, physicsClientId=env.client)
-    ball = p.createMultiBody(
-        0.001, shape, basePosition=(0.5, -0.3, 0.3), physicsClientId=env.client
-    )
-    env.reset_specific(START, GOAL)
-    for _ in range(20):
-        position = p.getBasePositionAndOrientation(ball, physicsClientId=env.client)[0]
-        p.resetBasePositionAndOrientation(
-            ball, (0.5, position[1], 0.3), (0, 0, 0, 1), physicsClientId=env.client
-        )
-        env.step(np.zeros(7))
-    box = env.current_scene.obstacles[0].position[1]
-    position = p.getBasePositionAndOrientation(ball, physicsClientId=env.client)[0]
-    assert position[1] - box > 0.05 + 0.02 - 0.005
-
-
 def test_replays_and_copies_are_exact():
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (60, 7))
@@ -146,19 +127,6 @@ def test_goal_may_be_occupied_by_what_moves():
 def env_goal_position():
     env = RoboArmEnv()
     return tuple(env.robot.forward_kinematics(GOAL).tolist())
-
-
-def test_rejected_query_does_not_disturb_a_running_episode():
-    env, other = RoboArmEnv(SCENE), RoboArmEnv(SCENE)
-    actions = np.random.default_rng(1).uniform(-1, 1, (20, 7))
-    for one in (env, other):
-        one.reset_specific(START, GOAL)
-        states_of(one, actions[:10])
-    inside = np.float32([0.81, -0.84, -2.72, -3.05, 1.86, 3.48, 0.63])  # in the table
-    with pytest.raises(ValueError, match="start is in collision"):
-        env.reset_specific(inside, GOAL)
-    assert env.time == other.time
-    np.testing.assert_array_equal(states_of(env, actions[10:]), states_of(other, actions[10:]))
 
 
 def test_link_distances_are_those_of_the_moment():

@@ -360,20 +360,6 @@ def test_motion_through_a_thin_board_is_not_free():
     assert checker.motion_checks(LEFT, RIGHT) == -3
 
 
-def test_number_of_checks_follows_the_resolution():
-    checker = CollisionChecker(EMPTY)
-    for length in (0.0, 0.01, 0.0209, 0.0211, 0.1, 0.3, 0.777):
-        end = STATE + np.array([length, 0, 0, 0, 0, 0, 0])
-        pieces = math.ceil(length / collision.RESOLUTION)
-        assert checker.motion_checks(STATE, end) == max(1, pieces) + 1
-        assert checker.motion_checks(STATE, end, resolution=1.0) == 2
-        between = max(0, pieces - 1)
-        assert checker.motion_checks(STATE, end, ends_known=True) == between
-        assert checker.is_motion_free(STATE, end, ends_known=True)
-    one = checker.motion_checker()
-    assert one(tuple(STATE), tuple(STATE)) == 1
-
-
 def test_known_ends_are_not_checked():
     checker = CollisionChecker(BOARD)
     assert checker.motion_checks(LEFT, RIGHT, ends_known=True) == -1  # the middle
@@ -413,20 +399,6 @@ def test_motion_is_free_where_all_its_states_are(robot):
 
 
 # --- The same answer whatever the batch
-
-
-def test_batches_of_one_and_of_two_thousand_agree():
-    checker = CollisionChecker(envs.TASKS["boxes"].scene)
-    states = np.random.default_rng(0).uniform(-1, 1, (2_000, 7))
-    near, free = checker.signed_distances(states), checker.is_free(states)
-    for i in range(0, 2_000, 97):
-        one = checker.signed_distances(states[i])
-        for all_, single in zip(near, one, strict=True):
-            assert all_[i].tobytes() == np.asarray(single).tobytes()
-        assert checker.is_free(states[i]) == free[i]
-        assert checker.is_free(states[i : i + 1]).shape == (1,)
-    shaped = checker.signed_distances(states.reshape(10, 200, 7))
-    np.testing.assert_array_equal(shaped.distance.reshape(-1, len(LINKS)), near.distance)
 
 
 def test_importing_envs_imports_no_numba():
@@ -477,22 +449,6 @@ def test_bad_margins_and_resolutions_are_rejected(wall, options, message):
         wall.is_motion_free(np.zeros(7), np.zeros(7), **options)
 
 
-@pytest.mark.parametrize(
-    "obstacle",
-    [
-        Box((0.5, 0, 0), (0.1, 0.0, 0.1)),
-        Box((0.5, np.nan, 0), (0.1, 0.1, 0.1)),
-        Cylinder((0.5, 0, 0), 0.1, -0.1),
-        Sphere((0.5, 0, 0), np.inf),
-    ],
-)
-def test_degenerate_obstacles_are_rejected(obstacle):
-    with pytest.raises(ValueError, match="finite numbers and positive sizes"):
-        CollisionChecker(Scene((Sphere((1, 1, 1), 0.1), obstacle)))
-    with pytest.raises(TypeError, match="a scene must be"):
-        CollisionChecker((obstacle,))
-
-
 def test_empty_scene_has_only_the_arm():
     checker = CollisionChecker(EMPTY)
     near = checker.signed_distances(STATE, self_collisions=False)
@@ -525,14 +481,3 @@ def test_link_distances_are_clipped_signed_distances(wall, self_collisions):
     for bad in (np.full(7, np.nan), np.zeros(6), "near"):
         with pytest.raises(ValueError, match="states must"):
             wall.link_distances(bad)
-
-
-def test_distances_from_very_thin_and_very_large_boxes(hulls):
-    """Thinner than the rounding, larger than the floor."""
-    link, tip = outermost(hulls)
-    for size in ((0.0002, 0.3, 0.3), (2.0, 500.0, 500.0)):
-        for gap in (0.004, -0.0005):
-            centre = tip + [gap + BULLET_MARGIN + size[0] / 2, 0, 0]
-            checker = CollisionChecker(Scene((Box(tuple(centre), size),), table=None, floor=None))
-            assert checker.signed_distances(STATE).distance[link] == pytest.approx(gap, abs=1e-5)
-            assert checker.is_free(STATE) == (gap > 0)

@@ -73,14 +73,3 @@ def test_velocities_are_derivatives():
     angular = (turns[1] * turns[0].inv()).as_rotvec() / (2 * step)
     np.testing.assert_allclose(now.angular_velocity.reshape(-1, 3), angular, atol=1e-6)
     assert np.abs(now.velocity).max() > 0.1 and np.abs(now.angular_velocity).max() > 1
-
-
-def test_answers_do_not_depend_on_the_batch():
-    moving, times = MovingObstacles(moving_scene()), np.linspace(0, 7, 24).reshape(4, 6)
-    together = moving.at(times)
-    for i, t in np.ndenumerate(times):
-        for one, all_of_them in zip(moving.at(t), together, strict=True):
-            np.testing.assert_array_equal(one, all_of_them[i])
-    assert MovingObstacles(Scene()).at(0.0).position.shape == (0, 3)
-    with pytest.raises(ValueError, match="finite"):
-        moving.at([0.0, math.nan])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.encoders import (
     DECODED_CELL,
@@ -102,45 +101,6 @@ def test_decoder_without_valid_distances_is_rejected(tmp_path):
     path = save_encoder(tmp_path / "encoder.pt", NotANumber())
     with pytest.raises(NetworkError, match=r"encoder.decoder.pt: its output is not"):
         make_encoder(path).decoded_points(Scene())
-
-
-class FarAway(DistanceFromBall):
-    def forward(self, latent, points):
-        return 5.0 + super().forward(latent, points)
-
-
-def test_decoded_scene_without_obstacles_is_an_empty_scene(tmp_path):
-    path = save_encoder(tmp_path / "encoder.pt", FarAway())
-    assert make_encoder(path).decoded_points(Scene()).shape == (0, 3)
-    states = np.random.default_rng(0).uniform(-1, 1, (50, 7))
-    one, other = (
-        source(Scene(())) for source in (find_geometry_source(path), ground_truth_checker)
-    )
-    np.testing.assert_array_equal(one.is_free(states), other.is_free(states))
-
-
-def test_environment_observes_decoded_points_and_link_distances(encoder):
-    env = envs.make(
-        "random_boxes_hard",
-        goal_type="combined",
-        encoder="point_cloud",
-        num_points=8,
-        geometry_source=encoder,
-        link_distances=True,
-    )
-    observation, _ = env.reset(seed=1)
-    assert env.encoder.size == 24 and env.encoder.token_size == 3
-    assert env.encoder.geometry_source == encoder
-    decoded = observation["observation"][10:].reshape(8, 3)
-    away = np.linalg.norm(decoded - BALL[:3], axis=1)
-    assert (away < BALL[3] + DECODED_REACH + 1e-4).all() and away.max() > BALL[3] - DECODED_CELL
-    distances = find_geometry_source(encoder)(env.scene).signed_distances(
-        observation["observation"][:7], self_collisions=False
-    )
-    np.testing.assert_allclose(
-        observation["link_distances"][:, 0], distances.distance.clip(max=0.3), atol=1e-5
-    )
-    env.close()
 
 
 def test_policy_of_observed_points_can_use_decoded_points(encoder):

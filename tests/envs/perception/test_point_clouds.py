@@ -5,11 +5,9 @@ import pytest
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import POINT, CollisionChecker
-from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import observed_checker
 from roboarm_nmp.envs.perception.point_clouds import (
     CELL,
-    farthest_points,
     observed_points,
 )
 from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, Box, Scene, Sphere
@@ -40,16 +38,6 @@ def test_observed_points_lie_on_visible_surfaces():
     # At most one in each cell.
     cells = np.floor(points / CELL).astype(int)
     assert len(np.unique(cells, axis=0)) == len(points)
-
-
-def test_empty_scene_has_no_observed_points():
-    assert observed_points(EMPTY).shape == (0, 3)
-    states = np.random.default_rng(0).uniform(-1, 1, (200, 7))
-    one, other = observed_checker(EMPTY), CollisionChecker(EMPTY)
-    assert (one.is_free(states) == other.is_free(states)).all()
-    assert (one.signed_distances(states).distance == other.signed_distances(states).distance).all()
-    assert not farthest_points(observed_points(EMPTY), 5).any()
-    assert not make_encoder("point_cloud")(EMPTY).any()
 
 
 def test_hidden_obstacle_changes_no_observation():

@@ -66,9 +66,8 @@ def test_objects_stay_when_the_gripper_is_held_elsewhere():
     assert robot == with_attached(with_held(PANDA, {"panda_finger_joint1": 0.01}), [BOARD])
 
 
-@pytest.mark.parametrize("objects", [[BOARD], MANY], ids=["board", "many"])
-def test_compiled_checks_agree_with_pybullet(objects):
-    robot, rng, free = with_attached(PANDA, objects), np.random.default_rng(0), 0
+def test_compiled_checks_agree_with_pybullet():
+    robot, rng, free = with_attached(PANDA, MANY), np.random.default_rng(0), 0
     for i in range(3):
         scene = replace(RandomBoxes(2, 4).sample(rng), robot=robot)
         if i == 0:
@@ -191,12 +190,8 @@ def test_mistake_in_a_file_is_rejected_with_its_line(fields, reason, tmp_path):
 def test_objects_that_cannot_be_are_rejected():
     with pytest.raises(ValueError, match="at most 100 attached objects"):
         with_attached(PANDA, [BOARD] * 101)
-    with pytest.raises(TypeError, match="must be of the type Attached"):
-        with_attached(PANDA, [BOARD.shape])
     with pytest.raises(TypeError, match="an attached shape must be Box"):
         Attached("box")
-    with pytest.raises(ValueError, match="positive sizes"):
-        Attached(Sphere((0, 0, 0), -1.0))
     with pytest.raises(ValueError, match="an attached shape has no motion"):
         Attached(Sphere((0, 0, 0), 0.1, Oscillation((0.1, 0, 0))))
     with pytest.raises(ValueError, match="the arm collides with itself in each of"):

@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.robots.urdf import robot_from_urdf
 from roboarm_nmp.envs.robots.variants import with_held
 from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene, scene_from_json, scene_to_json
@@ -111,15 +109,6 @@ def test_scene_files_keep_the_opening(tmp_path):
         load_scene(tmp_path / "c.yaml")
 
 
-def test_query_file_of_a_scene_file_with_another_opening_is_read(tmp_path):
-    task = tmp_path / "mine.yaml"
-    save_scene(Scene(robot=OPEN), task)
-    ends = np.array([START, GOAL], np.float32)
-    splits = {"test": (ends[:1], ends[1:]), "validation": (ends[1:], ends[:1])}
-    write_queries(tmp_path / "mine_queries.h5", str(task), 0, splits, "", {})
-    assert load_queries(str(task))[0].scene.robot == OPEN
-
-
 @pytest.mark.parametrize(
     ("positions", "reason"),
     [
@@ -131,48 +120,3 @@ def test_query_file_of_a_scene_file_with_another_opening_is_read(tmp_path):
 def test_positions_that_cannot_be_are_rejected(positions, reason):
     with pytest.raises(ValueError, match=reason):
         with_held(PANDA, positions)
-
-
-URDF = """<robot name="arm">
-<link name="base"/><link name="one"/><link name="two"/><link name="three"/>
-<link name="tip"><collision><origin xyz="0 0 0.1" rpy="0.1 0 0"/>
-<geometry><box size="0.02 0.03 0.1"/></geometry></collision></link>
-{}
-</robot>"""
-JOINT = (
-    '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/><axis xyz="{4}"/>'
-    '<origin xyz="0.1 0 0.2" rpy="0.2 -0.1 0.3"/>'
-    '<limit lower="-1.5" upper="1.5" effort="50" velocity="2"/></joint>'
-)
-
-
-@pytest.fixture(scope="module")
-def urdf(tmp_path_factory):
-    joints = (
-        ("turn", "revolute", "base", "one", "0 1 0"),
-        ("lift", "prismatic", "one", "two", "0 0 1"),
-        ("roll", "revolute", "two", "three", "1 1 0"),
-        ("grip", "revolute", "three", "tip", "0 1 1"),
-    )
-    path = tmp_path_factory.mktemp("held") / "arm.urdf"
-    path.write_text(URDF.format("".join(JOINT.format(*joint) for joint in joints)))
-    return path
-
-
-def test_arm_of_a_urdf_has_links_and_end_effector_as_if_described_so(urdf):
-    options = {"joints": ["turn", "lift", "roll"], "end_effector": "tip", "gain": 0.6}
-    options["end_effector_position"] = (0.0, 0.01, 0.05)
-    expected = robot_from_urdf(urdf, fixed={"grip": 0.7}, **options)
-    moved = with_held(robot_from_urdf(urdf, fixed={"grip": -0.2}, **options), {"grip": 0.7})
-    for name in ("end_effector_position", "held_positions"):
-        np.testing.assert_allclose(getattr(moved, name), getattr(expected, name), atol=1e-12)
-    [link], [other] = moved.links, expected.links
-    for one, two in zip(link.placements[0], other.placements[0], strict=True):
-        np.testing.assert_allclose(one, two, atol=1e-12)
-
-
-def test_joint_that_carries_others_cannot_be_moved(urdf):
-    robot = robot_from_urdf(urdf, joints=["turn", "roll"], end_effector="three", gain=0.6)
-    assert with_held(robot, {"grip": 0.3}).held["grip"] == 0.3
-    with pytest.raises(ValueError, match="lift carries joints that move"):
-        with_held(robot, {"lift": 0.1})

@@ -1,4 +1,4 @@
-"""Convex hulls as obstacles: PyBullet's answers, images, files, meshes of other programs."""
+"""Convex hulls as obstacles: PyBullet's answers, files, meshes of other programs."""
 
 from dataclasses import replace
 
@@ -11,19 +11,15 @@ from problem_files import (
     CUROBO_TRIANGLES,
     MOVEIT_MESH,
     MOVEIT_SCENE,
-    ROBOMETRICS,
     SCENE_MESH,
     TRIANGLES,
     write_file,
 )
 
 from roboarm_nmp.datasets.format import DatasetError, read_scenes, scene_arrays
-from roboarm_nmp.datasets.problems import load_problems, write_problems
 from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
-from roboarm_nmp.envs.perception.point_clouds import observed_points
-from roboarm_nmp.envs.perception.sensors import OBSTACLE, Camera, observe_scene
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes import meshes
@@ -149,27 +145,12 @@ def outside(hull, points):
     return (points @ normals.T - (normals * a).sum(1)).max(1)
 
 
-def test_hull_is_seen_as_an_obstacle_with_points_on_its_surface():
-    scene = Scene((WEDGE,))
-    points = observed_points(scene)
-    assert len(points) > 20
-    local = (points - WEDGE.position) @ matrix(WEDGE.orientation)
-    assert np.abs(outside(WEDGE, local)).max() < 1e-4
-    outputs = ("rgb", "segmentation")
-    camera = Camera((1.4, -0.6, 0.9), (0.5, 0.1, 0.3), outputs=outputs, size=(64, 48))
-    image = observe_scene(scene, {"camera": camera})["camera"]
-    seen = image["segmentation"] == OBSTACLE
-    assert 20 < seen.sum() < 1000
-    assert image["rgb"][seen].std() > 2  # its faces are shaded
-
-
 @pytest.mark.parametrize(
     ("vertices", "reason"),
     [
         (CORNERS[:3], "4 to 256 vertices, got 3"),
         ([*CORNERS[:3], [0.1, 0.1, 0.0]], "in one plane"),
         ([*CORNERS[:3], [0.0, 0.0, np.nan]], "finite numbers"),
-        ([*CORNERS[:3], [0.0, 0.0]], "three per vertex"),
     ],
 )
 def test_invalid_hull_is_rejected(vertices, reason):
@@ -235,11 +216,8 @@ def test_mesh_of_a_scene_file_becomes_its_hull(name, tmp_path):
     [
         ("{file: none.stl, position: [0, 0, 0]}", "none.stl: No such file"),
         ("{file: link.stl, position: [0, 0, 0]}", "link.stl: outside of the folder"),
-        ("{file: ., position: [0, 0, 0]}", r"\.: no regular file"),
         ("{file: bad.obj, position: [0, 0, 0]}", "bad.obj: damaged, or no OBJ file"),
-        ("{file: flat.obj, position: [0, 0, 0]}", "in one plane"),
         ("{file: part.obj, scale: 1e3, position: [900, 0, 0]}", "finite numbers|scale"),
-        ("{file: [part.obj], position: [0, 0, 0]}", "file must be text, got a list"),
     ],
 )
 def test_mesh_that_cannot_be_used_is_rejected_with_its_line(mesh, reason, tmp_path):
@@ -249,7 +227,6 @@ def test_mesh_that_cannot_be_used_is_rejected_with_its_line(mesh, reason, tmp_pa
     (folder / "link.stl").symlink_to(tmp_path / "part.stl")
     write_file(folder / "bad.obj", OBJ + "f 1 2 x\n")
     write_file(folder / "part.obj", OBJ.replace("0.2", "2.2"))
-    write_file(folder / "flat.obj", OBJ.replace("v 0.0 0.0 0.2", "v 0.1 0.1 0.0"))
     path = write_file(folder / "scene.yaml", f"floor: false\nobstacles:\n- mesh: {mesh}\n")
     with pytest.raises(DocumentError, match=f"scene.yaml:3: .*({reason})"):
         load_scene(path)
@@ -319,9 +296,7 @@ def test_meshes_of_other_programs_are_read(name, text, tmp_path):
     ("name", "text", "line", "reason"),
     [
         ("a.yaml", MOVEIT_MESH.replace("[0, 2, 1]", "[0, 2, 9]"), 4, "a vertex that is not there"),
-        ("a.yaml", MOVEIT_MESH.replace("[0, 2, 1]", "[0, 2]"), 5, "3 vertices, got 2"),
         ("a.yaml", CUROBO_MESH.replace("part", "../part"), 1, r"\.\./part.stl: (outside|No such)"),
-        ("a.yaml", CUROBO_MESH.replace("part", "none"), 1, "none.stl: No such file"),
         ("a.scene", SCENE_MESH.replace("\n4 4\n", "\n4 4000\n"), 7, "before the last triangle"),
         ("a.yaml", MOVEIT_SCENE.replace("- id: can", "- id: can\n      planes: [{a: 1}]"), 14,
          "planes are not supported"),
@@ -332,17 +307,3 @@ def test_mesh_of_another_program_is_rejected_with_its_line(name, text, line, rea
     write_file(tmp_path / "part.stl", STL)
     with pytest.raises(ValueError, match=f"{name}:{line}: .*{reason}"):
         load_world(write_file(tmp_path / name, text))
-
-
-def test_problems_keep_the_hulls_of_their_meshes(tmp_path):
-    (tmp_path / "part.stl").write_text(STL)
-    mesh = "    mesh:\n      w: {file_path: part.stl, pose: [0.5, 0.1, 0.3, 0.8, 0, 0, 0.6]}\n"
-    text = ROBOMETRICS.replace("  start:", mesh + "  start:")
-    problems = load_problems(write_file(tmp_path / "set.yaml", text))
-    assert not problems.rejected
-    assert_wedge(problems[0].scene.obstacles[2:])
-    write_problems(tmp_path / "problems.h5", problems)
-    assert load_problems(tmp_path / "problems.h5").scenes == problems.scenes
-    (tmp_path / "part.stl").unlink()
-    [rejected] = load_problems(tmp_path / "set.yaml").rejected
-    assert "part.stl: No such file" in rejected.reason

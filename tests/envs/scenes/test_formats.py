@@ -15,7 +15,6 @@ from roboarm_nmp.envs import make
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.variants import with_attached
 from roboarm_nmp.envs.scenes.formats import load_world
-from roboarm_nmp.envs.scenes.numbers import multiply
 from roboarm_nmp.envs.scenes.primitives import Attached, Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.tasks import get_task
 
@@ -81,11 +80,6 @@ def test_own_scene_files_are_worlds_too(tmp_path):
         load_world(write_file(path, "flor: false"))
 
 
-def test_product_of_quaternions_turns_one_after_the_other():
-    about_x, about_z = (HALF, 0, 0, HALF), (0, 0, HALF, HALF)
-    np.testing.assert_allclose(multiply(about_z, about_x), (0.5, 0.5, 0.5, 0.5))
-
-
 def edited(text, old, new):
     assert old in text
     return text.replace(old, new, 1)
@@ -94,22 +88,14 @@ def edited(text, old, new):
 MISTAKES = [
     ("a.yaml", edited(MOVEIT_TOUCHING, "frame_id: panda_hand", "frame_id: world"), 11,
      "the frame 'world' is not panda_hand, the object's link"),
-    ("a.yaml", edited(MOVEIT_TOUCHING, "[panda_link6]", "[thumb]"), 8, "panda has no link 'thumb'"),
     ("a.yaml", edited(MOVEIT_TOUCHING, "- [false, true, false, true]", "- [false, true]"), 43,
      "4 entry_names have a row of 2 values"),
     ("a.yaml", edited(MOVEIT_SCENE, "type: cylinder", "type: cone"), 15,
      "cones are not supported"),
-    ("a.yaml", edited(MOVEIT_SCENE, "[0.14, 0.03]", "[0.14, -0.03]"), 16,
-     "the dimensions of a cylinder must be positive"),
     ("a.yaml", edited(MOVEIT_SCENE, "translation: [0, 0, 0]", "translation: [0, 1, 0]"), 5,
      "a fixed frame's transform must be the identity"),
-    ("a.yaml", edited(MOVEIT_SCENE, "- id: can", "- id: can\n      header: {frame_id: camera}"), 14,
-     "the frame 'camera' is neither panda_link0, the base, nor world"),
     ("b.yml", edited(CUROBO, "mesh: {}", "mesh: {cup: {file_path: cup.obj}}"), 7,
      "mesh cup lacks pose"),
-    ("b.yml", edited(CUROBO, "-0.1, 1, 0, 0, 0]", "-0.1, 1, 0, 0]"), 4,
-     "pose of cuboid table must be a list of 7 numbers, got 6"),
-    ("c.scene", edited(SCENE_TEXT, "cylinder", "cone"), 11, "cones are not supported"),
     ("c.scene", edited(SCENE_TEXT, "0.3 0.04 0.5", "0.3 0.04"), 7,
      "the dimensions of a box must be a list of 3 numbers, got 2"),
     ("c.scene", edited(SCENE_TEXT, "\n.\n", "\n"), 19, "the file ends before the last line, a dot"),
@@ -122,11 +108,3 @@ def test_mistake_is_rejected_with_its_line(name, content, line, reason, tmp_path
     with pytest.raises(ValueError) as caught:
         load_world(path)
     assert str(caught.value).startswith(f"{path}:{line}: {reason}")
-
-
-def test_yaml_of_a_world_may_have_aliases_but_no_endless_ones(tmp_path):
-    text = "cuboid:\n  a: &a {dims: [1, 1, 1], pose: &p [0, 0, 5, 1, 0, 0, 0]}\n  b: *a\n"
-    assert len(load_world(write_file(tmp_path / "a.yaml", text)).obstacles) == 2
-    text = "cuboid: &a\n  b: *a\n"
-    with pytest.raises(ValueError, match="a.yaml:2: the alias 'a' stands for a value"):
-        load_world(write_file(tmp_path / "a.yaml", text))

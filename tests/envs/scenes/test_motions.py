@@ -18,8 +18,6 @@ from roboarm_nmp.envs.scenes.motions import (
     Oscillation,
     Presence,
     Waypoints,
-    motion_from_numbers,
-    motion_to_numbers,
 )
 from roboarm_nmp.envs.scenes.primitives import (
     Box,
@@ -115,25 +113,6 @@ def test_obstacle_waits_visits_and_leaves():
     assert box_at(standing, 1) == Box(PLACE, SIZE, TURN)
 
 
-def test_all_kinds_of_obstacles_move():
-    motion = Waypoints((0, 1), ((0, 0, 0), (0, 0, 0.4)), ((0, 0, 0, 1), QUARTER))
-    obstacles = (
-        Cylinder(PLACE, 0.1, 0.2, motion=motion),
-        Sphere(PLACE, 0.1, motion),
-        Box(PLACE, SIZE),
-    )
-    hull = convex_hull(CORNERS, PLACE)
-    hull = type(hull)(hull.position, hull.vertices, motion=motion)
-    found = Scene((*obstacles, hull)).at(1).obstacles
-    there = (0.5, 0.1, 0.7)
-    assert found[:3] == (
-        Cylinder(there, 0.1, 0.2, QUARTER),
-        Sphere(there, 0.1),
-        Box(PLACE, SIZE),
-    )
-    assert (found[3].position, found[3].orientation) == (there, QUARTER)
-
-
 def test_scenes_with_motions_are_values():
     def scene(period=2.0):
         motion = Presence([[0, 5]], Oscillation([0, 0.1, 0], period))
@@ -148,24 +127,16 @@ def test_scenes_with_motions_are_values():
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
-        (lambda: Oscillation((0, math.nan, 0)), "amplitude"),
         (lambda: Oscillation((0, 0.1, 0), period=0), "period .* at least 0.001 s"),
-        (lambda: Oscillation(period=1e-320), "period .* at least 0.001 s"),  # its frequency: inf
         (lambda: Oscillation(axis=(0, 0, 0)), "axis"),
         (lambda: Oscillation((0, 1, 0), period=1), "too fast: 6.28 m/s"),
-        (lambda: Oscillation(angle=4, period=1), "turns too fast"),
         (lambda: Waypoints(range(MAX_WAYPOINTS + 1), ()), "1 to 1,000 waypoints"),
         (lambda: Waypoints((0, 0), ((0, 0, 0),) * 2), "ascend"),
-        (lambda: Waypoints((0, 5e-324), ((0, 0, 0),) * 2, repeat="cyclic"), "at least 0.001 s"),
         (lambda: Waypoints((0, 1), ((0, 0, 0),)), "2 times, but 1 displacements"),
-        (lambda: Waypoints((0,), ((0, 0, 0),), ((0, 0, 0, 2),)), "norm 1"),
-        (lambda: Waypoints((0,), ((0, 0, 0),), repeat="cyclic"), "one waypoint cannot be cyclic"),
         (lambda: Waypoints((0, 1), ((0, 0, 0), (0, 0.1, 0)), repeat="cyclic"), "end where"),
         (lambda: Waypoints((0, 0.1), ((0, 0, 0), (0, MAX_SPEED, 0))), "waypoint 1 is too fast"),
         (lambda: Waypoints((0, 0.05), ((0, 0, 0),) * 2, ((0, 0, 0, 1), QUARTER)), "turns too fast"),
-        (lambda: Presence(()), "1 to 1,000 intervals"),
         (lambda: Presence(((0, 2), (1, 3))), "ascend"),
-        (lambda: Presence(((0, 1, 2),)), "two times"),
     ],
 )
 def test_impossible_motion_is_rejected(make, reason):
@@ -215,11 +186,6 @@ MOVING = Scene(
 )
 
 
-@pytest.mark.parametrize("motion", [None, *MOTIONS])
-def test_motion_of_numbers_is_exact(motion):
-    assert motion_from_numbers(motion_to_numbers(motion)) == motion
-
-
 def test_scene_file_of_moving_obstacles_is_exact(tmp_path):
     save_scene(MOVING, tmp_path / "scene.yaml")
     assert load_scene(tmp_path / "scene.yaml") == MOVING
@@ -265,35 +231,11 @@ BOX = "obstacles:\n- box: {position: [0.5, 0, 0.3], size: [0.1, 0.1, 0.1],\n    
 
 
 @pytest.mark.parametrize(
-    ("text", "motion"),
-    [
-        ("{oscillation: {period: 2}}", Oscillation(period=2)),
-        (
-            "{oscillation: {amplitude: [0, 0.2, 0], period: 2, phase: 1}, present: [[0, 1], [2]]}",
-            Presence(((0, 1), (2, math.inf)), Oscillation((0, 0.2, 0), 2, 1)),
-        ),
-        (
-            "{waypoints: {times: [1, 2], displacements: [[0, 0, 0], [0, 0.3, 0]]}}",
-            Waypoints((1, 2), ((0, 0, 0), (0, 0.3, 0))),
-        ),
-        ("{present: [[2]]}", Presence(((2, math.inf),))),
-    ],
-)
-def test_motion_in_a_scene_file(tmp_path, text, motion):
-    path = tmp_path / "scene.yaml"
-    path.write_text(BOX + text + "}\n")
-    assert load_scene(path).obstacles[0].motion == motion
-
-
-@pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("2", "motion of box must be a mapping with keys oscillation, waypoints, present"),
-        ("{spin: {period: 2}}", "unknown key spin"),
         ("{oscillation: {amplitude: [0, 1, 0]}}", "oscillation lacks period"),
         ("{oscillation: {amplitude: [0, 9, 0], period: 1}}", "motion of box: .* too fast"),
-        ("{waypoints: {times: [1], displacements: [[0, 0, 0]], repeat: [1]}}", "got a list"),
-        ("{waypoints: {times: 1, displacements: []}}", "times of waypoints must be a list"),
         ("{present: [[1], [2, 3]]}", "ascend"),
     ],
 )
@@ -301,18 +243,4 @@ def test_mistake_in_a_motion_is_reported_with_its_line(tmp_path, text, reason):
     path = tmp_path / "scene.yaml"
     path.write_text(BOX + text + "}\n")
     with pytest.raises(DocumentError, match=f"scene.yaml:3: .*{reason}"):
-        load_scene(path)
-
-
-def test_small_file_that_repeats_a_long_motion_too_often_is_rejected(tmp_path):
-    """10,000 repetitions of 1,000 waypoints would take minutes, and gigabytes."""
-    times = ", ".join(map(str, range(MAX_WAYPOINTS)))
-    ways = ", ".join(["[0, 0, 0]"] * MAX_WAYPOINTS)
-    sphere = "\n- sphere: {position: [1, 0, 0], radius: 0.1, motion: "
-    motion = f"&m {{waypoints: {{times: [{times}], displacements: [{ways}]}}}}"
-    path = tmp_path / "scene.yaml"
-    path.write_text(f"obstacles:{sphere}{motion}}}" + f"{sphere}*m}}" * 2)
-    assert len({obstacle.motion for obstacle in load_scene(path).obstacles}) == 1
-    path.write_text(f"obstacles:{sphere}{motion}}}" + f"{sphere}*m}}" * 900)
-    with pytest.raises(DocumentError, match=r"scene.yaml:599: more than 3,000,000 values"):
         load_scene(path)

@@ -1,7 +1,6 @@
 """Distributions of scenes with moving and appearing boxes, their tasks and query files."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +10,11 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets.format import OutOfDateError
 from roboarm_nmp.datasets.queries import load_queries, query_path
 from roboarm_nmp.demo_generation.make_queries import make_queries
-from roboarm_nmp.envs import arm_env
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.moving import free_over_time
 from roboarm_nmp.envs.scenes import moving_boxes
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.tasks import TASKS
-from roboarm_nmp.viewer import episodes
 
 MOVING = [name for name, task in TASKS.items() if hasattr(task.scene, "animate")]
 KINDS = {"moving": Oscillation, "appearing": Presence, "blocked": Waypoints, "chased": Waypoints}
@@ -93,22 +90,6 @@ def test_environment_draws_motions_for_each_episode_and_repeats_them_for_a_seed(
         scenes.append(env.unwrapped.scene)
     assert scenes[0] == scenes[2] != scenes[1]
     assert not scenes[1].is_static
-    env.close()
-
-
-def test_random_queries_of_the_viewer_have_motions(monkeypatch):
-    monkeypatch.setattr(episodes, "query_path", lambda task: Path("no such file"))
-    viewed = episodes.task_episodes("blocked_goals", seed=2).get("random", 1)[0]
-    assert not viewed.scene.is_static
-    assert not goal_is_free(viewed, [0.0])[0]
-
-
-def test_distribution_that_accepts_no_motions_is_an_error(monkeypatch):
-    monkeypatch.setattr(moving_boxes.MovingBoxes, "accepts", lambda *given: False)
-    monkeypatch.setattr(arm_env, "MAX_MOTION_TRIES", 2)
-    env = roboarm_nmp.make("moving_boxes_easy")
-    with pytest.raises(RuntimeError, match="no motions were accepted for 2 queries"):
-        env.reset(seed=0)
     env.close()
 
 

@@ -4,7 +4,6 @@ import math
 import os
 import re
 import textwrap
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,17 +124,6 @@ def test_text_is_read_as_scene(load, text, scene):
     assert load(text) == scene
 
 
-def test_quaternion_that_is_one_percent_off_is_normalised_and_others_are_rejected(load):
-    text = "table: {position: [0, 0, 0], size: [1, 1, 1], orientation: [0, 0, %r, %r]}"
-    assert load(text % (0.0, 0.9999991)).table.orientation == (0.0, 0.0, 0.0, 0.9999991)  # as given
-    assert load(text % (0.0, 1.0099)).table.orientation == (0.0, 0.0, 0.0, 1.0)
-    half = math.sqrt(0.5)
-    orientation = load(text % (0.7071, 0.7071)).table.orientation
-    np.testing.assert_allclose(orientation, (0.0, 0.0, half, half), rtol=1e-15)
-    with pytest.raises(DocumentError, match=r"of table: .*norm 1 \(within 1 %\), got norm 1.0101$"):
-        load(text % (0.0, 1.0101))
-
-
 # --- Writing
 
 
@@ -144,44 +132,6 @@ def test_round_trip_is_exact(tmp_path, seed):
     scene = random_scene(seed)
     save_scene(scene, tmp_path / "scene.yaml")
     assert load_scene(tmp_path / "scene.yaml") == scene
-
-
-def test_numbers_of_numpy_are_written(tmp_path):
-    position, radius = np.array([0.1, 0.2, 1e-20], dtype=np.float32), np.float64(1 / 3)
-    save_scene(Scene((Sphere(position, radius),), floor=np.float32(-0.7)), tmp_path / "scene.yaml")
-    expected = Sphere(tuple(float(number) for number in position), float(radius))
-    assert load_scene(tmp_path / "scene.yaml") == Scene((expected,), floor=float(np.float32(-0.7)))
-
-
-def test_written_file_is_short_and_has_comments(tmp_path):
-    path = str(tmp_path / "scene.yaml")  # a string does as well
-    save_scene(EXAMPLE, path)
-    lines = Path(path).read_text().splitlines()
-    assert lines[0].startswith("# A scene") and lines[1].startswith("#")
-    assert lines[2:6] == [
-        "table: true",
-        "floor: -0.6",
-        "obstacles:",
-        "  - box: {position: [0.5, 0.0, 0.3], size: [0.3, 0.04, 0.6]}",
-    ]
-    assert lines[7:] == [
-        "  - cylinder: {position: [0.4, 0.4, 0.25], radius: 0.05, length: 0.5}",
-        "  - sphere: {position: [0.3, -0.4, 0.5], radius: 0.1}",
-        "  - convex_hull: {position: [-0.4, 0.4, 0.2], "
-        "vertices: [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.2]]}",
-    ]
-
-
-def test_scene_that_could_not_be_loaded_is_not_written(tmp_path):
-    path = tmp_path / "scene.yaml"
-    save_scene(EXAMPLE, path)
-    before = path.read_bytes()
-    scene = Scene()
-    object.__setattr__(scene, "friction", 2000.0)  # more than a file may have
-    with pytest.raises(DocumentError, match=f"^{path}: cannot be written, friction must be at mo"):
-        save_scene(scene, path)
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["scene.yaml"]
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
@@ -224,17 +174,12 @@ def sphere(position="[0, 0, 0]", radius="1"):
         # Not YAML
         ("floor: 0\ntable: a: b", 2, "mapping values are not allowed"),
         ("obstacles: [\nfloor: 0: 1]", 2, "while parsing a flow sequence from line 1 on, did not"),
-        ("floor: 0\ntable: 'true\n", 3, "while scanning a quoted scalar from line 2 on, found un"),
         ("floor: 0\ntable: *none", 2, "the alias 'none' has no anchor before it"),
-        ("floor: 0\n# é\ntable: tr\x00ue", 3, "character 0x0 is not allowed"),
         ("floor: 0\n# caf\xe9\n".encode("latin-1"), 2, "byte 0xe9 is not UTF-8 text"),
-        ('floor: 0\ntable: "\\UFFFFFFFF"', 2, "invalid Unicode character escape code"),
         ("# only a comment\n", 1, "the file is empty"),
-        ("floor: 0\n---\nfloor: 1", 2, "a second document begins"),
         # Dangerous
         ("floor: 0\ntable: !!python/object/apply:os.abort []", 2, "tags .* are not allowed"),
         ("floor: 0\nobstacles:\n  " + "- " * 100_000, 3, "nested too deeply"),
-        ("floor: 0\nobstacles: " + "[" * 100_000, 2, "nested too deeply"),
         ("floor: 0\nobstacles: &all [*all]", 2, "the alias 'all' stands for a value that contains"),
         (
             "obstacles: [&a {sphere: {position: [0, 0, 0], radius: 1}}" + ", *a" * 50_000 + "]",
@@ -243,40 +188,27 @@ def sphere(position="[0, 0, 0]", radius="1"):
         ),
         # Whole
         ("\n- floor: 0", 2, "a scene must be a mapping .* obstacles, got a list"),
-        ("\n\nfloor\n\n 0", 3, "a scene must be a mapping .* got floor 0"),
         (
             "floor: 0\nflor: 0",
             2,
             "unknown key flor in a scene: known are robot, held, att",
         ),
-        ("floor: 0\n? [a]\n: 1", 2, "a key must be text, got a list"),
         ("floor: 0\ntable: true\n'floor': 0", 3, "the key 'floor' stands twice"),
         # Floor and table
         ("\nfloor: true", 2, "floor must be a height in metres or false, got true"),
-        ("\nfloor: 'false'", 2, "floor must be a finite number, got the text 'false'"),
-        ("\ntable: yes", 2, "table must be true, false or .*, got yes"),
         ("table:\n  size: [1, 1, 1]", 2, "table lacks position"),
         # Obstacles
-        ("\nobstacles:\n", 2, r"obstacles must be a list \(\[\] if .*, got nothing"),
-        (obstacle("box"), 3, r"an obstacle must be a mapping of its kind \(box, cyl.*, got box"),
         (obstacle("box:\n    size: 1"), 3, "exactly one key, its kind .*: box, size"),
         (obstacle("cube: {}"), 3, "unknown kind of obstacle cube: one of box, cylinder, sphere"),
-        (obstacle("box:"), 3, "box must be a mapping with keys position, size, .* got nothing"),
-        (obstacle("box: {}"), 3, "box lacks position, size"),
         (box("radius: 1"), 5, "unknown key radius in box: known are position, size, orient.*, yaw"),
-        (box("rgb:\n        - 1"), 5, "unknown key rgb in box"),
         # Numbers
         (sphere(radius="1e-400"), 5, "radius of sphere must be positive, got 1e-400"),
         (sphere("[1, -2e9, 3]"), 4, "position of sphere must be at most 1000, got -2e9"),
         (sphere(radius=".inf"), 5, "radius of sphere must be a finite number, got .inf"),
-        (sphere(radius="'1'"), 5, "radius of sphere must be a finite number, got the text '1'"),
-        (sphere(radius="9" * 50 + "x"), 5, "must be a finite number, got 9{40}...$"),
         (sphere("[1, 2]"), 4, "position of sphere must be a list of 3 numbers, got 2"),
-        (sphere("1, 2, 3"), 4, "position of sphere must be a list of 3 numbers, got 1, 2, 3"),
         (sphere("[1,\n 2,\n left]"), 6, "position of sphere must be a finite number, got left"),
         # Orientation
         (box("orientation: [0, 0, 1, 1]"), 5, r"norm 1 \(within 1 %\), got norm 1.41421356$"),
-        (box("yaw: 90 degrees"), 5, "yaw of box must be a finite number, got 90 degrees"),
         (box("orientation: [0, 0, 0, 1]\n      yaw: 0"), 6, "box has both yaw and orientation"),
     ],
 )
