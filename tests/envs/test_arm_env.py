@@ -279,14 +279,14 @@ def run_episode(env, seed):
 
 def test_replay_is_bit_identical_in_any_order_and_any_process():
     env = envs.make("double_walls")
-    first = {seed: run_episode(env, seed) for seed in range(30)}
-    order = np.random.default_rng(0).permutation(30).tolist()
+    first = {seed: run_episode(env, seed) for seed in range(12)}
+    order = np.random.default_rng(0).permutation(12).tolist()
     again = {seed: run_episode(env, seed) for seed in order}
     assert again == first
     code = (
         "from roboarm_nmp import envs; from test_arm_env import run_episode;"
         "env = envs.make('double_walls');"
-        "print(*[run_episode(env, seed) for seed in (29, 3, 11)])"
+        "print(*[run_episode(env, seed) for seed in (9, 3, 11)])"
     )
     output = subprocess.run(
         [sys.executable, "-c", code],
@@ -296,7 +296,7 @@ def test_replay_is_bit_identical_in_any_order_and_any_process():
         text=True,
         check=True,
     ).stdout
-    assert output.split()[-3:] == [first[29], first[3], first[11]]
+    assert output.split()[-3:] == [first[9], first[3], first[11]]
 
 
 def test_an_episode_is_the_same_with_and_without_rendering():
