@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 from paths import ROOT
 
-from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.datasets.queries import query_path, validate
-from roboarm_nmp.demo_generation import collect, roadmaps
+from roboarm_nmp.demo_generation import roadmaps
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
-from roboarm_nmp.demo_generation.verify import verify
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.files import load_robot
-from roboarm_nmp.planning.planner import Planner, PlanningError
 
 ROBOTS = ROOT / "examples" / "robots"
 
@@ -54,54 +51,6 @@ def test_queries_and_demonstrations_of_another_arm_are_made_and_verified(file):
     assert "4 good, 0 changed, 0 missed, 0 collided, 0 refused" in verified.stdout
     by_path = roboarm("verify", demo_path(task), "--workers", 1)
     assert by_path.returncode == 1 and "name the robot's file, as TASK@" in by_path.stderr
-
-
-def test_plans_of_a_larger_arm_keep_a_larger_distance():
-    env = envs.make(f"random_boxes_hard@{ROBOTS / 'iiwa.yaml'}")
-    # After 4,000 checks, margins shrink.
-    rng, planner, kept = np.random.default_rng(2), Planner(env, simplify=0, max_checks=4_000), []
-    while len(kept) < 3:
-        env.sample_scene(rng)
-        start, goal = env.sample_query(rng)
-        checker = CollisionChecker(env.scene)
-        ends = np.clip(env.robot.normalise([start, goal]), -1.0, 1.0)
-        if not checker.is_free(ends, 0.02, 0.02).all():
-            continue
-        try:
-            path = planner.plan(start, goal, seed=1, time_limit=60)
-        except PlanningError:
-            continue
-        states = np.clip(env.robot.normalise(path), -1.0, 1.0)
-        kept.append(checker.signed_distances(states, self_collisions=False).distance.min())
-    assert min(kept) > 0.011  # 8 mm for the Panda, whose reach is 1.5 times shorter
-    env.close()
-
-
-def test_interrupted_collection_of_another_arm_continues_to_the_same_bytes(tmp_path, monkeypatch):
-    task = f"no_obstacles@{ROBOTS / 'xarm6.yaml'}"
-    options = collect.options_of(collect.Args(task))
-    assert options["attempts"] == 1 and collect.options_of(collect.Args("wall"))["attempts"] == 3
-    whole, again = tmp_path / "whole.h5", tmp_path / "again.h5"
-    collect.collect(whole, 3, options, progress=False)
-    append = collect.Journal.append
-
-    def die(journal, entry):
-        if journal.entries:
-            raise OSError("the disk is full")
-        append(journal, entry)
-
-    monkeypatch.setattr(collect.Journal, "append", die)
-    with pytest.raises(OSError, match="disk is full"):
-        collect.collect(again, 3, options, progress=False)
-    monkeypatch.undo()
-    changed = tmp_path / "xarm6.yaml"
-    changed.write_text((ROBOTS / "xarm6.yaml").read_text() + "base_position: [0, 0, 0.1]\n")
-    other = options | {"task": f"no_obstacles@{changed}"}
-    with pytest.raises(ValueError, match="the journal of something else .*another scene"):
-        collect.collect(again, 3, other, progress=False)
-    collect.collect(again, 3, options, progress=False)
-    assert again.read_bytes() == whole.read_bytes()
-    assert verify(again, progress=False, task=task)["good"] == 3
 
 
 def test_roadmaps_and_examples_have_the_joints_of_the_arm(tmp_path):

@@ -7,7 +7,6 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
 from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
-from roboarm_nmp.demo_generation.roadmaps import Roadmap
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 
@@ -70,23 +69,3 @@ def test_directions_of_noisy_states_lead_back_to_the_path(tmp_path):
     assert off.std() == pytest.approx(0.03, rel=0.05)
     back = one["direction"][:, 2:]
     assert (back * off <= 1e-6).all() and np.linalg.norm(back, axis=1).mean() > 0.2
-
-
-def test_labels_are_those_of_a_roadmap_without_goals_that_are_reached(tmp_path):
-    scene = envs.get_task(HARD).scene.sample(np.random.default_rng(3))
-    paths = load_roadmap_paths(write_paths(tmp_path, [scene], [[CORNER]]))
-    examples = RoadmapExamples(paths, ground_truth_checker, seed=1, goal_type="config")
-    rng = np.random.default_rng(0)
-    states = rng.uniform(-0.5, 0.5, (200, 7))
-    states = states[CollisionChecker(scene).is_free(states, 0.02)][:4]
-    goals = np.repeat(states[:1], 4, axis=0)
-    labelled = examples.label(0, states, goals, np.random.default_rng(5))
-    rng = np.random.default_rng(5)
-    directions, lengths = Roadmap(scene, rng).labels(states, goals, rng)
-    has_path = lengths > 0.0
-    assert has_path.any() and not has_path[0]  # the first state is the goal
-    np.testing.assert_array_equal(labelled["direction"], directions[has_path])
-    np.testing.assert_array_equal(labelled["length"], lengths[has_path])
-    np.testing.assert_allclose(labelled["observation"][:, :7], states[has_path], atol=1e-6)
-    np.testing.assert_allclose(labelled["desired_goal"], goals[has_path], atol=1e-6)
-    assert (labelled["scene"] == 0).all()

@@ -64,42 +64,6 @@ def test_paths_keep_the_margin(roadmap):
     assert np.mean([x.min() > roadmap.margin - 0.001 for x in roomy]) > 0.9
 
 
-def test_paths_are_short(roadmap):
-    rng = np.random.default_rng(2)
-    starts, goals = roadmap.sample(30, rng, 0.015), roadmap.sample(30, rng, 0.015)
-    points, room, found = roadmap._search(starts, goals)
-    paths = roadmap.paths(starts, goals, np.random.default_rng(2))
-    assert found.sum() > 20
-    raw = np.array([length(p) for p in points[found]])
-    smooth = np.array([length(path) for path, one in zip(paths, found, strict=True) if one])
-    assert (smooth <= raw + 1e-5).all()
-    assert smooth.mean() < 0.85 * raw.mean()
-    for start, goal, path in zip(starts, goals, paths, strict=True):
-        if path is not None:
-            np.testing.assert_array_equal(path[0], start.astype(np.float32))
-            np.testing.assert_array_equal(path[-1], goal.astype(np.float32))
-
-
-@pytest.mark.parametrize("narrow", [False, True])
-def test_paths_equal_those_of_a_roadmap_with_all_motions_checked(narrow):
-    roadmap, checked = (Roadmap(hard_scene(4), np.random.default_rng(0), 300) for _ in range(2))
-    for _ in range(2):  # with the margin, and then with that of nodes
-        checked._check(checked._edges.T, narrow=True)
-    usable = checked._kept <= 1
-    assert checked._is_checked[usable].all() and 0.2 < usable.mean() < 0.9
-    ends, room = checked.nodes[checked._edges], checked._room[checked._edges]
-    free = checked._are_straight_free(*ends, *room, roadmap.margin)
-    # The coarse check is not at the same states of a motion.
-    assert (free == (checked._kept == 0)).mean() > 0.99
-    rng = np.random.default_rng(5)
-    starts, goals = roadmap.sample(40, rng), np.repeat(roadmap.sample(8, rng), 5, axis=0)
-    both = [one._search(starts, goals, narrow) for one in (roadmap, checked)]
-    assert both[0][2].sum() > 15
-    for ours, theirs in zip(*both, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    assert roadmap._is_checked.sum() < 0.5 * checked._is_checked.sum()
-
-
 def test_free_straight_motion_is_the_path():
     roadmap = Roadmap(Scene(), np.random.default_rng(0), num_nodes=100)
     start, goal = np.array([[0.1] * 7, [-0.1] * 7])
@@ -108,22 +72,6 @@ def test_free_straight_motion_is_the_path():
     directions, lengths = roadmap.labels([start, goal], [goal, goal], np.random.default_rng(0))
     np.testing.assert_allclose(directions, [[-(7**-0.5)] * 7, [0.0] * 7], atol=1e-6)
     np.testing.assert_allclose(lengths, [0.2 * 7**0.5, 0.0], atol=1e-6)
-
-
-def test_queries_that_a_planner_solves_have_paths():
-    queries = load_queries("random_boxes_hard", "validation")
-    near, found = [], 0
-    for i in range(6):
-        start, goal, scene = queries[i]
-        start, goal = PANDA.normalise(start), PANDA.normalise(goal)
-        near.append(distances(scene, np.stack([start, goal])).min())
-        roadmap = Roadmap(scene, np.random.default_rng(i), num_nodes=600)
-        (path,) = roadmap.paths([start], [goal], np.random.default_rng(i))
-        if path is not None:
-            found += 1
-            assert distances(scene, along(path)).min() > -1e-4
-    assert min(near) < 0.003  # some begin or end in a narrow place
-    assert found >= 5
 
 
 def colliding(roadmap, depth):
@@ -139,9 +87,8 @@ def colliding(roadmap, depth):
     return np.array(found[:10])
 
 
-@pytest.mark.parametrize("depth", [0.0003, 0.008])
-def test_labels_of_states_in_contact(roadmap, depth):
-    states = colliding(roadmap, depth)
+def test_labels_of_states_in_contact_lead_out_along_the_gradient(roadmap):
+    states = colliding(roadmap, 0.008)
     assert len(states) >= 5
     goals = np.repeat(roadmap.sample(1, np.random.default_rng(5), 0.015), len(states), axis=0)
     paths = roadmap.paths(states, goals, np.random.default_rng(6))
@@ -156,31 +103,15 @@ def test_labels_of_states_in_contact(roadmap, depth):
             continue
         assert rest == pytest.approx(length(path), rel=1e-5)
         before = distances(roadmap.scene, state)
-        if depth > 0.001:  # first along the gradient: no random direction is much better
-            assert distances(roadmap.scene, path[1:]).min() > -1e-4
-            rng = np.random.default_rng(7)
-            others = rng.standard_normal((50, 7))
-            others /= np.linalg.norm(others, axis=1, keepdims=True)
-            gain = distances(roadmap.scene, np.clip(state + 0.002 * direction, -1, 1)) - before
-            other = distances(roadmap.scene, np.clip(state + 0.002 * others, -1, 1)) - before
-            assert gain > 0
-            assert gain > other.max() - 1e-5
-        else:
-            assert distances(roadmap.scene, along(path)).min() > before - 1e-4
-
-
-def test_goal_in_collision_has_no_path(roadmap):
-    goal = colliding(roadmap, 0.008)[0]
-    start = roadmap.sample(1, np.random.default_rng(0))[0]
-    assert roadmap.paths([start], [goal], np.random.default_rng(0)) == [None]
-    directions, lengths = roadmap.labels([start], [goal], np.random.default_rng(0))
-    assert np.isnan(directions).all() and np.isnan(lengths).all()
-    assert roadmap.paths(np.empty((0, 7)), np.empty((0, 7)), np.random.default_rng(0)) == []
-
-
-def test_roadmaps_do_not_import_ompl():
-    check = "import sys, roboarm_nmp.demo_generation.roadmaps; sys.exit('ompl' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", check], cwd=ROOT).returncode == 0
+        assert distances(roadmap.scene, path[1:]).min() > -1e-4
+        # No random direction is much better than the first one of the path.
+        rng = np.random.default_rng(7)
+        others = rng.standard_normal((50, 7))
+        others /= np.linalg.norm(others, axis=1, keepdims=True)
+        gain = distances(roadmap.scene, np.clip(state + 0.002 * direction, -1, 1)) - before
+        other = distances(roadmap.scene, np.clip(state + 0.002 * others, -1, 1)) - before
+        assert gain > 0
+        assert gain > other.max() - 1e-5
 
 
 # --- Places
@@ -325,7 +256,6 @@ def test_corrupt_shard_is_rejected_by_name(collected, tmp_path):
         ({"seed": 1}, "made by another command"),
         ({"task": "pole_shelves"}, "for testing only"),
         ({"output": LIBRARY / "datasets" / "demos" / "new"}, "repository"),
-        ({"num_nodes": 20}, "--num-nodes"),
         ({"margin": 0.0}, "--margin"),
     ],
 )

@@ -8,7 +8,7 @@ from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.evaluation import rollout as module
-from roboarm_nmp.evaluation.rollout import Episode, render_strip, rollout, rollouts
+from roboarm_nmp.evaluation.rollout import render_strip, rollout, rollouts
 from roboarm_nmp.policies.registry import make_policy
 
 BENT = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
@@ -53,15 +53,6 @@ def test_trajectory_equals_the_steps_of_the_environment(env):
     assert len(outcomes) > 1
 
 
-def test_episode_ends_as_soon_as_the_goal_is_reached(env):
-    query = Query(BENT, AT_THE_SIDE, Scene())
-    trajectory = rollout(env, query, straight(query))
-    assert trajectory.success and not trajectory.collides and len(trajectory) > 10
-    positions = PANDA.forward_kinematics(trajectory.configurations)
-    to_goal = np.linalg.norm(positions - PANDA.forward_kinematics(AT_THE_SIDE), axis=1)
-    assert to_goal[-1] <= env.ee_tolerance + 1e-6 and (to_goal[:-1] > env.ee_tolerance).all()
-
-
 def test_start_at_the_goal_and_a_policy_that_gives_up_make_no_step(env):
     at_goal = rollout(env, Query(BENT, BENT, Scene()), straight)
     gives_up = rollout(env, Query(BENT, AT_THE_SIDE, Scene()), None)
@@ -90,28 +81,6 @@ def test_episodes_at_once_are_those_of_single_rollouts():
     assert max(together) == 2 and sum(together) == sum(map(len, alone))
     for env in several:
         env.close()
-
-
-def test_actions_are_copied(env):
-    action = np.zeros(7)
-
-    def act(observation):
-        action[:] += 1e-3
-        return action
-
-    episode = Episode(env, Query(BENT, AT_THE_SIDE, Scene()))
-    for _ in range(3):
-        episode.step(act(episode.observation))
-    assert not episode.ended
-    assert np.allclose(episode.trajectory().actions[:, 0], [1e-3, 2e-3, 3e-3])
-
-
-def test_refused_query_and_refused_action_are_errors(env):
-    outside = Query(BENT, np.full(7, 9.0, np.float32), Scene())
-    with pytest.raises(ValueError, match="goal is outside the joint limits"):
-        rollout(env, outside, straight(outside))
-    with pytest.raises(ValueError, match="an action is 7 finite numbers"):
-        rollout(env, Query(BENT, AT_THE_SIDE, Scene()), lambda observation: np.full(7, np.nan))
 
 
 def test_replay_renders_what_the_rollout_went_through():
@@ -149,27 +118,6 @@ def test_delayed_action_takes_effect_some_steps_later():
     assert np.array_equal(observed[:4], trajectory.states[:12:3])
     assert len(trajectory) == env.horizon
     assert len(rollout(env, query, act, delay=1).actions) == env.horizon
-
-
-def test_delay_of_one_step_is_the_action_before():
-    env, query = envs.RoboArmEnv(), Query(BENT, AT_THE_SIDE, Scene())
-    trajectory = rollout(env, query, straight(query), delay=1)
-    act, observation = straight(query), env.reset_specific(*query)[0]
-    previous = np.zeros(7)
-    for state, command in zip(trajectory.states[1:], trajectory.actions, strict=True):
-        assert np.array_equal(command, previous)
-        previous = act(observation)
-        observation, *_ = env.step(command)
-        assert np.array_equal(observation["observation"][:7], state)
-
-
-def test_held_arm_stays_where_it_is_in_mode_subgoal():
-    env, query = envs.RoboArmEnv(action_mode="subgoal"), Query(BENT, AT_THE_SIDE, Scene())
-    goal = PANDA.normalise(AT_THE_SIDE)
-    trajectory = rollout(env, query, lambda observation: goal, delay=10)
-    moved = np.linalg.norm(np.diff(trajectory.states, axis=0), axis=1)
-    moving = (moved > 5e-3).nonzero()[0]  # a step after each observation, and the lag of one
-    assert set(moving % 10) == {0, 1}
 
 
 def test_real_time_delays_by_the_time_that_an_action_takes(monkeypatch):

@@ -5,9 +5,9 @@ import json
 
 from paths import ROOT
 
-from roboarm_nmp.envs.perception.encoders import make_encoder, pretrained_encoders
+from roboarm_nmp.envs.perception.encoders import pretrained_encoders
 from roboarm_nmp.policies import __main__ as command
-from roboarm_nmp.policies.cards import encoder_card, observes, policy_card
+from roboarm_nmp.policies.cards import observes, policy_card
 from roboarm_nmp.policies.registry import find_policy, own_safety_filter, pretrained_policies
 
 DAGGER = "dagger-combined-point_cloud-random_boxes_hard-s1"
@@ -32,15 +32,6 @@ def test_cards_agree_with_the_files_and_the_measured_results():
     assert observes(card) == "32 points and link distances from point_cloud"
     assert observes(policy_card("sac-ee-wall-p1-s1")) == "nothing"
     assert observes(policy_card("bc-combined-vae-random_boxes_hard-s1")) == "latent code of vae"
-
-
-def test_encoder_cards_agree_with_the_encoders():
-    for name in pretrained_encoders():
-        card, encoder = encoder_card(name), make_encoder(name)
-        assert card["has_decoder"] == (encoder.decoder is not None)
-        assert card["sensors"] == len(encoder.sensors)
-    assert encoder_card("vae")["receives"] == "images"
-    assert encoder_card("field")["receives"] == "point clouds"
 
 
 def test_policies_and_encoders_are_listed(capsys):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from trainers import load, refusal, run_script
+from trainers import load, run_script
 
 import roboarm_nmp
 from roboarm_nmp import envs
@@ -17,7 +17,6 @@ from roboarm_nmp.envs.scenes.primitives import Box, Scene
 HARD = "random_boxes_hard"
 MOVING = Scene((Box((0.5, 0.2, 0.3), (0.1, 0.1, 0.6), motion=Oscillation((0, 0.3, 0), 1.0)),))
 oracle = make_encoder("oracle")
-SIZE = oracle.size
 
 
 @pytest.fixture
@@ -131,11 +130,3 @@ def test_policy_with_an_encoder_is_trained_and_evaluated(
     result = roboarm_nmp.evaluate(run, HARD, num_queries=2)
     assert result["goal_type"] == "combined" and result["privileged"]
     assert network["metadata"]["env"].get("append_link_distances", False) == (trainer != "bc")
-
-
-def test_file_that_is_no_encoder_is_rejected(tmp_path, capsys):
-    (tmp_path / "runs").mkdir()
-    (tmp_path / "encoder.pt").write_text("nothing")
-    given = ("--encoder", str(tmp_path / "encoder.pt"))
-    message = refusal("bc", capsys, tmp_path / "runs", *given)
-    assert "--encoder: " in message and "not a network file" in message

@@ -85,13 +85,6 @@ def test_pretrained_policy_brings_its_observations_and_its_safety_filter():
     assert own_safety_filter("planner") is None
 
 
-def test_safety_filter_needs_link_distances():
-    env = envs.make("wall")
-    with pytest.raises(PolicyError, match="needs link_distances"):
-        make_policy("go-to-goal", env, safety_filter=SafetyFilter())
-    env.close()
-
-
 def test_policies_are_listed_without_what_takes_long_to_import():
     code = "import sys, roboarm_nmp.policies.registry; print(*sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)

@@ -103,12 +103,6 @@ def test_bad_goal_pose_is_rejected_and_the_episode_goes_on(env, given, message):
     assert env.step(np.zeros(7))[-1]["elapsed_steps"] == 1
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 4.0])
-def test_angle_tolerance_out_of_range_is_rejected(tolerance):
-    with pytest.raises(ValueError, match="angle_tolerance must be"):
-        envs.make("no_obstacles", goal_type="pose", angle_tolerance=tolerance)
-
-
 def test_goal_pose_reaches_the_environment_through_wrappers_copies_and_vector_environments():
     pose = PANDA.end_effector_pose(NEAR_HOME)
     arguments = {"geometry_source": "ground_truth", "link_distances": True, "encoder": "oracle"}

@@ -2,9 +2,6 @@
 
 import os
 import re
-import subprocess
-import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,13 +14,9 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.queries import Query, load_queries, write_queries
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.motions import Presence
-from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
-from roboarm_nmp.evaluation.rollout import rollout
 from roboarm_nmp.motions.trajectories import load_joint_path
 from roboarm_nmp.networks.exported_networks import save_network
-from roboarm_nmp.policies.registry import find_policy, make_policy
-from roboarm_nmp.viewer import demo, images, show
+from roboarm_nmp.viewer import images, show
 
 SMALL = (96, 72)
 SIZE = ["--size", "96", "72"]
@@ -55,31 +48,6 @@ def pixels_of(path):
 # --- Images
 
 
-def test_image_shows_start_goal_and_obstacles(env):
-    scene = Scene((Sphere((0.5, 0.3, 0.4), 0.1),))
-    queries = [
-        Query(BENT, AT_THE_SIDE, scene),
-        Query(BENT + 0.2, AT_THE_SIDE, scene),
-        Query(BENT, AT_THE_SIDE + 0.2, scene),
-        Query(BENT, AT_THE_SIDE, Scene()),
-    ]
-    shown = [images.render_query(env, query, SMALL) for query in queries]
-    assert all(image.shape == (72, 96, 3) and image.dtype == np.uint8 for image in shown)
-    assert len({image.tobytes() for image in shown}) == 4
-    assert np.array_equal(images.render_query(env, queries[0], SMALL), shown[0])
-
-
-def test_goal_that_is_a_position_has_no_ghost(tmp_path):
-    shown = {}
-    for goal_type in ("ee", "config", "combined"):
-        path = tmp_path / f"{goal_type}.png"
-        assert run("wall", "--output", path, "--goal-type", goal_type, *SIZE) == 0
-        shown[goal_type] = pixels_of(path)
-    assert np.array_equal(shown["config"], shown["combined"])
-    changed = (shown["ee"] != shown["config"]).any(-1)
-    assert changed.sum() > 50
-
-
 def test_images_of_several_queries_form_a_grid(tmp_path, capsys):
     assert run("wall", "--output", tmp_path / "a.png", "--draws", 3, "--query", 5, *SIZE) == 0
     assert "test query 5 to 7" in capsys.readouterr().out
@@ -91,17 +59,6 @@ def test_images_of_several_queries_form_a_grid(tmp_path, capsys):
             query = load_queries("wall")[number]
             assert np.array_equal(tile, images.render_query(env, query, SMALL))
     assert (tiles[3] == 255).all()
-
-
-def test_obstacles_move_in_an_animation(env):
-    """A box that disappears after 1 s is not in the image of that time."""
-    box = Box((0.6, -0.3, 0.2), (0.2, 0.2, 0.2), motion=Presence(((0.0, 1.0),)))
-    query = Query(BENT, BENT, Scene((box,)))
-    options = {"times": (0.0, 1.0), "size": SMALL}
-    there, gone = images.render_configurations(env, query, [BENT, BENT], **options)
-    still = Query(BENT, BENT, Scene((replace(box, motion=None),)))
-    same = images.render_query(env, still, SMALL)
-    assert np.array_equal(there, same) and not np.array_equal(gone, same)
 
 
 # --- Animations
@@ -135,17 +92,6 @@ def test_animation_shows_the_episode_of_a_policy(tmp_path, capsys, monkeypatch):
         assert animation.info["duration"] == pytest.approx(1000 * -(-steps // 5) / 30, abs=10)
 
 
-@pytest.mark.parametrize(
-    ("policy", "contact"), [("go-to-goal", "with contact"), ("planner", "collision-free")]
-)
-def test_outcome_of_a_policy_is_printed(policy, contact, tmp_path, capsys):
-    # Straight to this goal the arm slides along a wall; there is a way around.
-    arguments = ["--policy", policy, "--query", 11, "--split", "validation", *SIZE]
-    assert run("double_walls", "--output", tmp_path / "a.gif", *arguments) == 0
-    text = capsys.readouterr().out
-    assert f"{policy}: reached the goal in " in text and contact in text
-
-
 def test_first_animation_of_the_quickstart_is_collision_free(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     commands = re.findall(
@@ -156,34 +102,18 @@ def test_first_animation_of_the_quickstart_is_collision_free(tmp_path, capsys, m
     assert "reached the goal" in text and "collision-free" in text
 
 
-def test_policy_in_the_animation_of_the_readme_is_collision_free():
-    """docs/make_hero.py shows the query of `roboarm demo`."""
-    policy, arguments = find_policy(demo.POLICY)
-    query = load_queries(demo.TASK)[demo.QUERY]
-    with envs.make(demo.TASK, **arguments) as env:
-        trajectory = rollout(env, query, make_policy(policy, env)(demo.QUERY, query).act)
-    assert trajectory.success and not trajectory.collides
-
-
 def test_demonstration_is_shown(tmp_path, capsys):
     recorded = load_demos("wall")[7]
     arguments = ["--policy", "demo", "--query", 7, *SIZE]
     assert run("wall", "--output", tmp_path / "a.gif", *arguments) == 0
     assert f"demonstration 7: {len(recorded.states) - 1} steps" in capsys.readouterr().out
-    # The still image is of the demonstration's query.
-    assert run("wall", "--output", tmp_path / "a.png", *arguments) == 0
-    query = Query(recorded.start, recorded.goal, recorded.scene)
-    with envs.make("wall", goal_type="combined") as env:
-        expected = images.render_query(env, query, SMALL)
-    assert np.array_equal(pixels_of(tmp_path / "a.png"), expected)
 
 
 # --- Trajectories
 
 
-@pytest.mark.parametrize("ending", [".csv", ".yaml"])
-def test_saved_trajectory_plays_as_the_episode(tmp_path, capsys, ending):
-    file = tmp_path / f"episode{ending}"
+def test_saved_trajectory_plays_as_the_episode(tmp_path, capsys):
+    file = tmp_path / "episode.csv"
     arguments = ["--query", 2, "--save-trajectory", file]
     assert run("wall", *arguments, "--output", tmp_path / "a.gif", *SIZE) == 0
     size = file.stat().st_size
@@ -259,10 +189,7 @@ def test_scene_is_shown_without_queries_that_are_out_of_date(tmp_path, capsys):
 
 
 def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
-    policy = save(tmp_path / "policy.pt")
-    (tmp_path / "broken.pt").write_bytes(policy.read_bytes()[:500])
     unfit = save(tmp_path / "unfit.pt", env={"goal_type": "ee"})
-    strange = save(tmp_path / "strange.pt", env={"goal_type": "poses"})
     (tmp_path / "bad.yaml").write_text("obstacles:\n  - bax: {}\n")
     (tmp_path / "full.yaml").write_text("obstacles: [sphere: {position: [0, 0, 0.3], radius: 0.3}]")
     before = sorted(os.listdir(tmp_path))
@@ -275,23 +202,12 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
         ([tmp_path / "full.yaml", *png], "no feasible configuration"),
         (["wall"], "give --output FILE.png or --output FILE.gif; `roboarm view`"),
         (["wall", "--output", tmp_path / "out.jpg"], "must end in .png or .gif"),
-        (["wall", "--output", tmp_path / "none" / "out.png"], "cannot write"),
         (["wall", *png, "--query", many], f"no test query {many}: the numbers are 0 to {many - 1}"),
-        (["wall", *png, "--query", many - 1, "--draws", 2], f"no test query {many}"),
-        (["wall", *png, "--query", -1], "--query must be at least 0, got -1"),
         (["wall", *gif, "--draws", 2], "--draws goes with --output FILE.png"),
-        (["wall", *png, "--split", "original"], "there are no original queries of wall"),
-        (["wall", *gif, "--policy", "go-to-gaol"], "no such policy: go-to-gaol"),
-        (["wall", *gif, "--policy", tmp_path / "broken.pt"], "broken.pt: not a network file"),
         (["wall", *gif, "--policy", unfit], "unfit.pt: aten.sub.Tensor failed"),
-        (["wall", *gif, "--policy", strange], "strange.pt: does not say which goal type"),
-        (["wall", *gif, "--policy", policy, "--goal-type", "ee"], "with the goal type 'config'"),
         (["benchmaker_bookshelf_tall", *gif, "--policy", "demo"], "has no demonstrations"),
         (["wall", *gif, "--trajectory", tmp_path / "none.csv"], "none.csv: No such file"),
-        (["wall", *gif, "--trajectory", "a.csv", "--policy", "planner"], "give one of them"),
         (["wall", *gif, "--save-trajectory", tmp_path / "a.txt"], "must end in .csv, .npz"),
-        (["wall", *png, "--save-trajectory", tmp_path / "a.csv"], "--output FILE.gif, or without"),
-        (["wall", "--policy", "demo", "--save-trajectory", tmp_path / "a.csv"], "with a policy"),
     ]
     for arguments, message in cases:
         assert run(*arguments) == 2, arguments
@@ -301,37 +217,18 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
     assert sorted(os.listdir(tmp_path)) == before
 
 
-def test_interrupt_and_a_full_disk_leave_the_old_image(tmp_path, capsys, monkeypatch):
+def test_full_disk_leaves_the_old_image(tmp_path, capsys, monkeypatch):
     path = tmp_path / "a.png"
     path.write_bytes(b"old")
-    for error in (KeyboardInterrupt, OSError("the disk is full")):
 
-        def fail(descriptor, error=error):
-            raise error
+    def fail(descriptor):
+        raise OSError("the disk is full")
 
-        # After a part of the image was written to a temporary file.
-        monkeypatch.setattr(os, "fsync", fail)
-        if error is KeyboardInterrupt:
-            with pytest.raises(KeyboardInterrupt):
-                run("wall", "--output", path, *SIZE)
-        else:
-            assert run("wall", "--output", path, *SIZE) == 2
-            assert "the disk is full" in capsys.readouterr().err
-        assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]
+    # After a part of the image was written to a temporary file.
+    monkeypatch.setattr(os, "fsync", fail)
+    assert run("wall", "--output", path, *SIZE) == 2
+    assert "the disk is full" in capsys.readouterr().err
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]
     monkeypatch.undo()
     assert run("wall", "--output", path, *SIZE) == 0
     assert path.read_bytes().startswith(b"\x89PNG") and os.listdir(tmp_path) == ["a.png"]
-
-
-def test_images_of_tasks_do_not_import_torch(tmp_path):
-    code = (
-        "import sys; from roboarm_nmp.viewer import show; code = show.main(sys.argv[1:]);"
-        "assert 'torch' not in sys.modules; sys.exit(code)"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code, "wall", "--output", str(tmp_path / "a.png"), *SIZE],
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0, result.stderr
-    assert f"{tmp_path / 'a.png'}: written, wall, test query 0" in result.stdout

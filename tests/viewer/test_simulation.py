@@ -9,7 +9,6 @@ import roboarm_nmp
 from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.datasets.roadmap_paths import shard_bytes
-from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence
@@ -113,21 +112,6 @@ def test_safety_filter_around_a_policy_is_that_of_an_evaluation(simulation):
     assert max(corrections) > 0.005
 
 
-def test_contacts_name_links_and_points_on_the_arm(simulation):
-    shown = simulation("wall", "go-to-goal", number=BLOCKED)
-    arm = shown.arms[0]
-    while not (arm.in_contact or arm.ended):
-        shown.step()
-    assert arm.contact_steps > 0 and len(arm.contacts.points) > 0
-    wall = shown.query.scene.obstacles[0]
-    apart = np.abs(arm.contacts.points - wall.position) - np.array(wall.size) / 2
-    assert apart.max() < 0.01
-    checker = CollisionChecker(shown.query.scene)
-    distances = checker.signed_distances(arm.state).distance
-    nearest = PANDA.collision_links[int(np.argmin(distances))]
-    assert nearest in arm.contacts.links
-
-
 def test_arm_goes_on_from_where_it_is_when_the_goal_moves(simulation):
     shown = simulation("no_obstacles", "go-to-goal")
     arm = shown.arms[0]
@@ -189,13 +173,6 @@ def test_point_cloud_policy_observes_an_obstacle_that_was_moved(simulation):
     assert not np.allclose(observed[0], observed[1], atol=1e-3)
 
 
-def test_goal_in_collision_is_a_problem_and_ends_planning(simulation):
-    shown = simulation("no_obstacles", "planner", "go-to-goal")
-    shown.add_obstacle(Sphere(tuple(PANDA.forward_kinematics(shown.query.goal)), 0.05))
-    assert [arm.problem for arm in shown.arms] == ["the goal is in collision"] * 2
-    assert [arm.ended for arm in shown.arms] == [True, False]
-
-
 def test_demonstrations_are_replayed_configuration_by_configuration():
     shown = Simulation(demonstration_episodes("wall"), number=4)
     shown.add(RecordedArm("demonstration"))
@@ -232,14 +209,6 @@ def test_roadmap_paths_are_replayed_along_their_points(tmp_path):
         assert np.linalg.norm(np.diff(states, axis=0), axis=1).max() < 0.03
         for point in path:
             assert np.linalg.norm(states - point, axis=1).min() < 1e-6
-
-
-@pytest.mark.parametrize(("split", "number"), [("test", 10_000), ("test", -1), ("original", 0)])
-def test_query_that_does_not_exist_is_rejected(simulation, split, number):
-    shown = simulation("wall", "go-to-goal")
-    with pytest.raises(ValueError, match="quer"):
-        shown.select(split, number)
-    assert shown.number == 0
 
 
 def test_file_of_a_trajectory_is_played_in_the_scene_of_each_query(tmp_path):
@@ -288,9 +257,3 @@ def test_obstacles_move_as_in_an_evaluation_and_are_drawn_where_they_are(simulat
     shown.restart()
     run(shown)
     np.testing.assert_array_equal(arm.trajectory().states, expected.states)
-    shown.restart()
-    shown.step()
-    shown.replace_obstacle(2, FAR)  # an edit: goes on without forces, from time 0
-    for _ in range(5):
-        shown.step()
-    assert arm.kinematic and arm.time == arm.env.unwrapped.time

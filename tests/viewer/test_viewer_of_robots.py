@@ -12,9 +12,8 @@ from roboarm_nmp.envs.robots.variants import with_attached
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.primitives import Attached, Box, Sphere, convex_hull
 from roboarm_nmp.utils.bullet import pybullet as p
-from roboarm_nmp.viewer import app
 from roboarm_nmp.viewer.episodes import task_episodes
-from roboarm_nmp.viewer.simulation import PolicyArm, Simulation, inverse_kinematics
+from roboarm_nmp.viewer.simulation import PolicyArm, Simulation
 
 pytest.importorskip("viser")
 from roboarm_nmp.viewer.meshes import arm_joints, link_meshes  # noqa: E402
@@ -126,34 +125,6 @@ def test_every_kind_of_visual_shape_is_drawn_at_its_origin_in_its_colour(arm):
         np.testing.assert_allclose((vertices.max(0) + vertices.min(0)) / 2, (0, 0, 0.1), atol=1e-3)
 
 
-def test_link_without_visual_shapes_has_its_collision_shapes(tmp_path):
-    path = of_shapes(tmp_path)
-    text = path.read_text()
-    start, end = text.index("<visual>"), text.index("</visual>") + len("</visual>")
-    path.write_text(text[:start] + text[end:])
-    [(_, vertices, _)] = link_meshes(robot_from_urdf(path, end_effector="five"), 0.005)[-1]
-    np.testing.assert_allclose(np.ptp(vertices, axis=0), (0.01, 0.01, 0.01), atol=1e-4)
-
-
-def test_mesh_that_cannot_be_drawn_is_named(tmp_path):
-    path = of_shapes(tmp_path)
-    robot = robot_from_urdf(path, end_effector="five", name="another")  # equal ones share meshes
-    (tmp_path / "box.stl").write_bytes((tmp_path / "box.stl").read_bytes()[:100])
-    with pytest.raises(ValueError, match="box.stl: the mesh cannot be drawn"):
-        link_meshes(robot, 0.005)
-
-
-def test_inverse_kinematics_moves_every_arm(robot):
-    rng, errors = np.random.default_rng(1), []
-    for state in rng.uniform(-0.7, 0.7, (20, robot.num_joints)):
-        here = robot.forward_kinematics(robot.denormalise(state))
-        near = robot.denormalise(np.clip(state + rng.uniform(-0.1, 0.1, state.shape), -1, 1))
-        found = inverse_kinematics(robot, here, near)
-        assert np.all(np.abs(robot.normalise(found)) <= 1 + 1e-9)
-        errors.append(np.linalg.norm(robot.forward_kinematics(found) - here))
-    assert np.mean(np.array(errors) < 1e-3) > 0.9
-
-
 def test_planner_moves_another_arm_and_its_scene_can_be_edited_and_saved(tmp_path):
     task = f"random_boxes_hard@{XARM6}"
     shown = Simulation(task_episodes(task))
@@ -180,30 +151,6 @@ def test_saving_a_scene_never_replaces_a_file(tmp_path):
     assert names == ["mine_2.yaml", "mine_3.yaml"] and first.read_bytes() == before
     assert load_scene(tmp_path / "mine_2.yaml") == shown.query.scene
     shown.close()
-
-
-def test_replay_of_another_arm_is_written(capfd, tmp_path, monkeypatch):
-    monkeypatch.setattr(app, "end_with_one_line", lambda advice: None)
-    path = tmp_path / "replay.html"
-    arguments = [f"no_obstacles@{XARM6}", "--record", str(path)]
-    assert app.main(arguments) == 0
-    assert capfd.readouterr().out.startswith(f"{path}: written")
-    assert path.stat().st_size < 1_500_000
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["no_obstacles@missing.yaml"], "missing.yaml: No such file"),
-        ([f"wall@{XARM6}"], "wall is the Panda's"),
-        ([f"no_obstacles@{XARM6}", "--policy", "sac-ee-wall-p1-s1"], "panda"),
-    ],
-)
-def test_robots_that_cannot_be_viewed_give_one_line(capfd, monkeypatch, arguments, words, tmp_path):
-    monkeypatch.setattr(app, "end_with_one_line", lambda advice: None)
-    assert app.main([*arguments, "--record", str(tmp_path / "a.html")]) == 2
-    output, errors = capfd.readouterr()
-    assert output == "" and len(errors.splitlines()) == 1 and words in errors
 
 
 def test_attached_objects_are_drawn_where_their_links_are():
