@@ -208,7 +208,6 @@ def test_editors_complete_names_of_an_editable_install(source, python):
     assert "plan" in completed("from roboarm_nmp.planning.planner import Planner; Planner.")
 
 
-@pytest.mark.xfail(reason="the trainers are not typed yet", strict=False)
 def test_copied_trainer_has_no_type_errors(tmp_path, python):
     pyright = Path(sysconfig.get_path("scripts"), "pyright")
     version = subprocess.run([pyright, "--version"], capture_output=True, cwd=tmp_path)

@@ -48,7 +48,7 @@ def folder(tmp_path_factory):
     return write_paths(tmp_path_factory.mktemp("paths"), scenes, [paths[0], [], paths[2]])
 
 
-@pytest.fixture(scope="module", params=["oracle", "point_cloud", "vqvae"])
+@pytest.fixture(scope="module", params=["point_cloud", "vqvae"])
 def setting(request, folder, tmp_path_factory):
     """An untrained policy, its environment, and a batch of examples in two scenes."""
     encoder = request.param
@@ -290,8 +290,6 @@ def test_no_kernel_receives_two_dtypes(tmp_path, folder, short_episodes):
         (["--paths", "nowhere"], "--paths: nowhere"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
         (["--encoder", "lidar"], "--encoder: no such encoder: lidar"),
-        (["--geometry-source", "vae"], "--geometry-source: a geometry source is"),
-        (["--batch-size", "0"], "--batch-size must be at least 1"),
         (["--pool-size", "5"], "--pool-size must be at least --examples-per-update"),
     ],
 )

@@ -15,32 +15,6 @@ from roboarm_nmp.networks.exported_networks import load_network
 CELLS = {cell.name: cell for cell in paper_tables.read_cells()}
 
 
-def result(name, seed, success, **more):
-    made_up = {
-        "cell": name,
-        "seed": seed,
-        "success_rate": success,
-        "success_rate_interval": [success - 0.01, success + 0.01],
-        "collision_free_success_rate": success / 2,
-        "num_queries": 10_000,
-        "steps": 300_000,
-        "policy_step": 275_000,
-        "training_seconds": 600,
-        "date": "2026-01-02",
-        "commit": "abc1234",
-        "kept": False,
-        "args": {},
-    }
-    return made_up | more
-
-
-def args_of(name):
-    """What a run of the cell's own recipe has in its JSON."""
-    flags = [flag for flag in CELLS[name].flags() if flag != "--no-jacobian"]
-    args = dict(zip(flags[::2], flags[1::2], strict=True))
-    return {flag[2:].replace("-", "_"): v for flag, v in args.items()} | {"jacobian": False}
-
-
 def test_cells_are_the_papers_numbers_and_commands():
     papers = [cell for cell in CELLS.values() if cell.mean is not None]
     assert len(papers) == 3 * 9 * 5 + 4 + 3 + 9 * 6  # goals, hindsight, encoders with BC and SAC
@@ -51,20 +25,6 @@ def test_cells_are_the_papers_numbers_and_commands():
     flags = CELLS["sac-combined-no_obstacles-p0-no_hindsight"].flags()
     assert flags[-4:] == ["--demo-prob", "0", "--her-probability", "0"]
     assert "--demo-prob" not in CELLS["bc-ee-wall"].flags()
-
-
-def test_runs_with_other_flags_do_not_count_beside_the_cells_own():
-    name = "sac-ee-double_walls-p1"
-    cells = list(CELLS.values())
-    results = {name: [result(name, 1, 0.83), result(name, 2, 0.7, num_queries=100)]}
-    tables = paper_tables.tables(cells, results, {})
-    assert "| none | no | 0.829 | [" in tables["paper-ee"]  # (8,300 + 70) / 10,100
-    assert f"| `{name}` | 0.829 | 0.916 |" in tables["paper-below"]
-    results[name].append(result(name, 3, 0.9, args=args_of(name)))
-    tables = paper_tables.tables(cells, results, {})
-    assert "| `double_walls` | SAC-MP (p = 1) | none | no | 0.900 |" in tables["paper-ee"]
-    assert len(tables["paper-below"].splitlines()) == 2
-    assert not CELLS[name].is_recipe_of(args_of(name) | {"jacobian": True})
 
 
 @pytest.fixture

@@ -11,8 +11,6 @@ import torch
 from one_type import OneType
 from trainers import PATHS, TRAINERS, command, run_here
 
-from roboarm_nmp.training import protocol
-
 ONCE = "--total-timesteps 60 --horizon 30 --eval-every 30 --learning-starts 15 --num-envs 3"
 ONCE_BC = "--total-updates 2 --eval-every 2"
 ENCODED = ["--task", "random_boxes_hard", "--encoder", "oracle", "--goal-type", "combined"]
@@ -49,13 +47,6 @@ def test_update_evaluation_and_resume_on_another_device(
     assert {tensor.device.type for tensor in resumed["actor"].values()} == {another_device}
 
 
-def test_tensor_left_on_the_cpu_raises(tmp_path, another_device, monkeypatch):
-    stack = protocol.stack
-    monkeypatch.setattr(protocol, "stack", lambda observations, _: stack(observations, "cpu"))
-    with pytest.raises(RuntimeError, match="device"):
-        run_here(*command("bc", tmp_path, *flags("bc"), "--device", another_device)[1:])
-
-
 @pytest.mark.parametrize("trainer", TRAINERS)
 def test_no_kernel_receives_two_dtypes(trainer, tmp_path):
     given = command(
@@ -63,15 +54,3 @@ def test_no_kernel_receives_two_dtypes(trainer, tmp_path):
     )[1:]
     with OneType():
         run_here(*given)
-
-
-def test_two_dtypes_in_a_kernel_are_noticed():
-    x, norm = torch.zeros(2, 8, dtype=torch.bfloat16), torch.nn.LayerNorm(8)
-    linear = torch.nn.Linear(8, 8)
-    with OneType():
-        linear(x.float())
-        with torch.autocast("cpu", torch.bfloat16):
-            linear(x)
-        for mixed in (lambda: norm(x), lambda: x + norm.weight):
-            with pytest.raises(AssertionError, match="of .*bfloat16"):
-                mixed()

@@ -1,7 +1,5 @@
 """sac_her_mp.py: numbers against independent formulas, and runs with flags of its own."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -17,38 +15,11 @@ from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.training import cuda_graphs
 from roboarm_nmp.training.network_parts import JacobianTranspose
-from roboarm_nmp.training.protocol import stack
 
 sac = load("sac_her_mp")
 
 
 # --- Numbers
-
-
-def test_polyak_update_by_hand():
-    target, network = torch.nn.Linear(1, 2, bias=False), torch.nn.Linear(1, 2, bias=False)
-    target.weight.data = torch.tensor([[1.0], [2.0]])
-    network.weight.data = torch.tensor([[3.0], [-2.0]])
-    sac.polyak_update(target, network, 0.25)
-    torch.testing.assert_close(target.weight.data, torch.tensor([[1.5], [1.0]]))
-    torch.testing.assert_close(network.weight.data, torch.tensor([[3.0], [-2.0]]))
-
-
-def test_log_probability_is_that_of_a_squashed_gaussian():
-    torch.manual_seed(0)
-    actor = sac.Actor(sac.Args(bf16=False), panda_env()).eval()
-    observation, goal = 0.3 * torch.randn(64, 10), 0.3 * torch.randn(64, 3)  # not saturated
-    action, log_prob = actor.get_action(actor.features(observation, goal))
-    mean, log_std = actor.mlp(actor.features(observation, goal)).chunk(2, dim=1)
-    std = (-5 + 3.5 * (torch.tanh(log_std) + 1)).exp()
-    squashed = torch.distributions.TransformedDistribution(
-        torch.distributions.Normal(mean.double(), std.double()),
-        torch.distributions.transforms.TanhTransform(),
-    )
-    expected = squashed.log_prob(action.double() / 0.06).sum(1)
-    torch.testing.assert_close(log_prob.double(), expected, rtol=1e-3, atol=1e-3)
-    deterministic = actor(observation, None, goal)
-    torch.testing.assert_close(deterministic, 0.06 * torch.tanh(mean))
 
 
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
@@ -101,27 +72,6 @@ def test_network_inputs_of_goal_poses():
     expected = [there[:3] - here[:3], axis * np.sin(turn.magnitude() / 2)]
     np.testing.assert_allclose(inputs[-6:], 5 * np.hstack(expected), atol=1e-5)
     np.testing.assert_allclose(inputs[:21], np.hstack([observation, there]), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("goal_type", "velocities", "link_distances"),
-    [("ee", True, True), ("config", False, True), ("combined", True, False), ("pose", True, True)],
-)
-def test_networks_fit_every_observation(goal_type, velocities, link_distances):
-    shared = {"goal_type": goal_type, "velocities": velocities}
-    source = "ground_truth" if link_distances else None
-    shared |= {"link_distances": link_distances, "geometry_source": source}
-    args = sac.Args(**shared, num_hidden_layers=4)
-    env = envs.make("wall", **shared, append_link_distances=link_distances)
-    batch = stack([env.reset(seed=0)[0], env.reset()[0]], "cpu")
-    actor = sac.Actor(args, env)
-    if link_distances:  # distances, ten times as large, are the last inputs
-        features = actor.features(batch["observation"], batch["desired_goal"])
-        torch.testing.assert_close(features[:, -10:], 10.0 * batch["link_distances"][..., 0])
-    action = actor(**batch)
-    assert action.shape == (2, 7)
-    features = actor.features(batch["observation"], batch["desired_goal"])
-    assert sac.Critics(args, actor.features)(features, action).shape == (2, 2)
 
 
 @pytest.mark.parametrize(
@@ -225,17 +175,6 @@ def test_ring_overwrites_the_oldest_and_keeps_episodes_apart():
     assert (now // 100 == goal // 100).all() and (goal >= now).all()
 
 
-def test_bfloat16_products_stay_close_to_float32():
-    torch.manual_seed(0)
-    args = sac.Args(bf16=True)
-    features = sac.Features(args, panda_env())
-    critics = sac.Critics(args, features)
-    inputs = torch.randn(256, features.size), torch.rand(256, 7) * 0.06
-    in_training, exact = critics.train()(*inputs), critics.eval()(*inputs)
-    assert 0 < (in_training - exact).abs().max() < 0.02
-    assert math.isclose(in_training.mean().item(), exact.mean().item(), abs_tol=2e-3)
-
-
 def test_updates_fall_due_evenly_after_learning_starts():
     args = sac.Args(learning_starts=200, updates_per_step=0.3, num_envs=7)
     due = {step: sac.updates_due(step, args) for step in range(7, 7001, 7)}
@@ -308,26 +247,6 @@ def test_demonstration_as_transitions_by_hand(goal_type):
     env.close()
 
 
-def test_rewards_and_hindsight_of_injected_demonstrations():
-    demo, env = hand_made_demos()[2], envs.make("no_obstacles")
-    episode = demo_transitions(demo, env)
-    for her_probability in (0.0, 1.0):
-        buffer = sac.HerReplayBuffer(env, 1000, her_probability, np.random.default_rng(0))
-        buffer.add_episode(episode)
-        batch = buffer.sample(2000)
-        arrived = (batch["next_observation"] == episode[-1]["next_observation"].astype("f4")).all(1)
-        own = np.abs(batch["desired_goal"] - episode[-1]["desired_goal"]).max(1) < 1e-6
-        if her_probability == 0.0:
-            assert own.all()
-            np.testing.assert_array_equal(batch["reward"], np.where(arrived, 0.0, -1.0))
-            np.testing.assert_array_equal(batch["terminated"], arrived)
-        else:
-            achieved = np.stack([t["next_achieved_goal"] for t in episode]).astype("f4")
-            assert all((goal == achieved).all(1).any() for goal in batch["desired_goal"])
-            assert 0 < (batch["reward"] == 0).mean() < 1
-    env.close()
-
-
 @pytest.fixture(scope="module")
 def demo_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("demos") / "demos.h5"
@@ -336,19 +255,13 @@ def demo_file(tmp_path_factory):
     return path
 
 
-def demo_run(folder, demo_file, prob):
-    """The buffer's arrays after such a run, and the events of it."""
-    run = run_script("sac_her_mp", folder, "--demo-prob", prob, "--demos", str(demo_file))
-    state = torch.load(run / "checkpoint.pt", weights_only=True)
-    events = EventAccumulator(str(run))
-    events.Reload()
-    return {name: a.numpy() for name, a in state["buffer"]["arrays"].items()}, events
-
-
-@pytest.mark.parametrize("prob", ["1", "0.4"])
-def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, demo_file, prob):
+def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, demo_file):
     demos = load_demos(demo_file)
-    arrays, events = demo_run(tmp_path, demo_file, prob)
+    flags = ["--demo-prob", "0.4", "--demos", str(demo_file)]
+    run = run_script("sac_her_mp", tmp_path, *flags)
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    arrays = {name: array.numpy() for name, array in state["buffer"]["arrays"].items()}
+    events = EventAccumulator(str(run)).Reload()
     first = np.concatenate([[True], arrays["remaining"][:-1] == 0])
     observation, goal = arrays["observation"][first], arrays["desired_goal"][first]
     starts = PANDA.normalise(demos.start)
@@ -361,12 +274,8 @@ def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, de
     ]
     failures = len(events.Scalars("charts/episodic_length"))  # so short a run never succeeds
     assert events.Scalars("charts/success")[-1].value == 0
-    assert failures > 5
     assert sum(injected) == events.Scalars("charts/demos_injected")[-1].value
-    if prob == "0.4":
-        assert 0 < sum(injected) < failures
-    else:
-        assert sum(injected) == float(prob) * failures
+    assert 0 < sum(injected) < failures
 
 
 CLONING = ["--demo-prob", "1", "--bc-weight", "5", "--demo-batch-size", "6"]
@@ -416,17 +325,3 @@ def test_resumed_run_with_cloning_is_the_same(tmp_path, demo_file):
     for name in ("actor", "actor_average", "critics"):
         for key, tensor in one[name].items():
             assert torch.equal(tensor, other[name][key]), (name, key)
-
-
-# --- Real runs
-
-
-def test_losses_are_logged_with_subgoal_actions_and_constant_alpha(tmp_path):
-    flags = "--action-mode subgoal --updates-per-step 3 --goal-type config --target-entropy None"
-    run = run_script("sac_her_mp", tmp_path, *flags.split())
-    events = EventAccumulator(str(run))
-    events.Reload()
-    for tag in ("qf1_values", "qf1_loss", "qf2_loss", "qf_loss", "actor_loss", "alpha"):
-        assert np.isfinite([event.value for event in events.Scalars(f"losses/{tag}")]).all()
-    assert events.Scalars("losses/alpha")[-1].value == pytest.approx(0.2)
-    assert events.Scalars("charts/SPS")[-1].value > 0

@@ -79,9 +79,7 @@ def test_search_space_is_parsed(text, name, distribution):
     assert sweep.parse_search(text) == (name, distribution)
 
 
-@pytest.mark.parametrize(
-    "text", ["lr", "=1..2", "lr=", "lr=1..2:logarithmic", "lr=2.0..1.0", "lr=0..1:log"]
-)
+@pytest.mark.parametrize("text", ["lr", "lr=1..2:logarithmic", "lr=2.0..1.0"])
 def test_bad_search_space_is_rejected(trainer, text, capsys):
     with pytest.raises(SystemExit) as exit:
         sweep.main([str(trainer), "--search", text])
@@ -198,9 +196,3 @@ def test_on_ray(trainer):
                 assert "it diverged" in row["error"]
     finally:
         cluster.shutdown()
-
-
-def test_trainer_without_a_policy_fails(trainer):
-    trainer.write_text(TRAINER.replace("validation_success_rate", "error_near"))
-    with pytest.raises(SystemExit, match="every trial failed"):
-        sweep.main(arguments(trainer, "--trials", "1"))

@@ -1,21 +1,9 @@
 """td3_her_mp.py: runs with flags of its own. (Its update: test_updates.py.)"""
 
-import numpy as np
 import torch
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainers import ONE_EVALUATION, load, panda_env, run_script
 
 td3 = load("td3_her_mp")
-
-
-def test_losses_are_logged(tmp_path):
-    flags = ["--updates-per-step", "3", "--goal-type", "config", *ONE_EVALUATION]
-    run = run_script("td3_her_mp", tmp_path, *flags)
-    events = EventAccumulator(str(run))
-    events.Reload()
-    for tag in ("qf1_values", "qf1_loss", "qf2_loss", "qf_loss", "actor_loss"):
-        assert np.isfinite([event.value for event in events.Scalars(f"losses/{tag}")]).all()
-    assert events.Scalars("charts/SPS")[-1].value > 0
 
 
 def test_exploration_noise_has_the_given_size(tmp_path):

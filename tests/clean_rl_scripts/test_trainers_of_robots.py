@@ -47,18 +47,12 @@ def file(tmp_path_factory):
     return file
 
 
-@pytest.mark.parametrize(("script", "kind"), [("sac_her_mp", "SAC"), ("td3_her_mp", "TD3")])
-def test_discount_factor_is_higher_where_a_joint_turns_all_the_way_round(script, kind):
-    module = load(script)
-    for arm, discounts in (("xarm6", (0.98, 0.9)), ("iiwa", (0.95, 0.9))):
-        env = envs.make(f"no_obstacles@{EXAMPLE.with_stem(arm)}", goal_type="ee")
-        agents = (
-            getattr(module, kind)(module.Args(bf16=False, gamma=gamma), env, torch.device("cpu"))
-            for gamma in ("auto", 0.9)
-        )
-        assert tuple(agent.gamma for agent in agents) == discounts
-        env.close()
-    assert module.discount_factor("auto", panda_env().unwrapped.robot) == 0.95
+def test_discount_factor_is_higher_where_a_joint_turns_all_the_way_round():
+    module = load("sac_her_mp")
+    for arm, discount in (("xarm6", 0.98), ("iiwa", 0.95)):
+        robot = load_robot(EXAMPLE.with_stem(arm))
+        assert module.discount_factor("auto", robot) == discount
+        assert module.discount_factor(0.9, robot) == 0.9
 
 
 @pytest.mark.parametrize("trainer", SHORT)
@@ -122,12 +116,8 @@ def test_evaluate_command_takes_a_robot(file, capsys):
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["robot", "xarm6"] in lines
     assert json.loads(path.read_text())["robot"] == "xarm6"
-    for policy, task, message in (
-        (PANDAS, "no_obstacles", "trained for the robot 'panda'"),
-        ("random", "wall", "wall is the Panda's"),
-    ):
-        assert evaluate_command.main(["--policy", policy, "--task", f"{task}@{file}"]) == 2
-        assert message in capsys.readouterr().err
+    assert evaluate_command.main(["--policy", "random", "--task", f"wall@{file}"]) == 2
+    assert "wall is the Panda's" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

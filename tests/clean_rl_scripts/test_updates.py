@@ -1,7 +1,6 @@
-"""One update of SAC, TD3 and BC against independent formulas; SAC and TD3 learn a tiny problem."""
+"""One update of SAC, TD3 and BC against independent formulas."""
 
 import copy
-import math
 
 import numpy as np
 import pytest
@@ -147,13 +146,6 @@ def test_update_of_sac(target_entropy, bc_weight):
     assert moved == pytest.approx(expected, rel=1e-3, abs=1e-8)
 
 
-@pytest.mark.parametrize("target_entropy, direction", [(50.0, 1), (-50.0, -1)])
-def test_alpha_follows_the_target_entropy(target_entropy, direction):
-    agent = make(sac, "SAC", target_entropy=target_entropy)
-    agent.update(batch(), True)
-    assert (agent.log_alpha.item() - math.log(0.2)) * direction > 0
-
-
 @pytest.mark.parametrize("bc_weight", [0.0, 3.0])
 def test_update_of_td3(bc_weight):
     flags = {"tau": 0.1, "policy_average": 0.2, "preactivation_penalty": 0.4}
@@ -216,44 +208,6 @@ def test_policy_is_updated_on_request(module, kind):
         assert moved["actor"] == moved["actor_average"] == ("actor_loss" in losses) == due
         assert moved["critics_target"] == (kind == "SAC" or due)
         assert all(parameter.requires_grad for parameter in agent.critics.parameters())
-
-
-@pytest.mark.parametrize("module, kind", [(sac, "SAC"), (td3, "TD3")])
-def test_agent_learns_the_best_action(module, kind):
-    """One-step episodes; the reward is minus the squared distance from the goal's action."""
-    flags = {"policy_lr": 3e-3, "q_lr": 3e-3, "policy_average": 0.05}
-    flags |= {"target_entropy": None, "alpha": 0.002} if kind == "SAC" else {}
-    agent = make(module, kind, **flags)
-    rng = torch.Generator().manual_seed(2)
-
-    def best(goal):  # within [-0.03, 0.03]
-        return 0.03 * torch.cat([goal, -goal, goal[:, :1]], dim=1)
-
-    def error(goal):
-        nothing = torch.zeros(len(goal), 10)
-        with torch.no_grad():
-            action = agent.actor_average(nothing, goal, goal)
-        return ((action - best(goal)) / 0.03).square().mean().item()
-
-    asked = 2 * torch.rand(500, 3, generator=rng) - 1
-    before = error(asked)
-    for _ in range(1500):
-        goal = 2 * torch.rand(N, 3, generator=rng) - 1
-        action = 0.06 * (2 * torch.rand(N, 7, generator=rng) - 1)
-        reward = -((action - best(goal)) / 0.03).square().mean(1)
-        nothing = torch.zeros(N, 10)
-        agent.update(
-            {
-                "observation": nothing,
-                "next_observation": nothing,
-                "desired_goal": goal,
-                "action": action,
-                "reward": reward,
-                "terminated": torch.ones(N),
-            },
-            True,
-        )
-    assert before > 0.2 and error(asked) < 0.25 * before
 
 
 def test_update_of_behavioural_cloning():

@@ -11,11 +11,9 @@ from paths import ROOT
 
 import roboarm_nmp
 from roboarm_nmp.clean_rl_scripts import evaluate
-from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.networks.exported_networks import load_network
 from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.policies.registry import PolicyError
-from roboarm_nmp.utils.bullet import pybullet as p
 
 PAGE = (ROOT / "docs/reference/api.md").read_text()
 
@@ -83,25 +81,3 @@ def test_policy_with_other_actions_or_arguments_is_rejected(tmp_path):
     assert not list(tmp_path.iterdir())
     save_policy(tmp_path / "a.pt", Goal(), "wall", goal_type="config")
     assert load_network(tmp_path / "a.pt").metadata["env"] == {"goal_type": "config"}
-
-
-def test_end_effector_is_where_the_page_says():
-    """0.105 m from the hand's frame, and 0.212 m from the flange of joint 7, along its axis."""
-    configuration = np.array([0.2, -0.3, 0.1, -1.8, 0.4, 1.6, 0.8])
-    *_, (position, axes) = PANDA.frame_poses(configuration)
-    hand = position + 0.107 * axes[:, 2]  # panda_link8 and panda_hand share this origin
-    np.testing.assert_allclose(
-        PANDA.forward_kinematics(configuration), hand + 0.105 * axes[:, 2], atol=1e-12
-    )
-    env = roboarm_nmp.make("no_obstacles")
-    env.reset_specific(configuration.astype(np.float32), configuration.astype(np.float32) + 0.2)
-    links = {
-        p.getJointInfo(env.body, i, physicsClientId=env.client)[12].decode(): p.getLinkState(
-            env.body, i, computeForwardKinematics=1, physicsClientId=env.client
-        )[4]
-        for i in range(p.getNumJoints(env.body, physicsClientId=env.client))
-    }
-    env.close()
-    np.testing.assert_allclose(links["panda_hand"], hand, atol=1e-5)
-    apart = np.subtract(links["panda_grasptarget"], links["panda_hand"])
-    assert np.linalg.norm(apart) == pytest.approx(0.105, abs=1e-5)

@@ -153,17 +153,3 @@ def test_command_is_accepted_by_its_parser(command, monkeypatch):
     for policy in as_list(values.get("policy")):
         if not is_example(policy) and policy != DEMO:
             find_policy(policy)  # raises PolicyError
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "roboarm evaluate --polcy go-to-goal --task wall",
-        "roboarm evalute --policy go-to-goal --task wall",
-        "python clean_rl_scripts/sac_her_mp.py --goal-type elbow",
-        "python benchmarks/baselines.py --only walls",
-    ],
-)
-def test_misspelt_flags_and_names_are_found(command, monkeypatch, capsys):
-    with pytest.raises((SystemExit, AssertionError)):
-        parse(shlex.split(command), {}, monkeypatch)

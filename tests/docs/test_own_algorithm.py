@@ -3,11 +3,8 @@
 import json
 import re
 
-import numpy as np
 from paths import ROOT
-from trainers import PATHS, TINIER, load, run_here, succeeds_here
-
-from roboarm_nmp import envs
+from trainers import PATHS, TINIER, run_here, succeeds_here
 
 PAGE = (ROOT / "docs/customise/algorithm.md").read_text()
 
@@ -27,29 +24,3 @@ def test_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
     flags += ["--json", tmp_path / "result.json"]
     succeeds_here(ROOT / "clean_rl_scripts" / "evaluate.py", *flags)
     assert json.loads((tmp_path / "result.json").read_text())["num_queries"] == 2
-
-
-def test_example_relabels_with_the_ends_of_episodes(tmp_path, monkeypatch):
-    before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:2]
-    script = tmp_path / "sac_final_mp.py"
-    script.write_text(PATHS["sac_her_mp"].read_text().replace(before, after))
-    monkeypatch.setitem(PATHS, "sac_final_mp", script)
-    module = load("sac_final_mp")
-    env = envs.make("no_obstacles")
-    buffer = module.HerReplayBuffer(env, 100, 1.0, np.random.default_rng(0))
-    for length in (3, 7):
-        buffer.add_episode(
-            [
-                {
-                    "observation": np.zeros(10),
-                    "action": np.zeros(7),
-                    "next_observation": np.zeros(10),
-                    "next_achieved_goal": np.full(3, 100 * length + step),
-                    "desired_goal": np.zeros(3),
-                    "collision": False,
-                }
-                for step in range(length)
-            ]
-        )
-    assert set(np.unique(buffer.sample(200)["desired_goal"])) == {302.0, 706.0}
-    env.close()

@@ -19,11 +19,11 @@ from paths import ROOT
 from PIL import Image
 from trainers import run_here
 
-from roboarm_nmp import __main__, envs
+from roboarm_nmp import __main__
 from roboarm_nmp.datasets.demonstrations import load_demos
-from roboarm_nmp.datasets.queries import load_queries, write_queries
-from roboarm_nmp.envs.scenes.files import load_scene, save_scene
-from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE, Box, Cylinder, Scene, Sphere
+from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.envs.scenes.files import load_scene
+from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE
 from roboarm_nmp.viewer import show
 
 SCRIPTS = ROOT / "clean_rl_scripts"
@@ -37,7 +37,6 @@ COMMANDS = [
     if kind == "" and line.startswith(("python ", "roboarm "))
 ]
 COMMANDS = [command for command in COMMANDS if "roboarm view" not in command]  # in the browser
-OF_MY_SCENE = [command for command in COMMANDS if "moving.yaml" not in command]
 YAML = next(text for kind, text in BLOCKS if kind == "yaml")
 POSTS = [text for kind, text in BLOCKS if kind == "python"][-1]
 
@@ -127,15 +126,6 @@ def page(tmp_path_factory):
     return folder, results
 
 
-@pytest.fixture
-def inside(page, tmp_path, monkeypatch):
-    """In a copy of what the page made, without the runs."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("my_scene.yaml", "my_scene_queries.h5", "my_scene_demos.h5"):
-        Path(name).write_bytes((page[0] / name).read_bytes())
-    return tmp_path
-
-
 def result_of(page, part):
     [result] = [result for command, result in page[1].items() if part in command]
     return result
@@ -161,19 +151,6 @@ def test_commands_of_the_page_work(page):
         "scene.png",
         "scenes.png",
     ]
-
-
-def test_scene_is_what_the_page_says(page):
-    cylinder = Cylinder((0.4, -0.4, 0.25), 0.05, 0.5)
-    sphere = Sphere((-0.1, 0.55, 0.5), 0.1)
-    box = Box((0.5, 0.3, 0.3), (0.3, 0.04, 0.6))
-    assert load_scene(page[0] / "from_python.yaml") == Scene((box, cylinder, sphere))
-    turned, *others = load_scene(page[0] / "my_scene.yaml").obstacles
-    assert others == [cylinder, sphere]
-    assert (turned.position, turned.size) == (box.position, box.size)
-    assert turned.orientation == pytest.approx(
-        (0, 0, math.sin(math.pi / 12), math.cos(math.pi / 12))
-    )
 
 
 def test_obstacles_of_the_page_move(page):
@@ -221,16 +198,18 @@ def test_run_of_the_page_is_trained_and_evaluated(page):
 # --- What is refused
 
 
-@pytest.mark.parametrize("command", [OF_MY_SCENE[0], OF_MY_SCENE[-1]])
-def test_malformed_scene_file_is_rejected_with_its_line(command, tmp_path, monkeypatch):
+def test_malformed_scene_file_is_rejected_with_its_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my_scene.yaml").write_text(YAML.replace("length:", "height:"))
     [message] = [text.strip() for kind, text in BLOCKS if kind == "" and "unknown key" in text]
-    assert message in error_of(command)
+    assert message in error_of(COMMANDS[0])
     assert [path.name for path in tmp_path.iterdir()] == ["my_scene.yaml"]
 
 
-def test_files_of_a_changed_scene_are_out_of_date(inside):
+def test_files_of_a_changed_scene_are_out_of_date(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("my_scene_queries.h5", "my_scene_demos.h5"):
+        Path(name).write_bytes((page[0] / name).read_bytes())
     [message] = [text.strip() for kind, text in BLOCKS if kind == "" and "out of date" in text]
     Path("my_scene.yaml").write_text(YAML.replace("radius: 0.1}", "radius: 0.11}"))
     queries = re.escape(message.removesuffix("..."))
@@ -242,31 +221,6 @@ def test_files_of_a_changed_scene_are_out_of_date(inside):
     ):
         assert re.search(expected, error_of(command)), command
     assert not Path("runs").exists()
-
-
-def test_two_scenes_of_one_name_do_not_mix_up(inside):
-    queries = load_queries("my_scene.yaml")
-    Path("other").mkdir()
-    other = "other/my_scene.yaml"
-    save_scene(Scene((Sphere((0.0, 0.7, 0.2), 0.05),)), other)
-    splits = {
-        "test": (queries.goal, queries.start),
-        "validation": (queries.start, queries.goal),
-    }
-    write_queries("other/my_scene_queries.h5", other, 0, splits, "a test", {})
-    np.testing.assert_array_equal(load_queries(other).start, queries.goal)
-    assert load_queries(other)[0].scene == envs.make(other).scene == load_scene(other)
-    command = "roboarm evaluate --policy go-to-goal --num-queries 1"
-    assert f"on {other}: 1 test" in run(f"{command} --task {other}").out
-    line = error_of(f"{command} --task {other} --queries my_scene_queries.h5")
-    assert "out of date: made for another version of the scene" in line
-
-
-def test_scene_without_room_for_the_arm_ends_a_command_with_one_line(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    save_scene(Scene((Sphere((0.0, 0.0, 0.3), 0.3),)), "my_scene.yaml")
-    command = "roboarm queries --task my_scene.yaml --num-test 1"
-    assert "no feasible configuration" in error_of(command)
 
 
 # --- Random scenes

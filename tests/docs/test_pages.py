@@ -2,7 +2,6 @@
 
 import re
 import unicodedata
-from pathlib import Path
 
 import markdown_tables
 import pytest
@@ -85,8 +84,3 @@ def test_site_lists_every_page():
     outside = re.findall(r"^  /(\S+\.md)$", text, re.M)
     there = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
     assert sorted(listed + outside) == sorted(there)
-
-
-def test_figures_are_small():
-    large = [path.name for path in Path(DOCS, "figures").iterdir() if path.stat().st_size > 200_000]
-    assert not [name for name in large if name.endswith((".png", ".jpg", ".svg"))]

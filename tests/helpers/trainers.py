@@ -44,6 +44,24 @@ def load(trainer):
     return module
 
 
+def shared_blocks(path):
+    """Name -> lines of a script's blocks from `# SHARED: name` to `# END SHARED`."""
+    blocks, name = {}, None
+    for line in path.read_text().splitlines():
+        if line.strip().startswith("# SHARED: "):
+            assert name is None, f"{line} inside {name}"
+            name = line.strip().removeprefix("# SHARED: ")
+            assert name not in blocks
+            blocks[name] = []
+        elif line.strip() == "# END SHARED":
+            assert name is not None
+            name = None
+        elif name is not None:
+            blocks[name].append(line)
+    assert name is None
+    return blocks
+
+
 @functools.cache
 def panda_env(goal_type="ee"):
     """An environment that gives networks their sizes."""

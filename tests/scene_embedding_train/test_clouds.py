@@ -9,17 +9,6 @@ from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE
 from roboarm_nmp.scene_embedding_train import clouds
 
 
-def test_thinned_points_are_evenly_spaced():
-    mask = torch.zeros(3, 50, dtype=torch.bool)
-    mask[0, 5:45], mask[1, [3, 9, 20, 40]] = True, True
-    chosen = clouds.thin_out(mask, 8)
-    assert chosen[:2].tolist() == [
-        [5, 10, 15, 20, 25, 30, 35, 40],
-        [3, 3, 9, 9, 20, 20, 40, 40],
-    ]
-    assert chosen[2].tolist() == [0] * 8
-
-
 def test_loaded_clouds_are_thinned_stored_ones(observations):
     read = Observations(observations)
     sensors, points, labels, depths = clouds.load_clouds(read, 64)
@@ -50,28 +39,6 @@ def test_queries_are_points_of_all_scenes_labelled_by_hand():
     assert classes[0].tolist() == [ignored, 1, 1, 1, 1, 2, 2, 2, 1, 1] + [ignored] * 5
     assert classes[1].tolist() == [1] * 10 + [NOTHING, ignored, NOTHING, ignored, ignored]
     assert classes[2].tolist() == [1] * 10 + [ignored] * 5
-
-
-def test_points_far_from_the_whole_cloud_are_labelled_as_nothing(observations):
-    """Also far from what thinning left out, such as thin poles; against a loop over the cloud."""
-    read = Observations(observations)
-    thinned = clouds.load_clouds(read, 16)
-    batch = clouds.batch_of(thinned, np.arange(8), "cpu")
-    differing = 0
-    for name, (points, labels, whole) in zip(thinned.sensors, batch, strict=True):
-        _, classes = clouds.queries_of(points, labels, whole)
-        _, of_thinned = clouds.queries_of(points, labels, points.flatten(1, 2))
-        cloud, kinds = clouds.whole_clouds(read, 0, name)
-        for i in range(8):
-            hits = cloud[i][kinds[i] != NOTHING].numpy()
-            for j, point in enumerate(points[i - 1, 1].numpy()):
-                distance = np.linalg.norm(hits - point, axis=1).min()
-                absent = labels[i - 1, 1, j] == OBSTACLE and distance > clouds.ABSENT_DISTANCE
-                if abs(distance - clouds.ABSENT_DISTANCE) > 1e-4:
-                    expected = NOTHING if absent else clouds.IGNORED
-                    assert classes[i, 32 + j] == expected
-        differing += (classes != of_thinned).sum()
-    assert differing > 0
 
 
 def test_scores_of_the_evaluation_equal_their_definitions(observations):

@@ -45,20 +45,6 @@ def test_augmented_scenes_have_the_same_distances():
     assert set(signs.round().tolist()) == {-1.0, 1.0}  # some are mirrored
 
 
-def test_hat_weights_interpolate_between_cells_around_the_axis():
-    """A point belongs to the cells whose centres it is between, all around the circle."""
-    angle = torch.tensor([0.0, 1.0, 3.14, -3.14, -2.0])
-    points = torch.stack([0.4 * angle.cos(), 0.4 * angle.sin(), torch.full((5,), 0.3)], dim=1)
-    angles, radii, heights = field.cylindrical(points)
-    for cells in (angles, radii, heights):
-        torch.testing.assert_close(cells.sum(1), torch.ones(5))
-    centres = (np.arange(field.ANGLES) + 0.5) / field.ANGLES * 2 * np.pi - np.pi
-    found = (angles.numpy() * np.exp(1j * centres)).sum(1)
-    np.testing.assert_allclose(np.angle(found * np.exp(-1j * angle.numpy())), 0.0, atol=1e-3)
-    radius = (radii @ ((torch.arange(field.RADII) + 0.5) / field.RADII * field.REACH)).numpy()
-    np.testing.assert_allclose(radius, 0.4, atol=1e-6)
-
-
 def test_rotation_by_a_sector_rolls_the_latent_code():
     torch.manual_seed(0)
     args = field.Args(width=8, latent_size=16)
