@@ -74,25 +74,6 @@ def test_network_inputs_of_goal_poses():
     np.testing.assert_allclose(inputs[:21], np.hstack([observation, there]), atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("flags", "scale"),
-    [
-        ({}, 0.06),
-        ({"max_step": 0.1}, 0.2),
-        ({"action_mode": "subgoal"}, 1.0),
-        ({"plain_networks": True}, 1.0),
-    ],
-)
-def test_actions_are_within_twice_the_longest_step(flags, scale):
-    args = sac.Args(**flags, bf16=False)
-    assert sac.action_scale(args) == scale
-    actor = sac.Actor(args, panda_env())
-    with torch.no_grad():
-        actor.mlp[-1].bias.fill_(100.0)  # saturated
-        action = actor(torch.zeros(1, 10), None, torch.zeros(1, 3))
-    torch.testing.assert_close(action, torch.full((1, 7), scale))
-
-
 def episode(length, offset, env):
     """Transition t of a made-up episode arrives at the position (offset + t, 0, 0)."""
     return [

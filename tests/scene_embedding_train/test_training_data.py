@@ -1,4 +1,4 @@
-"""Unpacked observations: made anew when the shards change, and by several trainers at once."""
+"""Unpacked observations are made anew when the shards change."""
 
 import h5py
 import numpy as np
@@ -22,21 +22,3 @@ def test_changed_observations_are_unpacked_again(observations, tmp_path):
     other = clouds.load_clouds(Observations(tmp_path), 64)
     changed = np.argwhere((thinned.labels != other.labels).any((2, 3)))
     np.testing.assert_array_equal(changed, [[10, 1]])
-
-
-def test_two_trainers_may_unpack_concurrently(observations, tmp_path):
-    for path in observations.glob("shard_*.h5"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    one, other = Observations(tmp_path), Observations(tmp_path)
-    made = []
-
-    def read(number, name):
-        if number == 1 and not made:  # one has begun, and the other does it all meanwhile
-            made.append(images.load_images(other, 16)[0])
-        return Observations.read(one, number, name)
-
-    one.read = read
-    expected, _ = images.load_images(Observations(observations), 16)
-    np.testing.assert_array_equal(images.load_images(one, 16)[0], expected)
-    np.testing.assert_array_equal(made[0], expected)
-    assert len([path for path in tmp_path.iterdir() if path.suffix != ".h5"]) == 1
