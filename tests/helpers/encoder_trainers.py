@@ -15,7 +15,7 @@ OF_CLOUDS = ("pointnet2", "field")
 TINY = ["--total-updates", "8", "--eval-every", "4", "--eval-scenes", "6", "--batch-size", "8"]
 TINY += ["--width", "4", "--validation-share", "0.3"]
 TINY_CLOUDS = ["--num-points", "64", "--num-query-points", "50"]
-TINY_POINTNET = ["--num-centres", "8", "4", "--num-neighbours", "4"]
+TINY_POINTNET = ["--num-centres", "4", "3", "--num-neighbours", "4"]
 OBSTACLES = (
     Box((0.3, 0.2, 0.5), (0.2, 0.1, 0.3), (0.5, 0.5, -0.1, 0.7)),
     Cylinder((-0.3, 0.2, 0.6), 0.1, 0.3, (0.1, -0.7, 0.1, 0.7)),
