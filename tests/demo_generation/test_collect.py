@@ -419,18 +419,16 @@ def verdicts(path):
     return [verifier(index)[1] for index in range(len(verifier.demos))]
 
 
-def test_verify_finds_bad_demonstrations(whole, damaged):
+def test_verify_finds_bad_demonstrations(damaged):
     path, bad = damaged
     before = path.read_bytes()
     expected = ["good"] * NUM
     for verdict, index in bad.items():
         expected[index] = verdict
     assert verdicts(path) == expected
-    result = verify_command(whole, path)
+    result = verify_command(path)
     assert result.returncode == 1
     lines = result.stdout.splitlines()
-    none = "0 changed, 0 missed, 0 collided, 0 refused"
-    assert f"{whole}: {NUM} good, {none} of {NUM} demonstrations" in lines
     one_each = "1 changed, 1 missed, 1 collided, 1 refused"
     assert f"{path}: {NUM - 4} good, {one_each} of {NUM} demonstrations" in lines
     assert path.read_bytes() == before

@@ -129,6 +129,7 @@ def test_arm_moves_and_an_edited_scene_is_saved(browser, tmp_path):
         assert "Traceback" not in output + errors
 
 
+@pytest.mark.slow
 def test_replay_plays_without_a_server(browser, tmp_path):
     path = tmp_path / "replay.html"
     command = [sys.executable, "-m", "roboarm_nmp", "view", "no_obstacles", "--record", str(path)]
