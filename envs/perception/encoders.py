@@ -10,6 +10,7 @@
 Paper: sections 5.1 and 5.3. `envs.wrappers.SceneEncodingWrapper` appends z_E to observations.
 """
 
+import abc
 import functools
 import hashlib
 import io
@@ -114,7 +115,7 @@ def _shared(kind: type["SceneEncoder"], *args: Any) -> "SceneEncoder":
     return kind(*args)
 
 
-class SceneEncoder:
+class SceneEncoder(abc.ABC):
     """Base class. It caches z_E, so that an equal scene is encoded once by the class's `_encode`.
 
     Copies, and unpickled encoders in other processes, are the one of `make_encoder`.
@@ -144,10 +145,11 @@ class SceneEncoder:
         z = self._of_demos.get(scene)
         return self._cached(scene) if z is None else z
 
+    @abc.abstractmethod
     def _encode(self, scene: Scene) -> np.ndarray:
-        raise NotImplementedError
+        """z_E of a `Scene`, float32 (size,)."""
 
-    def check_robot(self, robot: Robot) -> None:
+    def check_robot(self, robot: Robot) -> None:  # noqa: B027
         """Raise NetworkError if the encoder was trained for another `Robot`."""
 
     def encode_demos(self, demos: Any) -> np.ndarray:

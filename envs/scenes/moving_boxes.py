@@ -13,6 +13,7 @@ The ranges were fixed before any policy was measured. For an arm other than the 
 speeds are multiplied by the ratio of their reaches.
 """
 
+import abc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -66,7 +67,7 @@ TRIES = 50
 
 
 @dataclass(frozen=True)
-class MovingScenes:
+class MovingScenes(abc.ABC):
     """What the distributions of this file share.
 
     Attributes:
@@ -83,9 +84,9 @@ class MovingScenes:
         """A `Scene` at rest, drawn with a NumPy Generator."""
         return RandomBoxes(*self.boxes, self.base).sample(rng)
 
+    @abc.abstractmethod
     def animate(self, scene: Scene, start: np.ndarray, goal: np.ndarray, rng: Rng) -> Scene:
         """The scene with motions, drawn for a start and a goal (n,), rad."""
-        raise NotImplementedError
 
     def accepts(self, start_free: np.ndarray, goal_free: np.ndarray) -> bool:
         """Whether start and goal are free when they have to be: bool (t,), at `check_times`."""
