@@ -61,7 +61,7 @@ class Args(protocol.PolicyFlags):
     """train with hidden layers in bfloat16"""
     encoder: str | None = None
     """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
-    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/guide/perception.md),
+    `pointnet2`, `field`, or the path of your own `encoder.onnx`, docs/guide/perception.md),
     `point_cloud` for observed points, or `oracle` for the ground-truth obstacles; by default
     nothing"""
     num_points: flags.PositiveInt = 64
@@ -161,7 +161,7 @@ class Actor(nn.Module):
         return torch.logsumexp(log_weight + log_density.sum(2), dim=1)
 
     def forward(self, observation, achieved_goal, desired_goal):
-        """The most likely mode's mean (N, n), as an action; policy.pt contains this function."""
+        """The most likely mode's mean (N, n), as an action; policy.onnx contains this function."""
         mean, _, log_weight = self.modes(observation, desired_goal)
         likeliest = log_weight.argmax(1).reshape(-1, 1, 1).expand(-1, 1, self.num_joints)
         return MAX_STEP * mean.gather(1, likeliest).squeeze(1)

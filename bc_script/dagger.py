@@ -77,7 +77,7 @@ class Args(protocol.PolicyFlags):
     encoder: str = "oracle"
     """the encoded scene as tokens: `point_cloud` for observed points, `oracle` for the ground-truth
     obstacles, or an encoder's latent code, a single token (`vae`, `vqvae`, `pointnet2`, `field`, or
-    the path of your own `encoder.pt`)"""
+    the path of your own `encoder.onnx`)"""
     num_points: flags.PositiveInt = 64
     """points of the encoder `point_cloud`"""
     geometry_source: str | None = None
@@ -212,7 +212,7 @@ class Actor(nn.Module):
         return direction, to_goal.norm(dim=1) + F.softplus(outputs[:, joints])
 
     def forward(self, observation, achieved_goal, desired_goal, **distances):
-        """The action (N, n); policy.pt contains this function."""
+        """The action (N, n); policy.onnx contains this function."""
         direction, length = self.outputs(observation, desired_goal, **distances)
         joints = self.num_joints
         if self.goal_is_pose:

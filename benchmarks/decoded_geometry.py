@@ -1,7 +1,7 @@
 """Geometry in a latent code: the occupied cells that can be decoded from z_E.
 
     python benchmarks/decoded_geometry.py                  # pretrained encoders, oracle, mean
-    python benchmarks/decoded_geometry.py runs/RUN/encoder.pt --json geometry.json
+    python benchmarks/decoded_geometry.py runs/RUN/encoder.onnx --json geometry.json
 
 The space around the robot is divided into cells of 0.2 m. A cell is occupied if an obstacle
 overlaps it. A probe, a network with two layers of 256, predicts the occupied cells from z_E. The
@@ -231,7 +231,7 @@ def scores(probabilities, means, cells):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument(
-        "encoders", nargs="*", help="networks (encoder.pt); default: the pretrained"
+        "encoders", nargs="*", help="networks (encoder.onnx); default: the pretrained"
     )
     parser.add_argument("--num", type=int, default=10_000, help="scenes to train on (10,000)")
     parser.add_argument("--num-test", type=int, default=2_000, help="scenes to test on (2,000)")

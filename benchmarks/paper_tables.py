@@ -42,7 +42,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.evaluation.evaluate import wilson_interval
-from roboarm_nmp.networks.exported_networks import to_float16
+from roboarm_nmp.networks.export import to_float16
 from roboarm_nmp.utils.files import check_folder, write_atomically
 from roboarm_nmp.utils.flags import PositiveInt, Seed, Workers, check
 from roboarm_nmp.utils.signals import end_with_one_line
@@ -210,16 +210,16 @@ def run(cell, seed, steps, num_queries, runs_dir, keep_policies=True):
     trained = begun[-1] if begun else max(folder.glob("*/result.json")).parent
     kept.parent.mkdir(exist_ok=True)
     kept.unlink(missing_ok=True)  # a result is never beside another's policy
-    kept.with_suffix(".pt").unlink(missing_ok=True)
-    policy = (kept if keep_policies else folder / kept.name).with_suffix(".pt")
-    to_float16(trained / "policy.pt", policy)
+    kept.with_suffix(".onnx").unlink(missing_ok=True)
+    policy = (kept if keep_policies else folder / kept.name).with_suffix(".onnx")
+    to_float16(trained / "policy.onnx", policy)
     evaluation = evaluate(policy, cell.task, num_queries, folder / "evaluation.json")
     write_result(kept, summary(cell, trained, evaluation))
 
 
 def policy_file(name, policies, runs_dir):
     """Where a policy is: beside its result, or with its run, if the result stands alone."""
-    beside = policies / f"{name}.pt"
+    beside = policies / f"{name}.onnx"
     return beside if beside.exists() else runs_dir / name / beside.name
 
 
@@ -293,7 +293,7 @@ def load_results(folders):
     for folder in folders:
         for path in sorted(folder.glob("*.json")):
             result = json.loads(path.read_text())
-            result["kept"] = path.with_name(f"{result.get('policy', path.stem)}.pt").exists()
+            result["kept"] = path.with_name(f"{result.get('policy', path.stem)}.onnx").exists()
             results.setdefault(result["cell"], []).append(result)
     return {name: sorted(found, key=lambda r: r["seed"]) for name, found in results.items()}
 

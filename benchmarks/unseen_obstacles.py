@@ -29,7 +29,7 @@ from markdown_tables import NOTHING, interval, share, table, write, write_cells
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.perception.encoders import PRETRAINED
 from roboarm_nmp.envs.tasks import STATIC_TASKS
-from roboarm_nmp.networks.exported_networks import to_float16
+from roboarm_nmp.networks.export import to_float16
 from roboarm_nmp.policies.registry import PolicyError, find_policy
 from roboarm_nmp.policies.safety_filter import VERSION
 from roboarm_nmp.utils.files import write_atomically
@@ -164,7 +164,7 @@ def keep(run):
     paths = args["paths"][0] if isinstance(args["paths"], list) else args["paths"]
     scenes = load_roadmap_paths(Path(paths)).task
     name = f"dagger-{args['goal_type']}-{args['encoder']}-{scenes}-s{args['seed']}"
-    to_float16(run / "policy.pt", POLICIES / f"{name}.pt")
+    to_float16(run / "policy.onnx", POLICIES / f"{name}.onnx")
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
     made |= {key: training[key] for key in ("policy_step", "validation_success_rate")}
     made |= {"training_seconds": training["seconds"], "date": datetime.date.today().isoformat()}
@@ -176,7 +176,7 @@ def keep(run):
         for task, cells in load_results().items()
     }
     write_results(results)  # those of an earlier policy of that name are void
-    print(f"{POLICIES / name}.pt")
+    print(f"{POLICIES / name}.onnx")
 
 
 def load_results():
@@ -241,7 +241,7 @@ def digests(result):
     """Of the pretrained encoders that a result depends on, by name."""
     names = result["geometry_source"], result["env"].get("encoder")
     names = {*names, result["env"].get("geometry_source")} - {None}
-    files = {name: PRETRAINED / f"{name}.pt" for name in sorted(names)}
+    files = {name: PRETRAINED / f"{name}.onnx" for name in sorted(names)}
     return {
         name: hashlib.sha256(path.read_bytes()).hexdigest()[:12]
         for name, path in files.items()

@@ -60,7 +60,7 @@ FILTER_FLAGS = ("safety_margin", "escape", "lookahead", "obstacle_velocities", "
 class Args:
     policy: str
     """`go-to-goal`, `random`, `via-points`, `planner`, `replanning`, `space-time` (see above), a
-    policy network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy
+    policy network, a run's folder with a `policy.onnx` in it, or the name of a pretrained policy
     (`roboarm policies`)"""
     task: str | None = None
     """the task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); with another arm TASK@FILE, a

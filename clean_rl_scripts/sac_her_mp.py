@@ -223,7 +223,7 @@ class Actor(nn.Module):
         return self.action_scale * torch.tanh(mean)
 
     def forward(self, observation, achieved_goal, desired_goal, **_):
-        """The deterministic action (N, n), for evaluation; policy.pt contains this function."""
+        """The deterministic action (N, n), for evaluation; policy.onnx contains this function."""
         return self.mean_action(self.features(observation, desired_goal))
 
 

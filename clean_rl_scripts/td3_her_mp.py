@@ -209,7 +209,7 @@ class Actor(nn.Module):
         return self.action_scale * torch.tanh(preactivation), preactivation
 
     def forward(self, observation, achieved_goal, desired_goal, **_):
-        """The action (N, n) without noise; policy.pt contains this function."""
+        """The action (N, n) without noise; policy.onnx contains this function."""
         return self.get_action(self.features(observation, desired_goal))[0]
 
 

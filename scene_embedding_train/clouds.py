@@ -221,7 +221,8 @@ def thin_out(mask: Tensor, number: int) -> Tensor:
     Fewer are repeated; where none is true, all are the first index.
     """
     index = torch.arange(mask.shape[1], device=mask.device)
-    order = (index + mask.shape[1] * ~mask).argsort(1)  # true ones first
+    keys = index + mask.shape[1] * ~mask
+    order = keys.topk(mask.shape[1], dim=1, largest=False).indices  # true ones first
     steps = torch.arange(number, device=mask.device)
     counts = mask.sum(1, keepdim=True).clamp(min=1)
     return order.gather(1, (steps * counts).div(number, rounding_mode="floor"))

@@ -14,8 +14,8 @@ depends on the direction, so scenes are rotated and mirrored at random. (Convolu
 seen from above, and one layer to all of z_E, had twice the error after as many updates:
 docs/lab_notebook.md, "Encoders".)
 
-What is saved: `encoder.pt`, an exported network from the clouds to z_E, and `encoder.decoder.pt`,
-one from z_E and points to distances. To make an encoder of your own, copy this file and change the
+What is saved: `encoder.onnx`, a network from the clouds to z_E, and `encoder.decoder.onnx`, one
+from z_E and points to distances. To make an encoder of your own, copy this file and change the
 parts under `# MODEL`.
 """
 
@@ -29,7 +29,7 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.scene_embedding_train.clouds import (
     example_clouds,
     load_obstacle_points,
@@ -358,10 +358,17 @@ if __name__ == "__main__":
             if run.is_best(-result["error_near"], result):
                 encoder = ExportedEncoder(model, tuple(names), args.num_points)
                 details = metadata | {"step": step} | result
-                save_network(run.folder / "encoder.pt", encoder, example, details)
+                save_network(run.folder / "encoder.onnx", encoder, example, details, ["latent"])
                 inputs = {"latent": torch.zeros(2, args.latent_size), "points": queries[:2]}
                 details |= {"kind": "field"}
-                save_network(run.folder / "encoder.decoder.pt", model.decoder, inputs, details)
+                save_network(
+                    run.folder / "encoder.decoder.onnx",
+                    model.decoder,
+                    inputs,
+                    details,
+                    output_names=["distance"],
+                    variable_axes={"points": [1]},
+                )
         if evaluating or run.interrupted:
             run.checkpoint()
     run.close()

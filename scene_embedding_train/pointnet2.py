@@ -13,7 +13,7 @@ A point's position determines most of its class without the latent code. So the 
 receives points of another scene's obstacles and has to predict that nothing is there. Positions
 also enter as sines and cosines (as in NeRF), without which the network hardly learns.
 
-What is saved, `encoder.pt`, is an exported network from the clouds to z_E, the sensors' latent
+What is saved, `encoder.onnx`, is a network from the clouds to z_E, the sensors' latent
 codes side by side. To make an encoder of your own, copy this file and change the parts under
 `# MODEL`.
 """
@@ -27,7 +27,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from roboarm_nmp.envs.perception.sensors import NOTHING
-from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.scene_embedding_train import training_data
 from roboarm_nmp.scene_embedding_train.clouds import (
     IGNORED,
@@ -294,7 +294,7 @@ if __name__ == "__main__":
             if run.is_best(-error, result):
                 encoder = ExportedEncoder(model, tuple(clouds.sensors))
                 details = metadata | {"step": step} | result
-                save_network(run.folder / "encoder.pt", encoder, example, details)
+                save_network(run.folder / "encoder.onnx", encoder, example, details, ["latent"])
         if evaluating or run.interrupted:
             run.checkpoint()
     run.close()

@@ -86,7 +86,7 @@ def write_result(run: Run, num_training: int) -> dict:
     result = {
         **run.best_result,
         "scenes": num_training,
-        "encoder": str(run.folder / "encoder.pt"),
+        "encoder": str(run.folder / "encoder.onnx"),
         "updates": run.step,
         "best_update": run.best_step,
         "seconds": round(run.seconds),

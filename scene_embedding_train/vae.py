@@ -5,7 +5,7 @@
 
 A variational autoencoder (Kingma and Welling, 2013) as in the paper's appendix "Training and
 verifying the encoders": each camera has an encoder to 16 dimensions and a decoder, and every
-decoder receives all 64. What is saved, `encoder.pt`, is an exported network from the images to the
+decoder receives all 64. What is saved, `encoder.onnx`, is a network from the images to the
 mean of z_E. To make an encoder of your own, copy this file and change the parts under `# MODEL`.
 Parts between `# SHARED` and `# END SHARED` are those of `vqvae.py`.
 """
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import torch.nn as nn
 
-from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.scene_embedding_train.images import (
     average_down,
     batch_of,
@@ -218,7 +218,7 @@ if __name__ == "__main__":
             if run.is_best(-result["error_foreground"], result):
                 encoder = ExportedEncoder(model, tuple(cameras), size)
                 details = metadata | {"step": step} | result
-                save_network(run.folder / "encoder.pt", encoder, example, details)
+                save_network(run.folder / "encoder.onnx", encoder, example, details, ["latent"])
         if evaluating or run.interrupted:
             run.checkpoint()
     run.close()

@@ -5,7 +5,7 @@
 
 A vector-quantised autoencoder (van den Oord et al., 2017) as in the paper's appendix "Training and
 verifying the encoders": each camera has an encoder to 16 dimensions, which consist of vectors from
-a codebook, and a decoder that receives these 16. What is saved, `encoder.pt`, is an exported
+a codebook, and a decoder that receives these 16. What is saved, `encoder.onnx`, is a
 network from the images to z_E, the cameras' latent codes side by side. To make an encoder of your
 own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
 `# END SHARED` are those of `vae.py`.
@@ -18,7 +18,7 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.scene_embedding_train.images import (
     average_down,
     batch_of,
@@ -281,7 +281,7 @@ if __name__ == "__main__":
             if run.is_best(-result["error_foreground"], result):
                 encoder = ExportedEncoder(model, tuple(cameras), size)
                 details = metadata | {"step": step} | result
-                save_network(run.folder / "encoder.pt", encoder, example, details)
+                save_network(run.folder / "encoder.onnx", encoder, example, details, ["latent"])
         if evaluating or run.interrupted:
             run.checkpoint()
     run.close()

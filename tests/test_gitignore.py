@@ -17,7 +17,7 @@ def git(*arguments):
 
 
 def test_outputs_of_the_commands_in_the_readme_are_ignored():
-    outputs = set(OUTPUTS.findall((ROOT / "README.md").read_text())) | {"runs/a/policy.pt"}
+    outputs = set(OUTPUTS.findall((ROOT / "README.md").read_text())) | {"runs/a/policy.onnx"}
     assert set(git("check-ignore", *outputs)) == outputs
 
 

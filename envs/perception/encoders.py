@@ -1,7 +1,7 @@
 """Scene encoders: from a `Scene` to z_E, the latent code that a policy receives of the scene.
 
     encoder = make_encoder("vae")                         # pretrained, by name
-    encoder = make_encoder("runs/RUN/encoder.pt")         # a network file
+    encoder = make_encoder("runs/RUN/encoder.onnx")         # a network file
     encoder = make_encoder("oracle")                      # ground-truth obstacles (privileged)
     encoder = make_encoder("point_cloud", num_points=32)  # points that four sensors observe
     encoder = make_encoder("point_cloud", geometry_source="field")  # points decoded from z_E
@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from roboarm_nmp.envs.perception.point_clouds import (
     NUM_POINTS,
@@ -34,7 +33,8 @@ from roboarm_nmp.envs.perception.sensors import PointCloud, observe_scene, senso
 from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import ROW, Scene, padded_rows
-from roboarm_nmp.networks.exported_networks import ExportedNetwork, NetworkError, load_network
+from roboarm_nmp.networks.network_file import Network, load_network
+from roboarm_nmp.networks.untrusted import NetworkError
 from roboarm_nmp.utils.files import cache_folder, write_atomically
 from roboarm_nmp.utils.names import suggest
 from roboarm_nmp.utils.progress import progress_bar, write_line
@@ -42,7 +42,7 @@ from roboarm_nmp.utils.progress import progress_bar, write_line
 ORACLE = "oracle"
 PRETRAINED = Path(__file__).parent / "pretrained"
 # A decoder's file is named like its encoder's, with this ending.
-DECODER = ".decoder.pt"
+DECODER = ".decoder.onnx"
 # Obstacles that the oracle has room for: `narrow_shelves` has 28.
 MAX_OBSTACLES = 32
 MAX_POINTS = 9_999
@@ -58,7 +58,7 @@ DECODED_HIGH = (0.9, 0.9, 1.5)
 
 def pretrained_encoders() -> list[str]:
     """Names of the encoders in `PRETRAINED`."""
-    return sorted(path.stem for path in PRETRAINED.glob("*.pt") if not path.match(f"*{DECODER}"))
+    return sorted(path.stem for path in PRETRAINED.glob("*.onnx") if not path.match(f"*{DECODER}"))
 
 
 def make_encoder(
@@ -86,7 +86,7 @@ def make_encoder(
             encoder = encoder_with_decoder(geometry_source)
         return _shared(PointCloudEncoder, num_points, encoder)
     if name in pretrained_encoders():
-        return _shared(NetworkEncoder, PRETRAINED / f"{name}.pt", name)
+        return _shared(NetworkEncoder, PRETRAINED / f"{name}.onnx", name)
     path = Path(name).absolute()  # a relative path is another file in another folder
     if not os.path.exists(path):
         known = [ORACLE, POINT_CLOUD, *pretrained_encoders()]
@@ -130,7 +130,7 @@ class SceneEncoder(abc.ABC):
             information about a scene; `point_cloud` where z_E cannot be decoded.
     """
 
-    decoder: ExportedNetwork | None = None
+    decoder: Network | None = None
     geometry_source: str = POINT_CLOUD
 
     def __init__(self, name: str, size: int, token_size: int):
@@ -269,7 +269,7 @@ class NetworkEncoder(SceneEncoder):
         self._decoded = functools.lru_cache(CACHED_DECODED)(self._decode_points)
 
     def __reduce__(self):
-        if self.path == PRETRAINED / f"{self.name}.pt":  # elsewhere on another machine
+        if self.path == PRETRAINED / f"{self.name}.onnx":  # elsewhere on another machine
             return make_encoder, (self.name,)
         return _shared, (NetworkEncoder, self.path.absolute(), self.name)
 
@@ -277,8 +277,8 @@ class NetworkEncoder(SceneEncoder):
         """As `SceneEncoder.check_robot`: what sensors observe contains the robot."""
         check_robot(self.name, self._network.metadata, robot)
 
-    def observe(self, scene: Scene) -> dict[str, torch.Tensor]:
-        """The network's inputs, a batch of one: what the sensors observe of a `Scene`."""
+    def observe(self, scene: Scene) -> dict[str, np.ndarray]:
+        """The network's inputs, without the axis of batches: what the sensors observe."""
         inputs = {}
         for name, outputs in observe_scene(scene, self.sensors).items():
             if isinstance(self.sensors[name], PointCloud):
@@ -286,11 +286,11 @@ class NetworkEncoder(SceneEncoder):
                     inputs[f"{name}_{output}"] = array
             else:
                 inputs[name] = outputs["rgb"]
-        return {name: torch.from_numpy(inputs[name])[None] for name in self._network.inputs}
+        return {name: inputs[name] for name in self._network.inputs}
 
-    def encode(self, observed: dict[str, torch.Tensor]) -> np.ndarray:
+    def encode(self, observed: dict[str, np.ndarray]) -> np.ndarray:
         """z_E, float32 (size,), of what `observe` returned. Raises NetworkError: it is none."""
-        return np.asarray(self._network.predict_one(observed))
+        return self._network.predict_one(observed, None)[0]
 
     def _encode(self, scene: Scene) -> np.ndarray:
         self.check_robot(scene.robot)
@@ -329,10 +329,8 @@ class NetworkEncoder(SceneEncoder):
         """
         if self.decoder is None:
             raise _no_decoder(self.name)
-        latent = torch.from_numpy(self(scene))[None]
-        positions = torch.from_numpy(np.asarray(points, np.float32))[None]
-        inputs = {"latent": latent, "points": positions}
-        return np.asarray(self.decoder.predict_one(inputs, len(points)))
+        inputs = {"latent": self(scene), "points": np.asarray(points, np.float32)}
+        return self.decoder.predict_one(inputs, len(points))[0]
 
     def decoded_points(self, scene: Scene) -> np.ndarray:
         """Points of a scene's obstacles, decoded from z_E alone: float32 (n, 3), m.

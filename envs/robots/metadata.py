@@ -4,7 +4,7 @@ from pathlib import Path
 
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
-from roboarm_nmp.networks.operations import NetworkError
+from roboarm_nmp.networks.untrusted import NetworkError
 
 
 def robot_metadata(robot: Robot) -> dict:

@@ -12,7 +12,7 @@ from trainers import PATHS, load, panda_env, refusal, run_here, run_script
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.training.protocol import stack
 
 bc = load("bc")
@@ -70,7 +70,7 @@ def test_policy_overfits_five_demonstrations_and_follows_them(tmp_path, short_ep
     )
     flags += " --task no_obstacles --goal-type combined --learning-rate 3e-3 --policy-average 0.01"
     run = run_script("bc", tmp_path, *flags.split())
-    policy = load_network(run / "policy.pt")
+    policy = load_network(run / "policy.onnx")
     env, demos = envs.make("no_obstacles", goal_type="combined"), load_demos("no_obstacles")
     for i in range(5):
         observation, _ = env.reset_specific(demos.start[i], demos.goal[i])

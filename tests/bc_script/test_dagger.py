@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from one_type import OneType
@@ -24,7 +25,8 @@ from roboarm_nmp.demo_generation.roadmaps import Roadmap
 from roboarm_nmp.envs.perception.encoders import PRETRAINED
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 from roboarm_nmp.evaluation.evaluate import evaluate
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.export import read_weights
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.policies.registry import PolicyError, find_policy, make_policy
 from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.training import protocol
@@ -53,8 +55,8 @@ def setting(request, folder, tmp_path_factory):
     """An untrained policy, its environment, and a batch of examples in two scenes."""
     encoder = request.param
     if encoder == "vqvae":  # a copy: encoded scenes are stored beside it
-        encoder = str(tmp_path_factory.mktemp("encoder") / "vqvae.pt")
-        Path(encoder).write_bytes((PRETRAINED / "vqvae.pt").read_bytes())
+        encoder = str(tmp_path_factory.mktemp("encoder") / "vqvae.onnx")
+        Path(encoder).write_bytes((PRETRAINED / "vqvae.onnx").read_bytes())
     source = {"geometry_source": "ground_truth", "link_distances": True}
     env = envs.make(HARD, goal_type="combined", encoder=encoder, **source)
     paths = load_roadmap_paths(folder)
@@ -151,11 +153,12 @@ def test_saved_policy_has_its_safety_filter_and_acts_alone_as_in_a_batch(
         np.testing.assert_array_equal(safe(observation), filtered)
         changed += np.abs(filtered - together[row]).max() > 1e-4
     assert changed
-    content = torch.load(path, weights_only=True)
-    content["metadata"]["safety_filter"] = {"margin": "far"}
-    torch.save(content, tmp_path / "bad.pt")
-    with pytest.raises(PolicyError, match="bad.pt: invalid safety_filter"):
-        find_policy(tmp_path / "bad.pt")
+    model = onnx.load(path)
+    [entry] = [entry for entry in model.metadata_props if entry.key == "safety_filter"]
+    entry.value = '{"margin": "far"}'
+    onnx.save(model, tmp_path / "bad.onnx")
+    with pytest.raises(PolicyError, match="bad.onnx: invalid safety_filter"):
+        find_policy(tmp_path / "bad.onnx")
 
 
 def test_round_labels_states_that_the_policy_visits(folder):
@@ -231,10 +234,10 @@ def test_run_begins_with_the_weights_of_another_policy(tmp_path, folder, short_e
     first = run_script("dagger", tmp_path / "first", *flags)
     flags += ["--initial-policy", str(first), "--learning-rate", "1e-9", "--total-updates", "1"]
     second = run_script("dagger", tmp_path / "second", *flags)
-    one, other = (load_network(run / "policy.pt").parameters() for run in (first, second))
-    assert len(one) > 10 and one[-2].abs().max() > 0.001  # the head, which begins with zeros
-    for weights, same in zip(one, other, strict=True):
-        torch.testing.assert_close(weights, same, atol=1e-6, rtol=0.0)
+    one, other = (read_weights(run / "policy.onnx") for run in (first, second))
+    assert len(one) > 10 and np.abs(one["head.weight"]).max() > 0.001  # it begins with zeros
+    for name, weights in one.items():
+        np.testing.assert_allclose(other[name], weights, atol=1e-6, rtol=0.0)
 
 
 @pytest.mark.parametrize(
@@ -265,7 +268,7 @@ def test_run_on_another_device(tmp_path, folder, another_device, short_episodes)
     few = ["--total-updates", "4", "--eval-every", "4", "--round-every", "2", "--eval-queries", "1"]
     flags = ["--paths", str(folder), "--encoder", "oracle", *few]
     run = run_script("dagger", tmp_path, *flags, "--device", another_device)
-    assert load_network(run / "policy.pt").metadata["step"] == 4
+    assert load_network(run / "policy.onnx").metadata["step"] == 4
     assert json.loads((run / "result.json").read_text())["steps"] == 4
     args = json.loads((run / "args.json").read_text())
     assert args["bf16"] is True

@@ -10,7 +10,7 @@ import pytest
 from trainers import succeeds_here
 
 from roboarm_nmp import envs
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 
 CELLS = {cell.name: cell for cell in paper_tables.read_cells()}
 
@@ -54,7 +54,7 @@ def test_run_is_kept_and_not_done_again(
     assert kept["steps"] == 60 and kept["num_queries"] == 2
     assert [step for step, _ in kept["curve"]] == [60]
     assert re.fullmatch(r"[0-9a-f]{7,}\+?", kept["commit"])
-    load_network(tmp_path / "policies" / "bc-config-wall-s5.pt")
+    load_network(tmp_path / "policies" / "bc-config-wall-s5.onnx")
     capfd.readouterr()
     paper_tables.run(cell, 5, 60, 2, tmp_path / "runs")
     assert capfd.readouterr().out == "bc-config-wall-s5: done before\n"

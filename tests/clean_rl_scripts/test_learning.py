@@ -7,7 +7,7 @@ from trainers import load, panda_env, run_script
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.training import protocol
 
 READY = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8], np.float32)  # rad
@@ -41,7 +41,7 @@ def test_trainer_learns_to_reach_near_goals(trainer, tmp_path, monkeypatch):
     untrained = module.Actor(module.Args(hidden_size=64, bf16=False), panda_env()).eval()
     before, after = (
         protocol.evaluate(policy, made, queries, "cpu")["success_rate"]
-        for policy in (untrained, load_network(run / "policy.pt"))
+        for policy in (untrained, load_network(run / "policy.onnx"))
     )
     # (Seeds 1 to 3 reach 0.8 and more; below 0.5 without bootstrapping, --gamma 0, and below 0.1
     # without hindsight.)

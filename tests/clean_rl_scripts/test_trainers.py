@@ -24,7 +24,7 @@ from trainers import (
 
 from roboarm_nmp import envs
 from roboarm_nmp.evaluation.evaluate import evaluate
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.training import protocol, runs
 
 
@@ -97,7 +97,7 @@ def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
 
 
 def test_saved_policy_is_the_running_average_and_acts_without_the_script(finished_run, trainer):
-    policy = load_network(finished_run / "policy.pt")
+    policy = load_network(finished_run / "policy.onnx")
     assert policy.metadata["kind"] == "policy" and policy.metadata["task"] == "no_obstacles"
     env = envs.make(policy.metadata["task"], **policy.metadata["env"])
     observation, _ = env.reset(seed=0)
@@ -196,7 +196,7 @@ def test_evaluation_that_a_signal_ends_is_repeated_by_the_resumed_run(
         run_script("bc", tmp_path, *FINISHED["bc"])
     assert end.value.code == 143
     (run,) = tmp_path.iterdir()
-    assert not (run / "policy.pt").exists()
+    assert not (run / "policy.onnx").exists()
     run_here(PATHS["bc"], "--resume", run)
     assert_same_checkpoints(finished_runs["bc"], run)
 
@@ -211,7 +211,7 @@ def test_run_stops_at_a_success_rate(tmp_path, monkeypatch):
 def test_diverged_run_ends(tmp_path):
     with pytest.raises(FloatingPointError, match="the policy's actions are no longer finite"):
         run_here(*command("bc", tmp_path, "--learning-rate", "1e30")[1:])
-    assert not list(tmp_path.glob("*/policy.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
+    assert not list(tmp_path.glob("*/policy.onnx")) and not list(tmp_path.glob("*/checkpoint.pt"))
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import json
 import shutil
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from paths import ROOT
@@ -16,7 +17,7 @@ from roboarm_nmp.datasets.queries import query_path
 from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.policies.registry import PolicyError, find_policy, make_policy
 
@@ -64,7 +65,7 @@ def test_trainer_trains_another_arm(trainer, file, tmp_path, monkeypatch, short_
     assert args["task"] == result["task"] == "no_obstacles@xarm6.yaml"
     assert result["robot"] == "xarm6" and run.name.startswith("no_obstacles@xarm6__")
     robot = load_robot(file)
-    metadata = load_network(run / "policy.pt").metadata
+    metadata = load_network(run / "policy.onnx").metadata
     assert metadata["robot"] == ["xarm6", robot.fingerprint]
     # On its own task, and resumed, also from another folder.
     assert evaluate(run, num_queries=2)["robot"] == "xarm6"
@@ -89,15 +90,16 @@ def test_exported_policy_names_its_arm(file, tmp_path):
         def forward(self, observation, achieved_goal, desired_goal):
             return (desired_goal - observation[:, : desired_goal.shape[1]]).clamp(-1.0, 1.0)
 
-    task, path = f"no_obstacles@{file}", tmp_path / "policy.pt"
+    task, path = f"no_obstacles@{file}", tmp_path / "policy.onnx"
     save_policy(path, GoToGoal(), task, goal_type="config")
     assert load_network(path).metadata["robot"] == ["xarm6", load_robot(file).fingerprint]
     assert evaluate(path)["success_rate"] == evaluate("go-to-goal", task)["success_rate"]
-    content = torch.load(path, weights_only=True)
-    content["metadata"]["robot"] = 7
-    torch.save(content, tmp_path / "bad.pt")
-    with pytest.raises(EvaluationError, match="bad.pt: it was trained for the robot 7"):
-        evaluate(tmp_path / "bad.pt")
+    model = onnx.load(path)
+    [entry] = [entry for entry in model.metadata_props if entry.key == "robot"]
+    entry.value = "7"
+    onnx.save(model, tmp_path / "bad.onnx")
+    with pytest.raises(EvaluationError, match="bad.onnx: it was trained for the robot 7"):
+        evaluate(tmp_path / "bad.onnx")
 
 
 def test_target_entropy_is_minus_the_number_of_joints(file):

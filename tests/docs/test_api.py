@@ -11,7 +11,7 @@ from paths import ROOT
 
 import roboarm_nmp
 from roboarm_nmp.clean_rl_scripts import evaluate
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.policies.registry import PolicyError
 
@@ -30,7 +30,7 @@ def page(tmp_path_factory):
 def test_snippets_of_the_page_run(page):
     folder, names = page
     assert sorted(path.name for path in folder.iterdir()) == [
-        *("back.h5", "episode.npz", "my_scene.yaml", "path.csv", "policy.pt", "problems.h5")
+        *("back.h5", "episode.npz", "my_scene.yaml", "path.csv", "policy.onnx", "problems.h5")
     ]
     assert names["filtered"]["safety_filter"]["margin"] == 0.01
     assert len(names["demos"][:10]) == 10
@@ -56,16 +56,15 @@ def test_every_reference_of_the_page_exists():
 
 def test_stable_baselines3_policy_of_the_page_acts_as_its_model(page, capsys):
     folder, names = page
-    arguments = ["--policy", str(folder / "policy.pt"), "--task", "wall", "--num-queries", "2"]
+    arguments = ["--policy", str(folder / "policy.onnx"), "--task", "wall", "--num-queries", "2"]
     assert evaluate.main([*arguments, "--workers", "1"]) == 0
     assert "on wall: 2 test queries" in capsys.readouterr().out
-    model, network = names["model"], load_network(folder / "policy.pt")
+    model, network = names["model"], load_network(folder / "policy.onnx")
     env = roboarm_nmp.make("wall", goal_type="ee")
     for seed in range(5):
         observation, _ = env.reset(seed=seed)
-        inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
         expected = model.predict(observation, deterministic=True)[0]
-        np.testing.assert_allclose(network.predict_one(inputs), expected, atol=1e-5)
+        np.testing.assert_allclose(network.predict_one(observation, 7)[0], expected, atol=1e-5)
     env.close()
 
 
@@ -75,9 +74,9 @@ def test_policy_with_other_actions_or_arguments_is_rejected(tmp_path):
             return desired_goal
 
     with pytest.raises(PolicyError, match=r"must be \(2, 7\), got \(2, 3\)"):
-        save_policy(tmp_path / "a.pt", Goal(), "wall", goal_type="ee")
+        save_policy(tmp_path / "a.onnx", Goal(), "wall", goal_type="ee")
     with pytest.raises(PolicyError, match="horizon: not among the arguments that a policy stores"):
-        save_policy(tmp_path / "a.pt", Goal(), "wall", goal_type="config", horizon=10)
+        save_policy(tmp_path / "a.onnx", Goal(), "wall", goal_type="config", horizon=10)
     assert not list(tmp_path.iterdir())
-    save_policy(tmp_path / "a.pt", Goal(), "wall", goal_type="config")
-    assert load_network(tmp_path / "a.pt").metadata["env"] == {"goal_type": "config"}
+    save_policy(tmp_path / "a.onnx", Goal(), "wall", goal_type="config")
+    assert load_network(tmp_path / "a.onnx").metadata["env"] == {"goal_type": "config"}

@@ -26,7 +26,7 @@ from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.evaluation import evaluate as evaluation
 from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
 from roboarm_nmp.evaluation.report import report
-from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
@@ -72,7 +72,7 @@ def _save(path, module=None, goal_size=7, observation_size=10, **metadata):
         "desired_goal": torch.zeros(1, goal_size),
     }
     metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
-    save_network(path, module or Straight(), inputs, metadata)
+    save_network(path, module or Straight(), inputs, metadata, ["action"])
     return path
 
 
@@ -165,12 +165,12 @@ def test_network_function_and_baseline_with_the_same_actions_agree(queries, tmp_
     threads = torch.get_num_threads()
     baseline = evaluate("go-to-goal", "no_obstacles", goal_type="config", **few)
     function = evaluate(straight, "no_obstacles", goal_type="config", **few)
-    network = evaluate(_save(tmp_path / "policy.pt"), "no_obstacles", **few)
+    network = evaluate(_save(tmp_path / "policy.onnx"), "no_obstacles", **few)
     folder = evaluate(str(tmp_path), "no_obstacles", **few)
     assert torch.get_num_threads() == threads
     assert _numbers(network) == _numbers(folder)
     assert function["policy"] == "straight"
-    assert network["goal_type"] == "config" and network["policy"] == str(tmp_path / "policy.pt")
+    assert network["goal_type"] == "config" and network["policy"] == str(tmp_path / "policy.onnx")
     for result in (function, network):
         assert result["success_rate"] == baseline["success_rate"] > 0.8
         assert result["path_length"] == pytest.approx(baseline["path_length"], rel=1e-3)
@@ -183,7 +183,7 @@ def test_network_brings_its_environment_but_not_the_rules(queries, tmp_path):
 
     env = {"goal_type": "ee", "action_mode": "subgoal", "max_step": 0.05, "velocities": True}
     cheat = {"ee_tolerance": 10.0, "horizon": 10_000, "render_mode": "human"}
-    path = _save(tmp_path / "still.pt", Still(), 3, 17, env=env | cheat)
+    path = _save(tmp_path / "still.onnx", Still(), 3, 17, env=env | cheat)
     result = evaluate(path, "no_obstacles", queries=queries, num_queries=2)
     assert result["env"] == env | {"stop_on_collision": False}
     assert result["success_rate"] == 0.0
@@ -277,7 +277,7 @@ def test_flags_change_the_filter_that_a_policy_includes(tmp_path, capsys):
 
 def test_safety_filter_around_a_network_without_link_distances(tmp_path):
     source = "point_cloud"
-    path = _save(tmp_path / "policy.pt")
+    path = _save(tmp_path / "policy.onnx")
     few = {"split": "validation", "num_queries": 5}
     bare = evaluate(path, "boxes", **few)
     assert "link_distances" not in bare["env"] and bare["collision_rate"] > 0
@@ -325,7 +325,7 @@ def test_result_and_header_say_whether_ground_truth_was_used(policy, options, so
 
 def test_task_defaults_to_that_of_the_policy(tmp_path):
     (tmp_path / "run").mkdir()
-    path = _save(tmp_path / "run" / "policy.pt", task="boxes")
+    path = _save(tmp_path / "run" / "policy.onnx", task="boxes")
     for policy, task in (("sac-ee-wall-p1-s1", "wall"), (path, "boxes"), (path.parent, "boxes")):
         assert evaluate(str(policy), num_queries=1)["task"] == task
     assert evaluate(str(path), "wall", num_queries=1)["task"] == "wall"
@@ -348,8 +348,8 @@ def test_policy_with_longer_steps_is_not_comparable(query_file, tmp_path, capsys
         assert command.main([str(argument) for argument in arguments]) == 0
         return json.loads((tmp_path / "out.json").read_text()), capsys.readouterr().out
 
-    usual = _save(tmp_path / "usual.pt", env={"goal_type": "config", "max_step": 0.03})
-    longer = _save(tmp_path / "longer.pt", env={"goal_type": "config", "max_step": 0.06})
+    usual = _save(tmp_path / "usual.onnx", env={"goal_type": "config", "max_step": 0.03})
+    longer = _save(tmp_path / "longer.onnx", env={"goal_type": "config", "max_step": 0.06})
     standard, table = run(usual)
     assert standard["deviations"] == {} and "not comparable" not in table
     faster, table = run(longer)
@@ -436,13 +436,13 @@ def test_errors_of_the_command_are_one_line_before_any_work(
         raise AssertionError("work was done")
 
     monkeypatch.setattr(evaluation, "_run", never)
-    policy = str(_save(tmp_path / "policy.pt"))
-    encoder = str(_save(tmp_path / "encoder.pt", kind="encoder"))
-    unfit = str(_save(tmp_path / "unfit.pt", env={"goal_type": "ee"}))
+    policy = str(_save(tmp_path / "policy.onnx"))
+    encoder = str(_save(tmp_path / "encoder.onnx", kind="encoder"))
+    unfit = str(_save(tmp_path / "unfit.onnx", env={"goal_type": "ee"}))
     cases = [
         ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol: did you mean go-to-goal?"),
-        ({"policy": encoder}, "encoder.pt: a network, but not a policy"),
-        ({"policy": unfit}, "unfit.pt: aten.sub.Tensor failed"),
+        ({"policy": encoder}, "encoder.onnx: a network, but not a policy"),
+        ({"policy": unfit}, "unfit.onnx: its input desired_goal has the shape"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
         ({"task": "wal"}, "unknown task 'wal': did you mean wall?"),
         ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),

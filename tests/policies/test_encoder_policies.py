@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from trainers import load, run_script
 
 import roboarm_nmp
@@ -13,6 +12,7 @@ from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.scenes.motions import Oscillation
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.networks.network_file import load_network
 
 HARD = "random_boxes_hard"
 MOVING = Scene((Box((0.5, 0.2, 0.3), (0.1, 0.1, 0.6), motion=Oscillation((0, 0.3, 0), 1.0)),))
@@ -125,8 +125,8 @@ def test_policy_with_an_encoder_is_trained_and_evaluated(
     if trainer == "sac_her_mp":
         flags += ["--demo-prob", "1", "--geometry-source", "ground_truth", "--link-distances"]
     run = run_script(trainer, tmp_path, *flags)
-    network = torch.load(run / "policy.pt", weights_only=True)
-    assert network["metadata"]["env"]["encoder"] == "oracle"
+    trained = load_network(run / "policy.onnx").metadata["env"]
+    assert trained["encoder"] == "oracle"
     result = roboarm_nmp.evaluate(run, HARD, num_queries=2)
     assert result["goal_type"] == "combined" and result["privileged"]
-    assert network["metadata"]["env"].get("append_link_distances", False) == (trainer != "bc")
+    assert trained.get("append_link_distances", False) == (trainer != "bc")

@@ -8,7 +8,7 @@ import pytest
 from paths import LIBRARY, ROOT
 
 from roboarm_nmp import envs
-from roboarm_nmp.networks.exported_networks import to_float16
+from roboarm_nmp.networks.export import to_float16
 from roboarm_nmp.policies.registry import (
     PolicyError,
     find_policy,
@@ -22,11 +22,11 @@ from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 def test_pretrained_policies_are_found_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    files = {path.stem: path for path in (LIBRARY / "policies" / "pretrained").glob("*.pt")}
+    files = {path.stem: path for path in (LIBRARY / "policies" / "pretrained").glob("*.onnx")}
     found = {name: path.resolve() for name, path in pretrained_policies().items()}
     assert len(files) > 10 and found == files
     assert policy_file("bc-config-double_walls-s1").samefile(
-        ROOT / "src/roboarm_nmp/policies/pretrained/bc-config-double_walls-s1.pt"
+        ROOT / "src/roboarm_nmp/policies/pretrained/bc-config-double_walls-s1.onnx"
     )
     path, arguments = find_policy("sac-ee-wall-p1-s1")
     assert path.samefile(files["sac-ee-wall-p1-s1"]) and arguments["goal_type"] == "ee"
@@ -40,15 +40,15 @@ def test_pretrained_policies_are_found_from_anywhere(tmp_path, monkeypatch):
         PolicyError, match="no such policy: x: expected go-to-goal, .*`roboarm polic"
     ):
         policy_file("x")
-    (tmp_path / "sac-ee-wall-p1-s1" / "policy.pt").write_bytes(b"")
-    assert policy_file("sac-ee-wall-p1-s1") == Path("sac-ee-wall-p1-s1/policy.pt")
+    (tmp_path / "sac-ee-wall-p1-s1" / "policy.onnx").write_bytes(b"")
+    assert policy_file("sac-ee-wall-p1-s1") == Path("sac-ee-wall-p1-s1/policy.onnx")
 
 
 @pytest.mark.parametrize("name", pretrained_policies())
 def test_pretrained_policies_are_stored_in_float16(name, tmp_path):
     path = pretrained_policies()[name]
-    to_float16(path, tmp_path / "policy.pt")
-    assert (tmp_path / "policy.pt").read_bytes() == path.read_bytes()
+    to_float16(path, tmp_path / "policy.onnx")
+    assert (tmp_path / "policy.onnx").read_bytes() == path.read_bytes()
 
 
 def test_policy_without_its_encoder_in_the_environment_is_rejected():
@@ -56,7 +56,7 @@ def test_policy_without_its_encoder_in_the_environment_is_rejected():
     assert arguments["encoder"] == "oracle"
     del arguments["encoder"]
     env = envs.make("random_boxes_hard", **arguments)
-    with pytest.raises(PolicyError, match="bc-combined-oracle-random_boxes_hard-s1.pt"):
+    with pytest.raises(PolicyError, match="bc-combined-oracle-random_boxes_hard-s1.onnx"):
         make_policy(path, env)
     env.close()
 

@@ -16,7 +16,7 @@ from trainers import GPU, error_here, run_here, shared_blocks
 from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.sensors import PointCloud
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.scene_embedding_train import clouds, images
 
 
@@ -58,9 +58,9 @@ def test_run_writes_an_encoder_a_result_and_events(run):
 
 def test_saved_encoder_runs_without_its_script(run, observations):
     name, folder = run
-    encoder = load_network(folder / "encoder.pt")
+    encoder = load_network(folder / "encoder.onnx")
     assert encoder.metadata["kind"] == "encoder"
-    encode = make_encoder(folder / "encoder.pt")
+    encode = make_encoder(folder / "encoder.onnx")
     read = Observations(observations)
     if name in OF_CLOUDS:
         inputs = {}
@@ -129,7 +129,7 @@ def test_update_evaluation_and_resume_run_on_another_device(
         flags += ["--bf16", "False"]
     run_here(script, *flags)
     (folder,) = tmp_path.iterdir()
-    assert load_network(folder / "encoder.pt").metadata["step"] == 1
+    assert load_network(folder / "encoder.onnx").metadata["step"] == 1
     args = json.loads((folder / "args.json").read_text())
     (folder / "args.json").write_text(json.dumps(args | {"total_updates": 2}))
     run_here(script, "--resume", str(folder))

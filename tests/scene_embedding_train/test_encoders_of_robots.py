@@ -11,7 +11,7 @@ from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal
 from roboarm_nmp.envs.robots.files import load_robot
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.scene_embedding_train import collect
 
 XARM6 = ROOT / "examples" / "robots" / "xarm6.yaml"
@@ -46,7 +46,7 @@ def test_encoder_is_for_its_arm(observations, tmp_path):
     assert without.returncode == 1 and "made for the robot 'xarm6' " in without.stderr
     flags += ["--robot", str(XARM6)]
     subprocess.run(command("field", observations, tmp_path, *flags), check=True)
-    encoder = next(tmp_path.glob("*/encoder.pt"))
+    encoder = next(tmp_path.glob("*/encoder.onnx"))
     assert load_network(encoder).metadata["robot"] == ["xarm6", load_robot(XARM6).fingerprint]
     env = envs.make(f"random_boxes_hard@{XARM6}", encoder=encoder)
     assert env.reset(seed=0)[0]["observation"].shape == (6 + 3 + 8,)

@@ -12,8 +12,9 @@ import torch
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.evaluation.evaluate import evaluate
-from roboarm_nmp.networks.exported_networks import load_network, save_network
-from roboarm_nmp.policies.registry import PolicyError, make_policy
+from roboarm_nmp.networks.export import save_network
+from roboarm_nmp.networks.network_file import load_network
+from roboarm_nmp.policies.registry import OUTPUTS, PolicyError, make_policy
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 from roboarm_nmp.training import protocol
 from roboarm_nmp.utils import flags
@@ -141,7 +142,7 @@ def test_recurrent_state_starts_at_zero_in_every_episode(tmp_path):
 
     run = a_run(tmp_path, arguments, several, task="wall")
     run.save_policy(policy)
-    saved = load_network(run.folder / "policy.pt")
+    saved = load_network(run.folder / "policy.onnx")
     assert saved.metadata["recurrent_size"] == 8 and "recurrent_state" in saved.inputs
     assert protocol.evaluate(saved, several, queries, "cpu") == found
     result = evaluate(run.folder, "wall", split="validation", num_queries=5)
@@ -154,14 +155,14 @@ def test_recurrent_state_of_another_size_than_the_metadata_is_rejected(tmp_path)
     env = envs.make("wall", goal_type="config")
     example = protocol.stack([env.reset(seed=0)[0]] * 2, "cpu")
     metadata = {"kind": "policy", "env": {"goal_type": "config"}}
-    path = tmp_path / "policy.pt"
-    save_network(path, Toward(0.05), example, metadata | {"recurrent_size": 8})
-    with pytest.raises(PolicyError, match="not a sequence of 2"):
+    path = tmp_path / "policy.onnx"
+    save_network(path, Toward(0.05), example, metadata | {"recurrent_size": 8}, ["action"])
+    with pytest.raises(PolicyError, match="it has 1 outputs, not 2"):
         make_policy(path, env)
     example["recurrent_state"] = torch.zeros(2, 8)
-    sizes = ((0, "needs recurrent_state"), (7, "do not fit|failed"), (9, "do not fit|failed"))
+    sizes = ((0, "needs recurrent_state"), (7, "recurrent_state"), (9, "recurrent_state"))
     for size, message in sizes:
-        save_network(path, Hesitant(), example, metadata | {"recurrent_size": size})
+        save_network(path, Hesitant(), example, metadata | {"recurrent_size": size}, OUTPUTS)
         with pytest.raises(PolicyError, match=message):
             make_policy(path, env)
 

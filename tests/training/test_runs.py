@@ -193,11 +193,11 @@ def test_leftovers_of_a_kill_are_removed(parse, tmp_path):
     run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
     left = run / ".checkpoint.pt.0123abcd.tmp"
     left.write_text("half of one")
-    with new_contents(run / "policy.pt") as being_written:
+    with new_contents(run / "policy.onnx") as being_written:
         runs.run_folder(parse("--resume", run), "wall")
         assert not left.exists() and being_written.exists()
         being_written.write_text("whole")
-    assert {path.name for path in run.iterdir()} == {"args.json", "policy.pt"}
+    assert {path.name for path in run.iterdir()} == {"args.json", "policy.onnx"}
     left.touch()
     runs.save_checkpoint(run, parts(), "cpu")
     assert not left.exists()

@@ -15,7 +15,7 @@ from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.queries import Query, load_queries, write_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.motions.trajectories import load_joint_path
-from roboarm_nmp.networks.exported_networks import save_network
+from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.viewer import images, show
 
 SMALL = (96, 72)
@@ -75,13 +75,13 @@ def save(path, **metadata):
     sizes = {"observation": 10, "achieved_goal": 7, "desired_goal": 7}
     inputs = {name: torch.zeros(1, size) for name, size in sizes.items()}
     metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
-    save_network(path, Straight(), inputs, metadata)
+    save_network(path, Straight(), inputs, metadata, ["action"])
     return path
 
 
 def test_animation_shows_the_episode_of_a_policy(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(show, "MAX_FRAMES", 5)
-    save(tmp_path / "policy.pt")
+    save(tmp_path / "policy.onnx")
     arguments = ["--query", 2, *SIZE, "--policy", tmp_path]
     assert run("wall", "--output", tmp_path / "a.gif", *arguments) == 0
     text = capsys.readouterr().out
@@ -189,7 +189,7 @@ def test_scene_is_shown_without_queries_that_are_out_of_date(tmp_path, capsys):
 
 
 def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
-    unfit = save(tmp_path / "unfit.pt", env={"goal_type": "ee"})
+    unfit = save(tmp_path / "unfit.onnx", env={"goal_type": "ee"})
     (tmp_path / "bad.yaml").write_text("obstacles:\n  - bax: {}\n")
     (tmp_path / "full.yaml").write_text("obstacles: [sphere: {position: [0, 0, 0.3], radius: 0.3}]")
     before = sorted(os.listdir(tmp_path))
@@ -204,7 +204,7 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
         (["wall", "--output", tmp_path / "out.jpg"], "must end in .png or .gif"),
         (["wall", *png, "--query", many], f"no test query {many}: the numbers are 0 to {many - 1}"),
         (["wall", *gif, "--draws", 2], "--draws goes with --output FILE.png"),
-        (["wall", *gif, "--policy", unfit], "unfit.pt: aten.sub.Tensor failed"),
+        (["wall", *gif, "--policy", unfit], "unfit.onnx: its input desired_goal has the shape"),
         (["benchmaker_bookshelf_tall", *gif, "--policy", "demo"], "has no demonstrations"),
         (["wall", *gif, "--trajectory", tmp_path / "none.csv"], "none.csv: No such file"),
         (["wall", *gif, "--save-trajectory", tmp_path / "a.txt"], "must end in .csv, .npz"),

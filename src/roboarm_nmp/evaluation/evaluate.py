@@ -11,6 +11,7 @@ same numbers, times excepted, whatever the number of workers.
 import contextlib
 import math
 import platform
+import sys
 import time
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.format import AnimatedScenes, QueryScenes
@@ -162,7 +162,7 @@ def evaluate(
 
     Args:
         policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, `space-time`, the
-            path of a policy network or of a folder with a `policy.pt`, the name of a pretrained
+            path of a policy network or of a folder with a `policy.onnx`, the name of a pretrained
             policy, or a function from an observation (dict of `RoboArmEnv`) to an action (n,); with
             several workers, one that can be pickled.
         task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
@@ -476,7 +476,8 @@ class _Worker:
     """Runs the queries of a job, chunk by chunk."""
 
     def __init__(self, job: _Job):
-        torch.set_num_threads(1)
+        if torch := sys.modules.get("torch"):  # of a policy that is a function
+            torch.set_num_threads(1)
         self.job = job
         self.env, self.begin = job.make()
 
@@ -532,7 +533,8 @@ def _run(job: _Job, progress: bool) -> list[Outcome]:
     outcomes = {}
     successes = 0
     bar = progress_bar(total=count, unit="query", disable=not progress)
-    threads = torch.get_num_threads()
+    torch = sys.modules.get("torch")
+    threads = torch.get_num_threads() if torch else None
     try:
         with bar, contextlib.closing(_results(job, chunks)) as results:
             for indices, chunk in results:
@@ -542,7 +544,8 @@ def _run(job: _Job, progress: bool) -> list[Outcome]:
                 if bar.n:  # 0 if no bar is shown
                     bar.set_postfix(success=f"{successes / bar.n:.3f}")
     finally:
-        torch.set_num_threads(threads)
+        if torch:
+            torch.set_num_threads(threads)
     return [outcomes[index] for index in range(count)]
 
 
@@ -596,7 +599,7 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
         result["planning_seconds_solved"] = _mean(solved, "planning_seconds")
         if policy == "via-points":
             result["free_motion_rate"] = len(solved) / count
-    packages = ["pybullet", "torch", "numpy"]
+    packages = ["pybullet", "onnxruntime", "torch", "numpy"]
     if policy in OMPL_PLANNERS:
         packages.append("ompl")
     result |= {

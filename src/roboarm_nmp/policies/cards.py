@@ -13,7 +13,7 @@ from typing import Any
 from roboarm_nmp.envs.perception import encoders
 from roboarm_nmp.envs.perception.point_clouds import NUM_POINTS, POINT_CLOUD
 from roboarm_nmp.envs.perception.sensors import PointCloud, sensors_from_json
-from roboarm_nmp.networks.exported_networks import load_network
+from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.policies.registry import PolicyError, pretrained_policies
 from roboarm_nmp.utils.names import suggest
 
@@ -87,7 +87,7 @@ def encoder_card(name: str) -> dict[str, Any]:
     - `has_decoder`: whether obstacles can be decoded from its latent code;
     - `updates`, `training_seconds`, `date`, `args`: the training, and its flags.
     """
-    path = encoders.PRETRAINED / f"{name}.pt"
+    path = encoders.PRETRAINED / f"{name}.onnx"
     metadata = load_network(path).metadata
     saved = json.loads(path.with_suffix(".json").read_text())
     sensors = sensors_from_json(metadata["sensors"]).values()

@@ -1,8 +1,8 @@
 """Saving a policy of one's own, as a file that `roboarm evaluate` runs without its script.
 
-    save_policy("policy.pt", module, "wall", goal_type="ee")
+    save_policy("policy.onnx", module, "wall", goal_type="ee")
 
-The file's format, and what its network may compute: `networks.exported_networks`. For a policy
+The file's format, and what its network may compute: docs/reference/file_formats.md. For a policy
 of Stable-Baselines3 see docs/reference/api.md. A function needs no file: `roboarm_nmp.evaluate`.
 """
 
@@ -14,9 +14,9 @@ import torch
 
 from roboarm_nmp import envs
 from roboarm_nmp.envs.robots.metadata import robot_metadata
-from roboarm_nmp.networks.exported_networks import save_network
-from roboarm_nmp.networks.operations import NetworkError
-from roboarm_nmp.policies.registry import ENV_ARGUMENTS, PolicyError
+from roboarm_nmp.networks.export import save_network
+from roboarm_nmp.networks.untrusted import NetworkError
+from roboarm_nmp.policies.registry import ENV_ARGUMENTS, OUTPUTS, PolicyError
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 
@@ -30,7 +30,7 @@ def save_policy(
     """Write a module as a policy file.
 
     Args:
-        path: the file to write, e.g. `policy.pt`; its folder must exist.
+        path: the file to write, e.g. `policy.onnx`; its folder must exist.
         module: `nn.Module`. Its `forward` receives the observation by name (`observation`,
             `achieved_goal`, `desired_goal` and what else the environment observes), float32
             (N, ...), and returns deterministic actions, float32 (N, n), in [-1, 1]. It may not
@@ -75,6 +75,6 @@ def save_policy(
         got = tuple(action.shape) if isinstance(action, torch.Tensor) else type(action).__name__
         raise PolicyError(f"{path}: actions for {shape[0]} observations must be {shape}, got {got}")
     try:
-        save_network(path, module, example, metadata)
+        save_network(path, module, example, metadata, OUTPUTS)
     except NetworkError as error:
         raise PolicyError(str(error)) from error

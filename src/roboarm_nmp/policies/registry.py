@@ -31,8 +31,8 @@ from roboarm_nmp.policies.policy import BeginEpisode, EpisodePolicy, Policy
 from roboarm_nmp.policies.pose_goals import ConfigurationGoals
 from roboarm_nmp.utils.names import suggest
 
-if TYPE_CHECKING:  # PyTorch and Numba take a while to import
-    from roboarm_nmp.networks.exported_networks import ExportedNetwork
+if TYPE_CHECKING:  # Numba takes a while to import
+    from roboarm_nmp.networks.network_file import Network
     from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 # The arguments of an environment that a policy's metadata may contain. Tolerances and horizon are
@@ -41,7 +41,8 @@ ENV_ARGUMENTS = (
     *("goal_type", "action_mode", "max_step", "velocities"),
     *("encoder", "num_points", "geometry_source", "link_distances", "append_link_distances"),
 )
-"""Goal types of policies that also take goal poses, by inverse kinematics."""
+OUTPUTS = ("action", "next_recurrent_state")
+"""Names of a policy network's outputs; the second one only of a recurrent policy."""
 PRETRAINED = Path(__file__).parent / "pretrained"
 MAX_RECURRENT_SIZE = 65_536  # numbers
 
@@ -52,7 +53,7 @@ class PolicyError(ValueError):
 
 def pretrained_policies() -> dict[str, Path]:
     """The trained policies that come with the project: dict of name -> path."""
-    return {path.stem: path for path in sorted(PRETRAINED.glob("*.pt"))}
+    return {path.stem: path for path in sorted(PRETRAINED.glob("*.onnx"))}
 
 
 def policy_file(name: str | Path) -> Path:
@@ -62,14 +63,14 @@ def policy_file(name: str | Path) -> Path:
     """
     path = Path(name)
     if path.is_dir():
-        path = path / "policy.pt"
+        path = path / "policy.onnx"
     if path.exists():
         return path
     pretrained = pretrained_policies()
     if str(name) not in pretrained:
         otherwise = (
-            f"expected {', '.join(BASELINES)}, a policy network, a folder with a policy.pt in it, "
-            "or a name that `roboarm policies` lists"
+            f"expected {', '.join(BASELINES)}, a policy network, a folder with a policy.onnx "
+            "in it, or a name that `roboarm policies` lists"
         )
         hint = suggest(name, [*BASELINES, *pretrained], otherwise)
         raise PolicyError(f"no such policy: {path}: {hint}")
@@ -131,8 +132,8 @@ def recurrent_size(policy: Any) -> int:
     """The size of a trained policy's recurrent state; 0 for none.
 
     Args:
-        policy: an exported network, whose metadata may have `recurrent_size`, or a module that may
-            have that attribute. How it is called: `networks.exported_networks`.
+        policy: a `networks.network_file.Network`, whose metadata may have `recurrent_size`, or a
+            module that may have that attribute.
 
     Raises:
         PolicyError: it is no integer from 0 to `MAX_RECURRENT_SIZE`.
@@ -259,21 +260,21 @@ def _translated(begin, goals):
     return begin_translated
 
 
-# --- Trained policies. PyTorch is imported only here: it takes seconds.
+# --- Trained policies
 
 
 class _TrainedPolicy(NamedTuple):
     """A policy network, and what its metadata say."""
 
-    network: "ExportedNetwork"
+    network: "Network"
     env_arguments: dict[str, Any]
     safety_filter: "SafetyFilter | None"
     recurrent_size: int
 
 
 def _load(path: str | Path) -> _TrainedPolicy:
-    from roboarm_nmp.networks.exported_networks import load_network
-    from roboarm_nmp.networks.operations import NetworkError
+    from roboarm_nmp.networks.network_file import load_network
+    from roboarm_nmp.networks.untrusted import NetworkError
     from roboarm_nmp.policies.safety_filter import SafetyFilter
 
     try:
@@ -295,10 +296,8 @@ def _load(path: str | Path) -> _TrainedPolicy:
 
 def _trained(path, env):
     """`make_policy` of a policy network, and its `ConfigurationGoals`, None if it needs none."""
-    import torch
-
     from roboarm_nmp.envs.robots.metadata import check_robot
-    from roboarm_nmp.networks.operations import NetworkError
+    from roboarm_nmp.networks.untrusted import NetworkError
 
     network, trained, _, size = _load(path)
     robot = env.unwrapped.robot
@@ -315,11 +314,9 @@ def _trained(path, env):
     def predict(observation, recurrent_state) -> tuple[np.ndarray, np.ndarray]:
         if size:
             observation = observation | {"recurrent_state": recurrent_state}
-        inputs = {name: torch.from_numpy(observation[name])[None] for name in network.inputs}
-        if size:
-            action, recurrent_state = network.predict_one(inputs, (robot.num_joints, size))
+            action, recurrent_state = network.predict_one(observation, robot.num_joints, size)
         else:
-            action = np.asarray(network.predict_one(inputs, robot.num_joints))
+            [action] = network.predict_one(observation, robot.num_joints)
         return action, recurrent_state
 
     def begin(number, query):
@@ -345,6 +342,12 @@ def _trained(path, env):
         unknown -= {"recurrent_state"}
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
+    for name, (_, *shape) in network.inputs.items():
+        if name in example and list(example[name].shape) != shape:
+            raise PolicyError(
+                f"{path}: its input {name} has the shape {tuple(shape)}, the environment's "
+                f"observation {example[name].shape}"
+            )
     try:
         predict(example, np.zeros(size, np.float32))  # to see whether that raises
     except NetworkError as error:

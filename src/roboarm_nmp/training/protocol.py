@@ -1,8 +1,7 @@
 """The benchmark's protocol, for trainers of policies.
 
-The policy of a run that is the best on validation queries is saved, `policy.pt`. At the end of the
-run it is tested on test queries: `result.json`. (An evaluation on all queries, with more numbers:
-`evaluation.evaluate`.)
+The policy of a run that is best on validation queries is saved as `policy.onnx`, and tested on test
+queries at the end: `result.json`. (`evaluation.evaluate` takes more queries and returns more.)
 
 Functions that take flags are for scripts: on a mistake of the user, they end the program with a
 message.
@@ -26,8 +25,9 @@ from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.rollout import render_strip, rollouts
-from roboarm_nmp.networks.exported_networks import load_network, save_network
-from roboarm_nmp.policies.registry import policy_file, recurrent_size
+from roboarm_nmp.networks.export import read_weights, save_network
+from roboarm_nmp.networks.network_file import load_network
+from roboarm_nmp.policies.registry import OUTPUTS, policy_file, recurrent_size
 from roboarm_nmp.training.collection import FinishedEpisode, TrainingEnvs
 from roboarm_nmp.training.cuda_graphs import to_device
 from roboarm_nmp.training.runs import Run, RunFlags, check_finite, errors_of, fail, script_name
@@ -78,7 +78,7 @@ class EnvFlags:
     """joint velocities in the observation"""
     encoder: str | None = None
     """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
-    `pointnet2`, `field`, or the path of your own `encoder.pt`, docs/guide/perception.md),
+    `pointnet2`, `field`, or the path of your own `encoder.onnx`, docs/guide/perception.md),
     `point_cloud` for observed points, or `oracle` for the ground-truth obstacles; by default
     nothing"""
     geometry_source: str | None = None
@@ -120,14 +120,12 @@ def copy_weights(policy: str, module: torch.nn.Module) -> None:
 
     Ends the program with a message where that cannot be.
     """
-    weights = list(module.parameters())
     with errors_of("--initial-policy"):
-        initial = load_network(policy_file(policy)).parameters()
-        if [values.shape for values in initial] != [values.shape for values in weights]:
-            raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
-    with torch.no_grad():
-        for target, source in zip(weights, initial, strict=True):
-            target.copy_(source)
+        initial = read_weights(policy_file(policy))
+        for name, weights in module.named_parameters():
+            if name not in initial or initial[name].shape != weights.shape:
+                raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
+            weights.data.copy_(torch.from_numpy(initial[name]))
 
 
 def _first(queries: Queries, flag: str, number: int) -> Queries:
@@ -319,7 +317,7 @@ class PolicyRun(Run):
         args: the flags, `task`, `goal_type` and `seed` among them.
         state: dict from names to the parts of the run, as for `runs.Run`.
         device: of the run.
-        env_arguments: dict of `envs.make`'s arguments, which `policy.pt` is evaluated with.
+        env_arguments: dict of `envs.make`'s arguments, which `policy.onnx` is evaluated with.
         eval_envs: of `make_eval_envs`, with these arguments.
         validation: validation queries.
         safety_filter: an `policies.safety_filter.SafetyFilter` that is part of the policy, or
@@ -402,7 +400,7 @@ class PolicyRun(Run):
             self.checkpoint()
 
     def save_policy(self, policy: torch.nn.Module) -> None:
-        """Write `policy.pt` for `evaluate.py` and others.
+        """Write `policy.onnx` for `evaluate.py` and others.
 
         Args:
             policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else
@@ -422,10 +420,11 @@ class PolicyRun(Run):
             metadata["recurrent_size"] = size
             number = len(example["observation"])
             example["recurrent_state"] = torch.zeros(number, size, device=self.device)
-        save_network(self.folder / "policy.pt", policy, example, metadata)
+        outputs = OUTPUTS if size else OUTPUTS[:1]
+        save_network(self.folder / "policy.onnx", policy, example, metadata, outputs)
 
     def final_test(self, queries: Queries) -> None:
-        """Test `policy.pt` on test queries: `result.json`, and a line on the console. Ends the run.
+        """End the run: test `policy.onnx` on test queries, write `result.json`, and print a line.
 
         Always under the task's standard rules, the horizon of `RoboArmEnv` and contacts allowed,
         for comparable results. File and line contain the rules of the training, if they are others,
@@ -443,7 +442,7 @@ class PolicyRun(Run):
             robot=self.eval_envs[0].unwrapped.robot.name,
             goal_type=goal_type,
             num_queries=len(queries),
-            policy=str(self.folder / "policy.pt"),
+            policy=str(self.folder / "policy.onnx"),
             policy_step=self.best_step,
             validation_success_rate=self.best_score,
             steps=self.step,
@@ -462,7 +461,7 @@ class PolicyRun(Run):
         from roboarm_nmp.evaluation.evaluate import is_privileged
         from roboarm_nmp.policies.safety_filter import SafetyFilter
 
-        policy = load_network(self.folder / "policy.pt").to(self.device)
+        policy = load_network(self.folder / "policy.onnx")
         arguments = {name: value for name, value in self.env_arguments.items() if name not in RULES}
         test_envs = make_eval_envs(self.args.task, len(queries), **arguments)
         safety_filter = SafetyFilter.from_metadata(policy.metadata)

@@ -14,7 +14,7 @@
         if evaluating:
             error = ...
             if run.is_best(-error):
-                save_network(run.folder / "encoder.pt", model, ...)
+                save_network(run.folder / "encoder.onnx", model, ...)
         if evaluating or run.interrupted:   # Ctrl-C or SIGTERM
             run.checkpoint()                # an interrupted run ends here
     run.close()
@@ -68,7 +68,7 @@ class RunFlags:
     """seed of all random numbers; runs with the same seed, machine and device are identical"""
     runs_dir: Path = Path("runs")
     """parent of the run's folder, which has TensorBoard events, the checkpoint, the best network
-    (`policy.pt` or `encoder.pt`) and result.json"""
+    (`policy.onnx` or `encoder.onnx`) and result.json"""
     resume: Path | None = None
     """continue the run in this folder from its last checkpoint, with its flags"""
     device: str = "cpu"

@@ -85,7 +85,7 @@ class Args:
     """the task's name, the path of a scene file (.yaml), or a folder of roadmap paths"""
     policy: tuple[str, ...] = ()
     """the policies, side by side: `go-to-goal`, `random`, `via-points`, `planner`, a policy
-    network, a run's folder with a `policy.pt` in it, or the name of a pretrained policy; `demo`
+    network, a run's folder with a `policy.onnx` in it, or the name of a pretrained policy; `demo`
     replays the task's demonstrations, and --query is then the number of a demonstration; without
     one, `go-to-goal`, or the recorded motion alone"""
     trajectory: Path | None = None

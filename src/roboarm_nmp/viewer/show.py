@@ -62,8 +62,8 @@ class Args:
     policy: str = "go-to-goal"
     """The policy in an animation: `go-to-goal` (straight to the goal configuration), `random`,
     `via-points`, `planner` (as in clean_rl_scripts/evaluate.py), a policy network, a run's folder
-    with a `policy.pt` in it, or the name of a pretrained policy (docs/benchmark/results.md). `demo`
-    replays the task's demonstrations; --query is then the number of a demonstration."""
+    with a `policy.onnx` in it, or the name of a pretrained policy (docs/benchmark/results.md).
+    `demo` replays the task's demonstrations; --query is then the number of a demonstration."""
     goal_type: Literal["ee", "config", "combined", "pose"] | None = None
     """What the goal is; by default the policy's own, otherwise `combined`. For `ee`, the goal is a
     position: there is no ghost of the arm."""

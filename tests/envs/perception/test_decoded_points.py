@@ -21,8 +21,8 @@ from roboarm_nmp.envs.perception.geometry_source import (
 from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal, sensors_to_json
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
-from roboarm_nmp.networks.exported_networks import save_network
-from roboarm_nmp.networks.operations import NetworkError
+from roboarm_nmp.networks.export import save_network
+from roboarm_nmp.networks.untrusted import NetworkError
 
 BALL = (0.45, 0.1, 0.6, 0.15)  # decoded from every z_E, whatever the scene: position and radius, m
 POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
@@ -43,15 +43,22 @@ def save_encoder(path, decoder):
     """The path of an encoder, as a string, with a decoder beside it."""
     sensors = {"front": cardinal(PointCloud, num_samples=100)["front"]}
     metadata = {"kind": "encoder", "sensors": sensors_to_json(sensors)}
-    save_network(path, Constant(), {"front_points": torch.zeros(2, 100, 3)}, metadata)
+    save_network(path, Constant(), {"front_points": torch.zeros(2, 100, 3)}, metadata, ["latent"])
     inputs = {"latent": torch.rand(2, 4), "points": torch.rand(2, 5, 3)}
-    save_network(path.with_suffix(".decoder.pt"), decoder, inputs, {"kind": "field"})
+    save_network(
+        path.with_suffix(".decoder.onnx"),
+        decoder,
+        inputs,
+        {"kind": "field"},
+        ["distance"],
+        {"points": [1]},
+    )
     return str(path)
 
 
 @pytest.fixture(scope="module")
 def encoder(tmp_path_factory):
-    return save_encoder(tmp_path_factory.mktemp("decoded") / "encoder.pt", DistanceFromBall())
+    return save_encoder(tmp_path_factory.mktemp("decoded") / "encoder.onnx", DistanceFromBall())
 
 
 def test_decoded_points_are_the_grid_points_near_decoded_obstacles(encoder):
@@ -98,8 +105,8 @@ class NotANumber(DistanceFromBall):
 
 def test_decoder_without_valid_distances_is_rejected(tmp_path):
     """It must not count as a scene without obstacles."""
-    path = save_encoder(tmp_path / "encoder.pt", NotANumber())
-    with pytest.raises(NetworkError, match=r"encoder.decoder.pt: its output is not"):
+    path = save_encoder(tmp_path / "encoder.onnx", NotANumber())
+    with pytest.raises(NetworkError, match=r"encoder.decoder.onnx: its output is not"):
         make_encoder(path).decoded_points(Scene())
 
 

@@ -27,8 +27,8 @@ from roboarm_nmp.envs.perception.point_clouds import farthest_points, observed_p
 from roboarm_nmp.envs.perception.sensors import Camera, PointCloud, sensors_to_json
 from roboarm_nmp.envs.scenes.primitives import Scene, Sphere, from_array
 from roboarm_nmp.envs.wrappers import SceneEncodingWrapper
-from roboarm_nmp.networks.exported_networks import save_network
-from roboarm_nmp.networks.operations import NetworkError
+from roboarm_nmp.networks.export import save_network
+from roboarm_nmp.networks.untrusted import NetworkError
 
 FRONT = (1.6, 0.0, 0.8)
 SENSORS = {"front": Camera(FRONT, size=(8, 8)), "cloud": PointCloud(FRONT, num_samples=400)}
@@ -47,14 +47,14 @@ INPUTS = {"front": torch.zeros(2, 8, 8, 3).byte(), "cloud_points": torch.zeros(2
 
 def save_encoder(path, **changes):
     metadata = {"kind": "encoder", "sensors": sensors_to_json(SENSORS)} | changes
-    save_network(path, Means(), INPUTS, metadata)
+    save_network(path, Means(), INPUTS, metadata, ["latent"])
     return path
 
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory):
     """The path of an encoder's network."""
-    return save_encoder(tmp_path_factory.mktemp("encoder") / "encoder.pt")
+    return save_encoder(tmp_path_factory.mktemp("encoder") / "encoder.onnx")
 
 
 # --- z_E
@@ -137,7 +137,7 @@ def test_pretrained_encoders_are_found_by_name():
     assert pretrained_encoders() == ["field", "pointnet2", "vae", "vqvae"]
     queries = load_queries("random_boxes_hard")
     for name in pretrained_encoders():
-        encoder, path = make_encoder(name), PRETRAINED / f"{name}.pt"
+        encoder, path = make_encoder(name), PRETRAINED / f"{name}.onnx"
         assert encoder.name == name and encoder.path == path
         latents = np.stack([encoder(queries.scenes[i]) for i in (0, 9_999)])
         assert latents.shape == (2, 64) and np.isfinite(latents).all()
@@ -159,7 +159,7 @@ def test_demonstrations_are_encoded_once_into_the_cache_folder(
     network, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path / "cache"))
-    path = tmp_path / "encoder.pt"
+    path = tmp_path / "encoder.onnx"
     path.write_bytes(network.read_bytes())
     demos = replace(load_demos("random_boxes_hard"), start=np.zeros((5, 7)))  # the first 5
     latents = NetworkEncoder(path).encode_demos(demos)
@@ -169,7 +169,7 @@ def test_demonstrations_are_encoded_once_into_the_cache_folder(
     assert f"encoding random_boxes_hard with {path}, once; kept in {stored}" in (
         capsys.readouterr().err
     )
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["cache", "encoder.pt"]
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["cache", "encoder.onnx"]
     observe, observed = NetworkEncoder.observe, []
 
     def counted(self, scene):
@@ -213,7 +213,7 @@ def test_copies_and_unpickled_encoders_encode_equally(network):
 # --- Rejected
 
 
-@pytest.mark.parametrize("name", ["points", "nowhere/encoder.pt"])
+@pytest.mark.parametrize("name", ["points", "nowhere/encoder.onnx"])
 def test_unknown_encoder_is_rejected_with_the_known_names(name):
     with pytest.raises(NetworkError) as error:
         make_encoder(name)
@@ -235,7 +235,7 @@ def test_encoder_without_decoder_is_no_source_of_points(source):
 
 def test_network_that_is_no_encoder_is_rejected(tmp_path):
     with pytest.raises(NetworkError, match="not an encoder"):
-        make_encoder(save_encoder(tmp_path / "policy.pt", kind="policy"))
+        make_encoder(save_encoder(tmp_path / "policy.onnx", kind="policy"))
 
 
 @pytest.mark.parametrize(
@@ -248,6 +248,6 @@ def test_network_that_is_no_encoder_is_rejected(tmp_path):
     ],
 )
 def test_encoder_with_invalid_sensors_is_rejected(sensors, tmp_path):
-    path = save_encoder(tmp_path / "encoder.pt", sensors=sensors)
-    with pytest.raises(NetworkError, match=r"encoder.pt: its sensors are invalid"):
+    path = save_encoder(tmp_path / "encoder.onnx", sensors=sensors)
+    with pytest.raises(NetworkError, match=r"encoder.onnx: its sensors are invalid"):
         make_encoder(path)

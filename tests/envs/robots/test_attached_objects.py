@@ -56,7 +56,7 @@ def test_arm_without_objects_is_the_same_object_and_keeps_its_fingerprint():
     assert carrying == with_attached(PANDA, [BOARD]) == pickle.loads(pickle.dumps(carrying))
     assert carrying != with_attached(PANDA, [ROCK])
     assert carrying.collision_links == PANDA.collision_links
-    check_robot("policy.pt", {}, carrying)
+    check_robot("policy.onnx", {}, carrying)
 
 
 def test_objects_stay_when_the_gripper_is_held_elsewhere():

@@ -29,7 +29,7 @@ def test_arm_as_described_is_the_same_object_and_keeps_its_fingerprint():
     assert PANDA.held == dict.fromkeys(FINGERS, 0.04)
     assert PANDA.fingerprint.startswith("026faa3f2a77")
     assert OPEN != PANDA and OPEN.same_arm(PANDA) and PANDA.same_arm(OPEN)
-    check_robot("policy.pt", {}, OPEN)
+    check_robot("policy.onnx", {}, OPEN)
 
 
 def test_joint_that_mimics_another_one_follows_it_unless_it_is_named():

@@ -20,8 +20,9 @@ from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.demo_generation import collect, make_queries, roadmaps
 from roboarm_nmp.envs.scenes.files import load_scene, save_scene
 from roboarm_nmp.envs.tasks import get_task
-from roboarm_nmp.networks.exported_networks import load_network, save_network
-from roboarm_nmp.networks.operations import NetworkError
+from roboarm_nmp.networks.export import save_network
+from roboarm_nmp.networks.network_file import load_network
+from roboarm_nmp.networks.untrusted import NetworkError
 from roboarm_nmp.scene_embedding_train import collect as observe
 from roboarm_nmp.training import runs
 
@@ -44,9 +45,9 @@ def make_files(folder):
     """Make one file of each kind in a folder: dict from the kind to its path."""
     task = folder / "mine.yaml"
     save_scene(get_task("boxes").scene, task)
-    paths = {"scene": task, "network": folder / "network.pt"}
+    paths = {"scene": task, "network": folder / "network.onnx"}
     torch.manual_seed(0)
-    save_network(paths["network"], Mixed(), inputs(), {"kind": "encoder"})
+    save_network(paths["network"], Mixed(), inputs(), {"kind": "encoder"}, ["latent"])
     paths["queries"], paths["demos"] = folder / "mine_queries.h5", folder / "mine_demos.h5"
     make_queries.make_queries(paths["queries"], str(task), 0, 20, 5, progress=False)
     options = collect.options_of(collect.Args(str(task)))

@@ -30,11 +30,11 @@ def commands(folder):
     return {
         "training": (
             command("sac_her_mp", folder / "runs", "--task", "wall", "--eval-every", "300"),
-            "runs/*/policy.pt",
+            "runs/*/policy.onnx",
         ),
         "cloning": (
             command("bc", folder / "runs", "--task", "wall", "--eval-every", "300"),
-            "runs/*/policy.pt",
+            "runs/*/policy.onnx",
         ),
         "collecting": (
             [python, "-m", "roboarm_nmp", "collect", "--task", "wall", "--num", "150"]

@@ -10,7 +10,7 @@ from torch import nn
 from attacks.children import RAN, REFUSED
 from roboarm_nmp.networks import operations as network_operations
 from roboarm_nmp.networks.exported_networks import ExportedNetwork, save_network
-from roboarm_nmp.networks.operations import NetworkError
+from roboarm_nmp.networks.untrusted import NetworkError
 
 NUMBERS = (0, 1, -1, 2, 3, 7, -7, 255, 2**15, 2**31, -(2**31), 2**40, 2**62, -(2**63), 2**63, 2**70)
 ODD = (*NUMBERS, 0.5, float("nan"), float("inf"), 1e300, True, None, "mean", "floor", [])
